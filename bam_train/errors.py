@@ -1,0 +1,77 @@
+"""Every exception that `bam_train` raises on purpose; needs nothing but the standard library.
+
+::
+
+    BamTrainError
+    ├── CheckpointError            a checkpoint that cannot be used; carries its path
+    │   ├── NotACheckpoint         no such file, not a zip, truncated, or without bam/manifest.json
+    │   ├── AlteredCheckpoint      a member's bytes differ from the manifest, is missing or is extra
+    │   ├── NewerFormat            written by a newer bam-train
+    │   └── CheckpointMismatch     made for another environment, algorithm or setting
+    ├── PolicyError                a frozen policy that cannot run, or an observation that does not fit it
+    ├── SettingsError              a setting or option that does not exist or does not fit
+    ├── TrainingFailed             training cannot go on (a NaN loss); the last good checkpoint is kept
+    └── OutputError                no space, no permission, or a file that is in the way
+
+Third-party errors are mapped to these at the border, with the cause kept by ``from``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class BamTrainError(Exception):
+    """Root of the tree; its text is one line that says what, why and what to do."""
+
+
+class CheckpointError(BamTrainError):
+    """A checkpoint that cannot be used.
+
+    Attributes:
+        path: The file.
+    """
+
+    def __init__(self, path: str | Path, message: str) -> None:
+        self.path = Path(path)
+        super().__init__(f"{path}: {message}")
+
+
+class NotACheckpoint(CheckpointError):  # noqa: N818 - reads as what happened
+    """The file is missing, truncated, or not a checkpoint.zip."""
+
+
+class AlteredCheckpoint(CheckpointError):  # noqa: N818
+    """A member is not what the manifest says.
+
+    Attributes:
+        member: The name of that member.
+    """
+
+    def __init__(self, path: str | Path, member: str, message: str) -> None:
+        self.member = member
+        super().__init__(path, message)
+
+
+class NewerFormat(CheckpointError):  # noqa: N818
+    """The checkpoint was written by a newer bam-train."""
+
+
+class CheckpointMismatch(CheckpointError):  # noqa: N818
+    """The checkpoint belongs to another environment, algorithm or setting."""
+
+
+class PolicyError(BamTrainError, ValueError):
+    """A frozen policy that cannot run, or an observation that does not fit it."""
+
+
+class SettingsError(BamTrainError, ValueError):
+    """A setting or option that does not exist or does not fit."""
+
+
+class TrainingFailed(BamTrainError):  # noqa: N818
+    """Training cannot go on; the text names the last good checkpoint."""
+
+
+class OutputError(BamTrainError, OSError):
+    """A file cannot be written: no space, no permission, or something in the way."""

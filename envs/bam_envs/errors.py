@@ -1,0 +1,70 @@
+"""Every exception that `bam_envs` raises on purpose.
+
+::
+
+    BamEnvsError
+    ├── UnknownName            a name that is not in a table; carries the closest match
+    ├── InvalidValue           a value outside what is allowed: which, expected, found
+    ├── MissingExtra           an optional dependency is not installed; carries the pip command
+    ├── ResetNeeded            `step` before `reset`, or after the episode ended
+    └── RobotFault             the robot or the link to it went wrong; never an episode's end
+        └── PhysicsDiverged    the simulation left the finite numbers
+
+Third-party errors are mapped to these at the border, with the cause kept by ``from``.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class BamEnvsError(Exception):
+    """Root of the tree; its text is one line that says what, why and what to do."""
+
+
+class UnknownName(BamEnvsError, ValueError):  # noqa: N818 - reads as what happened
+    """A name that no table holds.
+
+    Attributes:
+        kind: What was looked up, e.g. ``"environment"``.
+        name: The name that was given.
+        choices: Every name the table has, sorted.
+        closest: The most similar choice, or None.
+    """
+
+    def __init__(self, kind: str, name: str, choices: Iterable[str]) -> None:
+        self.kind, self.name, self.choices = kind, name, sorted(choices)
+        matches = difflib.get_close_matches(name, self.choices, n=1, cutoff=0.5)
+        self.closest = matches[0] if matches else None
+        hint = f"Did you mean {self.closest!r}?" if self.closest else f"Choose from: {', '.join(self.choices)}."
+        super().__init__(f"Unknown {kind} {name!r}. {hint}")
+
+
+class InvalidValue(BamEnvsError, ValueError):  # noqa: N818
+    """A value that does not fit: the message names the thing, the expected and the found."""
+
+
+class MissingExtra(BamEnvsError, ImportError):  # noqa: N818
+    """An optional dependency is missing.
+
+    Attributes:
+        package: The import that failed.
+        extra: The extra of `bam-train` that brings it.
+    """
+
+    def __init__(self, package: str, extra: str, purpose: str) -> None:
+        self.package, self.extra = package, extra
+        super().__init__(f'{purpose} needs {package}, which is not installed. Run: pip install "bam-train[{extra}]"')
+
+
+class ResetNeeded(BamEnvsError, RuntimeError):  # noqa: N818
+    """`step` was called without a running episode."""
+
+
+class RobotFault(BamEnvsError, RuntimeError):  # noqa: N818
+    """The robot, or the link to it, went wrong."""
+
+
+class PhysicsDiverged(RobotFault):
+    """The simulated state is no longer finite; carries the rows in its text."""
