@@ -1,0 +1,127 @@
+"""The one table of environments: it registers them with Gymnasium, and other learners read the same rows.
+
+Importing this imports neither a simulator nor a task; a row's task and robot are strings, resolved when the environment is made.
+"""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+
+from bam_envs.errors import UnknownName
+
+if TYPE_CHECKING:
+    from bam_envs.robot_env import RobotEnv, RobotVectorEnv
+
+
+@dataclass(frozen=True)
+class EnvEntry:
+    """One environment."""
+
+    id: str
+    """Gymnasium's id, with its version."""
+    summary: str
+    """What the robot is asked to do, in one line."""
+    task: str
+    """``"module:Class"`` of the task."""
+    robot: str
+    """``"module:function"`` that makes the simulated robot."""
+    max_episode_steps: int
+    """Steps after which an episode is truncated."""
+    period: float = 0.05
+    """Time between two actions [s]."""
+
+
+_ENTRIES = (
+    EnvEntry(
+        "bam/reach-v0",
+        "move the tool of a UR5e to a point, with joint-space actions",
+        "bam_envs.tasks.reach:ReachTask",
+        "bam_envs.robots.simulated.arm:arm_scene",
+        max_episode_steps=100,
+    ),
+    EnvEntry(
+        "bam/pick-v0",
+        "pick up a cube that lies anywhere in 30 x 40 cm with any yaw",
+        "bam_envs.tasks.pick:PickTask",
+        "bam_envs.robots.simulated.arm:cube_scene",
+        max_episode_steps=100,
+    ),
+    EnvEntry(
+        "bam/pick-place-v0",
+        "pick up a cube and put it down within 2 cm of a goal",
+        "bam_envs.tasks.pick_place:PickPlaceTask",
+        "bam_envs.robots.simulated.arm:cube_scene",
+        max_episode_steps=200,
+    ),
+)
+ENVIRONMENTS: dict[str, EnvEntry] = {entry.id: entry for entry in _ENTRIES}
+
+
+def register() -> None:
+    """Register every row with Gymnasium; doing it twice is once."""
+    for entry in ENVIRONMENTS.values():
+        if entry.id not in gym.registry:
+            gym.register(
+                entry.id,
+                entry_point="bam_envs.registry:make_env",
+                vector_entry_point="bam_envs.registry:make_vector_env",
+                max_episode_steps=entry.max_episode_steps,
+                kwargs={"env_id": entry.id},
+            )
+
+
+def resolve_id(name: str) -> str:
+    """The id that `name` means: with its version added, ours or Gymnasium's, ``module:Env-v0`` as it is.
+
+    Raises:
+        UnknownName: Nothing of that name is registered; it carries the closest match.
+    """
+    module, _, bare = name.rpartition(":")
+    if module:
+        importlib.import_module(module)
+    versions = [spec for spec in gym.registry.values() if bare in (spec.id, spec.id.rpartition("-v")[0])]
+    if not versions:
+        raise UnknownName("environment", name, gym.registry)
+    newest = max(versions, key=lambda spec: spec.version or 0).id
+    return f"{module}:{newest}" if module else newest
+
+
+def resolve(reference: str) -> Any:
+    """The object that ``"module:name"`` names."""
+    module, _, name = reference.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def make_env(env_id: str, *, render_mode: str | None = None, randomize: bool = False, **task_options: Any) -> RobotEnv:
+    """One robot and its task; what `gymnasium.make` calls."""
+    from bam_envs.robot_env import RobotEnv
+
+    entry = ENVIRONMENTS[env_id]
+    return RobotEnv(
+        resolve(entry.robot)(1, randomize=randomize), resolve(entry.task)(1, **task_options), render_mode=render_mode
+    )
+
+
+def make_vector_env(
+    env_id: str,
+    num_envs: int = 1,
+    *,
+    max_episode_steps: int | None = None,
+    render_mode: str | None = None,
+    randomize: bool = False,
+    **task_options: Any,
+) -> RobotVectorEnv:
+    """n simulated robots and their task; what `gymnasium.make_vec` calls."""
+    from bam_envs.robot_env import RobotVectorEnv
+
+    entry = ENVIRONMENTS[env_id]
+    return RobotVectorEnv(
+        resolve(entry.robot)(num_envs, randomize=randomize),
+        resolve(entry.task)(num_envs, **task_options),
+        max_episode_steps=max_episode_steps,
+        render_mode=render_mode,
+    )

@@ -1,0 +1,293 @@
+"""One Robot and one Task, joined as a Gymnasium environment: `RobotEnv` for one, `RobotVectorEnv` for n stepped together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from bam_envs.errors import InvalidValue, ResetNeeded
+from bam_envs.robots.robot import Robot, RobotState, Rows
+from bam_envs.tasks.task import Score, Task
+
+RENDER_MODES = ["rgb_array", "human"]
+
+
+def start_rows(robot: Robot, task: Task, rows: Rows, rngs: Sequence[np.random.Generator]) -> RobotState:
+    """Begin a new episode on `rows`; the state of all rows."""
+    robot.connect()
+    state = robot.reset(rows, task.begin(rows, rngs))
+    task.start(rows, state)
+    return state
+
+
+def describe(robot: Robot, task: Task) -> dict[str, list[dict[str, Any]]]:
+    """What every number of observation, action, state and command means: name, unit, limits; plain values."""
+    labels = {"observation": task.observation_labels, "action": task.action_labels}
+    rows = {
+        kind: [
+            {"name": one.name, "unit": one.unit, "low": one.low, "high": one.high, "scale": one.scale, "meaning": one.meaning}
+            for one in group
+        ]
+        for kind, group in labels.items()
+    }
+    return {**rows, **robot.spec.describe()}
+
+
+def render(robot: Robot, task: Task, mode: str | None) -> NDArray[np.uint8] | None:
+    """Picture of row 0, by robots that have one."""
+    if mode is None:
+        gym.logger.warn('render() without a render_mode shows nothing. Make the environment with render_mode="rgb_array".')
+        return None
+    draw = getattr(robot, "render", None)
+    if draw is None:
+        raise InvalidValue(f"The robot {robot.spec.name!r} has no picture; use render_mode=None.")
+    image: NDArray[np.uint8] | None = draw(mode, task.marks())
+    return image
+
+
+def check_render_mode(mode: str | None) -> None:
+    """Refuse a render mode that does not exist."""
+    if mode is not None and mode not in RENDER_MODES:
+        raise InvalidValue(f"render_mode must be one of {RENDER_MODES} or None, not {mode!r}.")
+
+
+class RobotEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """One robot and one task. The robot is connected at the first `reset`.
+
+    Args:
+        robot: A robot with ``num_robots == 1``.
+        task: A task with ``num_rows == 1``.
+        render_mode: ``"rgb_array"``, ``"human"`` or None.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 20}  # noqa: RUF012 - Gymnasium's attribute
+
+    def __init__(self, robot: Robot, task: Task, render_mode: str | None = None) -> None:
+        check_render_mode(render_mode)
+        self.robot, self.task, self.render_mode = robot, task, render_mode
+        self.observation_space, self.action_space = task.observation_space, task.action_space
+        self.metadata = {**self.metadata, "render_fps": round(1 / robot.spec.period)}
+        self.state: RobotState | None = None
+        """The last state, or None when no episode runs."""
+        self._first = np.zeros(1, dtype=np.int64)
+
+    @property
+    def period(self) -> float:
+        """Time between two actions [s]."""
+        return self.robot.spec.period
+
+    def describe(self) -> dict[str, list[dict[str, Any]]]:
+        """What every number of observation, action, state and command means."""
+        return describe(self.robot, self.task)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin an episode; a live robot goes to its start pose slowly."""
+        super().reset(seed=seed)
+        self.state = start_rows(self.robot, self.task, self._first, [self.np_random])
+        if self.render_mode == "human":
+            self.render()
+        return self.task.observe(self.state)[0], {"is_success": False}
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Send the command of `action`; one period later, observe and score."""
+        if self.state is None:
+            raise ResetNeeded("No episode is running: it ended, or never began. Call reset() first.")
+        batch = self._checked(action)[None]
+        state = self.robot.step(self.task.command(batch, self.state))
+        score = self.task.score(state, batch)
+        observation = self.task.observe(state)[0]
+        terminated = bool(score.terminated[0])
+        self.state = None if terminated else state
+        if self.render_mode == "human":
+            self.render()
+        return observation, float(score.reward[0]), terminated, False, plain_info(score)
+
+    def _checked(self, action: Any) -> NDArray[np.float32]:
+        array = np.asarray(action, dtype=np.float32)
+        if array.shape != self.action_space.shape:
+            raise InvalidValue(f"The action must have shape {self.action_space.shape}, not {array.shape}.")
+        if not np.isfinite(array).all():
+            raise InvalidValue(f"The action must be finite numbers, not {array.tolist()}.")
+        return array
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """An image (480, 640, 3) for ``rgb_array``, None for ``human``."""
+        return render(self.robot, self.task, self.render_mode)
+
+    def close(self) -> None:
+        """Halt the robot and drop the link."""
+        self.state = None
+        self.robot.close()
+
+
+def plain_info(score: Score) -> dict[str, Any]:
+    """The info of row 0 in plain Python values."""
+    return {"is_success": bool(score.success[0]), **{key: float(value[0]) for key, value in score.info.items()}}
+
+
+class RobotVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
+    """n simulated robots stepped together; row i equals a `RobotEnv` with the same seed, bit for bit.
+
+    A row whose episode ends starts the next one in the same step (`AutoresetMode.SAME_STEP`): its last observation and info are in
+    ``infos["final_obs"]`` and ``infos["final_info"]``.
+
+    Args:
+        robot: A robot with n rows.
+        task: A task with n rows.
+        max_episode_steps: Steps after which an episode is truncated; None for never.
+        render_mode: ``"rgb_array"``, ``"human"`` or None; shows row 0.
+    """
+
+    def __init__(
+        self, robot: Robot, task: Task, max_episode_steps: int | None = None, render_mode: str | None = None
+    ) -> None:
+        check_render_mode(render_mode)
+        self.robot, self.task, self.render_mode = robot, task, render_mode
+        self.num_envs = robot.num_robots
+        self.max_episode_steps = max_episode_steps
+        self.metadata = {
+            "render_modes": RENDER_MODES,
+            "render_fps": round(1 / robot.spec.period),
+            "autoreset_mode": AutoresetMode.SAME_STEP,
+        }
+        self.single_observation_space, self.single_action_space = task.observation_space, task.action_space
+        self.observation_space = batch_space(task.observation_space, self.num_envs)
+        self.action_space = batch_space(task.action_space, self.num_envs)
+        self.state: RobotState | None = None
+        self.elapsed = np.zeros(self.num_envs, dtype=np.int64)
+        """Steps since each row's episode began. Shape: (n,)."""
+        self._rngs = [np.random.default_rng() for _ in range(self.num_envs)]
+        self._all = np.ones(self.num_envs, dtype=bool)
+
+    @property
+    def period(self) -> float:
+        """Time between two actions [s]."""
+        return self.robot.spec.period
+
+    def describe(self) -> dict[str, list[dict[str, Any]]]:
+        """What every number of observation, action, state and command means."""
+        return describe(self.robot, self.task)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin an episode on every row, or on those of ``options["reset_mask"]`` (n,) bool.
+
+        Args:
+            seed: Row i is seeded with ``seed + i``, or with ``seed[i]``.
+            options: ``reset_mask`` or nothing.
+        """
+        mask = self._all if options is None else np.asarray(options.get("reset_mask", self._all), dtype=bool)
+        rows = np.flatnonzero(mask)
+        for row, one in self._row_seeds(seed):
+            if one is not None and mask[row]:
+                self._rngs[row] = seeding.np_random(one)[0]
+        self._begin(rows)
+        return self._observe(), {"is_success": np.zeros(self.num_envs, dtype=bool), "_is_success": self._all.copy()}
+
+    def _row_seeds(self, seed: int | list[int | None] | None) -> list[tuple[int, int | None]]:
+        if seed is None:
+            return []
+        seeds = [seed + row for row in range(self.num_envs)] if isinstance(seed, (int, np.integer)) else list(seed)
+        if len(seeds) != self.num_envs:
+            raise InvalidValue(f"seed must be one number or {self.num_envs} of them, not {len(seeds)}.")
+        return list(enumerate(seeds))
+
+    def _begin(self, rows: Rows) -> None:
+        self.state = start_rows(self.robot, self.task, rows, [self._rngs[row] for row in rows])
+        self.elapsed[rows] = 0
+
+    def _observe(self) -> NDArray[np.float32]:
+        if self.state is None:
+            raise ResetNeeded("No episode is running. Call reset() first.")
+        return self.task.observe(self.state)
+
+    def step(
+        self, actions: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """Step every row; rows whose episode ended begin the next one."""
+        if self.state is None:
+            raise ResetNeeded("No episode is running. Call reset() first.")
+        actions = self._checked(actions)
+        self.state = self.robot.step(self.task.command(actions, self.state))
+        score = self.task.score(self.state, actions)
+        observation = self.task.observe(self.state)
+        self.elapsed += 1
+        truncated = self._truncated(score)
+        infos = {"is_success": score.success, "_is_success": self._all.copy()}
+        for key, value in score.info.items():
+            infos[key], infos["_" + key] = value, infos["_is_success"]
+        ended = score.terminated | truncated
+        if ended.any():
+            observation = self._next_episodes(ended, observation, infos)
+        return observation, score.reward, score.terminated, truncated, infos
+
+    def _truncated(self, score: Score) -> NDArray[np.bool_]:
+        if self.max_episode_steps is None:
+            return np.zeros(self.num_envs, dtype=bool)
+        truncated: NDArray[np.bool_] = self.elapsed >= self.max_episode_steps
+        return truncated
+
+    def _next_episodes(
+        self, ended: NDArray[np.bool_], observation: NDArray[np.float32], infos: dict[str, Any]
+    ) -> NDArray[np.float32]:
+        """Move the last observation and info of ended rows aside and begin their next episodes."""
+        values = {key: value for key, value in infos.items() if not key.startswith("_")}
+        infos["final_info"] = {**{key: value for key, value in values.items()}, **{"_" + key: ended for key in values}}
+        infos["final_obs"], infos["_final_obs"], infos["_final_info"] = observation, ended, ended
+        self._begin(np.flatnonzero(ended))
+        return self._observe()
+
+    def _checked(self, actions: Any) -> NDArray[np.float32]:
+        array = np.asarray(actions, dtype=np.float32)
+        if array.shape != self.action_space.shape:
+            raise InvalidValue(f"The actions must have shape {self.action_space.shape}, not {array.shape}.")
+        if not np.isfinite(array).all():
+            raise InvalidValue(f"The actions must be finite; rows {bad_rows(array)} are not.")
+        return array
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """An image of row 0."""
+        return render(self.robot, self.task, self.render_mode)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Halt the robots and drop the physics."""
+        self.state = None
+        self.robot.close()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything the future depends on: physics, task memory, generators, counters; plain arrays and values."""
+        robot: Any = self.robot
+        return {
+            "robot": robot.state_dict(),
+            "task": self.task.state_dict(),
+            "elapsed": self.elapsed.copy(),
+            "rngs": [rng.bit_generator.state for rng in self._rngs],
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> NDArray[np.float32]:
+        """Go to what `state_dict` returned; the observation there."""
+        robot: Any = self.robot
+        self.state = robot.load_state_dict(state["robot"])
+        self.task.load_state_dict(state["task"])
+        self.elapsed = np.array(state["elapsed"])
+        for rng, rng_state in zip(self._rngs, state["rngs"], strict=True):
+            rng.bit_generator.state = rng_state
+        return self._observe()
+
+
+def bad_rows(array: NDArray[np.float32]) -> list[int]:
+    """Rows that hold a number that is not finite."""
+    rows: list[int] = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1)).tolist()
+    return rows

@@ -1,0 +1,1 @@
+"""Robots: they take commands and give states, in SI units."""

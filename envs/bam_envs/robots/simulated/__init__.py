@@ -1,0 +1,1 @@
+"""Simulated robots on MuJoCo physics, stepped in batches."""

@@ -1,0 +1,178 @@
+"""A UR5e with a parallel gripper, simulated: position control, 20 Hz commands, 5 ms physics."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.errors import InvalidValue, PhysicsDiverged, ResetNeeded
+from bam_envs.robots.robot import Initial, RobotState, Rows
+from bam_envs.robots.ur5e import GRIPPER_OPEN, GRIPPER_SPEED, arm_spec
+
+if TYPE_CHECKING:
+    from bam_envs.robots.simulated.imperfection import Imperfection
+    from bam_envs.robots.simulated.physics import Physics
+    from bam_envs.robots.simulated.rendering import SceneRenderer
+
+Array = NDArray[np.float64]
+
+PHYSICS_STEPS = 10
+"""Physics steps a control period."""
+
+class SimulatedArm:
+    """n simulated UR5e arms, each on a table of its own.
+
+    The joint set points move linearly from the last command to the new one within a period, as a UR controller interpolates; the gripper's
+    set point moves at `GRIPPER_SPEED`.
+
+    Args:
+        num_robots: How many are stepped together.
+        with_object: Whether there is a cube, seen by a tracker.
+        randomize: Masses, friction, sizes and gains that differ each episode, a noisy tracker and late commands.
+    """
+
+    def __init__(self, num_robots: int = 1, *, with_object: bool = True, randomize: bool = False) -> None:
+        self.num_robots = num_robots
+        self.randomize = randomize
+        self.spec = arm_spec("ur5e", with_object=with_object)
+        self._with_object = with_object
+        self._scene = "ur5e_cube.xml" if with_object else "ur5e_gripper.xml"
+        self._physics: Physics | None = None
+        self._imperfection: Imperfection | None = None
+        self._renderer: SceneRenderer | None = None
+        self._all_rows = np.arange(num_robots)
+        self._setpoint = np.zeros((num_robots, 7))
+        self._command = np.zeros((num_robots, 7))
+        self._ramp = (np.arange(1, PHYSICS_STEPS + 1) / PHYSICS_STEPS)[None, :, None]
+
+    def connect(self) -> None:
+        """Build the physics."""
+        if self._physics is not None:
+            return
+        from bam_envs.robots.simulated.imperfection import Imperfection
+        from bam_envs.robots.simulated.physics import Physics
+
+        self._physics = Physics(self._scene, self.num_robots, varied=self.randomize)
+        self._imperfection = Imperfection(self._physics) if self.randomize else None
+
+    @property
+    def physics(self) -> Physics:
+        """The physics behind the robot; `ResetNeeded` before `connect`."""
+        if self._physics is None:
+            raise ResetNeeded("The simulated robot is not connected. Call reset() first.")
+        return self._physics
+
+    def reset(self, rows: Rows, initial: Initial) -> RobotState:
+        """Set `rows` to the initial joint positions and object pose, at rest, the gripper open."""
+        physics, signals = self.physics, initial.signals
+        physics.state = physics.state.copy()  # states handed out earlier are views of the old array
+        physics.time[rows], physics.qvel[rows] = 0.0, 0.0
+        physics.qpos[rows, :6] = signals["joint_position"]
+        physics.qpos[rows, 6:8] = GRIPPER_OPEN / 2
+        self._setpoint[rows, :6], self._setpoint[rows, 6] = signals["joint_position"], GRIPPER_OPEN
+        self._command[rows] = self._setpoint[rows]
+        if self._imperfection is not None:
+            for row, seed in zip(rows, initial.seeds, strict=True):
+                self._imperfection.reset(int(row), int(seed), self._setpoint[row])
+        if self._with_object:
+            self._place_object(rows, initial)
+        return self._measure(rows)
+
+    def _place_object(self, rows: Rows, initial: Initial) -> None:
+        """Put the object flat on the table at x, y [m] and yaw [rad] of ``object_pose`` (k, 3)."""
+        physics, pose = self.physics, initial.signals["object_pose"]
+        qpos = physics.qpos
+        qpos[rows, 8:10] = pose[:, :2]
+        geom = physics.model.geom("object").id
+        qpos[rows, 10] = [physics.model_of(int(row)).geom_size[geom, 2] for row in rows]
+        qpos[rows, 11], qpos[rows, 12:14], qpos[rows, 14] = np.cos(pose[:, 2] / 2), 0.0, np.sin(pose[:, 2] / 2)
+
+    def step(self, command: Array) -> RobotState:
+        """Send `command` (n, 7): six joint positions [rad] and the gripper's width [m]; one period later, measure."""
+        if command.shape != self._command.shape:
+            raise InvalidValue(f"The command must have shape {self._command.shape}, not {command.shape}.")
+        physics = self.physics
+        self._command = np.array(command)
+        arriving = self._command if self._imperfection is None else self._imperfection.delayed(self._command)
+        travel = arriving - self._setpoint
+        limit = GRIPPER_SPEED * self.spec.period
+        travel[:, 6] = np.clip(travel[:, 6], -limit, limit)
+        physics.step(self._setpoint[:, None] + travel[:, None] * self._ramp)
+        self._setpoint = self._setpoint + travel
+        return self._measure(self._all_rows)
+
+    def _measure(self, fresh: Rows) -> RobotState:
+        """The state of all rows; a noisy tracker looks again at the `fresh` ones only."""
+        physics = self.physics
+        qpos, qvel = physics.qpos, physics.qvel
+        if not np.isfinite(physics.state.sum()):
+            rows = np.flatnonzero(~np.isfinite(physics.state).all(axis=1)).tolist()
+            raise PhysicsDiverged(f"The simulated state of rows {rows} is not finite. Reset these rows.")
+        signals = {
+            "joint_position": qpos[:, :6],
+            "joint_velocity": qvel[:, :6],
+            "gripper_width": qpos[:, 6:7] + qpos[:, 7:8],
+        }
+        if self._with_object:
+            pose = qpos[:, 8:15]
+            if self._imperfection is not None:
+                self._imperfection.look(fresh, pose[fresh])
+                pose = self._imperfection.seen.copy()
+            signals |= {"object_position": pose[:, :3], "object_quaternion": pose[:, 3:]}
+        return RobotState(signals, physics.time, self._command)
+
+    def halt(self) -> None:
+        """Hold the measured joint positions."""
+        if self._physics is not None:
+            self._setpoint[:, :6] = self._physics.qpos[:, :6]
+            self._command = self._setpoint.copy()
+
+    def close(self) -> None:
+        """Halt, drop the physics and the window."""
+        self.halt()
+        if self._renderer is not None:
+            self._renderer.close()
+        if self._physics is not None:
+            self._physics.close()
+        self._renderer = self._physics = self._imperfection = None
+
+    def render(self, mode: str, marks: list[tuple[Array, tuple[float, float, float, float]]]) -> NDArray[np.uint8] | None:
+        """Show row 0: an image (480, 640, 3) for ``rgb_array``, a window for ``human``.
+
+        Args:
+            mode: ``"rgb_array"`` or ``"human"``.
+            marks: Spheres to draw: position (3,) [m] and colour (red, green, blue, alpha).
+        """
+        from bam_envs.robots.simulated.rendering import SceneRenderer
+
+        if self._renderer is None:
+            self._renderer = SceneRenderer(self.physics, mode)
+        return self._renderer.render(marks)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything the future of the simulated robots depends on."""
+        state = {"physics": self.physics.state.copy(), "setpoint": self._setpoint.copy(), "command": self._command.copy()}
+        if self._imperfection is not None:
+            state["imperfection"] = self._imperfection.state_dict()  # type: ignore[assignment]
+        return state
+
+    def load_state_dict(self, state: dict[str, Any]) -> RobotState:
+        """Go to what `state_dict` returned; the state there."""
+        self.connect()
+        if self._imperfection is not None:
+            self._imperfection.load_state_dict(state["imperfection"])
+        self.physics.state = np.array(state["physics"])
+        self._setpoint, self._command = np.array(state["setpoint"]), np.array(state["command"])
+        return self._measure(self._all_rows[:0])
+
+
+def cube_scene(num_robots: int = 1, *, randomize: bool = False) -> SimulatedArm:
+    """The arm with a cube in front of it."""
+    return SimulatedArm(num_robots, with_object=True, randomize=randomize)
+
+
+def arm_scene(num_robots: int = 1, *, randomize: bool = False) -> SimulatedArm:
+    """The arm alone."""
+    return SimulatedArm(num_robots, with_object=False, randomize=randomize)

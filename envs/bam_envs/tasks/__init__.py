@@ -1,0 +1,1 @@
+"""Tasks: observation, command, reward, end and success; pure, one a file."""

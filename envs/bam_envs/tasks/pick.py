@@ -1,0 +1,156 @@
+"""Pick: grasp a cube that lies anywhere in 30 x 40 cm with any yaw, lift it 10 cm and hold it for 0.25 s."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from bam_envs.kinematics import cube_yaw_phase
+from bam_envs.robots.robot import Initial, RobotState, Rows
+from bam_envs.robots.ur5e import GEOMETRY
+from bam_envs.tasks.task import Array, Floats, Label, Score, labelled_box
+from bam_envs.tasks.tool_control import ACTION_LABELS, HAND_LABELS, LEASH, WORKSPACE, ToolControl, hand_state
+
+CUBE_AREA = np.array([[0.35, -0.20], [0.65, 0.20]])
+"""Where the cube starts: lowest and highest x, y [m]."""
+CUBE_EDGE = 0.04
+"""Edge of the cube [m]."""
+START_AREA = np.array([[0.45, -0.05, 0.17], [0.55, 0.05, 0.23]])
+"""Where the tool starts: lowest and highest x, y, z [m]."""
+LIFT = 0.10
+"""How high the cube must be lifted [m]."""
+HOLD_STEPS = 5
+"""How long it must be held there: 0.25 s at 20 Hz."""
+TABLE_EDGE = -0.03
+"""An object below this height has left the table [m]."""
+
+OBJECT_LABELS = (
+    Label("object_x", "object, forward", "m", "(x - 0.5) / 0.2", -2, 2),
+    Label("object_y", "object, to the left", "m", "y / 0.25", -2, 2),
+    Label("object_lift", "object above where it lay", "m", "/ 0.1", -2, 2),
+    Label("object_dx", "object from the tool, forward", "m", "/ 0.1", -2, 2),
+    Label("object_dy", "object from the tool, to the left", "m", "/ 0.1", -2, 2),
+    Label("object_dz", "object from the tool, up", "m", "/ 0.1", -2, 2),
+    Label("object_yaw_cos", "cos(4 yaw) of the object seen from the gripper; a cube looks the same every 90 degrees", "1"),
+    Label("object_yaw_sin", "sin(4 yaw) of the object seen from the gripper", "1"),
+)
+
+
+class CubeSense:
+    """What the last state says of tool and cube, worked out once for `observe`, `command` and `score`."""
+
+    def __init__(self, state: RobotState) -> None:
+        self.state = state
+        self.tool, self.x_axis = GEOMETRY.tool_pose(state.signals["joint_position"])
+        self.object = state.signals["object_position"]
+        self.offset = self.object - self.tool
+        self.distance: Array = np.sqrt(np.einsum("ij,ij->i", self.offset, self.offset))
+
+    def yaw_phase(self) -> Any:
+        """exp(4 i (yaw of the cube - yaw of the gripper)). Shape: (n,) complex."""
+        axis = self.x_axis[:, 0] - 1j * self.x_axis[:, 1]
+        return cube_yaw_phase(self.state.signals["object_quaternion"]) * (axis * axis) ** 2
+
+
+class PickTask:
+    """Grasp the cube, lift it by `LIFT` and hold it for `HOLD_STEPS`.
+
+    Args:
+        num_rows: How many robots are scored together.
+    """
+
+    action_labels = ACTION_LABELS
+    observation_labels = HAND_LABELS + OBJECT_LABELS
+
+    def __init__(self, num_rows: int = 1) -> None:
+        self.num_rows = num_rows
+        self.action_space: spaces.Box = labelled_box(self.action_labels)
+        self.observation_space: spaces.Box = labelled_box(self.observation_labels)
+        self.control = ToolControl(num_rows)
+        self.rest_height = np.zeros(num_rows)
+        """Height of the object where it lay [m]. Shape: (n,)."""
+        self.held = np.zeros(num_rows, dtype=np.int64)
+        """For how many steps the object has been high enough. Shape: (n,)."""
+        self._sense: CubeSense | None = None
+
+    def begin(self, rows: Rows, rngs: Sequence[np.random.Generator]) -> Initial:
+        """A tool position above the table, a cube pose on it."""
+        draws = np.stack([rng.random(6) for rng in rngs])
+        seeds = np.array([rng.integers(2**63) for rng in rngs], dtype=np.int64)
+        tool = START_AREA[0] + draws[:, :3] * (START_AREA[1] - START_AREA[0])
+        cube = np.empty((len(rows), 3))
+        cube[:, :2] = CUBE_AREA[0] + draws[:, 3:5] * (CUBE_AREA[1] - CUBE_AREA[0])
+        cube[:, 2] = (2 * draws[:, 5] - 1) * np.pi
+        joints = GEOMETRY.reach_down(tool, np.zeros(len(rows)))
+        return Initial({"joint_position": joints, "object_pose": cube}, seeds)
+
+    def start(self, rows: Rows, state: RobotState) -> None:
+        """Note the measured joints and how high the object lies."""
+        self.control.start(rows, state.signals["joint_position"][rows])
+        self.rest_height[rows] = state.signals["object_position"][rows, 2]
+        self.held[rows] = 0
+
+    def sense(self, state: RobotState) -> CubeSense:
+        """Tool and cube of `state`, worked out once."""
+        if self._sense is None or self._sense.state is not state:
+            self._sense = CubeSense(state)
+        return self._sense
+
+    def lift(self, sense: CubeSense) -> Array:
+        """How high the object is above where it lay [m]. Shape: (n,)."""
+        return sense.object[:, 2] - self.rest_height
+
+    def observe(self, state: RobotState) -> Floats:
+        """See `observation_labels`. Shape: (n, 18) float32."""
+        sense = self.sense(state)
+        columns = hand_state(state, self.control, sense.tool, sense.x_axis) + self._object_columns(sense)
+        observation = np.concatenate(columns, axis=1).astype(np.float32)
+        return np.clip(observation, self.observation_space.low, self.observation_space.high)
+
+    def _object_columns(self, sense: CubeSense) -> list[Array]:
+        middle, half = WORKSPACE.mean(axis=0), (WORKSPACE[1] - WORKSPACE[0]) / 2
+        phase = sense.yaw_phase()
+        return [
+            (sense.object[:, :2] - middle[:2]) / half[:2],
+            self.lift(sense)[:, None] / LIFT,
+            sense.offset / 0.1,
+            phase.real[:, None],
+            phase.imag[:, None],
+        ]
+
+    def command(self, action: Floats, state: RobotState) -> Array:
+        """Joint positions [rad] and gripper width [m]. Shape: (n, 7)."""
+        return self.control.command(action, self.sense(state).tool)
+
+    def grasped(self, sense: CubeSense) -> Any:
+        """Whether the closed gripper is stopped by the object between its pads. Shape: (n,) bool."""
+        width = sense.state.signals["gripper_width"][:, 0]
+        return self.control.closed & (width > 0.6 * CUBE_EDGE) & (width < 1.6 * CUBE_EDGE) & (sense.distance < 0.03)
+
+    def score(self, state: RobotState, action: Floats) -> Score:
+        """Near the cube, squeezing it, lifting it; at success the worth of staying there."""
+        sense = self.sense(state)
+        lift, grasped = self.lift(sense), self.grasped(sense)
+        self.held = np.where(lift >= LIFT, self.held + 1, 0)
+        success = self.held >= HOLD_STEPS
+        fallen = sense.object[:, 2] < TABLE_EDGE
+        reward = 0.1 * (1 - np.tanh(5 * sense.distance)) + grasped * (0.1 + 0.5 * np.clip(lift / LIFT, 0.0, 1.0))
+        reward = reward + 30.0 * success - 5.0 * fallen
+        return Score(reward, success | fallen, success, {"distance": sense.distance, "lift": lift})
+
+    def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
+        """Nothing to draw beyond the scene."""
+        return []
+
+    def state_dict(self) -> dict[str, Any]:
+        """The memory, as plain arrays."""
+        return {"control": self.control.state_dict(), "rest_height": self.rest_height.copy(), "held": self.held.copy()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go to what `state_dict` returned."""
+        self.control.load_state_dict(state["control"])
+        self.rest_height, self.held = np.array(state["rest_height"]), np.array(state["held"])
+        self._sense = None

@@ -1,0 +1,134 @@
+"""From tool actions (dx, dy, dz, dyaw, grip) to joint commands, slow enough for a robot near people.
+
+The actions move a tool *target*, not the measured tool, which sags and lags; the target stays within `LEASH` of the measured tool and
+inside the workspace. The tool always points straight down, so the joints follow in closed form. From one command to the next the tool
+target moves at most `TOOL_STEP` and no joint more than `JOINT_STEP`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.robots.robot import RobotState, Rows
+from bam_envs.robots.ur5e import GEOMETRY, GRIPPER_OPEN
+from bam_envs.tasks.task import Array, Floats, Label
+
+TOOL_STEP = 0.0125
+"""Farthest the tool goes in a period of 0.05 s [m]: 0.25 m/s, the speed limit of a UR's recovery mode."""
+JOINT_STEP = 0.05
+"""Farthest a joint goes in a period of 0.05 s [rad]: 1.0 rad/s."""
+YAW_STEP = 0.05
+"""Farthest the gripper turns in a period [rad]."""
+LEASH = 0.04
+"""Farthest the tool target is from the measured tool, along each axis [m]."""
+WORKSPACE = np.array([[0.30, -0.25, 0.016], [0.70, 0.25, 0.35]])
+"""Box for the tool target: lowest and highest x, y, z [m]."""
+YAW_LIMIT = 1.2
+"""Farthest the gripper turns from straight ahead [rad]; a cube needs pi/4."""
+
+ACTION_LABELS = (
+    Label("dx", "move the tool target forward", "m", "/ 0.0125"),
+    Label("dy", "move the tool target to the left", "m", "/ 0.0125"),
+    Label("dz", "move the tool target up", "m", "/ 0.0125"),
+    Label("dyaw", "turn the gripper anticlockwise, seen from above", "rad", "/ 0.05"),
+    Label("grip", "close the gripper when positive, open it otherwise", "1"),
+)
+HAND_LABELS = (
+    Label("tool_x", "tool, forward", "m", "(x - 0.5) / 0.2", -2, 2),
+    Label("tool_y", "tool, to the left", "m", "y / 0.25", -2, 2),
+    Label("tool_z", "tool, above the table", "m", "(z - 0.183) / 0.167", -2, 2),
+    Label("target_dx", "tool target from the tool, forward", "m", "/ 0.04", -2, 2),
+    Label("target_dy", "tool target from the tool, to the left", "m", "/ 0.04", -2, 2),
+    Label("target_dz", "tool target from the tool, up", "m", "/ 0.04", -2, 2),
+    Label("yaw", "gripper, anticlockwise from straight ahead", "rad", "/ 1.2", -2, 2),
+    Label("target_dyaw", "commanded yaw from the measured one", "rad", "/ 0.05", -2, 2),
+    Label("gripper_width", "opening of the gripper", "m", "/ 0.0425 - 1", -2, 2),
+    Label("grip", "1 when the gripper was told to close, else -1", "1"),
+)
+
+
+class ToolControl:
+    """The commanded tool of n rows: its target, its yaw, the joints that were commanded, the gripper."""
+
+    def __init__(self, num_rows: int) -> None:
+        self.target = np.zeros((num_rows, 3))
+        """Tool target [m]. Shape: (n, 3)."""
+        self.yaw = np.zeros(num_rows)
+        """Commanded yaw [rad]. Shape: (n,)."""
+        self.closed = np.zeros(num_rows, dtype=bool)
+        """Whether the gripper was told to close. Shape: (n,)."""
+        self._joints = np.zeros((num_rows, 6))
+
+    def start(self, rows: Rows, joints: Array) -> None:
+        """Begin at the measured `joints` (k, 6) [rad] of `rows`."""
+        position, x_axis = GEOMETRY.tool_pose(joints)
+        self.target[rows] = position
+        self.yaw[rows] = np.arctan2(x_axis[:, 1], x_axis[:, 0])
+        self.closed[rows] = False
+        self._joints[rows] = joints
+
+    def command(self, action: Floats, tool: Array) -> Array:
+        """Joint positions [rad] and gripper width [m] for an action.
+
+        Args:
+            action: dx, dy, dz, dyaw, grip in [-1, 1]. Shape: (n, 5).
+            tool: Measured tool position [m]. Shape: (n, 3).
+
+        Returns:
+            Shape: (n, 7).
+        """
+        action = np.clip(action, -1.0, 1.0).astype(np.float64)
+        travel = self._travel(action[:, :3] * TOOL_STEP, tool)
+        turn = np.clip(self.yaw + action[:, 3] * YAW_STEP, -YAW_LIMIT, YAW_LIMIT) - self.yaw
+        self._move(travel, turn)
+        self.closed = action[:, 4] > 0
+        width = np.where(self.closed, 0.0, GRIPPER_OPEN)
+        return np.concatenate([self._joints, width[:, None]], axis=1)
+
+    def _travel(self, step: Array, tool: Array) -> Array:
+        """How far the target goes: inside the workspace, near the measured tool, at most TOOL_STEP."""
+        target = np.clip(self.target + step, tool - LEASH, tool + LEASH)
+        travel = np.clip(target, WORKSPACE[0], WORKSPACE[1]) - self.target
+        length = np.sqrt(np.einsum("ij,ij->i", travel, travel))
+        return travel * np.minimum(1.0, TOOL_STEP / np.maximum(length, 1e-9))[:, None]
+
+    def _move(self, travel: Array, turn: Array) -> None:
+        """Move target and joints by as much of `travel` and `turn` as the joint speed allows."""
+        share = np.ones(len(turn))
+        for _ in range(3):
+            joints = GEOMETRY.reach_down(self.target + travel * share[:, None], self.yaw + turn * share)
+            fastest = np.abs(joints - self._joints).max(axis=1)
+            if fastest.max() <= JOINT_STEP:
+                break
+            share *= np.minimum(1.0, 0.98 * JOINT_STEP / np.maximum(fastest, 1e-9))
+        else:
+            joints = self._joints + (joints - self._joints) * np.minimum(1.0, JOINT_STEP / fastest)[:, None]
+        self.target = self.target + travel * share[:, None]
+        self.yaw = self.yaw + turn * share
+        self._joints = joints
+
+    def state_dict(self) -> dict[str, NDArray[Any]]:
+        """The memory, as plain arrays."""
+        return {"target": self.target, "yaw": self.yaw, "closed": self.closed, "joints": self._joints}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go to what `state_dict` returned."""
+        self.target, self.yaw = np.array(state["target"]), np.array(state["yaw"])
+        self.closed, self._joints = np.array(state["closed"], dtype=bool), np.array(state["joints"])
+
+
+def hand_state(state: RobotState, control: ToolControl, tool: Array, x_axis: Array) -> list[Array]:
+    """The first ten numbers of an observation; see `HAND_LABELS`. Shape: (n, k) each."""
+    middle, half = WORKSPACE.mean(axis=0), (WORKSPACE[1] - WORKSPACE[0]) / 2
+    yaw = np.arctan2(x_axis[:, 1], x_axis[:, 0])
+    return [
+        (tool - middle) / half,
+        (control.target - tool) / LEASH,
+        yaw[:, None] / YAW_LIMIT,
+        (control.yaw - yaw)[:, None] / YAW_STEP,
+        state.signals["gripper_width"] * (2 / GRIPPER_OPEN) - 1,
+        np.where(control.closed, 1.0, -1.0)[:, None],
+    ]
