@@ -8,6 +8,7 @@
     │   ├── AlteredCheckpoint      a member's bytes differ from the manifest, is missing or is extra
     │   ├── NewerFormat            written by a newer bam-train
     │   └── CheckpointMismatch     made for another environment, algorithm or setting
+    ├── FormatError                bytes that do not follow their file format (safetensors, ONNX)
     ├── PolicyError                a frozen policy that cannot run, or an observation that does not fit it
     ├── SettingsError              a setting or option that does not exist or does not fit
     ├── TrainingFailed             training cannot go on (a NaN loss); the last good checkpoint is kept
@@ -59,6 +60,10 @@ class NewerFormat(CheckpointError):  # noqa: N818
 
 class CheckpointMismatch(CheckpointError):  # noqa: N818
     """The checkpoint belongs to another environment, algorithm or setting."""
+
+
+class FormatError(BamTrainError, ValueError):
+    """Bytes that do not follow their file format; the text says where."""
 
 
 class PolicyError(BamTrainError, ValueError):

@@ -1,0 +1,213 @@
+"""checkpoint.zip, format 1: one file that can be resumed and deployed.
+
+::
+
+    data, policy.pth, ...     what the trainer's own library wrote; hashed, never opened by us
+    bam/manifest.json         what this is, and the sha256 of every other member
+    bam/policy.onnx           the frozen policy
+    bam/golden.safetensors    observations and the trainer's own actions for them
+    bam/resume/...            everything needed to go on exactly
+
+A checkpoint is whole or absent: it is written to a temporary file in the same folder, flushed to the disk, then moved
+into place. Reading needs the standard library and NumPy, and never unpickles.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bam_train import safetensors_file
+from bam_train.errors import AlteredCheckpoint, CheckpointError, CheckpointMismatch, FormatError, OutputError
+from bam_train.manifest import AGAIN, FORMAT, MANIFEST, Manifest, manifest_bytes, parse_manifest
+from bam_train.zip_members import (
+    CHUNK,
+    digest,
+    list_members,
+    open_zip,
+    require_digest,
+    require_same_members,
+    unpack,
+)
+
+__all__ = [
+    "FORMAT",
+    "GOLDEN",
+    "MANIFEST",
+    "POLICY",
+    "Checkpoint",
+    "Manifest",
+    "next_free_path",
+    "write_checkpoint",
+]
+
+POLICY = "bam/policy.onnx"
+GOLDEN = "bam/golden.safetensors"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint.zip whose members were all verified when it was opened."""
+
+    path: Path
+    """The file."""
+    manifest: Manifest
+    """What it is."""
+
+    @classmethod
+    def open(cls, path: str | Path) -> Checkpoint:
+        """Verify every member against the manifest.
+
+        Args:
+            path: The file; ``~`` is expanded.
+
+        Raises:
+            NotACheckpoint: No such file, not a zip, truncated, or no manifest in it.
+            NewerFormat: Written by a newer bam-train.
+            AlteredCheckpoint: A member was changed, is missing or was added.
+        """
+        path = Path(path).expanduser()
+        with open_zip(path) as archive:
+            infos = list_members(path, archive)
+            manifest = parse_manifest(path, unpack(path, archive, infos[MANIFEST]))
+            require_same_members(path, set(infos) - {MANIFEST}, set(manifest.sha256))
+            for name, expected in manifest.sha256.items():
+                require_digest(path, name, expected, digest(path, archive, infos[name]))
+        return cls(path, manifest)
+
+    def has(self, member: str) -> bool:
+        """Whether a member is in the file."""
+        return member in self.manifest.sha256
+
+    def read(self, member: str) -> bytes:
+        """Return a member's bytes, verified again: the file may have been replaced since it was opened."""
+        if not self.has(member):
+            found = ", ".join(sorted(self.manifest.sha256)) or "nothing"
+            raise AlteredCheckpoint(self.path, member, f"has no {member}; it holds {found}. {AGAIN}")
+        with open_zip(self.path) as archive:
+            infos = list_members(self.path, archive)
+            require_same_members(self.path, set(infos) - {MANIFEST}, set(self.manifest.sha256))
+            data = unpack(self.path, archive, infos[member])
+        require_digest(self.path, member, self.manifest.sha256[member], hashlib.sha256(data).hexdigest())
+        return data
+
+    def arrays(self, member: str) -> dict[str, np.ndarray]:
+        """Return a safetensors member's arrays."""
+        try:
+            return safetensors_file.parse(self.read(member))
+        except FormatError as error:
+            raise AlteredCheckpoint(self.path, member, f"{member} cannot be read: {error}") from error
+
+    def json(self, member: str) -> Any:
+        """Return a JSON member's value."""
+        try:
+            return json.loads(self.read(member))
+        except (ValueError, RecursionError) as error:
+            raise AlteredCheckpoint(self.path, member, f"{member} is not JSON: {error}") from error
+
+    def requires_env(self, env_id: str) -> None:
+        """Refuse to be used with another environment than its own.
+
+        Raises:
+            CheckpointMismatch: Names both environments.
+        """
+        if env_id != self.manifest.env:
+            own = self.manifest.env
+            text = f"was trained on {own}, not on {env_id}. Use --env {own}, or train one for {env_id}"
+            raise CheckpointMismatch(self.path, text)
+
+
+def write_checkpoint(path: str | Path, manifest_fields: Mapping[str, Any], members: Mapping[str, bytes]) -> Checkpoint:
+    """Write a checkpoint, whole or not at all; an existing file is replaced in one step.
+
+    Args:
+        path: The file; ``~`` is expanded, a link is followed, missing folders are made.
+        manifest_fields: The fields of `Manifest` but for ``format`` and ``sha256``.
+        members: Name to bytes.
+
+    Raises:
+        OutputError: No space, no permission, or something in the way; nothing was changed.
+        CheckpointError: A field or member that no checkpoint may have.
+    """
+    path = Path(path).expanduser()
+    _require_names(path, members)
+    digests = {name: hashlib.sha256(data).hexdigest() for name, data in sorted(members.items())}
+    text = manifest_bytes(path, {**manifest_fields, "sha256": digests})
+    target = Path(os.path.realpath(path))
+    try:
+        if target.is_dir():
+            raise IsADirectoryError(None, "it is a folder; give the name of a file in it")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _write_then_replace(target, {**members, MANIFEST: text})
+    except OSError as error:
+        why = error.strerror or error
+        raise OutputError(f"{path}: cannot be written: {why}. Choose another place with --out") from error
+    return Checkpoint(path, parse_manifest(path, text))
+
+
+def next_free_path(path: str | Path) -> Path:
+    """Return the path itself if nothing is there, else the first free of name-2.zip, name-3.zip and so on."""
+    path = Path(path).expanduser()
+    free, number = path, 1
+    while os.path.lexists(free):
+        number += 1
+        free = path.with_name(f"{path.stem}-{number}{path.suffix}")
+    return free
+
+
+def _require_names(path: Path, members: Mapping[str, bytes]) -> None:
+    """Refuse names that would break the file: SB3 reads every ``.pth`` at any depth and would choke on ours."""
+    for name in members:
+        if name == MANIFEST or not name or (name.startswith("bam/") and name.endswith(".pth")):
+            raise CheckpointError(path, f"member {name!r} cannot be written: the name is reserved")
+
+
+def _write_then_replace(target: Path, members: Mapping[str, bytes]) -> None:
+    descriptor, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".tmp")
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            _write_zip(file, members)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(temporary, 0o666 & ~_umask())  # mkstemp makes it private
+        os.replace(temporary, target)
+    except BaseException:  # an interrupt too must leave nothing behind
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
+        raise
+    _sync_folder(target.parent)
+
+
+def _write_zip(file: Any, members: Mapping[str, bytes]) -> None:
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, data in members.items():
+            info = zipfile.ZipInfo(name)  # its date is 1980, so that equal content makes equal bytes
+            info.external_attr = 0o644 << 16
+            level = 1 if len(data) > CHUNK else 6
+            archive.writestr(info, data, zipfile.ZIP_DEFLATED, level)
+
+
+def _umask() -> int:
+    mask = os.umask(0o022)
+    os.umask(mask)
+    return mask
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make the rename itself durable, where the system can."""
+    with contextlib.suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
