@@ -105,10 +105,13 @@ class PickTask:
 
     def observe(self, state: RobotState) -> Floats:
         """See `observation_labels`. Shape: (n, 18) float32."""
+        return np.clip(self.observe_cube(state), self.observation_space.low, self.observation_space.high)
+
+    def observe_cube(self, state: RobotState) -> Floats:
+        """Hand and cube, not clipped. Shape: (n, 18) float32."""
         sense = self.sense(state)
         columns = hand_state(state, self.control, sense.tool, sense.x_axis) + self._object_columns(sense)
-        observation = np.concatenate(columns, axis=1).astype(np.float32)
-        return np.clip(observation, self.observation_space.low, self.observation_space.high)
+        return np.concatenate(columns, axis=1).astype(np.float32)
 
     def _object_columns(self, sense: CubeSense) -> list[Array]:
         middle, half = WORKSPACE.mean(axis=0), (WORKSPACE[1] - WORKSPACE[0]) / 2

@@ -1,0 +1,108 @@
+"""Pick and place: put the cube down within 2 cm of a goal on the table that differs every episode, and let go of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from bam_envs.robots.robot import Initial, RobotState, Rows
+from bam_envs.robots.ur5e import GRIPPER_OPEN
+from bam_envs.tasks.pick import CUBE_AREA, TABLE_EDGE, CubeSense, PickTask
+from bam_envs.tasks.task import Array, Floats, Label, Score
+
+GOAL_RADIUS = 0.02
+"""The object lies at the goal within this distance [m]."""
+GOAL_DISTANCE = 0.10
+"""A goal is at least this far from where the cube starts [m]."""
+REST_STEPS = 5
+"""How long the object must lie there, let go: 0.25 s at 20 Hz."""
+CARRY = 0.05
+"""How high the object is carried [m]."""
+
+GOAL_LABELS = (
+    Label("goal_dx", "goal from the object, forward", "m", "/ 0.2", -2, 2),
+    Label("goal_dy", "goal from the object, to the left", "m", "/ 0.2", -2, 2),
+    Label("goal_near_dx", "goal from the object, forward, close up", "m", "/ 0.04, clipped"),
+    Label("goal_near_dy", "goal from the object, to the left, close up", "m", "/ 0.04, clipped"),
+)
+
+
+class PickPlaceTask(PickTask):
+    """Grasp the cube, carry it to the goal, put it down and let go.
+
+    Args:
+        num_rows: How many robots are scored together.
+    """
+
+    observation_labels = PickTask.observation_labels + GOAL_LABELS
+
+    def __init__(self, num_rows: int = 1) -> None:
+        super().__init__(num_rows)
+        self.goal = np.zeros((num_rows, 2))
+        """Goals on the table [m]. Shape: (n, 2)."""
+
+    def begin(self, rows: Rows, rngs: Sequence[np.random.Generator]) -> Initial:
+        """As for picking, and a goal at least `GOAL_DISTANCE` from the cube."""
+        initial = super().begin(rows, rngs)
+        for row, rng, cube in zip(rows, rngs, initial.signals["object_pose"], strict=True):
+            self.goal[row] = sample_goal(rng, cube[:2])
+        return initial
+
+    def observe(self, state: RobotState) -> Floats:
+        """See `observation_labels`. Shape: (n, 22) float32."""
+        offset = self.goal - self.sense(state).object[:, :2]
+        goal = np.concatenate([offset / 0.2, offset / 0.04], axis=1).astype(np.float32)
+        observation = np.concatenate([self.observe_cube(state), goal], axis=1)
+        return np.clip(observation, self.observation_space.low, self.observation_space.high)
+
+    def goal_distance(self, sense: CubeSense) -> Array:
+        """Distance of the object from where it would lie at the goal [m]. Shape: (n,)."""
+        offset = np.concatenate([sense.object[:, :2] - self.goal, self.lift(sense)[:, None]], axis=1)
+        return np.sqrt(np.einsum("ij,ij->i", offset, offset))
+
+    def score(self, state: RobotState, action: Floats) -> Score:
+        """Near the cube, squeezing it, carrying it to the goal, letting go there; at success the worth of staying there."""
+        sense = self.sense(state)
+        lift, grasped, distance = self.lift(sense), self.grasped(sense), self.goal_distance(sense)
+        opening, width = ~self.control.closed, state.signals["gripper_width"][:, 0]
+        there = distance < GOAL_RADIUS
+        self.held = np.where(there & opening & (width > 0.6 * GRIPPER_OPEN), self.held + 1, 0)
+        success = self.held >= REST_STEPS
+        fallen = sense.object[:, 2] < TABLE_EDGE
+        reward = np.where(there & opening, 0.8, self._shaping(sense, lift, grasped) + 0.04 * there)
+        reward = reward + 40.0 * success - 2.0 * fallen
+        info = {"distance": sense.distance, "lift": lift, "goal_distance": distance}
+        return Score(reward, success | fallen, success, info)
+
+    def _shaping(self, sense: CubeSense, lift: Array, grasped: Any) -> Array:
+        """Reach, squeeze, lift to `CARRY`, move above the goal, go down there. Shape: (n,)."""
+        offset = sense.object[:, :2] - self.goal
+        across = np.sqrt(np.einsum("ij,ij->i", offset, offset))
+        near, over = 1 - np.tanh(5 * across), across < GOAL_RADIUS
+        height = np.clip(lift / CARRY, 0.0, 1.0)
+        carried = np.where(over, 1.0, height)  # over the goal, being low is as good as being high, and better
+        reach: Array = 0.04 * (1 - np.tanh(5 * sense.distance))
+        return reach + grasped * (0.04 + 0.08 * carried + 0.16 * carried * near + 0.12 * over * (1 - height))
+
+    def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
+        """The goal."""
+        return [(np.array([*self.goal[0], 0.0]), (0.1, 0.7, 0.3, 0.6))]
+
+    def state_dict(self) -> dict[str, Any]:
+        """The memory, as plain arrays."""
+        return {**super().state_dict(), "goal": self.goal.copy()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go to what `state_dict` returned."""
+        super().load_state_dict(state)
+        self.goal = np.array(state["goal"])
+
+
+def sample_goal(rng: np.random.Generator, cube: Array) -> Array:
+    """A point of `CUBE_AREA` at least `GOAL_DISTANCE` from `cube` (2,) [m]. Shape: (2,)."""
+    while True:
+        goal: Array = CUBE_AREA[0] + rng.random(2) * (CUBE_AREA[1] - CUBE_AREA[0])
+        if np.hypot(*(goal - cube)) >= GOAL_DISTANCE:
+            return goal

@@ -1,0 +1,133 @@
+"""Reach: bring the tool within 2 cm of a point, with actions that turn the joints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from bam_envs.robots.robot import Initial, RobotState, Rows
+from bam_envs.robots.ur5e import GEOMETRY, GRIPPER_OPEN, JOINTS
+from bam_envs.tasks.task import Array, Floats, Label, Score, labelled_box
+from bam_envs.tasks.tool_control import JOINT_STEP, TOOL_STEP
+
+HOME = np.array([-0.27, -1.54, 1.89, -1.93, -1.57, -1.84])
+"""Joint positions with the tool at about (0.5, 0, 0.2) m, pointing down [rad]."""
+START_NOISE = 0.1
+"""The start differs from `HOME` by at most this much in each joint [rad]."""
+GOAL_AREA = np.array([[0.30, -0.30, 0.10], [0.65, 0.30, 0.45]])
+"""Where goals are: lowest and highest x, y, z [m]."""
+GOAL_RADIUS = 0.02
+"""The tool has arrived within this distance of the goal [m]."""
+LOWEST_TOOL = 0.04
+"""Commands that would bring the tool lower than this are not followed [m]."""
+JOINT_MARGIN = 0.1
+"""Commands stay this far from the joint limits [rad]."""
+LEASH = 0.15
+"""Farthest the commanded joints are from the measured ones [rad]."""
+
+_LOW = np.array([-2 * np.pi, -2 * np.pi, -np.pi, -2 * np.pi, -2 * np.pi, -2 * np.pi]) + JOINT_MARGIN
+
+
+class ReachTask:
+    """Bring the tool within `GOAL_RADIUS` of a goal.
+
+    Args:
+        num_rows: How many robots are scored together.
+    """
+
+    action_labels = tuple(Label(f"d_{joint}", f"turn {joint}", "rad", "/ 0.05") for joint in JOINTS)
+    observation_labels = (
+        *(Label(joint, "joint position from the home pose", "rad", "- home", -4, 4) for joint in JOINTS),
+        *(Label(f"target_{joint}", "commanded joint position from the measured one", "rad", "/ 0.15", -2, 2) for joint in JOINTS),
+        *(Label(f"tool_{axis}", f"tool, {axis}", "m", "(from the middle of the goals) / 0.3", -4, 4) for axis in "xyz"),
+        *(Label(f"goal_d{axis}", f"goal from the tool, {axis}", "m", "/ 0.3", -4, 4) for axis in "xyz"),
+        *(Label(f"goal_near_d{axis}", f"goal from the tool, {axis}, close up", "m", "/ 0.05, clipped") for axis in "xyz"),
+    )
+
+    def __init__(self, num_rows: int = 1) -> None:
+        self.num_rows = num_rows
+        self.action_space: spaces.Box = labelled_box(self.action_labels)
+        self.observation_space: spaces.Box = labelled_box(self.observation_labels)
+        self.goal = np.zeros((num_rows, 3))
+        """Goals [m]. Shape: (n, 3)."""
+        self._joints = np.zeros((num_rows, 6))
+
+    def begin(self, rows: Rows, rngs: Sequence[np.random.Generator]) -> Initial:
+        """Joint positions about `HOME`; a goal in `GOAL_AREA`."""
+        draws = np.stack([rng.random(9) for rng in rngs])
+        seeds = np.array([rng.integers(2**63) for rng in rngs], dtype=np.int64)
+        self.goal[rows] = GOAL_AREA[0] + draws[:, 6:] * (GOAL_AREA[1] - GOAL_AREA[0])
+        return Initial({"joint_position": HOME + START_NOISE * (2 * draws[:, :6] - 1)}, seeds)
+
+    def start(self, rows: Rows, state: RobotState) -> None:
+        """Commands go on from the measured joints."""
+        self._joints[rows] = state.signals["joint_position"][rows]
+
+    def observe(self, state: RobotState) -> Floats:
+        """See `observation_labels`. Shape: (n, 21) float32."""
+        joints = state.signals["joint_position"]
+        tool = GEOMETRY.tool_position(joints)
+        offset = self.goal - tool
+        columns = [
+            joints - HOME,
+            (self._joints - joints) / LEASH,
+            (tool - GOAL_AREA.mean(axis=0)) / 0.3,
+            offset / 0.3,
+            offset / 0.05,
+        ]
+        observation = np.concatenate(columns, axis=1).astype(np.float32)
+        return np.clip(observation, self.observation_space.low, self.observation_space.high)
+
+    def command(self, action: Floats, state: RobotState) -> Array:
+        """Joint positions [rad], at most `TOOL_STEP` of tool and `JOINT_STEP` of joint on, and the open gripper. Shape: (n, 7)."""
+        measured = state.signals["joint_position"]
+        wanted = self._joints + np.clip(action, -1.0, 1.0).astype(np.float64) * JOINT_STEP
+        wanted = np.clip(np.clip(wanted, measured - LEASH, measured + LEASH), _LOW, -_LOW)
+        self._joints = slow_step(self._joints, wanted)
+        return np.concatenate([self._joints, np.full((self.num_rows, 1), GRIPPER_OPEN)], axis=1)
+
+    def score(self, state: RobotState, action: Floats) -> Score:
+        """Nearer is better; arriving is worth staying there."""
+        offset = self.goal - GEOMETRY.tool_position(state.signals["joint_position"])
+        distance = np.sqrt(np.einsum("ij,ij->i", offset, offset))
+        success = distance < GOAL_RADIUS
+        reward = 0.2 * (1 - np.tanh(3 * distance)) + 10.0 * success
+        return Score(reward, success, success, {"distance": distance})
+
+    def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
+        """The goal."""
+        return [(self.goal[0], (0.1, 0.7, 0.3, 0.6))]
+
+    def state_dict(self) -> dict[str, Any]:
+        """The memory, as plain arrays."""
+        return {"goal": self.goal.copy(), "joints": self._joints.copy()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go to what `state_dict` returned."""
+        self.goal, self._joints = np.array(state["goal"]), np.array(state["joints"])
+
+
+def slow_step(joints: Array, wanted: Array) -> Array:
+    """As far from `joints` towards `wanted` as a robot near people may go in a period, and never below `LOWEST_TOOL`.
+
+    Args:
+        joints: Joint positions that were commanded last [rad]. Shape: (n, 6).
+        wanted: Joint positions to go to [rad]. Shape: (n, 6).
+
+    Returns:
+        Shape: (n, 6).
+    """
+    travel = wanted - joints
+    travel *= np.minimum(1.0, JOINT_STEP / np.maximum(np.abs(travel).max(axis=1), 1e-9))[:, None]
+    tool = GEOMETRY.tool_position(joints)
+    for _ in range(3):
+        step = GEOMETRY.tool_position(joints + travel) - tool
+        length = np.sqrt(np.einsum("ij,ij->i", step, step))
+        if length.max() <= TOOL_STEP:
+            break
+        travel *= np.minimum(1.0, 0.99 * TOOL_STEP / np.maximum(length, 1e-9))[:, None]
+    sinks = (tool[:, 2] + step[:, 2] < LOWEST_TOOL) & (step[:, 2] < 0)
+    return joints + np.where(sinks[:, None], 0.0, travel)
