@@ -1,0 +1,152 @@
+"""Showing the loop: a live panel on a terminal, a line for each episode elsewhere."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+
+from bam_train.deploy.journal import EpisodeRecord, Journal
+from bam_train.deploy.pacer import Pacer
+from bam_train.deploy.report import lateness_text, rate_text
+
+if TYPE_CHECKING:
+    from rich.console import Console, RenderableType
+    from rich.live import Live
+    from rich.table import Table
+
+_MOST_NUMBERS = 16
+"""Numbers of an action or a state signal that are shown; the rest (of an image, say) is left out."""
+_BAR = 20
+"""Characters of a bar."""
+
+
+class PlainDisplay:
+    """One line for each episode.
+
+    Args:
+        journal: Says how many episodes are wanted.
+        write: Takes a line.
+    """
+
+    def __init__(self, journal: Journal, write: Callable[[str], None]) -> None:
+        self._journal, self._write = journal, write
+
+    def ticked(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> None:
+        """Nothing: a line for each tick is too many."""
+
+    def ended(self, record: EpisodeRecord, pacer: Pacer) -> None:
+        """Write how the episode went."""
+        self._write(episode_line(len(self._journal.records), self._journal.wanted, record))
+
+
+class LiveDisplay:
+    """A panel redrawn at most ten times a second, and only when the next deadline leaves time for it.
+
+    Args:
+        live: Rich's live area, without a thread of its own.
+        env: The environment, for the labels and the measured state.
+        title: First line.
+        journal: The episodes so far.
+        now: Clock of the redraws [s].
+    """
+
+    EVERY = 0.1
+    """Time between redraws [s]."""
+    COST = 0.01
+    """Time that a redraw may take [s]."""
+
+    def __init__(
+        self,
+        live: Live,
+        env: gym.Env[Any, Any],
+        title: str,
+        journal: Journal,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._live, self._env, self._title, self._journal, self._now = live, env, title, journal, now
+        self._labels = action_labels(env)
+        self._drawn = -math.inf
+
+    def ticked(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> None:
+        """Redraw if it is time and there is time."""
+        now = self._now()
+        if now - self._drawn >= self.EVERY and pacer.slack >= self.COST:
+            self._drawn = now
+            self._live.update(self._panel(record, action, pacer), refresh=True)
+
+    def ended(self, record: EpisodeRecord, pacer: Pacer) -> None:
+        """Write how the episode went above the panel."""
+        self._live.console.print(episode_line(len(self._journal.records), self._journal.wanted, record))
+
+    def _panel(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> RenderableType:
+        from rich.table import Table
+
+        table = Table.grid(padding=(0, 1))
+        table.title, table.title_justify = self._title, "left"
+        for justify in ("left", "left", "right", "left"):
+            table.add_column(justify=justify, no_wrap=True)  # type: ignore[arg-type]
+        number = len(self._journal.records)
+        table.add_row("episode", f"{number} of {self._journal.wanted}", "step", str(record.length))
+        table.add_row("return", f"{record.total:.2f}", "", "")
+        table.add_row("loop", rate_text(pacer), "", "")
+        if pacer.period is not None:
+            table.add_row("lateness", lateness_text(pacer), "", "")
+        _add_numbers(table, "action", self._labels, np.ravel(action), bars=True)
+        for name, labels, units, values in state_rows(self._env):
+            _add_numbers(table, name, labels, values, units=units)
+        return table
+
+
+def _add_numbers(
+    table: Table, name: str, labels: tuple[str, ...], values: Any, units: tuple[str, ...] = (), *, bars: bool = False
+) -> None:
+    for i, value in enumerate(values[:_MOST_NUMBERS]):
+        label = labels[i] if i < len(labels) else str(i)
+        number = f"{value:+.3f}" if np.asarray(value).dtype.kind == "f" else str(value)
+        last = bar(float(value)) if bars else units[i] if i < len(units) else ""
+        table.add_row(name if i == 0 else "", label, number, last)
+
+
+def bar(value: float) -> str:
+    """A number of [-1, 1] as a mark on a line whose middle is 0; what is outside is at the end."""
+    place = round((min(max(value, -1.0), 1.0) + 1) / 2 * _BAR)
+    return "".join("#" if i == place else "|" if i == _BAR // 2 else "." for i in range(_BAR + 1))
+
+
+def episode_line(number: int, wanted: int, record: EpisodeRecord) -> str:
+    """Such as ``episode 2/5 (seed 8): success after 47 steps, return 12.31``."""
+    how = {True: "success", False: "no success", None: record.end}[record.success]
+    return (
+        f"episode {number}/{wanted} (seed {record.seed}): {how} after {record.length} steps, return {record.total:.2f}"
+    )
+
+
+def action_labels(env: gym.Env[Any, Any]) -> tuple[str, ...]:
+    """Names of the action's numbers, if the environment has any."""
+    describe = getattr(env.unwrapped, "describe", None)
+    return () if describe is None else tuple(str(row["name"]) for row in describe()["action"])
+
+
+def state_rows(env: gym.Env[Any, Any]) -> Iterator[tuple[str, tuple[str, ...], tuple[str, ...], Any]]:
+    """Each signal that the robot measured last: its name, labels, units and numbers; none if it is no `RobotEnv`."""
+    signals = getattr(getattr(env.unwrapped, "state", None), "signals", None)
+    if signals is None:
+        return
+    for spec in env.unwrapped.robot.spec.signals:  # type: ignore[attr-defined]
+        if spec.name in signals:
+            yield spec.name.replace("_", " "), spec.labels, spec.units, np.ravel(signals[spec.name][0])
+
+
+@contextmanager
+def live_display(console: Console, env: gym.Env[Any, Any], title: str, journal: Journal) -> Iterator[LiveDisplay]:
+    """The live panel on `console`; it stays on the screen at the end."""
+    from rich.live import Live
+
+    with Live(console=console, auto_refresh=False, redirect_stdout=False, redirect_stderr=False) as live:
+        yield LiveDisplay(live, env, title, journal)

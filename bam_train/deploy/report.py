@@ -1,0 +1,87 @@
+"""What a deployment did, for people and for programs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.journal import Journal
+from bam_train.deploy.loop import Ending
+from bam_train.deploy.pacer import Lateness, Pacer
+
+
+@dataclass(frozen=True)
+class DeployReport:
+    """The outcome of one deployment."""
+
+    checkpoint: Checkpoint
+    ending: Ending
+    journal: Journal
+    pacer: Pacer
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values; times in the unit that their name says."""
+        journal, manifest = self.journal, self.checkpoint.manifest
+        return {
+            "stop_reason": self.ending.reason,
+            "episodes": len(journal.complete),
+            "successes": journal.successes,
+            "ticks": self.pacer.ticks,
+            "rate_hz": None if self.pacer.rate is None else round(self.pacer.rate, 3),
+            "target_rate_hz": None if self.pacer.period is None else round(1 / self.pacer.period, 3),
+            "lateness_ms": _milliseconds(self.pacer.lateness),
+            "missed_ticks": self.pacer.missed,
+            "startup_cpu_s": _startup(journal),
+            "env": manifest.env,
+            "algorithm": manifest.algorithm,
+            "checkpoint": str(self.checkpoint.path),
+            "per_episode": [record.to_json() for record in journal.records],
+        }
+
+    def lines(self) -> list[str]:
+        """The same for people, a few lines."""
+        return [
+            f"{self.ending.reason}: {episodes_text(self.journal)}, {self.pacer.ticks} ticks, {rate_text(self.pacer)}",
+            *([f"lateness {lateness_text(self.pacer)}"] if self.pacer.period is not None else []),
+            *([startup_text(self.journal)] if self.journal.startup.finished else []),
+        ]
+
+
+def episodes_text(journal: Journal) -> str:
+    """Such as ``5 of 5 episodes, 4 successes``."""
+    successes = journal.successes
+    text = f"{len(journal.complete)} of {journal.wanted} episodes"
+    return text if successes is None else f"{text}, {successes} success{'' if successes == 1 else 'es'}"
+
+
+def rate_text(pacer: Pacer) -> str:
+    """Such as ``20.00 Hz of 20``."""
+    measured = "no rate yet" if pacer.rate is None else f"{pacer.rate:.2f} Hz"
+    return f"{measured}, no waiting" if pacer.period is None else f"{measured} of {1 / pacer.period:g}"
+
+
+def lateness_text(pacer: Pacer) -> str:
+    """Such as ``p50 0.08 ms, p99 0.30 ms, max 1.20 ms, 0 missed``."""
+    late = _milliseconds(pacer.lateness)
+    figures = [f"{name} {value:.2f} ms" for name, value in late.items()] if late else ["none yet"]
+    return ", ".join([*figures, f"{pacer.missed} missed"])
+
+
+def startup_text(journal: Journal) -> str:
+    """Where the CPU time up to the first action went."""
+    stages = ", ".join(f"{name} {seconds:.2f}" for name, seconds in journal.startup.stages.items())
+    return f"first action after {journal.startup.total:.2f} s of CPU time: {stages}"
+
+
+def _milliseconds(lateness: Lateness | None) -> dict[str, float] | None:
+    if lateness is None:
+        return None
+    return {name: round(1e3 * getattr(lateness, name), 3) for name in ("p50", "p99", "max")}
+
+
+def _startup(journal: Journal) -> dict[str, float] | None:
+    if not journal.startup.finished:
+        return None
+    stages = {name: round(seconds, 3) for name, seconds in journal.startup.stages.items()}
+    return {"total": round(journal.startup.total, 3), **stages}

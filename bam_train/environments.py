@@ -1,0 +1,147 @@
+"""Making the environment that a checkpoint belongs to, and proving that it is the same one before anything moves."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+import gymnasium as gym
+from bam_envs.spaces import space_to_json
+from gymnasium.vector import AutoresetMode, VectorEnv
+
+import bam_envs  # noqa: F401 - registers our environments with Gymnasium
+from bam_envs.registry import ENVIRONMENTS
+from bam_train.checkpoint import Checkpoint
+from bam_train.errors import CheckpointMismatch, SettingsError
+
+T = TypeVar("T")
+AnyEnv = gym.Env[Any, Any] | VectorEnv[Any, Any, Any]
+
+
+def is_batched(env_id: str) -> bool:
+    """Whether `env_id` is one of ours, whose rows share one batched simulation."""
+    return env_id in ENVIRONMENTS
+
+
+def make_env(
+    env_id: str, env_kwargs: Mapping[str, Any] | None = None, *, render_mode: str | None = None
+) -> gym.Env[Any, Any]:
+    """One environment, with its time limit and without Gymnasium's (slow) checker.
+
+    Raises:
+        SettingsError: It cannot be made: a package is missing, or it does not take these arguments.
+    """
+    rendering = {} if render_mode is None else {"render_mode": render_mode}
+    return _made(env_id, lambda: gym.make(env_id, disable_env_checker=True, **{**(env_kwargs or {}), **rendering}))
+
+
+def make_rows(env_id: str, env_kwargs: Mapping[str, Any] | None, num_envs: int) -> VectorEnv[Any, Any, Any]:
+    """`num_envs` environments stepped together, with automatic resets in the same step.
+
+    Ours are one batched simulation; of others, `num_envs` Python environments take turns (their own vector forms differ
+    in resets and seeds).
+
+    Raises:
+        SettingsError: It cannot be made.
+    """
+    if is_batched(env_id):
+        return _made(env_id, lambda: gym.make_vec(env_id, num_envs=num_envs, **(env_kwargs or {})))
+    arguments = {"disable_env_checker": True, **(env_kwargs or {})}
+    same_step = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    return _made(
+        env_id,
+        lambda: gym.make_vec(env_id, num_envs, vectorization_mode="sync", vector_kwargs=same_step, **arguments),
+    )
+
+
+def control_period(env: gym.Env[Any, Any]) -> float | None:
+    """Time between two actions [s]: the environment's `period`, else one frame of its `render_fps`, else None."""
+    period = getattr(env.unwrapped, "period", None)
+    if period is not None:
+        return float(period)
+    rate = env.metadata.get("render_fps")
+    return 1.0 / float(rate) if rate else None
+
+
+def require_fit(checkpoint: Checkpoint, env: AnyEnv) -> None:
+    """Prove that `env` takes and gives what the checkpoint's policy was trained with.
+
+    Compared: both spaces, the labels and units of every signal, and the control period, as far as both sides say.
+
+    Raises:
+        CheckpointMismatch: Names the first thing that differs, and both values.
+    """
+    manifest = checkpoint.manifest
+    pairs = [
+        ("observation_space", manifest.observation_space, space_to_json(_single(env, "observation_space"))),
+        ("action_space", manifest.action_space, space_to_json(_single(env, "action_space"))),
+    ]
+    describe = getattr(env.unwrapped, "describe", None)
+    if describe is not None and manifest.signals:
+        pairs.append(("signals", _names_and_units(manifest.signals), _names_and_units(describe())))
+    for name, theirs, ours in pairs:
+        difference = first_difference(_plain(theirs), _plain(ours), name)
+        if difference is not None:
+            raise CheckpointMismatch(checkpoint.path, _mismatch(manifest.env, *difference))
+    period = getattr(env.unwrapped, "period", None)
+    if period is not None and manifest.period is not None and not math.isclose(period, manifest.period, rel_tol=1e-9):
+        raise CheckpointMismatch(checkpoint.path, _mismatch(manifest.env, "period [s]", manifest.period, float(period)))
+
+
+def first_difference(theirs: Any, ours: Any, name: str) -> tuple[str, Any, Any] | None:
+    """The first place where two JSON values differ: its name, their value and ours; None if there is none."""
+    if isinstance(theirs, dict) and isinstance(ours, dict):
+        keys: list[Any] = sorted(theirs.keys() | ours.keys(), key=lambda key: (key != "type", key != "shape", key))
+        pairs = [(f"{name}.{key}", theirs.get(key), ours.get(key)) for key in keys]
+    elif isinstance(theirs, list) and isinstance(ours, list) and len(theirs) == len(ours):
+        pairs = [(f"{name}[{i}]", a, b) for i, (a, b) in enumerate(zip(theirs, ours, strict=True))]
+    else:
+        return None if theirs == ours else (name, theirs, ours)
+    return next((found for pair in pairs if (found := first_difference(pair[1], pair[2], pair[0]))), None)
+
+
+def _names_and_units(signals: Mapping[str, Any]) -> dict[str, Any]:
+    """Of what `RobotEnv.describe` gives, the part that the policy's meaning hangs on."""
+    return {kind: [{key: row.get(key) for key in ("name", "unit")} for row in rows] for kind, rows in signals.items()}
+
+
+def _mismatch(env: str, name: str, theirs: Any, ours: Any) -> str:
+    return (
+        f"{name} is {_short(theirs)} in the checkpoint and {_short(ours)} in {env} as installed; "
+        f"train it anew, or install the version it was trained with"
+    )
+
+
+def _short(value: Any, most: int = 60) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
+def _plain(value: Any) -> Any:
+    """As it is after a round trip through JSON (tuples are lists)."""
+    return json.loads(json.dumps(value))
+
+
+def _single(env: AnyEnv, name: str) -> gym.Space[Any]:
+    space: gym.Space[Any] = getattr(env, f"single_{name}" if isinstance(env, VectorEnv) else name)
+    return space
+
+
+def _made(env_id: str, make: Callable[[], T]) -> T:
+    """What `make` returns; what it can raise for the caller's sake becomes one line."""
+    try:
+        return make()
+    except gym.error.Error as error:
+        raise SettingsError(f"{env_id} cannot be made: {_first_line(error)}") from error
+    except ModuleNotFoundError as error:
+        raise SettingsError(
+            f"{env_id} cannot be made: {_first_line(error)}; install the package that has it"
+        ) from error
+    except TypeError as error:
+        raise SettingsError(f"{env_id} cannot be made with these arguments: {_first_line(error)}") from error
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

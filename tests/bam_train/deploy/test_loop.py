@@ -1,0 +1,211 @@
+import os
+import signal
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from bam_envs.errors import RobotFault
+from bam_train.deploy.journal import Journal, Startup
+from bam_train.deploy.loop import Ending, deploy, fault_text
+from bam_train.deploy.pacer import Pacer
+
+
+class Right:
+    """Always to the right; remembers what it saw."""
+
+    def __init__(self, action=1):
+        self.action, self.seen, self.resets = action, [], 0
+
+    def reset(self, rows=None):
+        self.resets += 1
+
+    def act(self, observation):
+        self.seen.append(observation.tolist())
+        return self.action
+
+
+class Silent:
+    def __init__(self):
+        self.ticks, self.episodes = 0, []
+
+    def ticked(self, record, action, pacer):
+        self.ticks += 1
+
+    def ended(self, record, pacer):
+        self.episodes.append(record.seed)
+
+
+class Robot:
+    def __init__(self):
+        self.calls = []
+
+    def halt(self):
+        self.calls.append("halt")
+
+
+class Driven(gym.Wrapper):
+    """Something happens at the given step; has a robot that can be halted."""
+
+    def __init__(self, env, happens=lambda: None, at=2):
+        super().__init__(env)
+        self.robot = env.unwrapped.robot = Robot()
+        self.happens, self.at, self.count = happens, at, 0
+
+    def step(self, action):
+        self.count += 1
+        if self.count == self.at:
+            self.happens()
+        return super().step(action)
+
+    def close(self):
+        self.robot.calls.append("close")
+        super().close()
+
+
+def run(env, policy=None, episodes=3, seed=7, watcher=None):
+    journal = Journal(episodes)
+    pacer = Pacer(None)
+    ending = deploy(env, policy or Right(), pacer, journal, watcher or Silent(), seed=seed)
+    return ending, journal, pacer
+
+
+def raises(error):
+    def happens():
+        raise error
+
+    return happens
+
+
+def test_all_episodes(corridor, starting_cell):
+    env, policy, watcher = Driven(gym.make(corridor)), Right(), Silent()
+    ending, journal, pacer = run(env, policy, watcher=watcher)
+    lengths = [4 - starting_cell(seed) for seed in (7, 8, 9)]
+    assert ending == Ending("episodes done", 0)
+    assert [record.to_json() for record in journal.records] == [
+        {"seed": seed, "length": length, "return": 1 - 0.25 * length, "success": True, "end": "terminated"}
+        for seed, length in zip((7, 8, 9), lengths, strict=True)
+    ]
+    assert journal.successes == 3
+    assert pacer.ticks == watcher.ticks == sum(lengths)
+    assert watcher.episodes == [7, 8, 9]
+    assert policy.resets == 3
+    assert policy.seen[0] == [starting_cell(7)]
+    assert env.robot.calls == ["halt", "close"]
+
+
+def test_the_time_limit_is_not_the_end_of_the_task(corridor):
+    _, journal, _ = run(gym.make(corridor, slow=True), episodes=1)
+    assert journal.records[0].to_json() == {
+        "seed": 7, "length": 10, "return": -2.5, "success": False, "end": "truncated",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (RobotFault("link lost"), "fault: link lost"),
+        (ZeroDivisionError("division by zero"), "fault: ZeroDivisionError: division by zero"),
+        (ValueError("two\nlines"), "fault: ValueError: two lines"),
+        (KeyError(), "fault: KeyError"),
+    ],
+)
+def test_a_fault_halts_and_is_named(corridor, error, reason):
+    env = Driven(gym.make(corridor, slow=True), raises(error))
+    ending, journal, _ = run(env)
+    assert ending == Ending(reason, 1)
+    assert env.robot.calls == ["halt", "close"]
+    assert [record.end for record in journal.records] == ["stopped"]
+    assert journal.records[0].length == 1
+    assert journal.complete == []
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_halts(corridor, number, status):
+    before = signal.getsignal(number)
+    env = Driven(gym.make(corridor, slow=True), lambda: os.kill(os.getpid(), number), at=12)
+    ending, journal, _ = run(env)
+    assert ending == Ending("interrupted", status)
+    assert env.robot.calls == ["halt", "close"]
+    assert [record.end for record in journal.records] == ["truncated", "stopped"]
+    assert signal.getsignal(number) is before
+
+
+def test_a_second_signal_does_not_stop_the_halt(corridor):
+    env = Driven(gym.make(corridor, slow=True), lambda: os.kill(os.getpid(), signal.SIGINT))
+    halted = []
+
+    def halt():
+        os.kill(os.getpid(), signal.SIGINT)
+        halted.append(True)
+
+    env.robot.halt = halt
+    ending, _, _ = run(env)
+    assert ending == Ending("interrupted", 130)
+    assert halted == [True]
+
+
+def test_a_third_signal_gives_up(corridor):
+    env = Driven(gym.make(corridor, slow=True), lambda: os.kill(os.getpid(), signal.SIGINT))
+
+    def hangs():
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    env.robot.halt = hangs
+    with pytest.raises(KeyboardInterrupt):
+        run(env)
+
+
+def test_a_signal_while_closing_changes_nothing(corridor):
+    class Slow(gym.Wrapper):
+        def close(self):
+            os.kill(os.getpid(), signal.SIGTERM)
+            super().close()
+
+    ending, _, _ = run(Slow(gym.make(corridor)))
+    assert ending == Ending("episodes done", 0)
+
+
+def test_a_failing_close_is_a_fault(corridor):
+    class Stuck(gym.Wrapper):
+        def close(self):
+            raise OSError("stuck")
+
+    ending, journal, _ = run(Stuck(gym.make(corridor)))
+    assert ending == Ending("fault: closing failed: OSError: stuck", 1)
+    assert len(journal.complete) == 3
+
+
+def test_an_action_that_is_not_finite_never_reaches_the_robot(corridor):
+    env = Driven(gym.make(corridor))
+    ending, _, _ = run(env, Right(np.array([np.nan], np.float32)))
+    assert ending == Ending(
+        "fault: action[0] is nan at step 0 of the episode with seed 7; expected finite numbers: the policy is broken", 1
+    )
+    assert env.count == 0
+    assert env.robot.calls == ["halt", "close"]
+
+
+def test_without_a_robot_there_is_nothing_to_halt(corridor):
+    assert run(gym.make(corridor))[0].status == 0
+
+
+def test_startup_stages_add_up():
+    clock = iter([0.25, 0.75, 1.0, 9.0])
+    startup = Startup(clock=lambda: next(clock))
+    startup.mark("python")
+    startup.mark("policy")
+    startup.finish("first action")
+    startup.finish("first action")
+    assert startup.stages == {"python": 0.25, "policy": 0.5, "first action": 0.25}
+    assert startup.total == 1.0
+
+
+def test_successes_are_unknown_where_the_environment_does_not_say(corridor):
+    assert run(gym.make(corridor, says_success=False))[1].successes is None
+    assert Journal(3).successes == 0
+
+
+def test_fault_text_of_nothing():
+    assert fault_text(RobotFault()) == "RobotFault"

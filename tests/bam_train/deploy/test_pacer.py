@@ -1,0 +1,118 @@
+import math
+
+import pytest
+
+from bam_train.deploy.pacer import Lateness, Pacer
+
+
+class Clock:
+    """A clock that only moves when somebody sleeps or works."""
+
+    def __init__(self, start=100.0, overshoot=0.0):
+        self.time, self.overshoot, self.slept = start, overshoot, []
+
+    def now(self):
+        return self.time
+
+    def sleep(self, seconds):
+        self.slept.append(seconds)
+        self.time += seconds + self.overshoot
+
+    def work(self, seconds):
+        self.time += seconds
+
+
+def paced(clock, period=0.125):
+    pacer = Pacer(period, now=clock.now, sleep=clock.sleep)
+    pacer.start()
+    return pacer
+
+
+def starts(clock, pacer, works):
+    """When each tick started, relative to the first, if tick i works for works[i] seconds."""
+    times = []
+    for work in works:
+        pacer.wait()
+        times.append(clock.time - 100.0)
+        clock.work(work)
+    return times
+
+
+def test_deadlines_are_absolute():
+    clock = Clock()
+    pacer = paced(clock)
+    assert starts(clock, pacer, [0.0625, 0.03125, 0.125, 0.0]) == [0.0, 0.125, 0.25, 0.375]
+    assert clock.slept == [0.0625, 0.09375]
+    assert pacer.lateness == Lateness(0.0, 0.0, 0.0)
+    assert (pacer.ticks, pacer.missed, pacer.rate) == (4, 0, 8.0)
+
+
+def test_late_sleeps_do_not_add_up():
+    clock = Clock(overshoot=0.001)
+    pacer = paced(clock)
+    assert starts(clock, pacer, [0.0] * 4) == pytest.approx([0.0, 0.126, 0.251, 0.376])
+    assert pacer.lateness.max == pytest.approx(0.001)
+    assert pacer.missed == 0
+
+
+@pytest.mark.parametrize(
+    ("work", "expected", "missed"),
+    [
+        (0.15625, [0.0, 0.15625, 0.25, 0.375], 0),  # a quarter late: starts at once, then on the grid again
+        (0.1875, [0.0, 0.1875, 0.25, 0.375], 0),  # half a period late: the next is still run
+        (0.21875, [0.0, 0.21875, 0.375, 0.5], 1),  # three quarters late: too close to the next, which is missed
+        (0.5, [0.0, 0.5, 0.625, 0.75], 3),  # a long stall: no burst afterwards
+        (1.0625, [0.0, 1.0625, 1.125, 1.25], 7),
+    ],
+)
+def test_no_burst_after_a_late_tick(work, expected, missed):
+    clock = Clock()
+    pacer = paced(clock)
+    assert starts(clock, pacer, [work, 0.0, 0.0, 0.0]) == expected
+    assert pacer.missed == missed
+    assert pacer.lateness.max == work - 0.125
+
+
+def test_lateness_percentiles():
+    clock = Clock()
+    pacer = paced(clock)
+    starts(clock, pacer, [0.0] * 100 + [0.15625, 0.0])
+    assert pacer.lateness.p50 == 0.0
+    assert pacer.lateness.max == 0.03125
+    assert 0.0 <= pacer.lateness.p99 < 0.03125
+
+
+def test_each_episode_has_its_own_grid_and_pauses_do_not_count():
+    clock = Clock()
+    pacer = paced(clock)
+    starts(clock, pacer, [0.0, 0.0])
+    clock.work(7.03)  # the robot goes back to its start
+    pacer.start()
+    before = clock.time
+    pacer.wait()
+    assert clock.time == before
+    pacer.wait()
+    assert clock.time == before + 0.125
+    assert pacer.rate == pytest.approx(8.0)
+    assert pacer.missed == 0
+
+
+def test_running_free_never_waits_and_is_never_late():
+    clock = Clock()
+    pacer = paced(clock, period=None)
+    assert starts(clock, pacer, [0.25, 0.25, 0.25]) == [0.0, 0.25, 0.5]
+    assert clock.slept == []
+    assert (pacer.lateness, pacer.missed, pacer.rate, pacer.slack) == (None, 0, 4.0, math.inf)
+
+
+def test_slack_is_the_time_to_the_next_deadline():
+    clock = Clock()
+    pacer = paced(clock)
+    pacer.wait()
+    clock.work(0.03125)
+    assert pacer.slack == 0.09375
+
+
+def test_nothing_is_known_before_the_first_tick():
+    pacer = paced(Clock())
+    assert (pacer.rate, pacer.lateness, pacer.ticks) == (None, None, 0)

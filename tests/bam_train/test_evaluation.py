@@ -1,0 +1,185 @@
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from bam_train.environments import make_rows
+from bam_train.errors import PolicyError, SettingsError
+from bam_train.evaluation import (
+    Episode,
+    default_rows,
+    evaluate,
+    final_success,
+    play_wave,
+    require_finite,
+    summarise,
+    wilson_interval,
+)
+
+
+class Always:
+    """The same action in every row; remembers which rows were told to forget."""
+
+    def __init__(self, action=1):
+        self.action, self.forgotten, self.batches = action, [], []
+
+    def reset(self, rows=None):
+        self.forgotten.append(None if rows is None else list(rows))
+
+    def act_batch(self, observations):
+        self.batches.append(len(observations))
+        return np.full(len(observations), self.action)
+
+
+@pytest.mark.parametrize(
+    ("successes", "episodes", "low", "high"),
+    [  # Newcombe 1998, table I, method 3
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+        (29, 29, 0.8830, 1.0),
+    ],
+)
+def test_wilson_interval_is_the_published_one(successes, episodes, low, high):
+    assert wilson_interval(successes, episodes) == pytest.approx((low, high), abs=5e-5)
+
+
+def test_episode_k_has_seed_plus_k_and_exact_figures(corridor, starting_cell):
+    starts = [starting_cell(seed) for seed in range(7, 17)]
+    report = evaluate(Always(1), corridor, episodes=10, seed=7, num_envs=4)
+    lengths = [4 - start for start in starts]
+    assert set(starts) == {1, 2, 3}
+    assert report.seed == 7
+    assert report.successes == report.episodes == 10
+    assert report.success_rate == 1.0
+    assert report.success_interval == pytest.approx((0.722467, 1.0), abs=1e-6)
+    assert report.length_mean == np.mean(lengths)
+    assert report.return_mean == 1 - 0.25 * np.mean(lengths)
+    assert report.return_std == pytest.approx(0.25 * np.std(lengths))
+    assert (report.return_min, report.return_max) == (0.25, 0.75)
+
+
+@pytest.mark.parametrize("num_envs", [1, 3, 10, 16, None])
+def test_numbers_do_not_depend_on_the_rows(corridor, num_envs):
+    assert evaluate(Always(0), corridor, episodes=10, seed=3, num_envs=num_envs) == evaluate(
+        Always(0), corridor, episodes=10, seed=3, num_envs=2
+    )
+
+
+def test_time_limit_ends_an_episode(corridor):
+    report = evaluate(Always(), corridor, {"slow": True}, episodes=2, seed=0)
+    assert (report.length_mean, report.return_mean, report.success_rate) == (10.0, -2.5, 0.0)
+
+
+def test_no_success_where_the_environment_has_none(corridor):
+    report = evaluate(Always(), corridor, {"says_success": False}, episodes=3, seed=0)
+    assert (report.success_rate, report.success_interval, report.successes) == (None, None, None)
+    assert json.loads(json.dumps(report.to_json(), allow_nan=False))["success_rate"] is None
+
+
+def test_json_is_plain(corridor):
+    values = evaluate(Always(), corridor, episodes=2, seed=5).to_json()
+    assert json.loads(json.dumps(values)) == values
+    assert values["env"] == corridor
+    assert values["episodes"] == 2
+
+
+def test_recurrent_state_is_forgotten_row_by_row(corridor, starting_cell):
+    policy = Always(1)
+    rows = make_rows(corridor, None, 2)
+    seed = next(seed for seed in range(100) if starting_cell(seed) == 3 and starting_cell(seed + 1) == 2)
+    episodes = play_wave(rows, policy, seed, 2)
+    rows.close()
+    assert [episode.length for episode in episodes] == [1, 2]
+    assert policy.forgotten[:2] == [None, [0]]
+    assert 1 in policy.forgotten[2]
+
+
+def test_given_rows_are_used_again_and_left_open(corridor):
+    rows = make_rows(corridor, None, 4)
+    policy = Always(1)
+    first = evaluate(policy, corridor, episodes=6, seed=1, env=rows)
+    again = evaluate(policy, corridor, episodes=6, seed=1, env=rows)
+    assert first == again
+    assert set(policy.batches) == {4}
+    assert not rows.closed
+    rows.close()
+
+
+def test_given_rows_must_reset_in_the_same_step(corridor):
+    rows = gym.make_vec(corridor, 2, vectorization_mode="sync")
+    with pytest.raises(SettingsError, match=r"^env: expected autoreset mode SAME_STEP, found AutoresetMode.NEXT_STEP$"):
+        evaluate(Always(), corridor, episodes=2, env=rows)
+    rows.close()
+
+
+def test_progress_after_every_wave(corridor):
+    seen = []
+    evaluate(Always(), corridor, episodes=5, seed=0, num_envs=2, on_progress=lambda *counts: seen.append(counts))
+    assert seen == [(2, 5), (4, 5), (5, 5)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"episodes": 0}, "episodes: expected at least 1, found 0"),
+        ({"episodes": -3}, "episodes: expected at least 1, found -3"),
+        ({"seed": -1}, "seed: expected at least 0, found -1"),
+        ({"num_envs": 0}, "num_envs: expected at least 1, found 0"),
+    ],
+)
+def test_out_of_range(corridor, arguments, message):
+    with pytest.raises(SettingsError) as caught:
+        evaluate(Always(), corridor, **arguments)
+    assert str(caught.value) == message
+
+
+def test_an_action_that_is_not_finite_is_refused():
+    class Broken(Always):
+        def act_batch(self, observations):
+            return np.full((len(observations), 1), np.nan, np.float32)
+
+    with pytest.raises(PolicyError) as caught:
+        evaluate(Broken(), "Pendulum-v1", episodes=2, seed=4)
+    assert str(caught.value) == (
+        "action[0, 0] is nan after 0 steps of the episodes from seed 4 on; expected finite numbers: the policy is broken"
+    )
+
+
+def test_integer_actions_are_finite():
+    require_finite(np.array([1, 2]), "now")
+
+
+def test_returns_that_are_not_finite_are_none():
+    report = summarise("e", [Episode(0, float("nan"), 1, None), Episode(1, 1.0, 3, None)])
+    assert (report.return_mean, report.return_std, report.return_min, report.return_max) == (None, None, None, None)
+    assert (report.length_mean, report.length_std) == (2.0, 1.0)
+    json.dumps(report.to_json(), allow_nan=False)
+
+
+def test_success_of_a_row_is_read_from_its_own_end():
+    infos = {
+        "is_success": np.array([False, False]),
+        "final_info": {"is_success": np.array([True, False]), "_is_success": np.array([True, False])},
+    }
+    assert final_success(infos, 0) is True
+    assert final_success(infos, 1) is None
+    assert final_success({}, 0) is None
+
+
+@pytest.mark.parametrize(
+    ("env_id", "episodes", "rows"),
+    [("bam/pick-v0", 100, 50), ("bam/pick-v0", 64, 64), ("bam/pick-v0", 3, 3), ("CartPole-v1", 100, 15)],
+)
+def test_rows_share_the_episodes_evenly(env_id, episodes, rows):
+    assert default_rows(env_id, episodes) == rows
+
+
+def test_same_seeds_same_numbers_on_gymnasium():
+    one, two = (evaluate(Always(1), "CartPole-v1", episodes=20, seed=11) for _ in range(2))
+    assert one == two
+    assert one.success_rate is None
+    assert 8 <= one.length_mean <= 11
+    assert one.return_mean == one.length_mean
