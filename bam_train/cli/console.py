@@ -1,0 +1,53 @@
+"""Standard error as the programs use it: a rich console on a terminal, plain lines elsewhere; and numbers for people to read."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def is_terminal() -> bool:
+    """Whether somebody watches standard error on a terminal."""
+    return sys.stderr.isatty()
+
+
+def make_console() -> Console:
+    """A rich console on standard error; standard output is kept for results that programs read."""
+    from rich.console import Console
+
+    return Console(stderr=True, highlight=False)
+
+
+def say(text: str = "") -> None:
+    """Print one plain line on standard error."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def count(number: float) -> str:
+    """A count in short: 950, 12.3k, 1.25M."""
+    if number < 10_000:
+        return f"{number:.0f}"
+    return f"{number / 1e3:.4g}k" if number < 1e6 else f"{number / 1e6:.4g}M"
+
+
+def duration(seconds: float | None) -> str:
+    """A duration in short: 4.2 s, 3 min 05 s, 2 h 04 min; a dash if it is not known."""
+    if seconds is None or seconds != seconds or seconds == float("inf"):
+        return "–"
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def percent(share: float | None) -> str:
+    """A share: 98.5 %; a dash if it is not known."""
+    return "–" if share is None else f"{100 * share:.1f} %".replace(".0 %", " %")
+
+
+def number(value: float | None) -> str:
+    """A measured value to four digits; a dash if it is not known."""
+    return "–" if value is None else f"{value:.4g}"

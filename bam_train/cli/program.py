@@ -1,0 +1,100 @@
+"""What every program of ours shares: flags out of a frozen dataclass, and every expected failure as one line and a status.
+
+Only tyro is imported before the flags are parsed, so that ``--help`` is quick.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+Config = TypeVar("Config")
+
+EXTRAS = {
+    "torch": "train",
+    "stable_baselines3": "train",
+    "sb3_contrib": "train",
+    "onnx": "train",
+    "tensorboard": "train",
+    "matplotlib": "train",
+    "mujoco": "sim",
+    "PIL": "video",
+    "imageio": "video",
+}
+"""Optional package to the extra of bam-train that brings it."""
+
+INTERRUPTED = 130
+"""Exit status of a program that Ctrl-C ended (128 + SIGINT)."""
+
+
+def run_program(
+    main: Callable[[Config], int | None],
+    config: type[Config],
+    *,
+    prog: str,
+    description: str,
+    arguments: Sequence[str] | None = None,
+) -> None:
+    """Parse the command line into `config`, run `main`, and exit with its status.
+
+    Args:
+        main: The program; returns its exit status, None for 0.
+        config: A frozen dataclass; one field is one flag.
+        prog: The program's name, as it starts each error line.
+        description: First line of ``--help``.
+        arguments: Instead of those of the process.
+
+    Raises:
+        SystemExit: Always.
+    """
+    import tyro
+
+    parsed = tyro.cli(config, prog=prog, description=description, args=arguments)
+    sys.exit(guarded(lambda: main(parsed), prog))
+
+
+def guarded(main: Callable[[], int | None], prog: str) -> int:
+    """Run `main`; what is expected to go wrong becomes one line on standard error and a status other than 0."""
+    try:
+        return main() or 0
+    except KeyboardInterrupt as stop:
+        _complain(prog, str(stop) or "interrupted")
+        return INTERRUPTED
+    except BrokenPipeError:  # somebody closed our standard output, such as head
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except ModuleNotFoundError as error:
+        _complain(prog, missing_extra(error))
+        return 1
+    except Exception as error:
+        if not is_expected(error):
+            raise
+        _complain(prog, str(error))
+        return 1
+
+
+def is_expected(error: Exception) -> bool:
+    """Whether an error is of our own two trees, whose text says what to do."""
+    from bam_envs.errors import BamEnvsError
+
+    from bam_train.errors import BamTrainError
+
+    return isinstance(error, (BamTrainError, BamEnvsError))
+
+
+def missing_extra(error: ModuleNotFoundError) -> str:
+    """The line for a missing package: which command installs it.
+
+    Raises:
+        ModuleNotFoundError: It is none of ours.
+    """
+    package = (error.name or "").partition(".")[0]
+    if package not in EXTRAS:
+        raise error
+    return f'needs {package}, which is not installed. Run: pip install "bam-train[{EXTRAS[package]}]"'
+
+
+def _complain(prog: str, text: str) -> None:
+    print(f"{prog}: {' '.join(text.split())}", file=sys.stderr, flush=True)
