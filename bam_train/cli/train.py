@@ -1,0 +1,130 @@
+"""`bam-train`: train a policy, keep the best as one checkpoint.zip."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from bam_train.cli.program import run_program
+
+if TYPE_CHECKING:
+    from bam_train.checkpoint import Checkpoint
+    from bam_train.settings import TrainSettings
+
+_STARTED = time.monotonic()
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Flags of `bam-train`; what is not given comes from ``--config``, the preset, then the algorithm's defaults."""
+
+    env: str | None = None
+    """Environment: any Gymnasium id, such as bam/pick, CartPole-v1 or some_module:Env-v0."""
+    algo: str | None = None
+    """Algorithm: ppo, a2c, sac, td3, ddpg, dqn, tqc, trpo, qrdqn, crossq or recurrent-ppo."""
+    steps: int | None = None
+    """Environment steps of the whole run, also after --resume."""
+    seed: int | None = None
+    """Seed of weights, exploration and environments."""
+    num_envs: int | None = None
+    """Environments stepped side by side."""
+    device: str | None = None
+    """Where to compute: auto, cpu, cuda, cuda:1."""
+    threads: int | None = None
+    """Threads that torch computes with (default 1: more is slower on small networks)."""
+    config: Path | None = None
+    """File of settings, .toml or .json, such as --print-config writes."""
+    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    """One setting, again for each: learning_rate=lin_3e-4, policy_kwargs.net_arch=[64,64], env_kwargs.randomize=true."""
+    print_config: bool = False
+    """Print all settings of the run as JSON, and do not train."""
+    out: Path | None = None
+    """Where the best checkpoint goes (default checkpoints/<env>-<algo>.zip)."""
+    resume: Path | None = None
+    """Checkpoint to go on from, with its settings and up to --steps in all."""
+    until_success: float | None = None
+    """Stop once this share of evaluation episodes succeeds, such as 0.99."""
+    eval_every: int | None = None
+    """Steps between two evaluations (default a twentieth of the run)."""
+    eval_episodes: int | None = None
+    """Episodes of one evaluation."""
+    force: bool = False
+    """Overwrite the checkpoint at --out instead of adding a number to its name."""
+    runs: Path = Path("runs")
+    """Folder in which the run's own folder is made."""
+
+
+_NOT_SETTINGS = frozenset({"config", "set", "print_config", "out", "resume", "force", "runs"})
+
+
+def main() -> None:
+    """Run the program."""
+    run_program(train, TrainConfig, prog="bam-train", description="Train a policy and keep the best as one checkpoint.zip.")
+
+
+def train(config: TrainConfig) -> int:
+    """Do what the flags say; returns the exit status."""
+    from bam_train.checkpoint import Checkpoint
+
+    checkpoint = None if config.resume is None else Checkpoint.open(config.resume)
+    settings = _settings(config, checkpoint)
+    if config.print_config:
+        print(json.dumps(settings.to_mapping(), indent=2))
+        return 0
+    return _train(config, settings, checkpoint)
+
+
+def _settings(config: TrainConfig, checkpoint: Checkpoint | None) -> TrainSettings:
+    from bam_train.settings import merge, read_assignments, read_config
+    from bam_train.trainers.resolve import resolve, resolve_resumed
+
+    file = {} if config.config is None else read_config(config.config)
+    flags = {
+        field.name: getattr(config, field.name)
+        for field in fields(config)
+        if field.name not in _NOT_SETTINGS and getattr(config, field.name) is not None
+    }
+    given = merge(file, read_assignments(config.set), flags)
+    return resolve(given) if checkpoint is None else resolve_resumed(given, checkpoint)
+
+
+def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint | None) -> int:
+    """Train with complete settings; returns the exit status."""
+    from bam_train.cli.stop_signals import StopSignals
+    from bam_train.cli.train_display import make_display
+    from bam_train.cli.train_summary import summarise
+    from bam_train.settings import file_stem
+    from bam_train.trainers import load_trainer
+    from bam_train.trainers.output import choose_output
+    from bam_train.trainers.run import TrainingRun
+    from bam_train.trainers.run_folder import RunFolder
+
+    output = choose_output(settings, config.out, config.force, checkpoint)
+    folder = RunFolder(config.runs, file_stem(settings.env, settings.algo))
+    folder.write_config(settings.to_mapping())
+    kind = load_trainer(settings.trainer)
+    made: Any = (
+        kind.create(settings, folder.tensorboard)
+        if checkpoint is None
+        else kind.load(checkpoint, settings, folder.tensorboard)
+    )
+    try:
+        with make_display(f"{settings.algo} on {settings.env}, seed {settings.seed}") as display:
+            for notice in [*output.notices, *made.notices]:
+                display.note(notice)
+            run = TrainingRun(made, folder, output.path, display, output.best)
+            with StopSignals(run) as signals:
+                outcome = run.run()
+    finally:
+        made.close()
+    summarise(settings, outcome, folder, time.monotonic() - _STARTED)
+    return signals.status
+
+
+if __name__ == "__main__":
+    main()

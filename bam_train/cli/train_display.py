@@ -1,0 +1,131 @@
+"""How `bam-train` shows a run: a live panel on a terminal, plain lines elsewhere; on standard error either way."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from bam_train.cli.console import count, duration, is_terminal, make_console, number, percent, say
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from bam_train.evaluation import EvaluationReport
+    from bam_train.trainers.trainer import Progress, Statistics
+
+LINE_EVERY = 1.0
+"""Seconds between two plain lines about training at least."""
+
+
+def make_display(title: str) -> PlainDisplay:
+    """A live display where standard error is a terminal, else a plain one."""
+    return LiveDisplay(title) if is_terminal() else PlainDisplay(title)
+
+
+class PlainDisplay:
+    """One line for each evaluation and each note, and about one a second for training.
+
+    Args:
+        title: What is being trained.
+        clock: Monotonic time [s].
+    """
+
+    def __init__(self, title: str, clock: Callable[[], float] = time.monotonic) -> None:
+        self.title = title
+        self._clock = clock
+        self._said = float("-inf")
+
+    def __enter__(self) -> PlainDisplay:
+        self.note(self.title)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        return
+
+    def training(
+        self, progress: Progress, statistics: Statistics, steps_per_second: float, seconds_left: float | None
+    ) -> None:
+        """Say how training goes, unless that was said less than a second ago."""
+        if self._clock() - self._said < LINE_EVERY:
+            return
+        self._said = self._clock()
+        self.note(
+            f"{_steps(progress)}  {steps_per_second:,.0f} steps/s  {_scores(statistics)}  {duration(seconds_left)} left"
+        )
+
+    def evaluated(self, steps: int, report: EvaluationReport, best: bool) -> None:
+        """Say what an evaluation found."""
+        self.note(evaluation_line(steps, report, best))
+
+    def note(self, text: str) -> None:
+        """Say something."""
+        say(text)
+
+
+class LiveDisplay(PlainDisplay):
+    """A panel that changes in place, below the lines about evaluations."""
+
+    def __init__(self, title: str, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__(title, clock)
+        from rich.live import Live
+
+        self._console = make_console()
+        self._live = Live(console=self._console, refresh_per_second=4, transient=True)
+
+    def __enter__(self) -> LiveDisplay:
+        self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._live.stop()
+
+    def training(
+        self, progress: Progress, statistics: Statistics, steps_per_second: float, seconds_left: float | None
+    ) -> None:
+        """Change the panel."""
+        self._live.update(_panel(self.title, progress, statistics, steps_per_second, seconds_left))
+
+    def note(self, text: str) -> None:
+        """Say something above the panel."""
+        self._console.print(text, markup=False, soft_wrap=True)
+
+
+def evaluation_line(steps: int, report: EvaluationReport, best: bool) -> str:
+    """One line about an evaluation."""
+    success = "" if report.success_rate is None else f"success {percent(report.success_rate)}, "
+    rest = f"return {number(report.return_mean)}, {report.length_mean:.0f} steps an episode"
+    return f"evaluation at {count(steps)} steps: {success}{rest} ({report.episodes} episodes){', the best so far' if best else ''}"
+
+
+def _steps(progress: Progress) -> str:
+    return f"{count(progress.steps)} of {count(progress.total)} steps"
+
+
+def _scores(statistics: Statistics) -> str:
+    success = "" if statistics.success_rate is None else f"success {percent(statistics.success_rate)}  "
+    return f"{success}return {number(statistics.return_mean)}"
+
+
+def _panel(title: str, progress: Progress, statistics: Statistics, rate: float, left: float | None) -> Any:
+    from rich.panel import Panel
+    from rich.progress_bar import ProgressBar
+    from rich.table import Table
+
+    grid = Table.grid(padding=(0, 2))
+    rows = {
+        "steps": _steps(progress),
+        "speed": f"{rate:,.0f} steps/s",
+        "success": percent(statistics.success_rate),
+        "return": number(statistics.return_mean),
+        "time left": duration(left),
+    }
+    grid.add_row(*(f"[dim]{name}[/dim] {value}" for name, value in rows.items()))
+    outer = Table.grid(expand=True)
+    outer.add_row(ProgressBar(total=progress.total, completed=min(progress.steps, progress.total)))
+    outer.add_row(grid)
+    return Panel(outer, title=title, title_align="left")

@@ -1,0 +1,89 @@
+"""What `bam-train` says at the end: how it went, where everything is, what to run next."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bam_train.cli.console import count, duration, number, percent, say
+from bam_train.errors import OutputError
+
+if TYPE_CHECKING:
+    from bam_train.settings import TrainSettings
+    from bam_train.trainers.run import Outcome
+    from bam_train.trainers.run_folder import RunFolder
+
+_REASONS = {"steps": "all steps done", "success": "success reached", "stopped": "stopped"}
+
+
+def summarise(settings: TrainSettings, outcome: Outcome, folder: RunFolder, seconds: float) -> None:
+    """Draw the learning curve and say how the run went.
+
+    Args:
+        settings: Of the run.
+        outcome: How it ended.
+        folder: Its files.
+        seconds: Wall time since the program started [s].
+    """
+    _draw(settings, folder)
+    say()
+    say(f"{settings.algo} on {settings.env}: {_REASONS[outcome.reason]} at {count(outcome.steps)} steps, {duration(seconds)} in all")
+    for name, text in _rows(outcome, folder):
+        say(f"  {name:<11}{text}")
+    say("next:")
+    for command in _next_commands(settings, outcome):
+        say(f"  {command}")
+
+
+def _rows(outcome: Outcome, folder: RunFolder) -> list[tuple[str, str]]:
+    rows = []
+    if outcome.checkpoint is not None and outcome.best is not None:
+        rows.append(("best", _score_text(outcome)))
+        rows.append(("checkpoint", f"{_short(outcome.checkpoint)} ({outcome.checkpoint.stat().st_size / 1000:,.0f} kB)"))
+    if outcome.last is not None:
+        rows.append(("last state", f"{_short(outcome.last)}"))
+    rows.append(("run", f"{_short(folder.path)}/: learning-curve.png, progress.jsonl, config.json, tensorboard/"))
+    return rows
+
+
+def _score_text(outcome: Outcome) -> str:
+    best, scores = outcome.best, outcome.scores
+    if best is None:
+        return "–"
+    success = ""
+    if best.success_rate is not None:
+        interval = scores.get("success_interval")
+        between = f" (95 %: {percent(interval[0])} to {percent(interval[1])})" if interval else ""
+        success = f"success {percent(best.success_rate)}{between}, "
+    episodes = f" over {scores['episodes']} episodes" if "episodes" in scores else ""
+    return f"{success}return {number(best.return_mean)}{episodes}, after {count(best.steps)} steps"
+
+
+def _next_commands(settings: TrainSettings, outcome: Outcome) -> list[str]:
+    from bam_train.environments import is_batched
+
+    commands = []
+    usable = outcome.checkpoint or outcome.last
+    if usable is not None:
+        commands.append(f"bam-eval {_short(usable)}")
+        if is_batched(settings.env):
+            commands.append(f"bam-deploy {_short(usable)}")
+    if outcome.reason == "stopped" and outcome.last is not None:
+        commands.append(f"bam-train --resume {_short(outcome.last)}")
+    return commands
+
+
+def _short(path: Path) -> str:
+    """As short as it can be typed here."""
+    absolute, here = path.resolve(), Path.cwd()
+    return shlex.quote(str(absolute.relative_to(here) if absolute.is_relative_to(here) else absolute))
+
+
+def _draw(settings: TrainSettings, folder: RunFolder) -> None:
+    from bam_train.trainers.curve import draw_curve
+
+    try:
+        draw_curve(folder.records(), f"{settings.algo} on {settings.env}, seed {settings.seed}", folder.curve)
+    except OutputError as error:
+        say(f"no learning curve: {error}")

@@ -1,0 +1,193 @@
+"""What makes a training run: one frozen dataclass, merged from presets, files and flags.
+
+Layers, later ones win: the trainer's defaults, the preset of the environment and algorithm, ``--config`` file, ``--set`` and flags.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import typing
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from bam_train.errors import SettingsError
+from bam_train.values import closest, fit, parse_assignment
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """Everything that makes a run; saved as JSON in ``config.json`` and in every checkpoint."""
+
+    env: str
+    """Gymnasium id, e.g. bam/pick-v0."""
+    algo: str
+    """Algorithm, e.g. ppo."""
+    steps: int = 100_000
+    """Steps of the whole run, over all environments, counted from its first."""
+    seed: int = 0
+    """Seed of weights, exploration and environments (row i gets seed + i)."""
+    num_envs: int = 1
+    """Environments stepped side by side."""
+    device: str = "auto"
+    """cpu, cuda, cuda:1, …; auto is the GPU for images if there is one, else the CPU."""
+    threads: int = 1
+    """Threads that torch computes with; more than one is slower on small networks."""
+    trainer: str = "sb3"
+    """Library that trains."""
+    until_success: float | None = None
+    """Stop once this share of evaluation episodes succeeds, in (0, 1]."""
+    eval_every: int | None = None
+    """Steps between evaluations; by default a twentieth of the run."""
+    eval_episodes: int = 20
+    """Episodes of one evaluation."""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of the environment."""
+    normalize: bool | dict[str, Any] = False
+    """Normalise observations and rewards by running statistics; a table gives VecNormalize's arguments."""
+    hyperparameters: dict[str, Any] = field(default_factory=dict)
+    """The algorithm's own arguments."""
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any], source: str = "settings") -> TrainSettings:
+        """Check names, types and ranges of top-level settings.
+
+        Args:
+            values: Setting to JSON value.
+            source: Where they come from, as errors name it.
+
+        Raises:
+            SettingsError: An unknown name (with the closest match), a wrong type, or a value out of range.
+        """
+        check_names(values, source)
+        for name in ("env", "algo"):
+            if values.get(name) is None:
+                raise SettingsError(f"{name}: expected a name, found nothing. Give --{name} NAME")
+        fitted = {name: fit(name, value, HINTS[name]) for name, value in values.items()}
+        settings = cls(**json.loads(json.dumps(fitted)))  # a deep copy: nothing shares the caller's tables
+        check_ranges(settings)
+        return settings
+
+    def to_mapping(self) -> dict[str, Any]:
+        """The settings as plain JSON values, in the order of the fields."""
+        return asdict(self)
+
+
+HINTS: dict[str, Any] = typing.get_type_hints(TrainSettings)
+"""Name of every top-level setting to its type."""
+
+TABLES = frozenset({"env_kwargs", "normalize", "hyperparameters"})
+"""Settings that are tables of names of their own."""
+
+
+def check_names(values: Mapping[str, Any], source: str) -> None:
+    """Refuse a top-level setting that does not exist."""
+    for name in values:
+        if name not in HINTS:
+            raise SettingsError(f"{source}: unknown setting {name!r}. {closest(name, HINTS)}")
+
+
+def check_ranges(settings: TrainSettings) -> None:
+    """Refuse numbers that cannot be."""
+    least = {"steps": 1, "seed": 0, "num_envs": 1, "threads": 1, "eval_every": 1, "eval_episodes": 1}
+    for name, lowest in least.items():
+        value = getattr(settings, name)
+        if value is not None and value < lowest:
+            raise SettingsError(f"{name}: expected at least {lowest}, found {value}")
+    share = settings.until_success
+    if share is not None and not 0 < share <= 1:
+        raise SettingsError(f"until_success: expected a share above 0 and at most 1, such as 0.99, found {share}")
+
+
+def merge(*layers: Mapping[str, Any]) -> dict[str, Any]:
+    """One mapping out of several, later ones winning; tables within are merged too. No layer is changed."""
+    merged: dict[str, Any] = {}
+    for layer in layers:
+        for name, value in layer.items():
+            old = merged.get(name)
+            merged[name] = merge(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+    return merged
+
+
+def read_assignments(texts: Iterable[str]) -> dict[str, Any]:
+    """The layer that ``--set name=value`` texts make.
+
+    A top-level setting's name goes there; every other name is the algorithm's: ``gamma=0.9`` is ``hyperparameters.gamma=0.9``.
+    """
+    layer: dict[str, Any] = {}
+    for text in texts:
+        path, value = parse_assignment(text)
+        layer = merge(layer, _nest(path if path[0] in HINTS else ["hyperparameters", *path], value, text))
+    return layer
+
+
+def _nest(path: list[str], value: Any, text: str) -> dict[str, Any]:
+    if len(path) > 1 and path[0] not in TABLES:
+        raise SettingsError(f"--set {text}: {path[0]} is not a table; expected {path[0]}=value")
+    for name in reversed(path):
+        value = {name: value}
+    return dict(value)
+
+
+def read_config(path: str | Path) -> dict[str, Any]:
+    """Read a ``.toml`` or ``.json`` file of settings, such as ``--print-config`` writes.
+
+    Raises:
+        SettingsError: No such file, not readable, not a table, or an unknown setting.
+    """
+    path = Path(path).expanduser()
+    return parse_config(str(path), _read_text(path))
+
+
+def parse_config(name: str, text: str) -> dict[str, Any]:
+    """Read settings from the text of a file called `name`, whose suffix says the format.
+
+    Raises:
+        SettingsError: Truncated or not a table, or an unknown setting.
+    """
+    try:
+        values = json.loads(text) if name.endswith(".json") else tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise SettingsError(f"{name}: is not whole {name.rpartition('.')[2].upper()}: {error}") from error
+    if not isinstance(values, dict):
+        raise SettingsError(f"{name}: expected a table of settings, found a {type(values).__name__}")
+    check_names(values, name)
+    return values
+
+
+def _read_text(path: Path) -> str:
+    if path.suffix not in (".toml", ".json"):
+        raise SettingsError(f"{path}: expected a .toml or .json file, found {path.suffix or 'no suffix'}")
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise SettingsError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise SettingsError(f"{path}: is not text ({error.reason} at byte {error.start})") from error
+
+
+def differences(wanted: Mapping[str, Any], found: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any, Any]]:
+    """Name, wanted and found value of every entry of `wanted` that `found` has not the same way; tables are looked into."""
+    rows: list[tuple[str, Any, Any]] = []
+    for name, value in wanted.items():
+        other = found.get(name)
+        if isinstance(value, Mapping) and isinstance(other, Mapping):
+            rows += differences(value, other, f"{prefix}{name}.")
+        elif value != other or isinstance(value, bool) != isinstance(other, bool):
+            rows.append((prefix + name, value, other))
+    return rows
+
+
+def file_stem(env: str, algo: str) -> str:
+    """A run's name in file names: ``bam/pick-v0`` and ppo make ``pick-ppo``; a foreign id keeps its version."""
+    own = re.fullmatch(r"bam/(.+)-v\d+", env)
+    name = own[1] if own else env
+    return re.sub(r"[^\w.-]+", "-", f"{name}-{algo}").strip("-.")

@@ -1,0 +1,48 @@
+"""Training: one protocol, `Trainer`, and the libraries behind it, imported when they are used."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from bam_train.errors import SettingsError
+from bam_train.values import closest
+
+if TYPE_CHECKING:
+    from bam_train.trainers.trainer import Trainer
+
+TRAINERS: dict[str, str] = {"sb3": "bam_train.trainers.sb3.trainer:SB3Trainer"}
+"""Name of a trainer to its ``"module:Class"``."""
+
+ALGORITHMS: dict[str, str] = {"sb3": "bam_train.trainers.sb3.algorithms:ALGORITHMS"}
+"""Name of a trainer to the table of its algorithms; reading it imports no learning library."""
+
+
+def load_trainer(name: str) -> type[Trainer]:
+    """The class of a trainer; this imports its library.
+
+    Raises:
+        SettingsError: No trainer has this name.
+    """
+    if name not in TRAINERS:
+        raise SettingsError(f"Unknown trainer {name!r}. {closest(name, TRAINERS)}")
+    trainer: type[Trainer] = _resolve(TRAINERS[name])
+    return trainer
+
+
+def require_algorithm(trainer: str, algorithm: str) -> None:
+    """Refuse an algorithm that the trainer does not have.
+
+    Raises:
+        SettingsError: Carries the closest match.
+    """
+    if trainer not in ALGORITHMS:
+        raise SettingsError(f"Unknown trainer {trainer!r}. {closest(trainer, ALGORITHMS)}")
+    table = _resolve(ALGORITHMS[trainer])
+    if algorithm not in table:
+        raise SettingsError(f"Unknown algorithm {algorithm!r}. {closest(algorithm, table)}")
+
+
+def _resolve(reference: str) -> Any:
+    module, _, name = reference.partition(":")
+    return getattr(importlib.import_module(module), name)

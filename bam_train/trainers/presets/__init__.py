@@ -1,0 +1,31 @@
+"""Tuned settings as data: ``<environment>-<algorithm>.toml``, laid out like a ``--config`` file."""
+
+from __future__ import annotations
+
+from importlib import resources
+from typing import Any
+
+from bam_train.settings import file_stem, parse_config
+
+
+def preset_name(env: str, algo: str) -> str:
+    """File name of a preset: ``bam/pick-v0`` and ppo make ``pick-ppo.toml``."""
+    return f"{file_stem(env, algo)}.toml"
+
+
+def list_presets() -> list[str]:
+    """File names of all presets, sorted."""
+    names = (entry.name for entry in resources.files(__name__).iterdir())
+    return sorted(name for name in names if name.endswith(".toml"))
+
+
+def read_preset(env: str, algo: str) -> dict[str, Any]:
+    """The tuned settings of an environment and an algorithm; {} if there are none.
+
+    Raises:
+        SettingsError: The file is not as it should be.
+    """
+    name = preset_name(env, algo)
+    if name not in list_presets():
+        return {}
+    return parse_config(name, resources.files(__name__).joinpath(name).read_text(encoding="utf-8"))

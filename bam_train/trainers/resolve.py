@@ -1,0 +1,88 @@
+"""From what was asked for to complete settings: presets for new runs, the checkpoint's own for resumed ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from bam_train.checkpoint import Checkpoint
+from bam_train.errors import CheckpointMismatch, SettingsError
+from bam_train.settings import TrainSettings, check_names, differences, merge
+from bam_train.trainers import load_trainer, require_algorithm
+from bam_train.trainers.presets import read_preset
+
+CHANGEABLE = frozenset({"steps", "until_success", "eval_every", "eval_episodes", "device", "threads"})
+"""Settings that a resumed run may have otherwise: when to stop, how to measure, where to compute; not what to learn."""
+
+
+def resolve(given: Mapping[str, Any]) -> TrainSettings:
+    """Complete settings of a new run: the trainer's defaults, below the preset, below what was given.
+
+    Raises:
+        UnknownName: No such environment.
+        SettingsError: No such algorithm or setting, or one that does not fit.
+    """
+    check_names(given, "settings")
+    for name in ("env", "algo"):
+        if given.get(name) is None:
+            raise SettingsError(f"{name}: expected a name, found nothing. Give --{name} NAME")
+    env = resolve_env(given["env"])
+    require_algorithm(given.get("trainer", "sb3"), given["algo"])
+    settings = TrainSettings.from_mapping(merge(read_preset(env, given["algo"]), given, {"env": env}))
+    return load_trainer(settings.trainer).complete(settings)
+
+
+def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSettings:
+    """Complete settings of a run that goes on from a checkpoint: its own, but for what may change.
+
+    Raises:
+        CheckpointMismatch: Something else was asked for than the checkpoint has; names it and both values.
+        SettingsError: An unknown setting, or the run has all its steps already.
+    """
+    check_names(given, "settings")
+    own = checkpoint.manifest.settings
+    asked = {**given, "env": resolve_env(given["env"])} if given.get("env") is not None else dict(given)
+    if asked.get("normalize") is True and own.get("normalize"):
+        del asked["normalize"]
+    settings = TrainSettings.from_mapping(merge(own, asked), str(checkpoint.path))
+    require_algorithm(settings.trainer, settings.algo)
+    for name, wanted, found in differences(asked, own):
+        if name not in CHANGEABLE and found is not None:
+            raise CheckpointMismatch(
+                checkpoint.path, f"was trained with {name} {found!r}, not {wanted!r}. Leave it out to go on, or train anew"
+            )
+    completed = load_trainer(settings.trainer).complete(settings)
+    _require_same(asked, own, checkpoint)
+    _require_steps_left(checkpoint, completed)
+    return completed
+
+
+def resolve_env(name: str) -> str:
+    """The full id of an environment.
+
+    Raises:
+        UnknownName: No such environment; it carries the closest match.
+        SettingsError: ``module:Env-v0`` whose module is not there.
+    """
+    import bam_envs  # noqa: F401 - registers our environments
+    from bam_envs.registry import resolve_id
+
+    try:
+        return resolve_id(name)
+    except ModuleNotFoundError as error:
+        raise SettingsError(f"env {name!r}: no module {error.name!r}; expected module:Env-v0 with a module that can be imported") from error
+
+
+def _require_same(asked: Mapping[str, Any], own: Mapping[str, Any], checkpoint: Checkpoint) -> None:
+    """Refuse what the checkpoint has no value for at all."""
+    for name, wanted, found in differences(asked, own):
+        if name not in CHANGEABLE:
+            raise CheckpointMismatch(checkpoint.path, f"was trained with {name} {found!r}, not {wanted!r}. Leave it out to go on")
+
+
+def _require_steps_left(checkpoint: Checkpoint, settings: TrainSettings) -> None:
+    done = checkpoint.manifest.steps
+    if done >= settings.steps:
+        raise SettingsError(
+            f"{checkpoint.path}: has trained {done} of {settings.steps} steps already; give a larger total with --steps"
+        )

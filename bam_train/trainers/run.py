@@ -1,0 +1,249 @@
+"""One training run from its first step to its checkpoint, whatever trains it: evaluate, keep the best, save, stop.
+
+    train ─▶ between two updates: stop asked for? ─ evaluation due? ─ save due? ─ record ─▶ train …
+
+The best policy by evaluation (success rate, ties by return) goes to ``out``; the newest state to ``runs/<name>/last.zip``.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from bam_train.errors import OutputError, TrainingFailed
+from bam_train.evaluation import EvaluationReport, evaluate
+from bam_train.settings import TrainSettings
+from bam_train.trainers.run_folder import RunFolder
+from bam_train.trainers.trainer import Progress, Statistics, Trainer
+
+FIRST_SEED = 1_000_000
+"""Evaluation episode k during training is seeded FIRST_SEED + seed + k: never one of training's."""
+
+SAVE_EVERY = 30.0
+"""Seconds between two saves at least, unless an evaluation comes first."""
+
+SAVE_SHARE = 0.02
+"""Share of the time that saving may take: a large replay buffer is saved less often."""
+
+RECORD_EVERY = 0.1
+"""Seconds between two training records at least."""
+
+
+class Watcher(Protocol):
+    """Whoever shows how a run goes."""
+
+    def training(self, progress: Progress, statistics: Statistics, steps_per_second: float, seconds_left: float | None) -> None:
+        """An update was done."""
+
+    def evaluated(self, steps: int, report: EvaluationReport, best: bool) -> None:
+        """The policy was evaluated."""
+
+    def note(self, text: str) -> None:
+        """Something that the user should know."""
+
+
+@dataclass(frozen=True)
+class Best:
+    """The best evaluation so far."""
+
+    steps: int
+    """Steps trained when it was made."""
+    success_rate: float | None
+    return_mean: float | None
+
+    def rank(self) -> tuple[float, float]:
+        """Larger is better: success first, then return; what is unknown ranks last."""
+        lowest = float("-inf")
+        return tuple(lowest if value is None else value for value in (self.success_rate, self.return_mean))  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended."""
+
+    reason: str
+    """``steps`` (all done), ``success`` (``until_success`` reached) or ``stopped`` (asked to)."""
+    steps: int
+    """Steps trained since the first of the run."""
+    seconds: float
+    """Wall time of this part of the run [s]."""
+    best: Best | None
+    scores: dict[str, Any]
+    """The best policy's evaluation; {} if there was none."""
+    checkpoint: Path | None
+    """Where the best policy is."""
+    last: Path | None
+    """Where the newest state is."""
+
+
+class TrainingRun:
+    """Trains, evaluates and saves until it is done.
+
+    Args:
+        trainer: Set up and ready.
+        folder: Where the run's files go.
+        out: Where the best checkpoint goes.
+        watcher: Who is told.
+        best: The best evaluation of the part of this run that was trained before, whose checkpoint is at `out`.
+        clock: Monotonic time [s].
+    """
+
+    def __init__(
+        self,
+        trainer: Trainer,
+        folder: RunFolder,
+        out: Path,
+        watcher: Watcher,
+        best: Best | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.trainer, self.folder, self.out, self.watcher, self.best = trainer, folder, out, watcher, best
+        self.settings: TrainSettings = trainer.settings
+        self._clock = clock
+        self._start = self._recorded = self._saved = clock()
+        self._first_step = trainer.steps
+        self._save_pause = SAVE_EVERY
+        self._stop = self._reached = False
+        self._evaluated_at = trainer.steps if best else 0
+        self._report: EvaluationReport | None = None
+        self._best_scores: dict[str, Any] = {}
+        self._kept: Path | None = out if best else None
+        self._failure: OutputError | None = None
+
+    def stop(self) -> None:
+        """Ask for an end after the update in progress; may be called from a signal handler."""
+        self._stop = True
+
+    @property
+    def last(self) -> Path | None:
+        """The newest checkpoint on the disk that can be gone on from."""
+        return next((path for path in (self.folder.last, self._kept) if path is not None and path.exists()), None)
+
+    def run(self) -> Outcome:
+        """Train to the end.
+
+        Raises:
+            TrainingFailed: The loss or a weight is no longer finite; its text names the last good checkpoint.
+            OutputError: A checkpoint could not be written; what could be saved elsewhere was.
+        """
+        try:
+            self.trainer.train(self.settings.steps, self._between)
+            if not self._stop and self._evaluated_at < self.trainer.steps:
+                self._evaluate()
+        except TrainingFailed as error:
+            kept = f"the last good checkpoint is {self.last}" if self.last else "no checkpoint had been saved yet"
+            raise TrainingFailed(f"{error}; {kept}") from error
+        self._save_last()
+        if self._failure is not None:
+            raise self._failure
+        return self._outcome()
+
+    def _outcome(self) -> Outcome:
+        reason = "stopped" if self._stop else "success" if self._reached else "steps"
+        seconds = self._clock() - self._start
+        return Outcome(reason, self.trainer.steps, seconds, self.best, self._best_scores, self._kept, self.last)
+
+    def _between(self, progress: Progress) -> bool:
+        """What happens between two updates; False ends training."""
+        if self._stop:
+            return False
+        self._record(progress)
+        every = self.settings.eval_every or self.settings.steps
+        if progress.steps // every > self._evaluated_at // every:
+            self._evaluate()
+            self._save_last()
+        elif self._clock() - self._saved > self._save_pause:
+            self._save_last()
+        return not (self._stop or self._reached)
+
+    def _record(self, progress: Progress) -> None:
+        now = self._clock()
+        if now - self._recorded < RECORD_EVERY and progress.steps < progress.total:
+            return
+        self._recorded = now
+        statistics = progress.statistics()
+        rate = (progress.steps - self._first_step) / max(now - self._start, 1e-9)
+        left = (progress.total - progress.steps) / rate if rate > 0 else None
+        self.folder.add(_training_record(progress.steps, now - self._start, rate, statistics))
+        self.watcher.training(progress, statistics, rate, left)
+
+    def _evaluate(self) -> None:
+        """Evaluate the frozen policy; the best is kept."""
+        steps = self._evaluated_at = self.trainer.steps
+        with self.trainer.undisturbed():
+            report = self._report = self._confirmed(self.trainer.freeze())
+        found = Best(steps, report.success_rate, report.return_mean)
+        better = self.best is None or found.rank() > self.best.rank()
+        self.folder.add({"kind": "evaluation", "steps": steps, "seconds": round(self._clock() - self._start, 3), **report.to_json()})
+        numbers = {"eval/return_mean": report.return_mean, "eval/success_rate": report.success_rate}
+        self.trainer.log({name: value for name, value in numbers.items() if value is not None})
+        self.watcher.evaluated(steps, report, better)
+        if better:
+            self._keep(found)
+
+    def _confirmed(self, policy: Any) -> EvaluationReport:
+        """Evaluate; where that reaches ``until_success``, as many fresh episodes must confirm it, so that luck does not end the run."""
+        report = self._episodes(policy, 0)
+        wanted = self.settings.until_success
+        if wanted is None or report.success_rate is None or report.success_rate < wanted:
+            return report
+        again = self._episodes(policy, self.settings.eval_episodes)
+        self._reached = again.success_rate is not None and again.success_rate >= wanted
+        return min(report, again, key=lambda one: one.success_rate or 0.0)
+
+    def _episodes(self, policy: Any, skip: int) -> EvaluationReport:
+        settings = self.settings
+        seed = FIRST_SEED + settings.seed + skip
+        return evaluate(policy, settings.env, settings.env_kwargs, episodes=settings.eval_episodes, seed=seed)
+
+    def _keep(self, found: Best) -> None:
+        """Save the policy as the best so far; where `out` cannot be written, in the run's folder, and training goes on."""
+        self.best, self._best_scores = found, self._scores()
+        try:
+            self.trainer.save(self.out, self._best_scores, self._notes(self.out))
+            self._kept = self.out
+        except OutputError as error:
+            self._failure = error
+            rescue = self.folder.path / "best.zip"
+            self.trainer.save(rescue, self._best_scores, self._notes(rescue))
+            self._kept = rescue
+            self.watcher.note(f"{error}. The best policy is kept as {rescue} instead")
+
+    def _save_last(self) -> None:
+        """Save the newest state; the next save is put off while saving is slow."""
+        before = self._clock()
+        try:
+            self.trainer.save(self.folder.last, self._scores(), self._notes(self._kept))
+        except OutputError as error:
+            self._failure = error
+            self.watcher.note(f"{error}. Training goes on; the checkpoint before this one is whole")
+        self._saved = self._clock()
+        self._save_pause = max(SAVE_EVERY, (self._saved - before) / SAVE_SHARE)
+
+    def _scores(self) -> dict[str, Any]:
+        """The newest evaluation and the steps at which it was made, for a manifest."""
+        return {} if self._report is None else {**self._report.to_json(), "steps": self._evaluated_at}
+
+    def _notes(self, kept: Path | None) -> dict[str, Any]:
+        """What a resumed run needs to go on keeping the best in the same file."""
+        if self.best is None or kept is None:
+            return {"best": None}
+        best: Mapping[str, Any] = {"steps": self.best.steps, "success_rate": self.best.success_rate, "return_mean": self.best.return_mean}
+        return {"best": {**best, "path": str(kept.resolve())}}
+
+
+def _training_record(steps: int, seconds: float, rate: float, statistics: Statistics) -> dict[str, Any]:
+    return {
+        "kind": "training",
+        "steps": steps,
+        "seconds": round(seconds, 3),
+        "steps_per_second": round(rate, 1),
+        "episodes": statistics.episodes,
+        "return_mean": statistics.return_mean,
+        "length_mean": statistics.length_mean,
+        "success_rate": statistics.success_rate,
+        **statistics.metrics,
+    }

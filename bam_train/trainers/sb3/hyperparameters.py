@@ -1,0 +1,177 @@
+"""Hyperparameters: checked against the constructors of stable-baselines3, completed with its defaults, turned into its objects.
+
+In settings they are JSON: a schedule is ``"lin_3e-4"`` (linear to 0), action noise ``"normal_0.1"`` or ``"ornstein-uhlenbeck_0.1"``,
+a class its name (``activation_fn="tanh"``), ``train_freq`` ``1`` or ``[1, "episode"]``.
+"""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import re
+import types
+import typing
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common import noise, torch_layers, utils
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.vec_env import VecNormalize
+
+from bam_train.errors import SettingsError
+from bam_train.trainers.sb3.algorithms import Algorithm
+from bam_train.values import closest, fit, linear_start
+
+ELSEWHERE = {
+    "self": None,
+    "env": None,
+    "seed": "--seed",
+    "device": "--device",
+    "tensorboard_log": None,
+    "verbose": None,
+    "_init_setup_model": None,
+    "rollout_buffer_class": None,
+    "rollout_buffer_kwargs": None,
+    "replay_buffer_class": None,
+}
+"""Constructor arguments that are not hyperparameters, and the flag that sets them if there is one."""
+
+_POLICY_ELSEWHERE = frozenset({"self", "observation_space", "action_space", "lr_schedule", "use_sde"})
+
+_ACTIVATIONS = ("CELU", "ELU", "GELU", "Hardswish", "Identity", "LeakyReLU", "Mish", "ReLU", "SELU", "SiLU", "Softplus", "Tanh")
+_OPTIMIZERS = ("Adam", "AdamW", "NAdam", "RAdam", "RMSprop", "SGD")
+_EXTRACTORS = ("CombinedExtractor", "FlattenExtractor", "NatureCNN")
+CLASSES: dict[str, dict[str, type]] = {
+    "activation_fn": {name.lower(): getattr(torch.nn, name) for name in _ACTIVATIONS},
+    "optimizer_class": {name.lower(): getattr(torch.optim, name) for name in _OPTIMIZERS},
+    "features_extractor_class": {name.lower(): getattr(torch_layers, name) for name in _EXTRACTORS},
+}
+"""Policy arguments that are classes, by lower-case name."""
+
+_NOISE = re.compile(r"(?P<kind>normal|ornstein-uhlenbeck)_(?P<sigma>\d.*)")
+
+
+def complete(algorithm: Algorithm, given: Mapping[str, Any], observation_space: spaces.Space[Any]) -> dict[str, Any]:
+    """Check hyperparameters by name and type and add the defaults of those that are not given.
+
+    Raises:
+        SettingsError: An unknown name (with the closest match) or a wrong type.
+    """
+    parameters = {
+        name: parameter
+        for name, parameter in inspect.signature(algorithm.load().__init__).parameters.items()
+        if name not in ELSEWHERE
+    }
+    for name in given:
+        _require_known(name, parameters, f"{algorithm.name} hyperparameter")
+    values = {"policy": default_policy(algorithm, observation_space)}
+    for name, parameter in parameters.items():
+        if name in given:
+            values[name] = fit(name, given[name], _written(parameter.annotation))
+        elif name != "policy":
+            values[name] = list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
+    policies = algorithm.load().policy_aliases
+    if values["policy"] not in policies:
+        raise SettingsError(f"policy: unknown policy {values['policy']!r} of {algorithm.name}. {closest(values['policy'], policies)}")
+    values["policy_kwargs"] = _checked_policy(policies[values["policy"]], values["policy_kwargs"] or {})
+    _check_noise(values.get("action_noise"))
+    return values
+
+
+def default_policy(algorithm: Algorithm, observation_space: spaces.Space[Any]) -> str:
+    """Name of the policy that fits what is observed: several inputs, images, or numbers."""
+    kind = "Mlp"
+    if isinstance(observation_space, spaces.Dict):
+        kind = "MultiInput"
+    elif is_image_space(observation_space):
+        kind = "Cnn"
+    return f"{kind}LstmPolicy" if algorithm.recurrent else f"{kind}Policy"
+
+
+def complete_normalize(given: bool | Mapping[str, Any], gamma: float) -> bool | dict[str, Any]:
+    """Check the arguments of `VecNormalize`; its gamma is the algorithm's unless given."""
+    if isinstance(given, bool):
+        return {"gamma": gamma} if given else False
+    parameters = inspect.signature(VecNormalize.__init__).parameters
+    known = {name: row for name, row in parameters.items() if name not in ("self", "venv", "training")}
+    for name in given:
+        _require_known(name, known, "normalize argument")
+    return {"gamma": gamma, **{name: fit(f"normalize.{name}", value, known[name].annotation) for name, value in given.items()}}
+
+
+def build(values: Mapping[str, Any], action_space: spaces.Space[Any]) -> dict[str, Any]:
+    """Turn complete hyperparameters into the arguments that the constructor takes; `values` is left as it is."""
+    arguments = {name: _built(value) for name, value in copy.deepcopy(dict(values)).items()}
+    if arguments.get("action_noise") is not None:
+        arguments["action_noise"] = _action_noise(arguments["action_noise"], action_space)
+    policy = arguments["policy_kwargs"]
+    for name, table in CLASSES.items():
+        if name in policy:
+            policy[name] = table[policy[name].lower()]
+    return arguments
+
+
+def _require_known(name: str, parameters: Mapping[str, Any], what: str) -> None:
+    if name in parameters:
+        return
+    if ELSEWHERE.get(name) is not None:
+        raise SettingsError(f"{name} is not a hyperparameter here: use {ELSEWHERE[name]}")
+    if name in ELSEWHERE:
+        raise SettingsError(f"{name} cannot be set: bam-train takes care of it")
+    raise SettingsError(f"Unknown {what} {name!r}. {closest(name, parameters)}")
+
+
+def _written(hint: Any) -> Any:
+    """The annotation of a value as it is written down: classes and noise objects are names."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return typing.Union[tuple(_written(argument) for argument in arguments)]  # noqa: UP007 - built at run time
+    if origin is type or hint is noise.ActionNoise:
+        return str
+    return hint
+
+
+def _checked_policy(policy: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+    parameters = {
+        name: row for name, row in inspect.signature(policy.__init__).parameters.items() if name not in _POLICY_ELSEWHERE
+    }
+    values: dict[str, Any] = {}
+    for name, value in given.items():
+        _require_known(name, parameters, "policy_kwargs argument")
+        values[name] = fit(f"policy_kwargs.{name}", value, _written(parameters[name].annotation))
+        if name in CLASSES and values[name].lower() not in CLASSES[name]:
+            raise SettingsError(f"policy_kwargs.{name}: unknown {value!r}. {closest(value.lower(), CLASSES[name])}")
+    return values
+
+
+def _check_noise(text: str | None) -> None:
+    if text is not None and not _NOISE.fullmatch(text):
+        raise SettingsError(f'action_noise: expected "normal_0.1" or "ornstein-uhlenbeck_0.1", found {text!r}')
+
+
+def _action_noise(text: str, action_space: spaces.Space[Any]) -> noise.ActionNoise:
+    match = _NOISE.fullmatch(text)
+    if match is None or action_space.shape is None:
+        raise SettingsError(f"action_noise: {text!r} does not fit a {type(action_space).__name__} action space")
+    mean, sigma = np.zeros(action_space.shape), np.full(action_space.shape, float(match["sigma"]))
+    kind = noise.NormalActionNoise if match["kind"] == "normal" else noise.OrnsteinUhlenbeckActionNoise
+    return kind(mean, sigma)
+
+
+def _built(value: Any) -> Any:
+    """Schedules out of text, tuples out of ``[1, "step"]``; everything else as it is."""
+    if isinstance(value, str):
+        start = linear_start(value)
+        return value if start is None else linear(start)
+    if isinstance(value, list) and len(value) == 2 and value[1] in ("step", "episode"):
+        return tuple(value)
+    return value
+
+
+def linear(start: float) -> Any:
+    """A schedule from `start` to 0 over the run, which stable-baselines3 alone can load again."""
+    schedule = getattr(utils, "LinearSchedule", None) or utils.get_linear_fn
+    return schedule(start, 0.0, 1.0)

@@ -1,0 +1,198 @@
+"""What a run of stable-baselines3 needs to go on exactly, as trees of numbers: weights, optimisers, counters, buffers, random states.
+
+All of it is taken between two updates (before a rollout begins), where no rollout is half collected and no gradient half applied.
+"""
+
+from __future__ import annotations
+
+import random
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.save_util import recursive_getattr
+from stable_baselines3.common.vec_env import VecNormalize
+
+Tree = dict[str, Any]
+
+COUNTERS = (
+    "num_timesteps",
+    "_episode_num",
+    "_n_updates",
+    "_n_calls",
+    "_current_progress_remaining",
+    "exploration_rate",
+)
+"""Numbers that a model counts with, where it has them."""
+
+LAST = ("_last_obs", "_last_original_obs", "_last_episode_starts")
+"""What the model saw last, where its next rollout begins."""
+
+_DEQUES = ("ep_info_buffer", "ep_success_buffer")
+_REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+
+
+def weights(model: Any) -> Tree:
+    """Every network's and optimiser's state, and the loose parameters (SAC's entropy coefficient)."""
+    _, loose = model._get_torch_save_params()
+    return {"states": model.get_parameters(), "loose": {name: recursive_getattr(model, name) for name in loose}}
+
+
+def load_weights(model: Any, tree: Mapping[str, Any]) -> None:
+    """Put `weights` back."""
+    model.set_parameters(tree["states"], exact_match=True, device=model.device)
+    for name, value in tree["loose"].items():
+        if value is not None:
+            recursive_getattr(model, name).data.copy_(value)
+
+
+def all_finite(model: Any) -> bool:
+    """Whether every parameter of the policy is a finite number."""
+    return all(bool(torch.isfinite(parameter).all()) for parameter in model.policy.parameters())
+
+
+def counters(model: Any) -> Tree:
+    """How far the run is, what it saw last, and the last episodes' returns."""
+    tree: Tree = {name: getattr(model, name) for name in COUNTERS if hasattr(model, name)}
+    tree["last"] = {name: getattr(model, name) for name in LAST}
+    tree["deques"] = {name: list(getattr(model, name) or ()) for name in _DEQUES}
+    lstm = getattr(model, "_last_lstm_states", None)
+    tree["lstm"] = None if lstm is None else {"pi": tuple(lstm.pi), "vf": tuple(lstm.vf)}
+    return tree
+
+
+def load_counters(model: Any, tree: Mapping[str, Any]) -> None:
+    """Put `counters` back."""
+    for name in COUNTERS:
+        if name in tree:
+            setattr(model, name, tree[name])
+    for name in LAST:
+        setattr(model, name, tree["last"][name])
+    for name in _DEQUES:
+        setattr(model, name, deque(tree["deques"][name], maxlen=model._stats_window_size))
+    if tree["lstm"] is not None:
+        model._last_lstm_states = type(model._last_lstm_states)(tree["lstm"]["pi"], tree["lstm"]["vf"])
+
+
+def normaliser(env: VecNormalize | None) -> Tree | None:
+    """The running statistics of a `VecNormalize`."""
+    if env is None:
+        return None
+    observed = getattr(env, "obs_rms", None)
+    keyed = observed if isinstance(observed, dict) else {"": observed}
+    return {
+        "observations": {key: _moments(one) for key, one in keyed.items() if one is not None},
+        "returns": _moments(env.ret_rms),
+        "running": np.array(env.returns),
+    }
+
+
+def load_normaliser(env: VecNormalize, tree: Mapping[str, Any]) -> None:
+    """Put `normaliser` back."""
+    observed = getattr(env, "obs_rms", None)
+    for key, moments in tree["observations"].items():
+        _load_moments(observed[key] if isinstance(observed, dict) else observed, moments)
+    _load_moments(env.ret_rms, tree["returns"])
+    env.returns = np.array(tree["running"])
+
+
+def _moments(one: RunningMeanStd) -> Tree:
+    return {"mean": one.mean, "var": one.var, "count": one.count}
+
+
+def _load_moments(one: Any, tree: Mapping[str, Any]) -> None:
+    one.mean, one.var, one.count = tree["mean"], tree["var"], tree["count"]
+
+
+def noise(model: Any) -> list[Any]:
+    """What correlated action noise remembers, for each environment; [] if nothing."""
+    return [one.noise_prev for one in _noises(model.action_noise) if hasattr(one, "noise_prev")]
+
+
+def load_noise(model: Any, tree: list[Any]) -> None:
+    """Put `noise` back; after `learn` began, which spreads the noise over the environments."""
+    for one, previous in zip((one for one in _noises(model.action_noise) if hasattr(one, "noise_prev")), tree, strict=True):
+        one.noise_prev = previous
+
+
+def _noises(one: ActionNoise | None) -> list[Any]:
+    if one is None:
+        return []
+    return list(one.noises) if isinstance(one, VectorizedActionNoise) else [one]
+
+
+def replay(model: Any) -> Tree | None:
+    """The filled part of the replay buffer; None if the algorithm keeps none."""
+    buffer = getattr(model, "replay_buffer", None)
+    if buffer is None:
+        return None
+    # + 1: a buffer with optimize_memory_usage keeps the newest next observation at `pos`.
+    filled = buffer.buffer_size if buffer.full else min(buffer.pos + 1, buffer.buffer_size)
+    arrays = {name: _each(getattr(buffer, name, None), lambda array: array[:filled]) for name in _REPLAY}
+    return {"pos": buffer.pos, "full": buffer.full, "filled": filled, "arrays": arrays}
+
+
+def load_replay(model: Any, tree: Mapping[str, Any]) -> None:
+    """Put `replay` back into the empty buffer of a new model."""
+    buffer, filled = model.replay_buffer, tree["filled"]
+    for name, saved in tree["arrays"].items():
+        own = getattr(buffer, name, None)
+        if isinstance(own, dict):
+            for key, array in own.items():
+                array[:filled] = saved[key]
+        elif own is not None:
+            own[:filled] = saved
+    buffer.pos, buffer.full = tree["pos"], tree["full"]
+
+
+def _each(arrays: Any, change: Any) -> Any:
+    if isinstance(arrays, dict):
+        return {key: change(array) for key, array in arrays.items()}
+    return None if arrays is None else change(arrays)
+
+
+def random_states(model: Any) -> Tree:
+    """Every generator that training draws from, but for those inside environments."""
+    kind, keys, position, has_gauss, gauss = np.random.get_state(legacy=True)
+    return {
+        "python": random.getstate(),
+        "numpy": {"kind": kind, "keys": keys, "position": position, "has_gauss": has_gauss, "gauss": gauss},
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state_all() if _on_cuda(model) else [],
+        "actions": model.action_space.np_random.bit_generator.state,
+    }
+
+
+def load_random_states(model: Any, tree: Mapping[str, Any]) -> None:
+    """Put `random_states` back; the last thing to do before going on."""
+    _load_global(tree)
+    if tree["cuda"] and _on_cuda(model):
+        torch.cuda.set_rng_state_all([state.cpu() for state in tree["cuda"]])
+    model.action_space.np_random.bit_generator.state = tree["actions"]
+
+
+def _load_global(tree: Mapping[str, Any]) -> None:
+    version, numbers, gauss = tree["python"]
+    random.setstate((version, tuple(numbers), gauss))
+    saved = tree["numpy"]
+    np.random.set_state((saved["kind"], saved["keys"], saved["position"], saved["has_gauss"], saved["gauss"]))
+    torch.set_rng_state(tree["torch"].cpu())
+
+
+def _on_cuda(model: Any) -> bool:
+    return bool(model.device.type == "cuda")
+
+
+@contextmanager
+def undisturbed(model: Any) -> Iterator[None]:
+    """Do something between two updates that leaves training's random numbers as they were."""
+    before = random_states(model)
+    try:
+        yield
+    finally:
+        load_random_states(model, before)

@@ -1,0 +1,271 @@
+"""`SB3Trainer`: one run of a stable-baselines3 algorithm that can be stopped, saved and gone on with between any two updates.
+
+Everything happens where the algorithm asks for its next rollout: the last update is done, the next step not yet taken.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import io
+import math
+import warnings
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from bam_envs.spaces import space_to_json
+from stable_baselines3.common.logger import Logger, configure
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from bam_train.checkpoint import Checkpoint, write_checkpoint
+from bam_train.environments import control_period, make_env, require_fit
+from bam_train.errors import SettingsError, TrainingFailed
+from bam_train.policy import FrozenPolicy
+from bam_train.settings import TrainSettings
+from bam_train.trainers.provenance import git_commit, now, versions
+from bam_train.trainers.sb3 import hyperparameters, resume
+from bam_train.trainers.sb3.algorithms import ALGORITHMS
+from bam_train.trainers.sb3.freeze import freeze, golden
+from bam_train.trainers.sb3.state import all_finite, undisturbed
+from bam_train.trainers.sb3.vec_env import RowsVecEnv, make_training_env
+from bam_train.trainers.trainer import OnProgress, Progress, Statistics
+
+
+class _Stop(Exception):  # noqa: N818 - never leaves this module
+    """Ends `learn` between two updates."""
+
+
+class SB3Trainer:
+    """A run of one algorithm of stable-baselines3 or sb3-contrib; made by `create` or `load`."""
+
+    def __init__(self, settings: TrainSettings, model: Any, venv: VecEnv, signals: dict[str, Any], period: float | None) -> None:
+        self.settings, self.model, self.venv = settings, model, venv
+        self.notices: list[str] = []
+        self._signals, self._period = signals, period
+        self._normaliser: VecNormalize | None = model.get_vec_normalize_env()
+        self._waiting: resume.Waiting | None = None
+        self._on_progress: OnProgress = lambda progress: True
+        self._total = self._reported = 0
+        model.collect_rollouts = functools.partial(self._roll_out, model.collect_rollouts)
+
+    @classmethod
+    def complete(cls, settings: TrainSettings) -> TrainSettings:
+        """Check the algorithm's own settings and fill in its defaults."""
+        algorithm = ALGORITHMS[settings.algo]
+        env = make_env(settings.env, settings.env_kwargs)
+        try:
+            algorithm.require_actions(settings.env, type(env.action_space).__name__)
+            values = hyperparameters.complete(algorithm, settings.hyperparameters, env.observation_space)
+        finally:
+            env.close()
+        normalize = hyperparameters.complete_normalize(settings.normalize, values["gamma"])
+        eval_every = settings.eval_every or max(1, settings.steps // 20)
+        return dataclasses.replace(settings, hyperparameters=values, normalize=normalize, eval_every=eval_every)
+
+    @classmethod
+    def create(cls, settings: TrainSettings, log_folder: Path | None = None) -> SB3Trainer:
+        """Set up a new run of complete settings; TensorBoard files go to `log_folder`."""
+        torch.set_num_threads(settings.threads)
+        venv = make_training_env(settings.env, settings.env_kwargs, settings.num_envs)
+        signals, period = _meaning(venv)
+        with _notices() as notices, _refusals(settings):
+            model = _make_model(settings, venv)
+        model.set_logger(configure(str(log_folder), ["tensorboard"]) if log_folder else Logger(None, []))
+        trainer = cls(settings, model, venv, signals, period)
+        trainer.notices += notices
+        return trainer
+
+    @classmethod
+    def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None, log_folder: Path | None = None) -> SB3Trainer:
+        """Set up a run that goes on from a checkpoint, with its settings or with these."""
+        settings = settings or TrainSettings.from_mapping(checkpoint.manifest.settings, str(checkpoint.path))
+        trainer = cls.create(settings, log_folder)
+        require_fit(checkpoint, _one_env(trainer.venv))
+        trainer._waiting = resume.load(checkpoint, trainer.model, trainer.venv, trainer._normaliser)
+        if not trainer._waiting.same_episodes:
+            trainer.notices.append(
+                f"{settings.env} cannot save its running episodes: new ones begin, so the rest differs from a run without a stop"
+            )
+        return trainer
+
+    @property
+    def steps(self) -> int:
+        """Steps trained since the first of the run."""
+        return int(self.model.num_timesteps)
+
+    def train(self, steps: int, on_progress: OnProgress) -> None:
+        """Train until the run has at least `steps` steps, or `on_progress` returns False."""
+        if steps <= self.steps:
+            return
+        self._on_progress, self._total, self._reported = on_progress, steps, self.steps
+        try:
+            # reset_num_timesteps=False: the total is what is left, and a restored episode goes on.
+            self.model.learn(steps - self.steps, log_interval=self._log_interval(), reset_num_timesteps=False)
+            self._between()
+        except _Stop:
+            return
+
+    def _log_interval(self) -> int:
+        """Rollouts (on-policy) or episodes between two entries of the log."""
+        if ALGORITHMS[self.settings.algo].on_policy:
+            return int(max(1, 2048 // (self.model.n_steps * self.settings.num_envs)))
+        return max(4, self.settings.num_envs)
+
+    def _roll_out(self, collect: Any, *arguments: Any, **named: Any) -> Any:
+        """Stands before the algorithm's own `collect_rollouts`, where nothing is half done."""
+        if self._waiting is not None:
+            waiting, self._waiting = self._waiting, None
+            waiting.restore(self.model)
+        if self.steps > self._reported:
+            self._between()
+        return collect(*arguments, **named)
+
+    def _between(self) -> None:
+        self._reported = self.steps
+        self._require_finite_losses()
+        if ALGORITHMS[self.settings.algo].on_policy:
+            self._require_finite_weights()
+        if not self._on_progress(Progress(self.steps, self._total, self._statistics)):
+            raise _Stop
+
+    def _require_finite_losses(self) -> None:
+        for name, value in self.model.logger.name_to_value.items():
+            if "loss" in name and not math.isfinite(value):
+                raise TrainingFailed(f"{name} is {value} at step {self.steps}; expected a finite number: try a smaller learning_rate")
+
+    def _require_finite_weights(self) -> None:
+        if not all_finite(self.model):
+            raise TrainingFailed(f"the policy's weights are not finite at step {self.steps}: try a smaller learning_rate")
+
+    def _statistics(self) -> Statistics:
+        episodes, successes = self.model.ep_info_buffer or (), self.model.ep_success_buffer or ()
+        numbers = {name: float(value) for name, value in self.model.logger.name_to_value.items() if name.startswith("train/")}
+        return Statistics(
+            episodes=len(episodes),
+            return_mean=float(np.mean([one["r"] for one in episodes])) if episodes else None,
+            length_mean=float(np.mean([one["l"] for one in episodes])) if episodes else None,
+            success_rate=float(np.mean(successes)) if successes else None,
+            metrics={name: value for name, value in numbers.items() if math.isfinite(value)},
+        )
+
+    def save(self, path: Path, scores: Mapping[str, Any], notes: Mapping[str, Any]) -> Checkpoint:
+        """Write a checkpoint that can be resumed and deployed."""
+        self._require_finite_weights()
+        spaces = self._spaces()
+        with undisturbed(self.model):
+            members = {
+                **_sb3_members(self.model),
+                "bam/policy.onnx": freeze(self.model, self._normaliser, *spaces),
+                "bam/golden.safetensors": golden(self.model, self._normaliser, spaces[0]),
+            }
+        members |= resume.members(self.model, self.venv, self._normaliser, self._waiting, notes)
+        return write_checkpoint(path, self._manifest(scores), members)
+
+    def _manifest(self, scores: Mapping[str, Any]) -> dict[str, Any]:
+        observation_space, action_space = self._spaces()
+        return {
+            "env": self.settings.env,
+            "env_kwargs": self.settings.env_kwargs,
+            "observation_space": space_to_json(observation_space),
+            "action_space": space_to_json(action_space),
+            "signals": self._signals,
+            "period": self._period,
+            "algorithm": self.settings.algo,
+            "trainer": self.settings.trainer,
+            "settings": self.settings.to_mapping(),
+            "steps": self.steps,
+            "seed": self.settings.seed,
+            "scores": dict(scores),
+            "versions": versions(),
+            "git_commit": git_commit(),
+            "created": now(),
+        }
+
+    def _spaces(self) -> tuple[Any, Any]:
+        """The environment's own, before normalisation and image transposition."""
+        return self.venv.observation_space, self.venv.action_space
+
+    def freeze(self) -> FrozenPolicy:
+        """The policy as it is now."""
+        self._require_finite_weights()
+        observation_space, action_space = self._spaces()
+        with undisturbed(self.model):
+            graph = freeze(self.model, self._normaliser, observation_space, action_space)
+        return FrozenPolicy.from_graph(graph, space_to_json(observation_space), space_to_json(action_space))
+
+    @contextmanager
+    def undisturbed(self) -> Iterator[None]:
+        """Do something between two updates that leaves training's random numbers as they were."""
+        with undisturbed(self.model):
+            yield
+
+    def log(self, metrics: Mapping[str, float]) -> None:
+        """Put numbers next to the trainer's own in TensorBoard."""
+        for name, value in metrics.items():
+            self.model.logger.record(name, value)
+
+    def close(self) -> None:
+        """Let go of environments and log files."""
+        self.model.logger.dump(self.steps)
+        self.model.logger.close()
+        self.model.env.close()
+
+
+def _make_model(settings: TrainSettings, venv: VecEnv) -> Any:
+    """The algorithm's model; its constructor seeds everything and initialises the weights."""
+    env: VecEnv = venv
+    if settings.normalize:
+        arguments = settings.normalize if isinstance(settings.normalize, dict) else {}
+        env = VecNormalize(venv, **arguments)
+    arguments = hyperparameters.build(settings.hyperparameters, venv.action_space)
+    policy = arguments.pop("policy")
+    device = settings.device
+    if device == "auto" and policy.startswith("Mlp"):
+        device = "cpu"  # copies to a GPU cost more than a small network computes
+    return ALGORITHMS[settings.algo].load()(policy, env, seed=settings.seed, device=device, verbose=0, **arguments)
+
+
+@contextmanager
+def _refusals(settings: TrainSettings) -> Iterator[None]:
+    """What stable-baselines3 and torch say about settings that cannot be, as our own error."""
+    try:
+        yield
+    except (AssertionError, ValueError, TypeError, RuntimeError, ZeroDivisionError, NotImplementedError) as error:
+        if isinstance(error, SettingsError):
+            raise
+        raise SettingsError(f"{settings.algo} on {settings.env} cannot be set up: {' '.join(str(error).split())}") from error
+
+
+@contextmanager
+def _notices() -> Iterator[list[str]]:
+    """Collect warnings as lines for the user."""
+    lines: list[str] = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        yield lines
+    lines += [" ".join(str(one.message).split()) for one in caught if issubclass(one.category, UserWarning)]
+
+
+def _one_env(venv: VecEnv) -> Any:
+    """What stands behind `venv`: our vector environment, or the first of the others."""
+    return venv.rows if isinstance(venv, RowsVecEnv) else venv.envs[0]  # type: ignore[attr-defined]
+
+
+def _meaning(venv: VecEnv) -> tuple[dict[str, Any], float | None]:
+    """Signals (labels, units, limits) and control period [s], as far as the environment says."""
+    env = _one_env(venv)
+    describe = getattr(env.unwrapped, "describe", None)
+    return (describe() if describe else {}), control_period(env)
+
+
+def _sb3_members(model: Any) -> dict[str, bytes]:
+    """What stable-baselines3 itself writes, so that its own `load` opens the checkpoint."""
+    stream = io.BytesIO()
+    model.save(stream, exclude=["collect_rollouts"])
+    with zipfile.ZipFile(stream) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}

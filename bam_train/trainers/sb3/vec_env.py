@@ -1,0 +1,148 @@
+"""Environments as stable-baselines3 takes them: `RowsVecEnv` over our batched ones, `DummyVecEnv` over all others."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from numpy.typing import NDArray
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from bam_train.environments import is_batched, make_env, make_rows
+from bam_train.errors import SettingsError
+
+Observations = Any
+"""An array (n, …), or a mapping of them."""
+
+
+def make_training_env(env_id: str, env_kwargs: Mapping[str, Any], num_envs: int) -> VecEnv:
+    """`num_envs` environments to train on; our own can save and restore their state.
+
+    Raises:
+        SettingsError: The environment cannot be made.
+    """
+    if is_batched(env_id):
+        return RowsVecEnv(make_rows(env_id, env_kwargs, num_envs))
+    return DummyVecEnv([lambda: Monitor(make_env(env_id, env_kwargs)) for _ in range(num_envs)])
+
+
+def can_restore(venv: VecEnv) -> bool:
+    """Whether episodes that run in `venv` can be saved and gone on with."""
+    return isinstance(venv, RowsVecEnv)
+
+
+class RowsVecEnv(VecEnv):
+    """A Gymnasium vector environment whose rows restart in the same step, as a stable-baselines3 `VecEnv`.
+
+    Args:
+        rows: The environment; with ``state_dict`` and ``load_state_dict``.
+
+    Raises:
+        SettingsError: Its rows do not restart in the same step.
+    """
+
+    def __init__(self, rows: VectorEnv[Any, Any, Any]) -> None:
+        mode = rows.metadata.get("autoreset_mode")
+        if mode is not AutoresetMode.SAME_STEP:
+            raise SettingsError(f"{rows}: expected autoreset mode SAME_STEP, found {mode}")
+        self.rows = rows
+        super().__init__(rows.num_envs, rows.single_observation_space, rows.single_action_space)
+        self._dict = isinstance(rows.single_observation_space, spaces.Dict)
+        self._returns = np.zeros(self.num_envs)
+        self._lengths = np.zeros(self.num_envs, dtype=np.int64)
+        self._started = time.monotonic()
+        self._actions: NDArray[Any] = np.empty(0)
+
+    def reset(self) -> Observations:
+        """Begin an episode on every row, with the seeds that `seed` left."""
+        seeds = None if all(seed is None for seed in self._seeds) else list(self._seeds)
+        observations, _ = self.rows.reset(seed=seeds)
+        self._reset_seeds()
+        self._returns[:], self._lengths[:] = 0, 0
+        return self._own(observations)
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Keep the actions for `step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Observations, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        """Step all rows. Shapes: observations (n, …), rewards (n,) float32, done (n,) bool, n infos."""
+        observations, rewards, terminated, truncated, extra = self.rows.step(self._actions)
+        done = terminated | truncated
+        self._returns += rewards
+        self._lengths += 1
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for row in np.flatnonzero(done):
+            infos[row] = self._end(int(row), bool(terminated[row]), extra)
+        return self._own(observations), np.asarray(rewards, dtype=np.float32), done, infos
+
+    def _end(self, row: int, terminated: bool, extra: Mapping[str, Any]) -> dict[str, Any]:
+        """The info of a row whose episode ended, in the words of stable-baselines3; its sums begin again."""
+        info = {
+            "terminal_observation": self._row(extra["final_obs"], row),
+            "TimeLimit.truncated": not terminated,
+            "episode": {
+                "r": float(self._returns[row]),
+                "l": int(self._lengths[row]),
+                "t": round(time.monotonic() - self._started, 6),
+            },
+        }
+        success = extra["final_info"].get("is_success")
+        if success is not None:
+            info["is_success"] = bool(success[row])
+        self._returns[row], self._lengths[row] = 0, 0
+        return info
+
+    def _own(self, observations: Observations) -> Observations:
+        """A copy: the environment may write its next observation into the same array."""
+        if self._dict:
+            return {key: np.array(value) for key, value in observations.items()}
+        return np.array(observations)
+
+    def _row(self, observations: Observations, row: int) -> Any:
+        if self._dict:
+            return {key: np.array(value[row]) for key, value in observations.items()}
+        return np.array(observations[row])
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything the rows' future depends on, as arrays and plain values."""
+        rows: Any = self.rows
+        return {"rows": rows.state_dict(), "returns": self._returns.copy(), "lengths": self._lengths.copy()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go to what `state_dict` returned."""
+        rows: Any = self.rows
+        rows.reset()  # builds what a first episode needs before it is overwritten
+        rows.load_state_dict(state["rows"])
+        self._returns, self._lengths = np.array(state["returns"]), np.array(state["lengths"])
+
+    def close(self) -> None:
+        """Let go of the simulation."""
+        self.rows.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """An attribute of the vector environment, once for each row asked for."""
+        value = getattr(self.rows, attr_name)
+        return [value for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute of the vector environment; it has one for all rows."""
+        setattr(self.rows, attr_name, value)
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        """Call a method of the vector environment once; its result for each row asked for."""
+        value = getattr(self.rows, method_name)(*method_args, **method_kwargs)
+        return [value for _ in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """No row has a wrapper of its own."""
+        return [False for _ in self._get_indices(indices)]
+
+    def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
+        """No pictures: training is not watched."""
+        return [None] * self.num_envs

@@ -1,0 +1,104 @@
+"""What every trainer is: something that trains in steps, saves a whole checkpoint, goes on from one, and freezes its policy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+    from bam_train.checkpoint import Checkpoint
+    from bam_train.policy import FrozenPolicy
+    from bam_train.settings import TrainSettings
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """How training goes, over the last hundred or so training episodes; None before the first one ended."""
+
+    episodes: int
+    """Training episodes behind the means."""
+    return_mean: float | None
+    """Undiscounted sum of rewards of an episode."""
+    length_mean: float | None
+    """Steps of an episode."""
+    success_rate: float | None
+    """Share of successful episodes; None too if the environment does not say."""
+    metrics: dict[str, float]
+    """The trainer's own numbers, such as train/loss; finite ones only."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where training is, between two updates; cheap to make."""
+
+    steps: int
+    """Steps trained since the first of the run."""
+    total: int
+    """Steps to train."""
+    statistics: Callable[[], Statistics]
+    """Computes how training goes."""
+
+
+OnProgress = Callable[[Progress], bool]
+"""Called between updates, when the trainer may be saved, frozen or evaluated; False ends training there."""
+
+
+class Trainer(Protocol):
+    """A run of one algorithm on one environment."""
+
+    settings: TrainSettings
+    notices: list[str]
+    """What the user should know about this run, one line each."""
+
+    @classmethod
+    def complete(cls, settings: TrainSettings) -> TrainSettings:
+        """Check the algorithm's own settings and fill in its defaults; no training is set up.
+
+        Raises:
+            SettingsError: An unknown name (closest match), a wrong type, or an algorithm that does not fit the action space.
+        """
+
+    @classmethod
+    def create(cls, settings: TrainSettings, log_folder: Path | None = None) -> Self:
+        """Set up a new run of complete settings; TensorBoard files go to `log_folder`."""
+
+    @classmethod
+    def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None, log_folder: Path | None = None) -> Self:
+        """Set up a run that goes on from a checkpoint, with its settings or with these."""
+
+    @property
+    def steps(self) -> int:
+        """Steps trained since the first of the run."""
+
+    def train(self, steps: int, on_progress: OnProgress) -> None:
+        """Train until the run has at least `steps` steps, or `on_progress` returns False.
+
+        Raises:
+            TrainingFailed: The loss or a weight is no longer finite.
+        """
+
+    def save(self, path: Path, scores: Mapping[str, Any], notes: Mapping[str, Any]) -> Checkpoint:
+        """Write a checkpoint that can be resumed and deployed; training is not disturbed, not even its random numbers.
+
+        Args:
+            path: The file.
+            scores: What evaluation found, for the manifest.
+            notes: JSON values kept for `load`'s caller in ``bam/resume/notes.json``.
+        """
+
+    def freeze(self) -> FrozenPolicy:
+        """The policy as it is now, raw observation in, deterministic action out; training is not disturbed."""
+
+    def undisturbed(self) -> AbstractContextManager[None]:
+        """Do something between two updates, an evaluation say, that leaves training's random numbers as they were."""
+
+    def log(self, metrics: Mapping[str, float]) -> None:
+        """Put numbers next to the trainer's own in TensorBoard."""
+
+    def close(self) -> None:
+        """Let go of environments and log files."""
