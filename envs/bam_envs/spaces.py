@@ -12,8 +12,8 @@ Dict           spaces: by key, in the order of the space
 Tuple          spaces: a list
 =============  ==========================================================================
 
-Infinities are the strings ``"inf"`` and ``"-inf"``: JSON has none. Floats keep every bit. A space comes back equal to what
-it was, except that ``MultiBinary([n])`` comes back as ``MultiBinary(n)``, which holds the same arrays.
+Infinities are the strings ``"inf"`` and ``"-inf"``: JSON has none. Floats keep every bit. A space comes back equal to
+what it was, except that ``MultiBinary([n])`` comes back as ``MultiBinary(n)``, which holds the same arrays.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def _make_box(value: Mapping[str, Any]) -> Space[Any]:
     dtype = np.dtype(value["dtype"])
     shape = tuple(int(length) for length in value["shape"])
     low, high = (_bounds(value[side], shape, dtype, side) for side in ("low", "high"))
-    return spaces.Box(low, high, shape=shape, dtype=dtype)  # type: ignore[arg-type] - a dtype is as good as its type
+    return spaces.Box(low, high, shape=shape, dtype=dtype.type)
 
 
 def _bounds(value: Any, shape: tuple[int, ...], dtype: np.dtype[Any], side: str) -> NDArray[Any]:
@@ -117,7 +117,7 @@ def _nested(value: Any, change: Callable[[Any], Any]) -> Any:
     return [_nested(one, change) for one in value] if isinstance(value, list) else change(value)
 
 
-def _write_discrete(space: spaces.Discrete) -> Json:
+def _write_discrete(space: spaces.Discrete[Any]) -> Json:
     return {"n": int(space.n), "start": int(space.start), "dtype": str(space.dtype)}
 
 
@@ -133,7 +133,7 @@ def _write_multi_discrete(space: spaces.MultiDiscrete) -> Json:
 
 def _make_multi_discrete(value: Mapping[str, Any]) -> Space[Any]:
     dtype = np.dtype(value["dtype"])
-    return spaces.MultiDiscrete(value["nvec"], dtype=dtype, start=value["start"])  # type: ignore[arg-type]
+    return spaces.MultiDiscrete(value["nvec"], dtype=dtype.type, start=value["start"])
 
 
 def _write_multi_binary(space: spaces.MultiBinary) -> Json:
