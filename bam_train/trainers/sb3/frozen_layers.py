@@ -1,0 +1,250 @@
+"""The pieces of a frozen policy, as torch modules: what encodes an observation, the network, what makes the action."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.distributions import StateDependentNoiseDistribution
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space
+from torch import nn
+
+from bam_train.errors import PolicyError
+
+
+_KINDS = "Box, Discrete, MultiDiscrete or MultiBinary"
+
+
+class Layer(nn.Module):  # type: ignore[misc]
+    """A torch module; torch has no types here."""
+
+
+# Observation
+
+
+class _Numbers(Layer):
+    """A Box or MultiBinary: normalise in float64 as VecNormalize does, channels first, pixels to [0, 1], float32."""
+
+    def __init__(self, statistics: Any, channels_last: bool, pixels: bool) -> None:
+        super().__init__()
+        self.statistics, self.channels_last, self.pixels = statistics, channels_last, pixels
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        if self.statistics is not None:
+            mean, deviation, limit = self.statistics
+            x = ((_to(x, torch.float64) - mean) / deviation).clamp(-limit, limit)
+        if self.channels_last:
+            x = x.permute(0, 3, 1, 2)
+        x = _to(x, torch.float32)
+        return x / 255.0 if self.pixels else x
+
+
+class _OneHot(Layer):
+    """A Discrete, (n,), or MultiDiscrete, (n, k): a one-hot code of each number, side by side."""
+
+    def __init__(self, counts: np.ndarray, starts: np.ndarray) -> None:
+        super().__init__()
+        columns = np.repeat(np.arange(len(counts)), counts)
+        values = np.concatenate([np.arange(count) + start for count, start in zip(counts, starts, strict=True)])
+        self.columns, self.values = torch.as_tensor(columns), torch.as_tensor(values)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        x = x.long()
+        x = x.unsqueeze(1) if x.ndim == 1 else x.flatten(1)
+        return (x.index_select(1, self.columns) == self.values).float()
+
+
+def encoder(
+    key: str, raw: spaces.Space[Any], seen: spaces.Space[Any], statistics: Any, scale_images: bool
+) -> nn.Module:
+    """Return what turns one raw array into what the policy's feature extractor takes.
+
+    Args:
+        key: Of a Dict, for errors.
+        raw: As the environment gives it.
+        seen: As the policy was built for; its image's channels may have been moved to the front.
+        statistics: Mean, standard deviation and limit of VecNormalize, or None.
+        scale_images: Whether the policy divides images by 255.
+    """
+    if isinstance(raw, spaces.Discrete):
+        return _OneHot(np.array([raw.n]), np.array([raw.start]))
+    if isinstance(raw, spaces.MultiDiscrete):
+        return _OneHot(raw.nvec.ravel(), raw.start.ravel())
+    if not isinstance(raw, (spaces.Box, spaces.MultiBinary)):
+        raise PolicyError(f"observation {key!r}: a {type(raw).__name__} cannot be frozen; expected {_KINDS}")
+    channels_last = raw.shape != seen.shape
+    if channels_last and (len(raw.shape) != 3 or (raw.shape[2], *raw.shape[:2]) != seen.shape):
+        raise PolicyError(
+            f"observation {key!r}: the policy takes shape {seen.shape}, the environment gives {raw.shape}"
+        )
+    return _Numbers(statistics, channels_last, scale_images and is_image_space(seen))
+
+
+def _to(x: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
+    """Cast, without leaving a node in the graph where there is nothing to do."""
+    return x if x.dtype == dtype else x.to(dtype)
+
+
+def torch_dtype(dtype: Any) -> torch.dtype:
+    """Return torch's name for a NumPy dtype."""
+    return torch.as_tensor(np.zeros((), dtype)).dtype
+
+
+# Network
+
+
+class _Chain(Layer):
+    """The actor's part of an `MlpExtractor`, then the output layer."""
+
+    def __init__(self, extractor: nn.Module, output: nn.Module) -> None:
+        super().__init__()
+        self.extractor, self.output = extractor, output
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.output(self.extractor.forward_actor(x))
+
+
+class _Lstm(Layer):
+    """One step of an `nn.LSTM`, written out as dense layers; its state is a hidden and a cell array for each layer."""
+
+    def __init__(self, lstm: nn.LSTM) -> None:
+        super().__init__()
+        if lstm.bidirectional or lstm.proj_size or not lstm.bias:
+            raise PolicyError("an LSTM that is bidirectional, projects or has no bias cannot be frozen")
+        self.sizes = [lstm.hidden_size] * lstm.num_layers
+        self.gates = nn.ModuleList(_gates(lstm, layer) for layer in range(lstm.num_layers))
+
+    def forward(self, x: torch.Tensor, state: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        following = []
+        for layer, gates in enumerate(self.gates):
+            hidden, cell = state[2 * layer : 2 * layer + 2]
+            take, keep, new, give = gates(torch.cat([x, hidden], 1)).split(self.sizes[layer], dim=1)
+            cell = keep.sigmoid() * cell + take.sigmoid() * new.tanh()
+            x = give.sigmoid() * cell.tanh()
+            following += [x, cell]
+        return x, following
+
+
+def _gates(lstm: nn.LSTM, layer: int) -> nn.Linear:
+    """Return one linear layer from (input, hidden) to the four gates."""
+    w_input, w_hidden, b_input, b_hidden = (weight.detach() for weight in lstm.all_weights[layer])
+    weight = torch.cat([w_input, w_hidden], 1)
+    gates = nn.utils.skip_init(nn.Linear, weight.shape[1], weight.shape[0])
+    gates.weight.data, gates.bias.data = weight, b_input + b_hidden
+    return gates
+
+
+def network(policy: BasePolicy) -> tuple[Any, nn.Module, nn.Module, nn.Module | None]:
+    """Return the module that owns the network, and copies of its feature extractor, its layers and its LSTM if any."""
+    lstm = None
+    if isinstance(policy, ActorCriticPolicy):
+        owner, extractor = policy, policy.pi_features_extractor
+        layers: nn.Module = _Chain(policy.mlp_extractor, policy.action_net)
+        lstm = getattr(policy, "lstm_actor", None)
+    elif hasattr(policy, "quantile_net"):  # QR-DQN
+        owner, extractor = policy.quantile_net, policy.quantile_net.features_extractor
+        layers = _mean_of_quantiles(owner.quantile_net, owner.n_quantiles)
+    elif hasattr(policy, "q_net"):  # DQN
+        owner, extractor, layers = policy.q_net, policy.q_net.features_extractor, policy.q_net.q_net
+    elif hasattr(policy, "actor"):  # SAC, TQC and CrossQ have latent_pi and mu; TD3 and DDPG only mu
+        owner, extractor = policy.actor, policy.actor.features_extractor
+        layers = nn.Sequential(getattr(owner, "latent_pi", nn.Identity()), owner.mu)
+    else:
+        raise PolicyError(f"policy {type(policy).__name__} cannot be frozen; expected one of stable-baselines3's own")
+    return owner, _copy(extractor), _copy(layers), None if lstm is None else _Lstm(_copy(lstm))
+
+
+def _copy(module: Any) -> Any:
+    return copy.deepcopy(module).cpu().eval().requires_grad_(False)
+
+
+def _mean_of_quantiles(layers: nn.Sequential, quantiles: int) -> nn.Sequential:
+    """Fold the mean over quantiles into the last layer: the mean of linear functions is linear."""
+    *hidden, last = copy.deepcopy(layers).cpu()
+    mean = nn.utils.skip_init(nn.Linear, last.in_features, last.out_features // quantiles)
+    weight = last.weight.detach().double().reshape(quantiles, mean.out_features, last.in_features).mean(0)
+    mean.weight.data = weight.float()
+    mean.bias.data = last.bias.detach().double().reshape(quantiles, mean.out_features).mean(0).float()
+    return nn.Sequential(*hidden, mean)
+
+
+# Action
+
+
+class _Continuous(Layer):
+    """Squash and scale, or only clip, as ``predict`` does; float64 where the space is."""
+
+    def __init__(self, space: spaces.Box, tanh: bool, scale: bool) -> None:
+        super().__init__()
+        self.dtype = torch.float64 if space.dtype == np.float64 else torch.float32
+        self.low, self.high = (torch.as_tensor(bound).to(self.dtype) for bound in (space.low, space.high))
+        self.bounded = bool(np.isfinite(space.low).any()), bool(np.isfinite(space.high).any())
+        self.shape, self.tanh, self.scale = space.shape, tanh, scale
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        x = torch.tanh(x) if self.tanh else x
+        if len(self.shape) != 1:
+            x = x.reshape(-1, *self.shape)
+        x = _to(x, self.dtype)
+        if self.scale:
+            x = self.low + (0.5 * (x + 1.0) * (self.high - self.low))
+        x = torch.minimum(x, self.high) if self.bounded[1] else x  # scaled ones too: they can round past a bound
+        return torch.maximum(x, self.low) if self.bounded[0] else x
+
+    def margin(self, scores: torch.Tensor) -> torch.Tensor:
+        return torch.ones(len(scores))
+
+
+class _Choice(Layer):
+    """The best of each group of scores, counted from ``starts``: Discrete gives (n,), MultiDiscrete (n, k)."""
+
+    def __init__(self, counts: list[int], starts: np.ndarray, dtype: torch.dtype) -> None:
+        super().__init__()
+        self.counts, self.starts, self.dtype = counts, torch.as_tensor(starts), dtype
+        self.single, self.shifted = np.ndim(starts) == 0, bool(np.any(starts))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        if self.single:
+            best = x.argmax(1)
+        else:
+            best = torch.cat([group.argmax(1, keepdim=True) for group in x.split(self.counts, dim=1)], 1)
+        return _to(best + self.starts if self.shifted else best, self.dtype)
+
+    def margin(self, scores: torch.Tensor) -> torch.Tensor:
+        gaps = [group.topk(2)[0] for group in scores.split(self.counts, dim=1) if group.shape[1] > 1]
+        return torch.stack([gap[:, 0] - gap[:, 1] for gap in gaps]).amin(0) if gaps else torch.ones(len(scores))
+
+
+class _Switches(Layer):
+    """A MultiBinary: on where the logit is positive, which is where the probability rounds to 1."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return (x > 0).to(torch.int8)
+
+    def margin(self, scores: torch.Tensor) -> torch.Tensor:
+        return scores.abs().amin(1)
+
+
+def head(space: spaces.Space[Any], policy: BasePolicy) -> nn.Module:
+    """Return what turns the network's output into an action of the environment's space."""
+    if isinstance(space, spaces.Box):
+        return _Continuous(space, _has_tanh(policy), policy.squash_output)
+    if isinstance(space, spaces.Discrete):
+        return _Choice([int(space.n)], np.asarray(space.start), torch.int64)
+    if isinstance(space, spaces.MultiDiscrete):
+        return _Choice(space.nvec.tolist(), space.start, torch_dtype(space.dtype))
+    if isinstance(space, spaces.MultiBinary):
+        return _Switches()
+    raise PolicyError(f"action space {space}: expected {_KINDS}")
+
+
+def _has_tanh(policy: BasePolicy) -> bool:
+    """Whether a tanh follows the last layer that `_network` returns; TD3 and DDPG have theirs among the layers."""
+    if isinstance(policy, ActorCriticPolicy):
+        distribution = policy.action_dist
+        return isinstance(distribution, StateDependentNoiseDistribution) and distribution.bijector is not None
+    return hasattr(policy.actor, "latent_pi")

@@ -1,0 +1,172 @@
+"""Golden actions: observations, and what the trainer itself does on them, to check the frozen policy against."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize
+from torch import nn
+
+from bam_train import safetensors_file
+
+_BUDGET = 200_000  # bytes of observations; images are random and do not pack
+_FAR = 1e6  # a bound beyond this says nothing about the values that occur
+
+
+def golden(
+    model: BaseAlgorithm,
+    normaliser: VecNormalize | None,
+    observation_space: spaces.Space[Any],
+    n: int = 256,
+    seed: int = 0,
+    *,
+    action_space: spaces.Space[Any] | None = None,
+) -> bytes:
+    """Draw observations and record ``model.predict(..., deterministic=True)``.
+
+    Args:
+        model: The trained model; left as it was, and no random number of torch, NumPy or SB3 is drawn.
+        normaliser: What its observations were normalised with, if anything.
+        observation_space: The environment's own.
+        n: Rows; fewer if they are large. Of a recurrent policy: steps of one episode.
+        seed: Of the observations.
+        action_space: The environment's own; the model's if it is the same.
+
+    Returns:
+        A safetensors file with ``observation`` (or ``observation.<key>``), (n, ...), and ``action``, (n, ...).
+    """
+    action_space = model.action_space if action_space is None else action_space
+    recurrent = hasattr(model.policy, "lstm_actor")
+    n = min(n, max(4, _BUDGET // _size(observation_space)))
+    rng = np.random.default_rng(seed)
+    observations = draw(observation_space, n if recurrent else 2 * n, rng, normaliser)
+    if not recurrent:
+        keep = _clearest(model, normaliser, observation_space, action_space, observations, n)
+        observations = {key: value[keep] for key, value in observations.items()}
+    actions = trainer_actions(model, normaliser, observation_space, action_space, observations)
+    named = {f"observation.{key}" if key else "observation": value for key, value in observations.items()}
+    return safetensors_file.dump({**named, "action": actions})
+
+
+def draw(
+    space: spaces.Space[Any], n: int, rng: np.random.Generator, normaliser: VecNormalize | None = None
+) -> dict[str, np.ndarray]:
+    """Draw n observations; the keys are those of a Dict, or just ``""``.
+
+    Normalised numbers are drawn about their running mean, so that few of them end at the normaliser's limits.
+    """
+    return {key: _draw(leaf, n, rng, _moments(normaliser, key)) for key, leaf in _leaves(space).items()}
+
+
+def trainer_actions(
+    model: BaseAlgorithm,
+    normaliser: VecNormalize | None,
+    observation_space: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+    observations: dict[str, np.ndarray],
+) -> np.ndarray:
+    """Return the trainer's own actions for raw observations, in the environment's action space."""
+    leaves = _leaves(observation_space)
+    seen: Any = {key: _from_zero(leaves[key], value) for key, value in observations.items()}
+    if not isinstance(observation_space, spaces.Dict):
+        seen = seen[""]
+    if normaliser is not None:
+        seen = normaliser.normalize_obs(seen)
+    with _evaluating(model.policy):
+        if hasattr(model.policy, "lstm_actor"):
+            actions = _episode(model, seen)
+        else:
+            actions = model.predict(seen, deterministic=True)[0]
+    if isinstance(action_space, (spaces.Discrete, spaces.MultiDiscrete)):
+        return np.asarray(actions + action_space.start).astype(action_space.dtype)
+    return actions.astype(np.int8) if isinstance(action_space, spaces.MultiBinary) else actions
+
+
+def _episode(model: BaseAlgorithm, observations: Any) -> np.ndarray:
+    """Run a recurrent policy over one episode, a row a step."""
+    rows = len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
+    state, actions = None, []
+    for t in range(rows):
+        one = (
+            {k: v[t : t + 1] for k, v in observations.items()}
+            if isinstance(observations, dict)
+            else observations[t : t + 1]
+        )
+        action, state = model.predict(one, state=state, episode_start=np.array([t == 0]), deterministic=True)
+        actions.append(action[0])
+    return np.stack(actions)
+
+
+def _clearest(
+    model: BaseAlgorithm,
+    normaliser: VecNormalize | None,
+    observation_space: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+    observations: dict[str, np.ndarray],
+    n: int,
+) -> np.ndarray:
+    """Return the n rows whose choice is clearest: where two choices tie, rounding decides, and that proves nothing."""
+    from bam_train.trainers.sb3.freeze import FrozenModule
+
+    module = FrozenModule(model, normaliser, observation_space, action_space)
+    with torch.no_grad():
+        margin = module.head.margin(module.scores(*map(torch.as_tensor, observations.values()))).numpy()
+    return np.sort(np.argsort(-margin, kind="stable")[:n])
+
+
+@contextlib.contextmanager
+def _evaluating(policy: nn.Module) -> Iterator[None]:
+    """Undo the switch to evaluation mode that ``predict`` makes."""
+    before = [(module, module.training) for module in policy.modules()]
+    try:
+        yield
+    finally:
+        for module, training in before:
+            module.training = training
+
+
+def _leaves(space: Any) -> dict[str, Any]:
+    return dict(space.spaces) if isinstance(space, spaces.Dict) else {"": space}
+
+
+def _size(space: spaces.Space[Any]) -> int:
+    """Return the bytes of one observation."""
+    return sum(math.prod(leaf.shape) * np.dtype(leaf.dtype).itemsize for leaf in _leaves(space).values()) or 1
+
+
+def _from_zero(space: spaces.Space[Any], values: np.ndarray) -> np.ndarray:
+    return values - space.start if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)) else values
+
+
+def _moments(normaliser: VecNormalize | None, key: str) -> Any:
+    if normaliser is None or not normaliser.norm_obs or (key and key not in normaliser.norm_obs_keys):
+        return None
+    rms = normaliser.obs_rms[key] if key else normaliser.obs_rms
+    return rms.mean, np.sqrt(rms.var + normaliser.epsilon)
+
+
+def _draw(space: Any, n: int, rng: np.random.Generator, moments: Any) -> np.ndarray:
+    shape = (n, *space.shape)
+    if isinstance(space, spaces.MultiBinary):
+        return rng.integers(2, size=shape, dtype=np.int8)
+    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
+        counts = space.n if isinstance(space, spaces.Discrete) else space.nvec
+        return np.asarray(space.start + rng.integers(counts, size=shape), space.dtype)
+    if np.issubdtype(space.dtype, np.integer):
+        return rng.integers(space.low, space.high, size=shape, dtype=space.dtype, endpoint=True)
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    values = rng.normal(size=shape)
+    if moments is not None:
+        values = moments[0] + 2.0 * moments[1] * values
+    else:
+        near = (low > -_FAR) & (high < _FAR)
+        start, stop = np.where(near, low, 0.0), np.where(near, high, 1.0)
+        values = np.where(near, start + (stop - start) * rng.random(shape), values)
+    return np.clip(values, low, high).astype(space.dtype)
