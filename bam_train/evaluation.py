@@ -146,10 +146,7 @@ def evaluate(
         SettingsError: `episodes`, `seed` or `num_envs` out of range.
         PolicyError: An action that is not finite.
     """
-    _require("episodes", episodes, 1)
-    _require("seed", seed, 0)
-    if num_envs is not None:
-        _require("num_envs", num_envs, 1)
+    require_range(episodes, seed, num_envs)
     with _rows(env_id, env_kwargs, num_envs, episodes, env) as rows:
         done: list[Episode] = []
         while len(done) < episodes:
@@ -159,12 +156,25 @@ def evaluate(
     return summarise(env_id, done)
 
 
+def require_range(episodes: int, seed: int, num_envs: int | None = None, **counts: int) -> None:
+    """Refuse numbers that cannot be; `counts` are others that have to be at least 1.
+
+    Raises:
+        SettingsError: Names the first that is out of range.
+    """
+    counts = {"episodes": episodes, "num_envs": 1 if num_envs is None else num_envs, **counts}
+    for name, value, least in [("seed", seed, 0), *((name, value, 1) for name, value in counts.items())]:
+        if value < least:
+            raise SettingsError(f"{name}: expected at least {least}, found {value}")
+
+
 def play_wave(env: VectorEnv[Any, Any, Any], policy: BatchPolicy, seed: int, count: int) -> list[Episode]:
     """One episode in each of the first `count` rows; row i is seeded ``seed + i``.
 
     The surplus rows of a last, smaller wave run too (a vector environment steps all rows) and are ignored.
     """
-    observations, _ = env.reset(seed=[seed + i for i in range(env.num_envs)])
+    seeds: Any = [seed + i for i in range(env.num_envs)]  # lists are taken, though Gymnasium's hint says int only
+    observations, _ = env.reset(seed=seeds)
     policy.reset()
     totals, lengths = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=np.int64)
     success: list[bool | None] = [None] * env.num_envs
@@ -212,11 +222,6 @@ def require_finite(action: NDArray[Any], when: str) -> None:
 
 def _finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
-
-
-def _require(name: str, value: int, least: int) -> None:
-    if value < least:
-        raise SettingsError(f"{name}: expected at least {least}, found {value}")
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
@@ -116,7 +117,7 @@ def _write_mp4(path: Path, pictures: Iterator[Frame], rate: float) -> int:
     count = 0
     with imageio.get_writer(path, format="FFMPEG", fps=rate, codec="libx264", macro_block_size=2) as writer:
         for one in pictures:
-            writer.append_data(one)
+            writer.append_data(one)  # type: ignore[attr-defined]
             count += 1
     return count
 
@@ -126,10 +127,8 @@ _WRITERS: dict[str, Callable[[Path, Iterator[Frame], float], int]] = {".gif": _w
 
 def _require_writer(suffix: str) -> None:
     try:
-        if suffix == ".gif":
-            import PIL.Image  # noqa: F401
-        else:
-            import imageio_ffmpeg  # noqa: F401
+        for module in ("PIL",) if suffix == ".gif" else ("imageio", "imageio_ffmpeg"):
+            importlib.import_module(module)
     except ModuleNotFoundError as error:
         raise MissingExtra(str(error.name), "video", f"A {suffix} film") from error
 

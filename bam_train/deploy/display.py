@@ -90,7 +90,7 @@ class LiveDisplay:
         table = Table.grid(padding=(0, 1))
         table.title, table.title_justify = self._title, "left"
         for justify in ("left", "left", "right", "left"):
-            table.add_column(justify=justify, no_wrap=True)  # type: ignore[arg-type]
+            table.add_column(justify=justify, no_wrap=True)
         number = len(self._journal.records)
         table.add_row("episode", f"{number} of {self._journal.wanted}", "step", str(record.length))
         table.add_row("return", f"{record.total:.2f}", "", "")
@@ -122,9 +122,8 @@ def bar(value: float) -> str:
 def episode_line(number: int, wanted: int, record: EpisodeRecord) -> str:
     """Such as ``episode 2/5 (seed 8): success after 47 steps, return 12.31``."""
     how = {True: "success", False: "no success", None: record.end}[record.success]
-    return (
-        f"episode {number}/{wanted} (seed {record.seed}): {how} after {record.length} steps, return {record.total:.2f}"
-    )
+    steps = f"{record.length} step{'' if record.length == 1 else 's'}"
+    return f"episode {number}/{wanted} (seed {record.seed}): {how} after {steps}, return {record.total:.2f}"
 
 
 def action_labels(env: gym.Env[Any, Any]) -> tuple[str, ...]:

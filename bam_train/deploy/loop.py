@@ -115,7 +115,7 @@ def fault_text(error: Exception) -> str:
 def _close(env: Env, ending: Ending) -> Ending:
     """Drop the link; a failure to is a fault too, unless there was one before."""
     try:
-        env.close()
+        env.close()  # type: ignore[no-untyped-call]
     except Exception as error:  # an environment's own business, and the report must come out all the same
         if ending.status == 0:
             return replace(ending, reason=f"fault: closing failed: {fault_text(error)}", status=1)

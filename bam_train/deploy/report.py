@@ -16,6 +16,8 @@ class DeployReport:
     """The outcome of one deployment."""
 
     checkpoint: Checkpoint
+    seed: int
+    """Of the first episode."""
     ending: Ending
     journal: Journal
     pacer: Pacer
@@ -33,6 +35,7 @@ class DeployReport:
             "lateness_ms": _milliseconds(self.pacer.lateness),
             "missed_ticks": self.pacer.missed,
             "startup_cpu_s": _startup(journal),
+            "seed": self.seed,
             "env": manifest.env,
             "algorithm": manifest.algorithm,
             "checkpoint": str(self.checkpoint.path),

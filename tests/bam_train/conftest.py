@@ -6,11 +6,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from bam_envs.spaces import space_to_json
+from bam_train import safetensors_file
+from bam_train.checkpoint import GOLDEN, POLICY, write_checkpoint
+
 
 class Corridor(gym.Env):
-    """Cells 0 to 4; starts in 1, 2 or 3; action 0 goes left, 1 right. Cell 4 is the goal, cell 0 a hole; each step costs 0.25."""
+    """Cells 0 to 4; starts in 1, 2 or 3; action 0 goes left, 1 right. 4 is the goal, 0 a hole; each step costs 0.25."""
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
     observation_space = gym.spaces.Box(0.0, 4.0, (1,), np.float32)
     action_space = gym.spaces.Discrete(2)
 
@@ -53,3 +57,55 @@ def starting_cell(seed: int) -> int:
 @pytest.fixture(name="starting_cell")
 def starting_cell_fixture():
     return starting_cell
+
+
+@pytest.fixture
+def corridor_checkpoint(corridor, tmp_path):
+    """A checkpoint.zip whose frozen policy always goes right, and that can be changed: ``make(name="x.zip", env="...")``."""
+
+    def make(name="right.zip", **fields):
+        manifest = {
+            "env": corridor,
+            "env_kwargs": {},
+            "observation_space": space_to_json(Corridor.observation_space),
+            "action_space": space_to_json(Corridor.action_space),
+            "signals": {},
+            "period": None,
+            "algorithm": "ppo",
+            "trainer": "sb3",
+            "settings": {},
+            "steps": 2048,
+            "seed": 0,
+            "scores": {},
+            "versions": {},
+            "git_commit": None,
+            "created": "2026-01-01T00:00:00Z",
+            **fields,
+        }
+        numbers = manifest["observation_space"]["shape"][0]
+        golden = {"observation": np.ones((2, numbers), np.float32), "action": np.array([1, 1])}
+        members = {POLICY: always_right(numbers), GOLDEN: safetensors_file.dump(golden)}
+        return write_checkpoint(tmp_path / name, manifest, members).path
+
+    return make
+
+
+def always_right(numbers: int) -> bytes:
+    """ONNX: the larger of two scores that do not depend on the observation."""
+    from onnx import TensorProto, helper, numpy_helper
+
+    nodes = [
+        helper.make_node("Gemm", ["observation", "weight", "bias"], ["scores"]),
+        helper.make_node("ArgMax", ["scores"], ["action"], axis=1, keepdims=0),
+    ]
+    graph = helper.make_graph(
+        nodes,
+        "policy",
+        [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["n", numbers])],
+        [helper.make_tensor_value_info("action", TensorProto.INT64, ["n"])],
+        [
+            numpy_helper.from_array(np.zeros((numbers, 2), np.float32), "weight"),
+            numpy_helper.from_array(np.array([0, 1], np.float32), "bias"),
+        ],
+    )
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8).SerializeToString()

@@ -144,7 +144,8 @@ def test_an_action_that_is_not_finite_is_refused():
     with pytest.raises(PolicyError) as caught:
         evaluate(Broken(), "Pendulum-v1", episodes=2, seed=4)
     assert str(caught.value) == (
-        "action[0, 0] is nan after 0 steps of the episodes from seed 4 on; expected finite numbers: the policy is broken"
+        "action[0, 0] is nan after 0 steps of the episodes from seed 4 on; "
+        "expected finite numbers: the policy is broken"
     )
 
 

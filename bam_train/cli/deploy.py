@@ -1,0 +1,152 @@
+"""`bam-deploy`: drive a robot with a checkpoint's frozen policy, at the environment's own rate, without torch."""
+
+from __future__ import annotations
+
+import json as json_module
+import math
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from bam_train.cli.console import is_terminal, make_console, say
+from bam_train.cli.program import run_program
+
+if TYPE_CHECKING:
+    import gymnasium as gym
+
+    from bam_train.checkpoint import Checkpoint
+    from bam_train.deploy.journal import Journal
+    from bam_train.deploy.loop import Watcher
+    from bam_train.policy import FrozenPolicy
+
+
+@dataclass(frozen=True)
+class DeployConfig:
+    """Run the frozen policy of a checkpoint on its (simulated) robot, at the rate it was made for."""
+
+    checkpoint: tyro.conf.Positional[Path]
+    """The checkpoint.zip that bam-train wrote."""
+    episodes: int = 5
+    """How many episodes."""
+    seed: int = 1_000_000
+    """Seed of the first episode; episode k gets seed + k, as in bam-eval."""
+    rate: Annotated[float | None, tyro.conf.arg(metavar="HZ")] = None
+    """Actions a second [Hz]; by default the environment's own."""
+    fast: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Do not wait for deadlines: as fast as it goes."""
+    render: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Show the robot in a window."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON report on standard output instead of a few lines."""
+
+
+def deploy_checkpoint(config: DeployConfig) -> int:
+    """The program, with its arguments read."""
+    from bam_train.deploy.journal import Journal, Startup
+
+    startup = Startup()
+    startup.mark("python and arguments")
+    _require_sane(config)
+    from bam_train.checkpoint import Checkpoint
+    from bam_train.environments import make_env, require_fit
+    from bam_train.policy import FrozenPolicy
+
+    startup.mark("imports")
+    checkpoint = Checkpoint.open(config.checkpoint)
+    policy = FrozenPolicy.from_checkpoint(checkpoint)
+    startup.mark("policy")
+    manifest = checkpoint.manifest
+    env = make_env(manifest.env, manifest.env_kwargs, render_mode="human" if config.render else None)
+    try:
+        require_fit(checkpoint, env)
+        period = period_of(config, checkpoint, env)
+    except BaseException:
+        env.close()  # type: ignore[no-untyped-call]
+        raise
+    startup.mark("environment")
+    return _run(config, checkpoint, env, policy, period, Journal(config.episodes, startup))
+
+
+def _run(
+    config: DeployConfig,
+    checkpoint: Checkpoint,
+    env: gym.Env[Any, Any],
+    policy: FrozenPolicy,
+    period: float | None,
+    journal: Journal,
+) -> int:
+    from bam_train.deploy.loop import deploy
+    from bam_train.deploy.pacer import Pacer
+    from bam_train.deploy.report import DeployReport
+
+    pacer = Pacer(period)
+    with _display(f"{checkpoint.path} on {checkpoint.manifest.env}", env, journal) as watcher:
+        journal.startup.mark("display")
+        ending = deploy(env, policy, pacer, journal, watcher, seed=config.seed)
+    if ending.status:
+        say(f"bam-deploy: {ending.reason}")
+    report = DeployReport(checkpoint, config.seed, ending, journal, pacer)
+    text = json_module.dumps(report.to_json(), allow_nan=False) if config.json else "\n".join(report.lines())
+    print(text, flush=True)
+    return ending.status
+
+
+@contextmanager
+def _display(title: str, env: gym.Env[Any, Any], journal: Journal) -> Iterator[Watcher]:
+    from bam_train.deploy.display import PlainDisplay, live_display
+
+    if not is_terminal():
+        yield PlainDisplay(journal, say)
+        return
+    with live_display(make_console(), env, title, journal) as display:
+        yield display
+
+
+def _require_sane(config: DeployConfig) -> None:
+    """Refuse what cannot be, before anything is loaded."""
+    from bam_train.errors import SettingsError
+
+    for name, value, least in (("episodes", config.episodes, 1), ("seed", config.seed, 0)):
+        if value < least:
+            raise SettingsError(f"{name}: expected at least {least}, found {value}")
+    if config.rate is not None and not (config.rate > 0 and math.isfinite(config.rate)):
+        raise SettingsError(f"rate: expected more than 0 Hz, found {config.rate:g}")
+    if config.rate is not None and config.fast:
+        raise SettingsError("--fast does not wait for deadlines, so --rate has no meaning with it; give one of the two")
+    if config.render and sys.platform == "linux" and not (os.environ.keys() & {"DISPLAY", "WAYLAND_DISPLAY"}):
+        raise SettingsError(
+            "--render needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set; "
+            "leave it out, or make a film: bam-eval CHECKPOINT --video film.gif"
+        )
+
+
+def period_of(config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> float | None:
+    """Time between two actions [s]; None for as fast as it goes.
+
+    Raises:
+        SettingsError: Neither the flags nor the environment nor the checkpoint say.
+    """
+    from bam_train.environments import control_period
+    from bam_train.errors import SettingsError
+
+    if config.fast:
+        return None
+    own = control_period(env) or checkpoint.manifest.period
+    if config.rate is None and own is None:
+        raise SettingsError(f"{checkpoint.manifest.env} does not say its rate; give --rate HZ, or --fast not to wait")
+    if config.rate is not None and own is not None and not math.isclose(config.rate * own, 1.0, rel_tol=1e-6):
+        say(f"bam-deploy: warning: {config.rate:g} Hz is asked for, and the policy was made for {1 / own:g} Hz")
+    return own if config.rate is None else 1 / config.rate
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of the console script."""
+    run_program(
+        deploy_checkpoint, DeployConfig, prog="bam-deploy", description=DeployConfig.__doc__ or "", arguments=arguments
+    )

@@ -1,0 +1,125 @@
+"""`bam-envs`: the environments that come with this package, and what each number of theirs means."""
+
+from __future__ import annotations
+
+import json as json_module
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import tyro
+
+from bam_train.cli.program import run_program
+
+
+@dataclass(frozen=True)
+class EnvsConfig:
+    """List our environments, or describe one (any Gymnasium id): spaces, rate, name and unit of every number."""
+
+    env: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="ID")] = None
+    """The environment to describe, e.g. bam/pick; without it, all of ours are listed."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print JSON."""
+
+
+def show_environments(config: EnvsConfig) -> None:
+    """The program, with its arguments read."""
+    if config.env is None:
+        rows = overview()
+        print(json_module.dumps(rows, indent=2) if config.json else "\n".join(overview_lines(rows)), flush=True)
+        return
+    facts = details(config.env)
+    text = json_module.dumps(facts, indent=2, allow_nan=False) if config.json else "\n".join(detail_lines(facts))
+    print(text, flush=True)
+
+
+def overview() -> list[dict[str, Any]]:
+    """One row of plain values for each of our environments; imports no simulator."""
+    from bam_envs.registry import ENVIRONMENTS, resolve
+
+    rows = []
+    for entry in ENVIRONMENTS.values():
+        task = resolve(entry.task)(1)
+        rows.append(
+            {
+                "id": entry.id,
+                "summary": entry.summary,
+                "observation": short_space(task.observation_space),
+                "action": short_space(task.action_space),
+                "episode_steps": entry.max_episode_steps,
+                "rate_hz": 1 / entry.period,
+            }
+        )
+    return rows
+
+
+def short_space(space: Any) -> str:
+    """A space in a few characters: ``float32 (23,)``, ``2 choices``."""
+    if hasattr(space, "n") and not isinstance(space.n, Sequence):
+        return f"{space.n} choices"
+    return f"{space.dtype} {space.shape}" if space.shape is not None else str(space)
+
+
+def overview_lines(rows: list[dict[str, Any]]) -> list[str]:
+    """The rows as a table."""
+    header = {"id": "id", "observation": "observation", "action": "action", "episode_steps": "steps", "rate_hz": "Hz"}
+    cells = [header, *({**row, "rate_hz": f"{row['rate_hz']:g}"} for row in rows)]
+    widths = {key: max(len(str(row[key])) for row in cells) for key in header}
+    lines = ["  ".join(str(row[key]).ljust(widths[key]) for key in header) for row in cells]
+    summaries = ["what to do", *(row["summary"] for row in rows)]
+    table = [f"{line}  {summary}" for line, summary in zip(lines, summaries, strict=True)]
+    return [*table, "", "Details: bam-envs ID. Training: bam-train --env ID --algo ppo; any Gymnasium id will do."]
+
+
+def details(name: str) -> dict[str, Any]:
+    """Everything about one environment, as plain values; makes it, so it needs its simulator."""
+    from bam_envs.registry import ENVIRONMENTS, resolve_id
+    from bam_envs.spaces import space_to_json
+    from bam_train.environments import control_period, make_env
+
+    env_id = resolve_id(name)
+    env = make_env(env_id)
+    try:
+        describe = getattr(env.unwrapped, "describe", None)
+        period = control_period(env)
+        return {
+            "id": env_id,
+            "summary": ENVIRONMENTS[env_id].summary if env_id in ENVIRONMENTS else None,
+            "episode_steps": None if env.spec is None else env.spec.max_episode_steps,
+            "rate_hz": None if period is None else 1 / period,
+            "observation_space": space_to_json(env.observation_space),
+            "action_space": space_to_json(env.action_space),
+            "signals": {} if describe is None else describe(),
+        }
+    finally:
+        env.close()  # type: ignore[no-untyped-call]
+
+
+def detail_lines(facts: dict[str, Any]) -> list[str]:
+    """The same for people."""
+    lines = [facts["id"] if facts["summary"] is None else f"{facts['id']}: {facts['summary']}"]
+    steps = "no time limit" if facts["episode_steps"] is None else f"{facts['episode_steps']} steps an episode"
+    lines.append(f"{steps}, {'no rate given' if facts['rate_hz'] is None else format(facts['rate_hz'], 'g') + ' Hz'}")
+    if not facts["signals"]:
+        lines += [f"{kind}: {json_module.dumps(facts[kind + '_space'])}" for kind in ("observation", "action")]
+    for kind, rows in facts["signals"].items():
+        lines += ["", kind, *_signal_lines(rows)]
+    return lines
+
+
+def _signal_lines(rows: list[dict[str, Any]]) -> list[str]:
+    keys = [key for key in ("name", "low", "high", "scale", "unit", "meaning") if any(key in row for row in rows)]
+    cells = [keys, *([_cell(row.get(key, "")) for key in keys] for row in rows)]
+    widths = [max(len(line[i]) for line in cells) for i in range(len(keys))]
+    padded = [[text.ljust(width) for text, width in zip(line, widths, strict=True)] for line in cells]
+    return ["  " + "  ".join(line).rstrip() for line in padded]
+
+
+def _cell(value: Any) -> str:
+    return value if isinstance(value, str) else f"{value:.4g}"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of the console script."""
+    description = EnvsConfig.__doc__ or ""
+    run_program(show_environments, EnvsConfig, prog="bam-envs", description=description, arguments=arguments)

@@ -1,0 +1,193 @@
+"""`bam-eval`: how well a checkpoint's frozen policy does, over seeded episodes."""
+
+from __future__ import annotations
+
+import json as json_module
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from bam_train.cli.console import say
+from bam_train.cli.program import run_program
+
+if TYPE_CHECKING:
+    from bam_train.checkpoint import Checkpoint
+    from bam_train.evaluation import EvaluationReport
+    from bam_train.policy import FrozenPolicy
+
+
+@dataclass(frozen=True)
+class EvalConfig:
+    """Evaluate the frozen policy of a checkpoint over seeded episodes."""
+
+    checkpoint: tyro.conf.Positional[Path]
+    """The checkpoint.zip that bam-train wrote."""
+    episodes: int = 100
+    """How many episodes."""
+    seed: int = 1_000_000
+    """Seed of the first episode; episode k gets seed + k. The default is far from the seeds that training uses."""
+    env: Annotated[str | None, tyro.conf.arg(metavar="ID")] = None
+    """Refuse the checkpoint unless it was trained on this environment; needed for a plain stable-baselines3 zip."""
+    algo: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Refuse the checkpoint unless it was trained by this algorithm; needed for a plain stable-baselines3 zip."""
+    num_envs: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Environments stepped side by side; by default as many as is quick."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON object on standard output instead of a table."""
+    video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Film the first episodes into this .gif or .mp4 file."""
+    video_episodes: int = 3
+    """How many episodes the film shows."""
+    trust_pickle: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Load a plain stable-baselines3 zip, which runs whatever code is in it."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is evaluated, and where."""
+
+    policy: FrozenPolicy
+    env: str
+    env_kwargs: dict[str, Any]
+    facts: dict[str, Any]
+    """For the report: checkpoint, algorithm, steps."""
+    checkpoint: Checkpoint | None
+    """None for a plain stable-baselines3 zip."""
+
+
+def evaluate_checkpoint(config: EvalConfig) -> int:
+    """The program, with its arguments read."""
+    from bam_train.environments import make_rows, require_fit
+    from bam_train.evaluation import default_rows, evaluate, require_range
+    from bam_train.video import require_video_path
+
+    require_range(config.episodes, config.seed, config.num_envs, video_episodes=config.video_episodes)
+    video = None if config.video is None else require_video_path(config.video)
+    subject = _subject(config)
+    rows = make_rows(subject.env, subject.env_kwargs, config.num_envs or default_rows(subject.env, config.episodes))
+    try:
+        if subject.checkpoint is not None:
+            require_fit(subject.checkpoint, rows)
+        report = evaluate(
+            subject.policy, subject.env, episodes=config.episodes, seed=config.seed, env=rows, on_progress=_progress
+        )
+    finally:
+        rows.close()
+    _show(report, subject.facts, as_json=config.json)
+    if video is not None:
+        _film(config, subject, video)
+    return 0
+
+
+def _subject(config: EvalConfig) -> Subject:
+    from bam_train.trainers.sb3.foreign import is_plain_sb3
+
+    path = config.checkpoint.expanduser()
+    return _foreign(config, path) if is_plain_sb3(path) else _own(config, path)
+
+
+def _own(config: EvalConfig, path: Path) -> Subject:
+    """One of our checkpoints: nothing is unpickled, and torch is not imported."""
+    from bam_envs.registry import resolve_id
+    from bam_train.checkpoint import Checkpoint
+    from bam_train.errors import CheckpointMismatch
+    from bam_train.policy import FrozenPolicy
+
+    checkpoint = Checkpoint.open(path)
+    manifest = checkpoint.manifest
+    if config.env is not None:
+        checkpoint.requires_env(resolve_id(config.env))
+    if config.algo not in (None, manifest.algorithm):
+        raise CheckpointMismatch(path, f"was trained by {manifest.algorithm}, not by {config.algo}")
+    facts = {"checkpoint": str(path), "algorithm": manifest.algorithm, "steps": manifest.steps}
+    return Subject(FrozenPolicy.from_checkpoint(checkpoint), manifest.env, dict(manifest.env_kwargs), facts, checkpoint)
+
+
+def _foreign(config: EvalConfig, path: Path) -> Subject:
+    """A plain stable-baselines3 zip, if the user trusts its maker."""
+    from bam_envs.registry import resolve_id
+    from bam_train.errors import NotACheckpoint, SettingsError
+    from bam_train.trainers import require_algorithm
+    from bam_train.trainers.sb3.foreign import load_trusted
+
+    if not config.trust_pickle:
+        raise NotACheckpoint(
+            path,
+            "a plain stable-baselines3 file, not made by bam-train. Loading it runs whatever code is in it: "
+            "if you trust its maker, add --trust-pickle, --env and --algo",
+        )
+    if config.env is None or config.algo is None:
+        raise SettingsError(f"{path}: a plain stable-baselines3 file does not say what it is; give --env and --algo")
+    require_algorithm("sb3", config.algo)
+    env = resolve_id(config.env)
+    say(
+        f"bam-eval: warning: loading {path} runs whatever code is in it (--trust-pickle). If its run normalised "
+        f"observations, these figures are wrong: the normaliser is not in such a file."
+    )
+    model = load_trusted(path, config.algo, env)
+    facts = {"checkpoint": str(path), "algorithm": config.algo, "steps": model.steps}
+    return Subject(model.policy, env, {}, facts, None)
+
+
+def _show(report: EvaluationReport, facts: dict[str, Any], *, as_json: bool) -> None:
+    if as_json:
+        print(json_module.dumps({**report.to_json(), **facts}, allow_nan=False), flush=True)
+        return
+    print("\n".join(table(report, facts)), flush=True)
+
+
+def table(report: EvaluationReport, facts: dict[str, Any]) -> list[str]:
+    """The report for people, line by line."""
+    return [
+        f"{facts['checkpoint']} ({facts['algorithm']}, {facts['steps']:,} steps) on {report.env}",
+        f"  success   {_success(report)}",
+        f"  return    {_spread(report.return_mean, report.return_std)}, {_range(report)}",
+        f"  length    {_spread(report.length_mean, report.length_std)} steps",
+        f"  episodes  {report.episodes}, seeds {report.seed} to {report.seed + report.episodes - 1}",
+    ]
+
+
+def _success(report: EvaluationReport) -> str:
+    if report.success_rate is None or report.success_interval is None:
+        return "unknown: the environment does not report is_success"
+    low, high = report.success_interval
+    return f"{report.success_rate:.1%} ({report.successes} of {report.episodes}; 95 % interval {low:.1%} to {high:.1%})"
+
+
+def _spread(mean: float | None, deviation: float | None) -> str:
+    return "not finite" if mean is None or deviation is None else f"{mean:.2f} ± {deviation:.2f}"
+
+
+def _range(report: EvaluationReport) -> str:
+    if report.return_min is None or report.return_max is None:
+        return "range not finite"
+    return f"from {report.return_min:.2f} to {report.return_max:.2f}"
+
+
+def _film(config: EvalConfig, subject: Subject, path: Path) -> None:
+    from bam_train.environments import control_period, make_env
+    from bam_train.video import frames, write_video
+
+    env = make_env(subject.env, subject.env_kwargs, render_mode="rgb_array")
+    period = control_period(env) or 1 / 30
+    episodes = min(config.video_episodes, config.episodes)
+    try:
+        count = write_video(path, frames(env, subject.policy, episodes, config.seed), 1 / period)
+    finally:
+        env.close()  # type: ignore[no-untyped-call]
+    say(f"bam-eval: {path}: {episodes} episodes, {count} pictures")
+
+
+def _progress(done: int, episodes: int) -> None:
+    if done < episodes:
+        say(f"bam-eval: {done} of {episodes} episodes")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of the console script."""
+    run_program(
+        evaluate_checkpoint, EvalConfig, prog="bam-eval", description=EvalConfig.__doc__ or "", arguments=arguments
+    )

@@ -1,0 +1,68 @@
+"""Zips that stable-baselines3 wrote without us: loading one runs whatever is pickled in it, so it has to be asked for."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bam_envs.spaces import space_to_json
+from bam_train.environments import make_env
+from bam_train.errors import CheckpointMismatch
+from bam_train.manifest import MANIFEST
+from bam_train.policy import FrozenPolicy
+from bam_train.trainers.sb3.algorithms import ALGORITHMS
+
+# What SB3's load lets out for a file of another algorithm or another version.
+_MISFIT = (ValueError, TypeError, KeyError, AttributeError, RuntimeError, AssertionError, ImportError)
+
+
+@dataclass(frozen=True)
+class ForeignModel:
+    """A frozen policy out of a plain stable-baselines3 zip."""
+
+    policy: FrozenPolicy
+    steps: int
+    """Environment steps it was trained for."""
+
+
+def is_plain_sb3(path: Path) -> bool:
+    """Whether the file is a zip as stable-baselines3 writes it, without our manifest; opens nothing in it."""
+    if not path.is_file() or not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        names = set(archive.namelist())
+    return "data" in names and MANIFEST not in names
+
+
+def load_trusted(path: Path, algo: str, env_id: str, env_kwargs: Mapping[str, Any] | None = None) -> ForeignModel:
+    """Load with stable-baselines3, UNPICKLING what the file holds, and freeze. Only for files whose maker is trusted.
+
+    Observations that were normalised by a VecNormalize are not the business of such a zip, and are not normalised here.
+
+    Args:
+        path: The zip.
+        algo: A name of `ALGORITHMS`.
+        env_id: The environment it was trained on.
+        env_kwargs: Its keyword arguments.
+
+    Raises:
+        CheckpointMismatch: It is not of this algorithm, or not for this environment.
+    """
+    from bam_train.trainers.sb3.freeze import freeze
+
+    algorithm = ALGORITHMS[algo].load()
+    env = make_env(env_id, env_kwargs)
+    try:
+        model = algorithm.load(path, env=env, device="cpu")
+        graph = freeze(model, None, env.observation_space, env.action_space)
+    except _MISFIT as error:
+        reason = " ".join(str(error).split())[:200]
+        raise CheckpointMismatch(
+            path, f"{algorithm.__name__}.load cannot use it with {env_id}: {reason}. Check --algo and --env"
+        ) from error
+    policy = FrozenPolicy.from_graph(graph, space_to_json(env.observation_space), space_to_json(env.action_space))
+    env.close()  # type: ignore[no-untyped-call]
+    return ForeignModel(policy, int(model.num_timesteps))

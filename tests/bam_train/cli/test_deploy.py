@@ -1,0 +1,219 @@
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import gymnasium as gym
+import pytest
+
+from bam_train.cli.deploy import main
+
+
+def corridor_class(corridor):
+    return gym.spec(corridor).entry_point
+
+
+def test_report_for_programs(corridor_checkpoint, starting_cell, run):
+    path = corridor_checkpoint()
+    status, out, err = run(main, path, "--fast", "--json", "--episodes", 3, "--seed", 7)
+    report = json.loads(out)
+    lengths = [4 - starting_cell(seed) for seed in (7, 8, 9)]
+    assert status == 0
+    assert out.count("\n") == 1
+    assert report.pop("startup_cpu_s")["total"] > 0
+    assert report.pop("rate_hz") > 0
+    assert report == {
+        "stop_reason": "episodes done",
+        "episodes": 3,
+        "successes": 3,
+        "ticks": sum(lengths),
+        "target_rate_hz": None,
+        "lateness_ms": None,
+        "missed_ticks": 0,
+        "seed": 7,
+        "env": "test/Corridor-v0",
+        "algorithm": "ppo",
+        "checkpoint": str(path),
+        "per_episode": [
+            {"seed": seed, "length": length, "return": 1 - 0.25 * length, "success": True, "end": "terminated"}
+            for seed, length in zip((7, 8, 9), lengths, strict=True)
+        ],
+    }
+    assert err.splitlines() == [
+        f"episode {k}/3 (seed {6 + k}): success after {n} step{'s' * (n > 1)}, return {1 - 0.25 * n:.2f}"
+        for k, n in enumerate(lengths, 1)
+    ]
+
+
+def test_report_for_people(corridor_checkpoint, run):
+    status, out, _ = run(main, corridor_checkpoint(), "--fast", "--episodes", 8, "--seed", 3)
+    assert status == 0
+    first, second = out.splitlines()
+    assert first.startswith("episodes done: 8 of 8 episodes, 8 successes, ")
+    assert first.endswith(" Hz, no waiting")
+    assert second.startswith("first action after ")
+    assert "python and arguments" in second
+
+
+def test_deadlines_are_reported(corridor_checkpoint, run):
+    status, out, err = run(main, corridor_checkpoint(), "--rate", 2000, "--json", "--episodes", 2)
+    report = json.loads(out)
+    assert status == 0
+    assert report["target_rate_hz"] == 2000
+    assert sorted(report["lateness_ms"]) == ["max", "p50", "p99"]
+    assert err.startswith("bam-deploy: warning: 2000 Hz is asked for, and the policy was made for 20 Hz\n")
+
+
+def test_the_environment_gives_the_rate(corridor_checkpoint, corridor):
+    from bam_train.checkpoint import Checkpoint
+    from bam_train.cli.deploy import DeployConfig, period_of
+
+    path = corridor_checkpoint()
+    with gym.make(corridor) as env:
+        assert period_of(DeployConfig(path), Checkpoint.open(path), env) == 0.05
+        assert period_of(DeployConfig(path, rate=50.0), Checkpoint.open(path), env) == 0.02
+        assert period_of(DeployConfig(path, fast=True), Checkpoint.open(path), env) is None
+
+
+def test_a_rate_is_needed(corridor_checkpoint, corridor, run, monkeypatch):
+    monkeypatch.setattr(corridor_class(corridor), "metadata", {"render_modes": []})
+    status, out, err = run(main, corridor_checkpoint())
+    assert (status, out) == (1, "")
+    assert err == "bam-deploy: test/Corridor-v0 does not say its rate; give --rate HZ, or --fast not to wait\n"
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_still_gives_the_report(corridor_checkpoint, corridor, run, monkeypatch, number, status):
+    def step(self, action):
+        os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(corridor_class(corridor), "step", step)
+    found, out, err = run(main, corridor_checkpoint(), "--fast", "--json")
+    report = json.loads(out)
+    assert found == status
+    assert err == "bam-deploy: interrupted\n"
+    assert (report["stop_reason"], report["episodes"]) == ("interrupted", 0)
+    assert [record["end"] for record in report["per_episode"]] == ["stopped"]
+
+
+def test_a_fault_still_gives_the_report(corridor_checkpoint, corridor, run, monkeypatch):
+    def step(self, action):
+        raise OSError("cable pulled")
+
+    monkeypatch.setattr(corridor_class(corridor), "step", step)
+    status, out, err = run(main, corridor_checkpoint(), "--fast", "--json")
+    assert status == 1
+    assert err == "bam-deploy: fault: OSError: cable pulled\n"
+    assert json.loads(out)["stop_reason"] == "fault: OSError: cable pulled"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--episodes", "-1"], "episodes: expected at least 1, found -1"),
+        (["--seed", "-1"], "seed: expected at least 0, found -1"),
+        (["--rate", "0"], "rate: expected more than 0 Hz, found 0"),
+        (["--rate", "nan"], "rate: expected more than 0 Hz, found nan"),
+        (
+            ["--rate", "5", "--fast"],
+            "--fast does not wait for deadlines, so --rate has no meaning with it; give one of the two",
+        ),
+    ],
+)
+def test_out_of_range(run, arguments, message):
+    assert run(main, "nowhere.zip", *arguments) == (1, "", f"bam-deploy: {message}\n")
+
+
+def test_no_screen(run, monkeypatch):
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert run(main, "nowhere.zip", "--render") == (
+        1,
+        "",
+        "bam-deploy: --render needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set; "
+        "leave it out, or make a film: bam-eval CHECKPOINT --video film.gif\n",
+    )
+
+
+def test_no_such_file(run, tmp_path):
+    status, out, err = run(main, tmp_path / "no.zip")
+    assert (status, out) == (1, "")
+    assert err == f"bam-deploy: {tmp_path}/no.zip: no such file. Train one with bam-train, or check the name\n"
+
+
+def test_a_truncated_checkpoint(corridor_checkpoint, run):
+    path = corridor_checkpoint()
+    path.write_bytes(path.read_bytes()[:-40])
+    status, out, err = run(main, path)
+    assert (status, out) == (1, "")
+    assert err.startswith(f"bam-deploy: {path}: not a whole zip file (File is not a zip file)")
+    assert err.count("\n") == 1
+
+
+def test_nothing_moves_when_the_spaces_differ(corridor_checkpoint, corridor, run, monkeypatch):
+    space = {"type": "Box", "shape": [1], "dtype": "float32", "low": 0.0, "high": 9.0}
+    monkeypatch.delattr(corridor_class(corridor), "step")
+    path = corridor_checkpoint(observation_space=space)
+    assert run(main, path, "--fast") == (
+        1,
+        "",
+        f"bam-deploy: {path}: observation_space.high is 9.0 in the checkpoint and 4.0 in test/Corridor-v0 as installed; "
+        "train it anew, or install the version it was trained with\n",
+    )
+
+
+def test_an_environment_that_is_not_here(corridor_checkpoint, run):
+    path = corridor_checkpoint(env="bam/stack-v9")
+    status, out, err = run(main, path, "--fast")
+    assert (status, out, err.count("\n")) == (1, "", 1)
+    assert err.startswith("bam-deploy: bam/stack-v9 cannot be made: Environment `stack` doesn't exist in namespace bam")
+
+
+def test_unknown_option_names_the_closest(run):
+    status, _, err = run(main, "x.zip", "--episode", "3")
+    assert status == 2
+    assert "--episodes" in err
+
+
+def test_a_closed_pipe_is_quiet(cartpole_checkpoint):
+    code = "from bam_train.cli.deploy import main; main()"
+    command = [sys.executable, "-c", code, str(cartpole_checkpoint), "--fast", "--episodes", "1"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as program:
+        program.stdout.close()
+        err = program.stderr.read()
+    assert program.returncode == 1
+    assert err.splitlines() == [err.splitlines()[0]]
+    assert err.startswith("episode 1/1 (seed 1000000): terminated after ")
+
+
+def test_no_torch_and_no_simulator_of_ours(cartpole_checkpoint):
+    code = """
+import sys
+from bam_train.cli.deploy import main
+try:
+    main()
+except SystemExit as done:
+    heavy = {"torch", "stable_baselines3", "mujoco", "onnxruntime", "rich", "roslibpy", "onnx", "PIL"}
+    print(done.code, sorted(heavy & set(sys.modules)))
+"""
+    command = [sys.executable, "-c", code, str(cartpole_checkpoint), "--fast", "--episodes", "1"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "0 []"
+
+
+def test_live_display_on_a_terminal(corridor_checkpoint, run, monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    status, out, _ = run(main, corridor_checkpoint(), "--fast", "--json", "--episodes", 2)
+    assert status == 0
+    assert json.loads(out)["episodes"] == 2
+    assert "episode 2/2 (seed 1000001): success after 2 steps, return 0.50" in terminal.getvalue()
+    assert "1 of 2" in terminal.getvalue()

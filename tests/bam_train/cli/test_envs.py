@@ -1,0 +1,67 @@
+import json
+import subprocess
+import sys
+
+from bam_train.cli.envs import main
+
+
+def test_table(run):
+    status, out, err = run(main)
+    lines = out.splitlines()
+    assert (status, err) == (0, "")
+    assert lines[0].split() == ["id", "observation", "action", "steps", "Hz", "what", "to", "do"]
+    assert [line.split()[0] for line in lines[1:4]] == ["bam/reach-v0", "bam/pick-v0", "bam/pick-place-v0"]
+    assert lines[2].endswith("pick up a cube that lies anywhere in 30 x 40 cm with any yaw")
+    assert lines[-1] == "Details: bam-envs ID. Training: bam-train --env ID --algo ppo; any Gymnasium id will do."
+
+
+def test_json(run):
+    rows = json.loads(run(main, "--json")[1])
+    assert [row["id"] for row in rows] == ["bam/reach-v0", "bam/pick-v0", "bam/pick-place-v0"]
+    assert rows[1]["episode_steps"] == 100
+    assert rows[1]["rate_hz"] == 20
+    assert rows[1]["action"] == "float32 (5,)"
+
+
+def test_the_list_imports_no_simulator():
+    code = """
+import sys
+from bam_train.cli.envs import main
+try:
+    main([])
+except SystemExit as done:
+    print(done.code, sorted({"torch", "mujoco", "onnxruntime", "rich", "roslibpy"} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "0 []"
+
+
+def test_details_of_ours(run):
+    status, out, _ = run(main, "bam/pick")
+    lines = out.splitlines()
+    assert status == 0
+    assert lines[:2] == [
+        "bam/pick-v0: pick up a cube that lies anywhere in 30 x 40 cm with any yaw",
+        "100 steps an episode, 20 Hz",
+    ]
+    assert {"observation", "action", "state", "command"} <= set(lines)
+    actions = lines[lines.index("action") + 1 :][:6]
+    assert actions[0].split() == ["name", "low", "high", "scale", "unit", "meaning"]
+    assert [line.split()[0] for line in actions[1:]] == ["dx", "dy", "dz", "dyaw", "grip"]
+
+
+def test_details_as_json(run):
+    facts = json.loads(run(main, "bam/pick", "--json")[1])
+    assert facts["id"] == "bam/pick-v0"
+    assert facts["action_space"]["shape"] == [5]
+    assert len(facts["signals"]["observation"]) == facts["observation_space"]["shape"][0]
+
+
+def test_details_of_any_gymnasium_id(run):
+    _, out, _ = run(main, "CartPole")
+    assert out.splitlines()[:2] == ["CartPole-v1", "500 steps an episode, 50 Hz"]
+    assert out.splitlines()[3] == 'action: {"type": "Discrete", "n": 2, "start": 0, "dtype": "int64"}'
+
+
+def test_unknown(run):
+    assert run(main, "bam/pik") == (1, "", "bam-envs: Unknown environment 'bam/pik'. Did you mean 'bam/pick-v0'?\n")

@@ -1,0 +1,156 @@
+import json
+import subprocess
+import sys
+
+import pytest
+from PIL import Image
+
+from bam_train.cli.eval import main
+
+
+def test_one_json_object(corridor_checkpoint, starting_cell, run):
+    path = corridor_checkpoint()
+    status, out, err = run(main, path, "--json", "--episodes", 4, "--seed", 7)
+    lengths = [4 - starting_cell(seed) for seed in range(7, 11)]
+    mean = sum(lengths) / 4
+    deviation = (sum((length - mean) ** 2 for length in lengths) / 4) ** 0.5
+    report = json.loads(out)
+    assert (status, err, out.count("\n")) == (0, "", 1)
+    assert report.pop("success_interval") == pytest.approx([0.510109, 1.0], abs=1e-6)
+    assert report.pop("length_std") == pytest.approx(deviation)
+    assert report.pop("return_std") == pytest.approx(deviation / 4)
+    assert report == {
+        "env": "test/Corridor-v0",
+        "episodes": 4,
+        "seed": 7,
+        "successes": 4,
+        "success_rate": 1.0,
+        "return_mean": 1 - mean / 4,
+        "return_min": 1 - max(lengths) / 4,
+        "return_max": 1 - min(lengths) / 4,
+        "length_mean": mean,
+        "checkpoint": str(path),
+        "algorithm": "ppo",
+        "steps": 2048,
+    }
+
+
+def test_the_same_seeds_give_the_same_numbers(corridor_checkpoint, run):
+    path = corridor_checkpoint()
+    first = run(main, path, "--json", "--episodes", 30)
+    assert first == run(main, path, "--json", "--episodes", 30)
+    assert json.loads(first[1]) == json.loads(run(main, path, "--json", "--episodes", 30, "--num-envs", 4)[1])
+
+
+def test_table(corridor_checkpoint, run):
+    path = corridor_checkpoint()
+    status, out, err = run(main, path, "--episodes", 20)
+    assert (status, err) == (0, "bam-eval: 10 of 20 episodes\n")
+    lines = out.splitlines()
+    assert lines[0] == f"{path} (ppo, 2,048 steps) on test/Corridor-v0"
+    assert lines[1] == "  success   100.0% (20 of 20; 95 % interval 83.9% to 100.0%)"
+    assert lines[2].endswith(", from 0.25 to 0.75")
+    assert lines[4] == "  episodes  20, seeds 1000000 to 1000019"
+
+
+def test_table_without_success(corridor_checkpoint, run):
+    _, out, _ = run(main, corridor_checkpoint(env_kwargs={"says_success": False}), "--episodes", 2)
+    assert out.splitlines()[1] == "  success   unknown: the environment does not report is_success"
+
+
+def test_environment_arguments_come_from_the_checkpoint(corridor_checkpoint, run):
+    _, out, _ = run(main, corridor_checkpoint(env_kwargs={"slow": True}), "--episodes", 2, "--json")
+    assert json.loads(out)["length_mean"] == 10
+
+
+def test_film(corridor_checkpoint, starting_cell, run, tmp_path):
+    film = tmp_path / "film.gif"
+    arguments = ("--episodes", 4, "--seed", 7, "--video", film, "--video-episodes", 2, "--json")
+    status, out, err = run(main, corridor_checkpoint(), *arguments)
+    pictures = sum(5 - starting_cell(seed) for seed in (7, 8))
+    assert status == 0
+    assert json.loads(out)["episodes"] == 4
+    assert err == f"bam-eval: {film}: 2 episodes, {pictures} pictures\n"
+    with Image.open(film) as image:
+        assert image.n_frames == pictures
+        assert image.info["duration"] == 50
+
+
+def test_its_environment_and_algorithm_may_be_asked_for(corridor_checkpoint, run):
+    status, _, _ = run(main, corridor_checkpoint(), "--env", "test/Corridor", "--algo", "ppo", "--episodes", 1)
+    assert status == 0
+
+
+def refused(run, *arguments):
+    status, out, err = run(main, *arguments)
+    assert (status, out, err.count("\n")) == (1, "", 1)
+    assert err.startswith("bam-eval: ")
+    return err.removeprefix("bam-eval: ").rstrip("\n")
+
+
+def test_another_environment(corridor_checkpoint, run):
+    path = corridor_checkpoint()
+    assert refused(run, path, "--env", "CartPole-v1") == (
+        f"{path}: was trained on test/Corridor-v0, not on CartPole-v1. "
+        "Use --env test/Corridor-v0, or train one for CartPole-v1"
+    )
+
+
+def test_an_unknown_environment(corridor_checkpoint, run):
+    assert refused(run, corridor_checkpoint(), "--env", "bam/pik") == (
+        "Unknown environment 'bam/pik'. Did you mean 'bam/pick-v0'?"
+    )
+
+
+def test_another_algorithm(corridor_checkpoint, run):
+    path = corridor_checkpoint()
+    assert refused(run, path, "--algo", "sac") == f"{path}: was trained by ppo, not by sac"
+
+
+def test_other_spaces(corridor_checkpoint, run):
+    path = corridor_checkpoint(action_space={"type": "Discrete", "n": 3, "start": 0, "dtype": "int64"})
+    assert refused(run, path) == (
+        f"{path}: action_space.n is 3 in the checkpoint and 2 in test/Corridor-v0 as installed; "
+        "train it anew, or install the version it was trained with"
+    )
+
+
+def test_bad_numbers_and_files_are_refused_before_anything_is_loaded(run, tmp_path):
+    assert refused(run, "no.zip", "--episodes", -3) == "episodes: expected at least 1, found -3"
+    assert refused(run, "no.zip", "--seed", -1) == "seed: expected at least 0, found -1"
+    assert refused(run, "no.zip", "--num-envs", 0) == "num_envs: expected at least 1, found 0"
+    assert refused(run, "no.zip", "--video-episodes", 0, "--video", tmp_path / "a.gif") == (
+        "video_episodes: expected at least 1, found 0"
+    )
+    film = tmp_path / "films" / "a.gif"
+    assert refused(run, "no.zip", "--video", film) == f"{film}: there is no folder {tmp_path}/films; make it first"
+    assert refused(run, tmp_path / "no.zip") == (
+        f"{tmp_path}/no.zip: no such file. Train one with bam-train, or check the name"
+    )
+
+
+def test_a_truncated_checkpoint(corridor_checkpoint, run):
+    path = corridor_checkpoint()
+    path.write_bytes(path.read_bytes()[:-40])
+    assert refused(run, path).startswith(f"{path}: not a whole zip file")
+
+
+def test_an_unknown_option_names_the_closest(run):
+    status, _, err = run(main, "x.zip", "--episode", "3")
+    assert status == 2
+    assert "--episodes" in err
+
+
+def test_no_torch(cartpole_checkpoint):
+    code = """
+import sys
+from bam_train.cli.eval import main
+try:
+    main()
+except SystemExit as done:
+    heavy = {"torch", "stable_baselines3", "mujoco", "onnxruntime", "rich", "onnx", "PIL"}
+    print(done.code, sorted(heavy & set(sys.modules)))
+"""
+    command = [sys.executable, "-c", code, str(cartpole_checkpoint), "--episodes", "2"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "0 []"
