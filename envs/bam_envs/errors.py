@@ -31,13 +31,20 @@ class UnknownName(BamEnvsError, ValueError):  # noqa: N818 - reads as what happe
         name: The name that was given.
         choices: Every name the table has, sorted.
         closest: The most similar choice, or None.
+
+    Args:
+        kind: See above.
+        name: See above.
+        choices: See above.
+        examples: What to suggest when nothing is similar; every choice by default.
     """
 
-    def __init__(self, kind: str, name: str, choices: Iterable[str]) -> None:
+    def __init__(self, kind: str, name: str, choices: Iterable[str], examples: Iterable[str] | None = None) -> None:
         self.kind, self.name, self.choices = kind, name, sorted(choices)
         matches = difflib.get_close_matches(name, self.choices, n=1, cutoff=0.5)
         self.closest = matches[0] if matches else None
-        hint = f"Did you mean {self.closest!r}?" if self.closest else f"Choose from: {', '.join(self.choices)}."
+        some = ", ".join(self.choices if examples is None else examples)
+        hint = f"Did you mean {self.closest!r}?" if self.closest else f"Choose from: {some}."
         super().__init__(f"Unknown {kind} {name!r}. {hint}")
 
 

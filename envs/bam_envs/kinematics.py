@@ -1,8 +1,8 @@
 """Closed-form forward and inverse kinematics of Universal Robots arms, batched over rows.
 
-Six joints with the Denavit-Hartenberg structure alpha = (90, 0, 0, 90, -90, 0) degrees: joints 2, 3 and 4 have parallel axes, so a tool
-that points straight down has an exact inverse. Positions are in the ROS ``base_link`` frame (x forward, z up; the DH frame turned by 180
-degrees about z), in metres; angles in radians.
+Six joints with the Denavit-Hartenberg structure alpha = (90, 0, 0, 90, -90, 0) degrees: joints 2, 3 and 4 have
+parallel axes, so a tool that points straight down has an exact inverse. Positions are in the ROS ``base_link`` frame
+(x forward, z up; the DH frame turned by 180 degrees about z), in metres; angles in radians.
 
 Source of the constants: Universal Robots, "DH parameters for calculations of kinematics and dynamics", article 45257.
 """
@@ -76,8 +76,8 @@ class ArmGeometry:
     def reach_down(self, position: Array, yaw: Array) -> Array:
         """Joint positions that put the tool at `position`, pointing straight down, its x axis at `yaw` from world x.
 
-        The elbow is up, the wrist is not flipped. A position out of reach gets the stretched arm in its direction, so the result is
-        always finite.
+        The elbow is up, the wrist is not flipped. A position out of reach gets the stretched arm in its direction, so
+        the result is always finite.
 
         Args:
             position: Tool position [m]. Shape: (n, 3).
@@ -115,8 +115,9 @@ UR5E = ArmGeometry(d1=0.1625, a2=-0.425, a3=-0.3922, d4=0.1333, d5=0.0997, d6=0.
 def cube_yaw_phase(quaternion: Array) -> NDArray[np.complex128]:
     """exp(4 i yaw) of a cube, whichever of its faces is up.
 
-    The sum over the body axes of ((x + i y) of the axis) ** 4, halved: the vertical axis adds nothing and the two horizontal ones, 90
-    degrees apart, add the same number. Shape: (n, 4) as w, x, y, z -> (n,) complex, of length 1 when a face is level.
+    The sum over the body axes of ((x + i y) of the axis) ** 4, halved: the vertical axis adds nothing and the two
+    horizontal ones, 90 degrees apart, add the same number. Shape: (n, 4) as w, x, y, z -> (n,) complex, of length 1
+    when a face is level.
     """
     w, x, y, z = quaternion.T
     plane: Any = np.empty((len(w), 3), dtype=np.complex128)

@@ -1,6 +1,7 @@
 """The one table of environments: it registers them with Gymnasium, and other learners read the same rows.
 
-Importing this imports neither a simulator nor a task; a row's task and robot are strings, resolved when the environment is made.
+Importing this imports neither a simulator nor a task; a row's task and robot are strings, resolved when the
+environment is made.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
-from bam_envs.errors import UnknownName
+from bam_envs.errors import InvalidValue, UnknownName
 
 if TYPE_CHECKING:
     from bam_envs.robot_env import RobotEnv, RobotVectorEnv
@@ -79,15 +80,26 @@ def resolve_id(name: str) -> str:
 
     Raises:
         UnknownName: Nothing of that name is registered; it carries the closest match.
+        InvalidValue: The module of ``module:Env-v0`` is not installed.
     """
     module, _, bare = name.rpartition(":")
     if module:
-        importlib.import_module(module)
-    versions = [spec for spec in gym.registry.values() if bare in (spec.id, spec.id.rpartition("-v")[0])]
+        _import_for(module, name)
+    versions = [spec for spec in gym.registry.values() if bare and bare in (spec.id, spec.id.rpartition("-v")[0])]
     if not versions:
-        raise UnknownName("environment", name, gym.registry)
+        raise UnknownName("environment", name, gym.registry, examples=ENVIRONMENTS)
     newest = max(versions, key=lambda spec: spec.version or 0).id
     return f"{module}:{newest}" if module else newest
+
+
+def _import_for(module: str, name: str) -> None:
+    """Import `module`, which is to register the environment `name`."""
+    try:
+        importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise  # the module is there, and one that it imports is not
+        raise InvalidValue(f"Environment {name!r} needs the module {module!r}, which is not installed.") from error
 
 
 def resolve(reference: str) -> Any:
@@ -115,7 +127,7 @@ def make_vector_env(
     randomize: bool = False,
     **task_options: Any,
 ) -> RobotVectorEnv:
-    """n simulated robots and their task; what `gymnasium.make_vec` calls."""
+    """Simulated robots and their task, stepped together; what `gymnasium.make_vec` calls."""
     from bam_envs.robot_env import RobotVectorEnv
 
     entry = ENVIRONMENTS[env_id]

@@ -1,8 +1,10 @@
-"""One Robot and one Task, joined as a Gymnasium environment: `RobotEnv` for one, `RobotVectorEnv` for n stepped together."""
+"""A Robot and a Task joined as a Gymnasium environment: `RobotEnv` for one, `RobotVectorEnv` for n stepped together."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import gymnasium as gym
@@ -30,20 +32,14 @@ def start_rows(robot: Robot, task: Task, rows: Rows, rngs: Sequence[np.random.Ge
 def describe(robot: Robot, task: Task) -> dict[str, list[dict[str, Any]]]:
     """What every number of observation, action, state and command means: name, unit, limits; plain values."""
     labels = {"observation": task.observation_labels, "action": task.action_labels}
-    rows = {
-        kind: [
-            {"name": one.name, "unit": one.unit, "low": one.low, "high": one.high, "scale": one.scale, "meaning": one.meaning}
-            for one in group
-        ]
-        for kind, group in labels.items()
-    }
+    rows = {kind: [asdict(label) for label in group] for kind, group in labels.items()}
     return {**rows, **robot.spec.describe()}
 
 
 def render(robot: Robot, task: Task, mode: str | None) -> NDArray[np.uint8] | None:
     """Picture of row 0, by robots that have one."""
     if mode is None:
-        gym.logger.warn('render() without a render_mode shows nothing. Make the environment with render_mode="rgb_array".')
+        gym.logger.warn('render() without a render_mode shows nothing. Make it with render_mode="rgb_array".')
         return None
     draw = getattr(robot, "render", None)
     if draw is None:
@@ -139,8 +135,9 @@ def plain_info(score: Score) -> dict[str, Any]:
 class RobotVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
     """n simulated robots stepped together; row i equals a `RobotEnv` with the same seed, bit for bit.
 
-    A row whose episode ends starts the next one in the same step (`AutoresetMode.SAME_STEP`): its last observation and info are in
-    ``infos["final_obs"]`` and ``infos["final_info"]``.
+    A row whose episode ends starts the next one in the same step (`AutoresetMode.SAME_STEP`): its last observation
+    and info are in ``infos["final_obs"]`` and ``infos["final_info"]``; the other infos of that row are the new
+    episode's.
 
     Args:
         robot: A robot with n rows.
@@ -244,7 +241,9 @@ class RobotVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.float3
     ) -> NDArray[np.float32]:
         """Move the last observation and info of ended rows aside and begin their next episodes."""
         values = {key: value for key, value in infos.items() if not key.startswith("_")}
-        infos["final_info"] = {**{key: value for key, value in values.items()}, **{"_" + key: ended for key in values}}
+        infos |= {"_" + key: ~ended for key in values}  # what `reset` says nothing of
+        infos |= {"is_success": values["is_success"] & ~ended, "_is_success": self._all.copy()}
+        infos["final_info"] = {**values, **{"_" + key: ended for key in values}}
         infos["final_obs"], infos["_final_obs"], infos["_final_info"] = observation, ended, ended
         self._begin(np.flatnonzero(ended))
         return self._observe()
@@ -271,7 +270,7 @@ class RobotVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.float3
         robot: Any = self.robot
         return {
             "robot": robot.state_dict(),
-            "task": self.task.state_dict(),
+            "task": copy.deepcopy(self.task.state_dict()),
             "elapsed": self.elapsed.copy(),
             "rngs": [rng.bit_generator.state for rng in self._rngs],
         }

@@ -9,6 +9,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from bam_envs.errors import InvalidValue
+
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
@@ -71,13 +73,30 @@ class RobotState:
 class Initial:
     """Where an episode starts, for k rows.
 
-    A simulated robot is set to it; a live one goes to ``signals["joint_position"]`` slowly, and its object is where it is.
+    A simulated robot is set to it; a live one goes to ``signals["joint_position"]`` slowly, and its object is
+    where it is.
     """
 
     signals: Mapping[str, Array]
     """Start values of signals. Shape: (k, ...)."""
     seeds: NDArray[np.int64]
     """Seeds for what the robot itself draws (noise, masses), one a row. Shape: (k,)."""
+
+
+def checked_command(command: Array, shape: tuple[int, int]) -> Array:
+    """A copy of `command`, which must have `shape` and be finite; what every robot asks of a command first.
+
+    Raises:
+        InvalidValue: It has another shape, or is not finite.
+    """
+    array = np.array(command, dtype=np.float64)
+    if array.shape != shape:
+        raise InvalidValue(f"The command must have shape {shape}, not {array.shape}.")
+    finite = np.isfinite(array)
+    if not finite.all():
+        rows = np.flatnonzero(~finite.all(axis=1)).tolist()
+        raise InvalidValue(f"The command must be finite numbers; those of rows {rows} are not.")
+    return array
 
 
 @runtime_checkable

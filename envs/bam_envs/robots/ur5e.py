@@ -1,7 +1,7 @@
 """The UR5e with a parallel gripper, simulated or live: its signals, limits and lengths.
 
-Sources: UR5e data sheet and user manual, Universal Robots (+-360 degrees and 180 degrees/s on all joints; the elbow cannot fold by more
-than 180 degrees); Robotiq 2F-85 instruction manual (85 mm stroke, 20 to 150 mm/s).
+Sources: UR5e data sheet and user manual, Universal Robots (+-360 degrees and 180 degrees/s on all joints; the elbow
+cannot fold by more than 180 degrees); Robotiq 2F-85 instruction manual (85 mm stroke, 20 to 150 mm/s).
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.errors import InvalidValue, PhysicsDiverged, ResetNeeded
-from bam_envs.robots.robot import Initial, RobotState, Rows
+from bam_envs.errors import PhysicsDiverged, ResetNeeded
+from bam_envs.robots.robot import Initial, RobotState, Rows, checked_command
 from bam_envs.robots.ur5e import GRIPPER_OPEN, GRIPPER_SPEED, arm_spec
 
 if TYPE_CHECKING:
@@ -21,11 +21,12 @@ Array = NDArray[np.float64]
 PHYSICS_STEPS = 10
 """Physics steps a control period."""
 
+
 class SimulatedArm:
     """n simulated UR5e arms, each on a table of its own.
 
-    The joint set points move linearly from the last command to the new one within a period, as a UR controller interpolates; the gripper's
-    set point moves at `GRIPPER_SPEED`.
+    The joint set points move linearly from the last command to the new one within a period, as a UR controller
+    interpolates; the gripper's set point moves at `GRIPPER_SPEED`.
 
     Args:
         num_robots: How many are stepped together.
@@ -72,6 +73,7 @@ class SimulatedArm:
         physics.qpos[rows, :6] = signals["joint_position"]
         physics.qpos[rows, 6:8] = GRIPPER_OPEN / 2
         self._setpoint[rows, :6], self._setpoint[rows, 6] = signals["joint_position"], GRIPPER_OPEN
+        self._command = self._command.copy()  # so does the command
         self._command[rows] = self._setpoint[rows]
         if self._imperfection is not None:
             for row, seed in zip(rows, initial.seeds, strict=True):
@@ -91,10 +93,8 @@ class SimulatedArm:
 
     def step(self, command: Array) -> RobotState:
         """Send `command` (n, 7): six joint positions [rad] and the gripper's width [m]; one period later, measure."""
-        if command.shape != self._command.shape:
-            raise InvalidValue(f"The command must have shape {self._command.shape}, not {command.shape}.")
         physics = self.physics
-        self._command = np.array(command)
+        self._command = checked_command(command, (self.num_robots, 7))
         arriving = self._command if self._imperfection is None else self._imperfection.delayed(self._command)
         travel = arriving - self._setpoint
         limit = GRIPPER_SPEED * self.spec.period
@@ -124,10 +124,15 @@ class SimulatedArm:
         return RobotState(signals, physics.time, self._command)
 
     def halt(self) -> None:
-        """Hold the measured joint positions."""
-        if self._physics is not None:
-            self._setpoint[:, :6] = self._physics.qpos[:, :6]
-            self._command = self._setpoint.copy()
+        """Hold the measured joint positions; commands that are on their way do not arrive."""
+        physics, imperfection = self._physics, self._imperfection  # `close` may come from another thread
+        if physics is None:
+            return
+        setpoint = self._setpoint.copy()
+        setpoint[:, :6] = physics.qpos[:, :6]
+        self._setpoint, self._command = setpoint, setpoint.copy()
+        if imperfection is not None:
+            imperfection.forget(setpoint)
 
     def close(self) -> None:
         """Halt, drop the physics and the window."""
@@ -138,7 +143,9 @@ class SimulatedArm:
             self._physics.close()
         self._renderer = self._physics = self._imperfection = None
 
-    def render(self, mode: str, marks: list[tuple[Array, tuple[float, float, float, float]]]) -> NDArray[np.uint8] | None:
+    def render(
+        self, mode: str, marks: list[tuple[Array, tuple[float, float, float, float]]]
+    ) -> NDArray[np.uint8] | None:
         """Show row 0: an image (480, 640, 3) for ``rgb_array``, a window for ``human``.
 
         Args:
@@ -153,9 +160,10 @@ class SimulatedArm:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the future of the simulated robots depends on."""
-        state = {"physics": self.physics.state.copy(), "setpoint": self._setpoint.copy(), "command": self._command.copy()}
+        state: dict[str, Any] = {"physics": self.physics.state.copy()}
+        state |= {"setpoint": self._setpoint.copy(), "command": self._command.copy()}
         if self._imperfection is not None:
-            state["imperfection"] = self._imperfection.state_dict()  # type: ignore[assignment]
+            state["imperfection"] = self._imperfection.state_dict()
         return state
 
     def load_state_dict(self, state: dict[str, Any]) -> RobotState:

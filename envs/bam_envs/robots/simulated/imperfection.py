@@ -1,7 +1,8 @@
 """What differs between a simulated robot and a real one, drawn anew for each episode: domain randomisation.
 
-Everything a row draws follows from one seed, so an episode can be repeated exactly. The noise of a whole episode is drawn at its start
-(a tape of `TAPE` steps, read in a circle), which costs one call of the generator an episode instead of one a row and step.
+Everything a row draws follows from one seed, so an episode can be repeated exactly. The noise of a whole episode is
+drawn at its start (a tape of `TAPE` steps, read in a circle), which costs one call of the generator an episode
+instead of one a row and step.
 """
 
 from __future__ import annotations
@@ -100,6 +101,10 @@ class Imperfection:
         self._sent[:, 0] = command
         arrived: Array = self._sent[np.arange(len(command)), self.delay]
         return arrived
+
+    def forget(self, command: Array) -> None:
+        """Drop the commands that are on their way; `command` (n, m) is what the robots hold."""
+        self._sent = np.repeat(command[:, None], self._sent.shape[1], axis=1)
 
     def look(self, rows: Rows, pose: Array) -> None:
         """Let the tracker see the objects of `rows` at `pose` (k, 7): position [m] and quaternion, w first."""

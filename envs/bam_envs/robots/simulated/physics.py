@@ -1,7 +1,8 @@
 """Batched MuJoCo physics: n rows of one model, or of n varied copies of it, stepped on all cores.
 
-The whole physical state is one array of shape (n, nstate): it can be set, saved and restored row by row, and a row's future depends on its
-own state and controls only (`mujoco.rollout` starts the solver from zero at each call). So row i of many equals one alone, bit for bit.
+The whole physical state is one array of shape (n, nstate): it can be set, saved and restored row by row, and a row's
+future depends on its own state and controls only (`mujoco.rollout` starts the solver from zero at each call). So row
+i of many equals one alone, bit for bit.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ MODELS = Path(__file__).parent / "models"
 
 
 class Physics:
-    """n rows of one MJCF model.
+    """Rows of one MJCF model.
 
     Args:
         scene: File name of a model in ``models/``.
@@ -95,7 +96,16 @@ class Physics:
             skip_checks=True,
             chunk_size=self._chunk,
         )
-        self.state = states[:, -1].copy()
+        after = states[:, -1].copy()
+        self._mark_diverged(after, self.time + control.shape[1] * self.model.opt.timestep)
+        self.state = after
+
+    @staticmethod
+    def _mark_diverged(state: Array, time: Array) -> None:
+        """Fill rows that did not get to `time` (n,) [s] with NaN: MuJoCo puts a diverged row back to its default."""
+        late = np.abs(state[:, 0] - time) > 1e-6
+        if late.any():
+            state[late] = np.nan
 
     def _output(self, steps: int) -> tuple[Array, Array]:
         if steps not in self._buffers:

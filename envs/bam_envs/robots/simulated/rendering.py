@@ -1,7 +1,8 @@
 """Pictures of a simulated robot: off screen through EGL or OSMesa, or in a window.
 
-MuJoCo picks its OpenGL backend when it is imported, from the variable ``MUJOCO_GL``, and without it takes one that needs a display. Here
-the first backend that works is found when the first picture is asked for; ``MUJOCO_GL`` still wins where it is set.
+MuJoCo picks its OpenGL backend when it is imported, from the variable ``MUJOCO_GL``, and without it takes one that
+needs a display. Here the first backend that works is found when the first picture is asked for; ``MUJOCO_GL`` still
+wins where it is set.
 """
 
 from __future__ import annotations
@@ -147,4 +148,7 @@ def works(backend: str) -> bool:
     """Try `backend` in a process of its own: PyOpenGL keeps the first platform that it was given."""
     environment = {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
     command = [sys.executable, "-c", _PROBE, backend]
-    return subprocess.run(command, env=environment, capture_output=True, timeout=60, check=False).returncode == 0
+    try:
+        return subprocess.run(command, env=environment, capture_output=True, timeout=60, check=False).returncode == 0
+    except subprocess.TimeoutExpired:
+        return False
