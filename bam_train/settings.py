@@ -1,26 +1,25 @@
 """What makes a training run: one frozen dataclass, merged from presets, files and flags.
 
-Layers, later ones win: the trainer's defaults, the preset of the environment and algorithm, ``--config`` file, ``--set`` and flags.
+Layers, later ones win: the trainer's defaults, the preset of the environment and algorithm, the ``--config`` file,
+``--set`` and flags.
 """
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
 import sys
 import typing
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from bam_train.errors import SettingsError
 from bam_train.values import closest, fit, parse_assignment
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 
 
 @dataclass(frozen=True)
@@ -120,7 +119,7 @@ def merge(*layers: Mapping[str, Any]) -> dict[str, Any]:
 def read_assignments(texts: Iterable[str]) -> dict[str, Any]:
     """The layer that ``--set name=value`` texts make.
 
-    A top-level setting's name goes there; every other name is the algorithm's: ``gamma=0.9`` is ``hyperparameters.gamma=0.9``.
+    A top-level setting's name goes there, any other to the algorithm: ``gamma=0.9`` is ``hyperparameters.gamma=0.9``.
     """
     layer: dict[str, Any] = {}
     for text in texts:
@@ -175,7 +174,7 @@ def _read_text(path: Path) -> str:
 
 
 def differences(wanted: Mapping[str, Any], found: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any, Any]]:
-    """Name, wanted and found value of every entry of `wanted` that `found` has not the same way; tables are looked into."""
+    """Name, wanted and found value of every entry of `wanted` that `found` has otherwise; tables are looked into."""
     rows: list[tuple[str, Any, Any]] = []
     for name, value in wanted.items():
         other = found.get(name)

@@ -1,6 +1,6 @@
 """Values that people type: parsed from text, fitted to a type annotation, described in errors.
 
-Everything here stays within JSON (None, bool, int, float, str, list, dict), so that settings can be written down and read back.
+Everything here stays within JSON (None, bool, int, float, str, list, dict): settings can be written and read back.
 """
 
 from __future__ import annotations
@@ -56,7 +56,8 @@ def linear_start(text: str) -> float | None:
 
 def describe(value: Any) -> str:
     """A value and its type, as errors show it."""
-    kind = {bool: "a bool", int: "an int", float: "a float", str: "text", list: "a list", dict: "a table"}.get(type(value))
+    kinds = {bool: "a bool", int: "an int", float: "a float", str: "text", list: "a list", dict: "a table"}
+    kind = kinds.get(type(value))
     return f"{value!r} ({kind})" if kind else repr(value)
 
 

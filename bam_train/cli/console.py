@@ -1,4 +1,4 @@
-"""Standard error as the programs use it: a rich console on a terminal, plain lines elsewhere; and numbers for people to read."""
+"""Standard error as the programs use it: a rich console on a terminal, plain lines elsewhere; and numbers to read."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def count(number: float) -> str:
 def duration(seconds: float | None) -> str:
     """A duration in short: 4.2 s, 3 min 05 s, 2 h 04 min; a dash if it is not known."""
     if seconds is None or seconds != seconds or seconds == float("inf"):
-        return "–"
+        return "-"
     if seconds < 60:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)
@@ -45,9 +45,9 @@ def duration(seconds: float | None) -> str:
 
 def percent(share: float | None) -> str:
     """A share: 98.5 %; a dash if it is not known."""
-    return "–" if share is None else f"{100 * share:.1f} %".replace(".0 %", " %")
+    return "-" if share is None else f"{100 * share:.1f} %".replace(".0 %", " %")
 
 
 def number(value: float | None) -> str:
     """A measured value to four digits; a dash if it is not known."""
-    return "–" if value is None else f"{value:.4g}"
+    return "-" if value is None else f"{value:.4g}"

@@ -1,4 +1,4 @@
-"""What every program of ours shares: flags out of a frozen dataclass, and every expected failure as one line and a status.
+"""What every program of ours shares: flags out of a frozen dataclass, every expected failure one line and a status.
 
 Only tyro is imported before the flags are parsed, so that ``--help`` is quick.
 """
@@ -51,7 +51,9 @@ def run_program(
     """
     import tyro
 
-    parsed = tyro.cli(config, prog=prog, description=description, args=arguments)
+    sys.path.append(os.getcwd())  # --env my_module:Env-v0, as with python -m; last, so that it hides nothing
+    one_way = (tyro.conf.FlagCreatePairsOff,)  # --force, no --no-force
+    parsed = tyro.cli(config, prog=prog, description=description, args=arguments, config=one_way)
     sys.exit(guarded(lambda: main(parsed), prog))
 
 
@@ -78,7 +80,6 @@ def guarded(main: Callable[[], int | None], prog: str) -> int:
 def is_expected(error: Exception) -> bool:
     """Whether an error is of our own two trees, whose text says what to do."""
     from bam_envs.errors import BamEnvsError
-
     from bam_train.errors import BamTrainError
 
     return isinstance(error, (BamTrainError, BamEnvsError))

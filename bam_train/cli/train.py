@@ -6,7 +6,7 @@ import json
 import time
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -19,39 +19,51 @@ if TYPE_CHECKING:
 _STARTED = time.monotonic()
 
 
+def _flag(metavar: str) -> object:
+    """A flag that shows what it takes, and no default: what is not given is not set."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
+
+
+Text = Annotated[str | None, _flag("NAME")]
+Whole = Annotated[int | None, _flag("N")]
+Share = Annotated[float | None, _flag("SHARE")]
+File = Annotated[Path | None, _flag("FILE")]
+
+
 @dataclass(frozen=True)
 class TrainConfig:
     """Flags of `bam-train`; what is not given comes from ``--config``, the preset, then the algorithm's defaults."""
 
-    env: str | None = None
+    env: Text = None
     """Environment: any Gymnasium id, such as bam/pick, CartPole-v1 or some_module:Env-v0."""
-    algo: str | None = None
+    algo: Text = None
     """Algorithm: ppo, a2c, sac, td3, ddpg, dqn, tqc, trpo, qrdqn, crossq or recurrent-ppo."""
-    steps: int | None = None
+    steps: Whole = None
     """Environment steps of the whole run, also after --resume."""
-    seed: int | None = None
+    seed: Whole = None
     """Seed of weights, exploration and environments."""
-    num_envs: int | None = None
+    num_envs: Whole = None
     """Environments stepped side by side."""
-    device: str | None = None
+    device: Text = None
     """Where to compute: auto, cpu, cuda, cuda:1."""
-    threads: int | None = None
+    threads: Whole = None
     """Threads that torch computes with (default 1: more is slower on small networks)."""
-    config: Path | None = None
+    config: File = None
     """File of settings, .toml or .json, such as --print-config writes."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")] = ()
-    """One setting, again for each: learning_rate=lin_3e-4, policy_kwargs.net_arch=[64,64], env_kwargs.randomize=true."""
+    """One setting, any number of times: learning_rate=lin_3e-4, policy_kwargs.net_arch=[64,64],
+    env_kwargs.randomize=true."""
     print_config: bool = False
     """Print all settings of the run as JSON, and do not train."""
-    out: Path | None = None
+    out: File = None
     """Where the best checkpoint goes (default checkpoints/<env>-<algo>.zip)."""
-    resume: Path | None = None
+    resume: File = None
     """Checkpoint to go on from, with its settings and up to --steps in all."""
-    until_success: float | None = None
+    until_success: Share = None
     """Stop once this share of evaluation episodes succeeds, such as 0.99."""
-    eval_every: int | None = None
+    eval_every: Whole = None
     """Steps between two evaluations (default a twentieth of the run)."""
-    eval_episodes: int | None = None
+    eval_episodes: Whole = None
     """Episodes of one evaluation."""
     force: bool = False
     """Overwrite the checkpoint at --out instead of adding a number to its name."""
@@ -64,7 +76,8 @@ _NOT_SETTINGS = frozenset({"config", "set", "print_config", "out", "resume", "fo
 
 def main() -> None:
     """Run the program."""
-    run_program(train, TrainConfig, prog="bam-train", description="Train a policy and keep the best as one checkpoint.zip.")
+    description = "Train a policy and keep the best as one checkpoint.zip."
+    run_program(train, TrainConfig, prog="bam-train", description=description)
 
 
 def train(config: TrainConfig) -> int:
@@ -105,14 +118,11 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
     from bam_train.trainers.run_folder import RunFolder
 
     output = choose_output(settings, config.out, config.force, checkpoint)
+    kind = load_trainer(settings.trainer)
+    made = kind.create(settings) if checkpoint is None else kind.load(checkpoint, settings)
     folder = RunFolder(config.runs, file_stem(settings.env, settings.algo))
     folder.write_config(settings.to_mapping())
-    kind = load_trainer(settings.trainer)
-    made: Any = (
-        kind.create(settings, folder.tensorboard)
-        if checkpoint is None
-        else kind.load(checkpoint, settings, folder.tensorboard)
-    )
+    made.log_to(folder.tensorboard)
     try:
         with make_display(f"{settings.algo} on {settings.env}, seed {settings.seed}") as display:
             for notice in [*output.notices, *made.notices]:

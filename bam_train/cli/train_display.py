@@ -52,9 +52,7 @@ class PlainDisplay:
         if self._clock() - self._said < LINE_EVERY:
             return
         self._said = self._clock()
-        self.note(
-            f"{_steps(progress)}  {steps_per_second:,.0f} steps/s  {_scores(statistics)}  {duration(seconds_left)} left"
-        )
+        self.note(f"{_steps(progress)}  {steps_per_second:,.0f} steps/s  {_scores(statistics)}  {_left(seconds_left)}")
 
     def evaluated(self, steps: int, report: EvaluationReport, best: bool) -> None:
         """Say what an evaluation found."""
@@ -99,7 +97,12 @@ def evaluation_line(steps: int, report: EvaluationReport, best: bool) -> str:
     """One line about an evaluation."""
     success = "" if report.success_rate is None else f"success {percent(report.success_rate)}, "
     rest = f"return {number(report.return_mean)}, {report.length_mean:.0f} steps an episode"
-    return f"evaluation at {count(steps)} steps: {success}{rest} ({report.episodes} episodes){', the best so far' if best else ''}"
+    newest = ", the best so far" if best else ""
+    return f"evaluation at {count(steps)} steps: {success}{rest} ({report.episodes} episodes){newest}"
+
+
+def _left(seconds: float | None) -> str:
+    return f"{duration(max(0.0, seconds))} left" if seconds is not None else ""
 
 
 def _steps(progress: Progress) -> str:
@@ -122,7 +125,7 @@ def _panel(title: str, progress: Progress, statistics: Statistics, rate: float, 
         "speed": f"{rate:,.0f} steps/s",
         "success": percent(statistics.success_rate),
         "return": number(statistics.return_mean),
-        "time left": duration(left),
+        "time left": duration(None if left is None else max(0.0, left)),
     }
     grid.add_row(*(f"[dim]{name}[/dim] {value}" for name, value in rows.items()))
     outer = Table.grid(expand=True)

@@ -28,9 +28,10 @@ def summarise(settings: TrainSettings, outcome: Outcome, folder: RunFolder, seco
     """
     _draw(settings, folder)
     say()
-    say(f"{settings.algo} on {settings.env}: {_REASONS[outcome.reason]} at {count(outcome.steps)} steps, {duration(seconds)} in all")
+    end = f"{_REASONS[outcome.reason]} at {count(outcome.steps)} steps, {duration(seconds)} in all"
+    say(f"{settings.algo} on {settings.env}: {end}")
     for name, text in _rows(outcome, folder):
-        say(f"  {name:<11}{text}")
+        say(f"  {name:<12}{text}")
     say("next:")
     for command in _next_commands(settings, outcome):
         say(f"  {command}")
@@ -40,7 +41,8 @@ def _rows(outcome: Outcome, folder: RunFolder) -> list[tuple[str, str]]:
     rows = []
     if outcome.checkpoint is not None and outcome.best is not None:
         rows.append(("best", _score_text(outcome)))
-        rows.append(("checkpoint", f"{_short(outcome.checkpoint)} ({outcome.checkpoint.stat().st_size / 1000:,.0f} kB)"))
+        size = outcome.checkpoint.stat().st_size / 1000
+        rows.append(("checkpoint", f"{_short(outcome.checkpoint)} ({size:,.0f} kB)"))
     if outcome.last is not None:
         rows.append(("last state", f"{_short(outcome.last)}"))
     rows.append(("run", f"{_short(folder.path)}/: learning-curve.png, progress.jsonl, config.json, tensorboard/"))
@@ -50,7 +52,7 @@ def _rows(outcome: Outcome, folder: RunFolder) -> list[tuple[str, str]]:
 def _score_text(outcome: Outcome) -> str:
     best, scores = outcome.best, outcome.scores
     if best is None:
-        return "–"
+        return "-"
     success = ""
     if best.success_rate is not None:
         interval = scores.get("success_interval")

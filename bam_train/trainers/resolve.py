@@ -48,9 +48,7 @@ def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSe
     require_algorithm(settings.trainer, settings.algo)
     for name, wanted, found in differences(asked, own):
         if name not in CHANGEABLE and found is not None:
-            raise CheckpointMismatch(
-                checkpoint.path, f"was trained with {name} {found!r}, not {wanted!r}. Leave it out to go on, or train anew"
-            )
+            raise _mismatch(checkpoint, name, wanted, found)
     completed = load_trainer(settings.trainer).complete(settings)
     _require_same(asked, own, checkpoint)
     _require_steps_left(checkpoint, completed)
@@ -70,14 +68,21 @@ def resolve_env(name: str) -> str:
     try:
         return resolve_id(name)
     except ModuleNotFoundError as error:
-        raise SettingsError(f"env {name!r}: no module {error.name!r}; expected module:Env-v0 with a module that can be imported") from error
+        raise SettingsError(
+            f"env {name!r}: no module {error.name!r}; expected module:Env-v0 with a module that can be imported"
+        ) from error
 
 
 def _require_same(asked: Mapping[str, Any], own: Mapping[str, Any], checkpoint: Checkpoint) -> None:
     """Refuse what the checkpoint has no value for at all."""
     for name, wanted, found in differences(asked, own):
         if name not in CHANGEABLE:
-            raise CheckpointMismatch(checkpoint.path, f"was trained with {name} {found!r}, not {wanted!r}. Leave it out to go on")
+            raise _mismatch(checkpoint, name, wanted, found)
+
+
+def _mismatch(checkpoint: Checkpoint, name: str, wanted: Any, found: Any) -> CheckpointMismatch:
+    message = f"was trained with {name} {found!r}, not {wanted!r}. Leave {name} out to go on with it, or train anew"
+    return CheckpointMismatch(checkpoint.path, message)
 
 
 def _require_steps_left(checkpoint: Checkpoint, settings: TrainSettings) -> None:

@@ -2,14 +2,14 @@
 
     train ─▶ between two updates: stop asked for? ─ evaluation due? ─ save due? ─ record ─▶ train …
 
-The best policy by evaluation (success rate, ties by return) goes to ``out``; the newest state to ``runs/<name>/last.zip``.
+The best policy by evaluation (success rate, ties by return) goes to ``out``, the newest state to ``last.zip``.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -35,7 +35,9 @@ RECORD_EVERY = 0.1
 class Watcher(Protocol):
     """Whoever shows how a run goes."""
 
-    def training(self, progress: Progress, statistics: Statistics, steps_per_second: float, seconds_left: float | None) -> None:
+    def training(
+        self, progress: Progress, statistics: Statistics, steps_per_second: float, seconds_left: float | None
+    ) -> None:
         """An update was done."""
 
     def evaluated(self, steps: int, report: EvaluationReport, best: bool) -> None:
@@ -177,7 +179,8 @@ class TrainingRun:
             report = self._report = self._confirmed(self.trainer.freeze())
         found = Best(steps, report.success_rate, report.return_mean)
         better = self.best is None or found.rank() > self.best.rank()
-        self.folder.add({"kind": "evaluation", "steps": steps, "seconds": round(self._clock() - self._start, 3), **report.to_json()})
+        seconds = round(self._clock() - self._start, 3)
+        self.folder.add({"kind": "evaluation", "steps": steps, "seconds": seconds, **report.to_json()})
         numbers = {"eval/return_mean": report.return_mean, "eval/success_rate": report.success_rate}
         self.trainer.log({name: value for name, value in numbers.items() if value is not None})
         self.watcher.evaluated(steps, report, better)
@@ -185,7 +188,7 @@ class TrainingRun:
             self._keep(found)
 
     def _confirmed(self, policy: Any) -> EvaluationReport:
-        """Evaluate; where that reaches ``until_success``, as many fresh episodes must confirm it, so that luck does not end the run."""
+        """Evaluate; if that reaches ``until_success``, as many fresh episodes must confirm it."""
         report = self._episodes(policy, 0)
         wanted = self.settings.until_success
         if wanted is None or report.success_rate is None or report.success_rate < wanted:
@@ -200,7 +203,7 @@ class TrainingRun:
         return evaluate(policy, settings.env, settings.env_kwargs, episodes=settings.eval_episodes, seed=seed)
 
     def _keep(self, found: Best) -> None:
-        """Save the policy as the best so far; where `out` cannot be written, in the run's folder, and training goes on."""
+        """Save the policy as the best so far; if `out` cannot be written, in the run's folder, and training goes on."""
         self.best, self._best_scores = found, self._scores()
         try:
             self.trainer.save(self.out, self._best_scores, self._notes(self.out))
@@ -231,8 +234,7 @@ class TrainingRun:
         """What a resumed run needs to go on keeping the best in the same file."""
         if self.best is None or kept is None:
             return {"best": None}
-        best: Mapping[str, Any] = {"steps": self.best.steps, "success_rate": self.best.success_rate, "return_mean": self.best.return_mean}
-        return {"best": {**best, "path": str(kept.resolve())}}
+        return {"best": {**asdict(self.best), "path": str(kept.resolve())}}
 
 
 def _training_record(steps: int, seconds: float, rate: float, statistics: Statistics) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 ::
 
     config.json         every setting; `--config` reads it back
-    progress.jsonl      one JSON object for every update looked at ("kind": "training") and every evaluation ("kind": "evaluation")
+    progress.jsonl      a JSON object a line: how training goes ("kind": "training"), evaluations ("kind": "evaluation")
     tensorboard/        event files
     last.zip            the newest checkpoint; `--resume` goes on from it
     learning-curve.png  return and success over steps
@@ -12,6 +12,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -96,9 +98,6 @@ def require_writable(path: Path, least: int = 20_000_000) -> None:
     Raises:
         OutputError: It is a folder, the folder cannot be made or written to, or the disk is full.
     """
-    import shutil
-    import tempfile
-
     remedy = "Choose another place with --out"
     if path.is_dir():
         raise OutputError(f"{path}: is a folder; give the name of a file in it, such as --out {path / 'policy.zip'}")
@@ -109,4 +108,5 @@ def require_writable(path: Path, least: int = 20_000_000) -> None:
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}. {remedy}") from error
     if free < least:
-        raise OutputError(f"{path}: the disk has {free / 1e6:.1f} MB free, expected at least {least / 1e6:.0f} MB. {remedy}")
+        found, expected = f"{free / 1e6:.1f} MB", f"{least / 1e6:.0f} MB"
+        raise OutputError(f"{path}: the disk has {found} free, expected at least {expected}. {remedy}")

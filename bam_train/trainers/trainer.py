@@ -1,4 +1,4 @@
-"""What every trainer is: something that trains in steps, saves a whole checkpoint, goes on from one, and freezes its policy."""
+"""What every trainer is: it trains in steps, saves a whole checkpoint, goes on from one, and freezes its policy."""
 
 from __future__ import annotations
 
@@ -60,16 +60,23 @@ class Trainer(Protocol):
         """Check the algorithm's own settings and fill in its defaults; no training is set up.
 
         Raises:
-            SettingsError: An unknown name (closest match), a wrong type, or an algorithm that does not fit the action space.
+            SettingsError: An unknown name (closest match), a wrong type, or an algorithm that does not fit the actions.
         """
 
     @classmethod
-    def create(cls, settings: TrainSettings, log_folder: Path | None = None) -> Self:
-        """Set up a new run of complete settings; TensorBoard files go to `log_folder`."""
+    def create(cls, settings: TrainSettings) -> Self:
+        """Set up a new run of complete settings.
+
+        Raises:
+            SettingsError: The library refuses the settings.
+        """
 
     @classmethod
-    def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None, log_folder: Path | None = None) -> Self:
+    def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None) -> Self:
         """Set up a run that goes on from a checkpoint, with its settings or with these."""
+
+    def log_to(self, folder: Path) -> None:
+        """Write TensorBoard files into a folder from now on."""
 
     @property
     def steps(self) -> int:

@@ -1,7 +1,7 @@
 """Any nested state as two files without code in them: a JSON skeleton and the arrays it names, as safetensors.
 
-Exact both ways: ints of any size, floats to the last bit (NaN and infinities too), arrays and torch tensors with dtype and shape,
-tuples, and mappings with keys other than text. Nothing is ever unpickled.
+Exact both ways: ints of any size, floats to the last bit (NaN and infinities too), arrays and torch tensors with dtype
+and shape, tuples, and mappings with keys other than text. Nothing is ever unpickled.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def pack(tree: Any) -> tuple[bytes, bytes]:
     """Turn a tree into (JSON skeleton, safetensors).
 
     Args:
-        tree: None, bool, int, float, str, NumPy scalars and arrays, torch tensors, and lists, tuples and mappings of these.
+        tree: None, bool, int, float, str, NumPy scalars and arrays, torch tensors; lists, tuples, mappings of these.
 
     Raises:
         FormatError: Something else is in it; names where.
@@ -67,7 +67,7 @@ def _pack(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
         return [_pack(item, f"{path}/{i}", arrays) for i, item in enumerate(value)]
     if isinstance(value, Mapping):
         return _pack_mapping(value, path, arrays)
-    raise FormatError(f"{path or '/'}: a {type(value).__name__} cannot be saved; expected numbers, text, arrays or nests of them")
+    raise FormatError(f"{path or '/'}: expected numbers, text, arrays or nests of them, found a {type(value).__name__}")
 
 
 def _pack_mapping(value: Mapping[Any, Any], path: str, arrays: dict[str, np.ndarray]) -> Any:

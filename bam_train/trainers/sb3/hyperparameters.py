@@ -1,7 +1,7 @@
-"""Hyperparameters: checked against the constructors of stable-baselines3, completed with its defaults, turned into its objects.
+"""Hyperparameters: checked against the constructors of stable-baselines3, completed, turned into its objects.
 
-In settings they are JSON: a schedule is ``"lin_3e-4"`` (linear to 0), action noise ``"normal_0.1"`` or ``"ornstein-uhlenbeck_0.1"``,
-a class its name (``activation_fn="tanh"``), ``train_freq`` ``1`` or ``[1, "episode"]``.
+In settings they are JSON: a schedule is ``"lin_3e-4"`` (linear to 0), action noise ``"normal_0.1"`` or
+``"ornstein-uhlenbeck_0.1"``, a class its name (``activation_fn="tanh"``), ``train_freq`` ``1`` or ``[1, "episode"]``.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import inspect
 import re
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecNormalize
 
 from bam_train.errors import SettingsError
+from bam_train.settings import HINTS
 from bam_train.trainers.sb3.algorithms import Algorithm
 from bam_train.values import closest, fit, linear_start
 
@@ -41,7 +42,7 @@ ELSEWHERE = {
 
 _POLICY_ELSEWHERE = frozenset({"self", "observation_space", "action_space", "lr_schedule", "use_sde"})
 
-_ACTIVATIONS = ("CELU", "ELU", "GELU", "Hardswish", "Identity", "LeakyReLU", "Mish", "ReLU", "SELU", "SiLU", "Softplus", "Tanh")
+_ACTIVATIONS = ("CELU", "ELU", "GELU", "Hardswish", "Identity", "LeakyReLU", "Mish", "ReLU", "SELU", "SiLU", "Tanh")
 _OPTIMIZERS = ("Adam", "AdamW", "NAdam", "RAdam", "RMSprop", "SGD")
 _EXTRACTORS = ("CombinedExtractor", "FlattenExtractor", "NatureCNN")
 CLASSES: dict[str, dict[str, type]] = {
@@ -66,17 +67,17 @@ def complete(algorithm: Algorithm, given: Mapping[str, Any], observation_space: 
         if name not in ELSEWHERE
     }
     for name in given:
-        _require_known(name, parameters, f"{algorithm.name} hyperparameter")
-    values = {"policy": default_policy(algorithm, observation_space)}
+        _require_known(name, parameters, f"{algorithm.name} hyperparameter", HINTS)
+    values: dict[str, Any] = {"policy": default_policy(algorithm, observation_space)}
     for name, parameter in parameters.items():
         if name in given:
             values[name] = fit(name, given[name], _written(parameter.annotation))
         elif name != "policy":
             values[name] = list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
-    policies = algorithm.load().policy_aliases
-    if values["policy"] not in policies:
-        raise SettingsError(f"policy: unknown policy {values['policy']!r} of {algorithm.name}. {closest(values['policy'], policies)}")
-    values["policy_kwargs"] = _checked_policy(policies[values["policy"]], values["policy_kwargs"] or {})
+    policies, policy = algorithm.load().policy_aliases, values["policy"]
+    if policy not in policies:
+        raise SettingsError(f"policy: unknown policy {policy!r} of {algorithm.name}. {closest(policy, policies)}")
+    values["policy_kwargs"] = _checked_policy(policies[policy], values["policy_kwargs"] or {})
     _check_noise(values.get("action_noise"))
     return values
 
@@ -99,7 +100,8 @@ def complete_normalize(given: bool | Mapping[str, Any], gamma: float) -> bool | 
     known = {name: row for name, row in parameters.items() if name not in ("self", "venv", "training")}
     for name in given:
         _require_known(name, known, "normalize argument")
-    return {"gamma": gamma, **{name: fit(f"normalize.{name}", value, known[name].annotation) for name, value in given.items()}}
+    fitted = {name: fit(f"normalize.{name}", value, known[name].annotation) for name, value in given.items()}
+    return {"gamma": gamma, **fitted}
 
 
 def build(values: Mapping[str, Any], action_space: spaces.Space[Any]) -> dict[str, Any]:
@@ -114,14 +116,14 @@ def build(values: Mapping[str, Any], action_space: spaces.Space[Any]) -> dict[st
     return arguments
 
 
-def _require_known(name: str, parameters: Mapping[str, Any], what: str) -> None:
+def _require_known(name: str, parameters: Mapping[str, Any], what: str, others: Iterable[str] = ()) -> None:
     if name in parameters:
         return
     if ELSEWHERE.get(name) is not None:
         raise SettingsError(f"{name} is not a hyperparameter here: use {ELSEWHERE[name]}")
     if name in ELSEWHERE:
         raise SettingsError(f"{name} cannot be set: bam-train takes care of it")
-    raise SettingsError(f"Unknown {what} {name!r}. {closest(name, parameters)}")
+    raise SettingsError(f"Unknown {what} {name!r}. {closest(name, [*parameters, *others])}")
 
 
 def _written(hint: Any) -> Any:
@@ -136,7 +138,9 @@ def _written(hint: Any) -> Any:
 
 def _checked_policy(policy: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     parameters = {
-        name: row for name, row in inspect.signature(policy.__init__).parameters.items() if name not in _POLICY_ELSEWHERE
+        name: row
+        for name, row in inspect.signature(policy.__init__).parameters.items()
+        if name not in _POLICY_ELSEWHERE
     }
     values: dict[str, Any] = {}
     for name, value in given.items():

@@ -22,7 +22,7 @@ MODEL, STATE, REPLAY, NOTES = "bam/resume/model", "bam/resume/state", "bam/resum
 
 @dataclass(frozen=True)
 class Waiting:
-    """What may be put back only when training is about to take its next step: setting up draws random numbers and resets noise."""
+    """What is put back only when training takes its next step: setting up draws random numbers and resets noise."""
 
     random: dict[str, Any]
     noise: list[Any]
@@ -58,8 +58,10 @@ def members(
     replay = state.replay(model)
     if replay is not None:
         packed[REPLAY] = pack(replay)
-    written = {f"{name}{suffix}": data for name, pair in packed.items() for suffix, data in zip(_SUFFIXES, pair, strict=True)}
-    return {**written, NOTES: json.dumps(dict(notes)).encode()}
+    written = {NOTES: json.dumps(dict(notes)).encode()}
+    for name, pair in packed.items():
+        written |= {f"{name}{suffix}": data for suffix, data in zip(_SUFFIXES, pair, strict=True)}
+    return written
 
 
 _SUFFIXES = (".json", ".safetensors")

@@ -1,6 +1,6 @@
-"""What a run of stable-baselines3 needs to go on exactly, as trees of numbers: weights, optimisers, counters, buffers, random states.
+"""What a run of stable-baselines3 needs to go on exactly, as trees of numbers: weights, counters, random states.
 
-All of it is taken between two updates (before a rollout begins), where no rollout is half collected and no gradient half applied.
+It is taken between two updates (before a rollout begins): no rollout is half collected, no gradient half applied.
 """
 
 from __future__ import annotations
@@ -116,7 +116,8 @@ def noise(model: Any) -> list[Any]:
 
 def load_noise(model: Any, tree: list[Any]) -> None:
     """Put `noise` back; after `learn` began, which spreads the noise over the environments."""
-    for one, previous in zip((one for one in _noises(model.action_noise) if hasattr(one, "noise_prev")), tree, strict=True):
+    remembering = [one for one in _noises(model.action_noise) if hasattr(one, "noise_prev")]
+    for one, previous in zip(remembering, tree, strict=True):
         one.noise_prev = previous
 
 

@@ -1,10 +1,11 @@
-"""`SB3Trainer`: one run of a stable-baselines3 algorithm that can be stopped, saved and gone on with between any two updates.
+"""`SB3Trainer`: a run of a stable-baselines3 algorithm that can be stopped, saved and gone on with between two updates.
 
 Everything happens where the algorithm asks for its next rollout: the last update is done, the next step not yet taken.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import io
@@ -12,16 +13,15 @@ import math
 import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from bam_envs.spaces import space_to_json
 from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
+from bam_envs.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint, write_checkpoint
 from bam_train.environments import control_period, make_env, require_fit
 from bam_train.errors import SettingsError, TrainingFailed
@@ -35,6 +35,8 @@ from bam_train.trainers.sb3.state import all_finite, undisturbed
 from bam_train.trainers.sb3.vec_env import RowsVecEnv, make_training_env
 from bam_train.trainers.trainer import OnProgress, Progress, Statistics
 
+_FINITE = "expected finite numbers: try a smaller learning_rate"
+
 
 class _Stop(Exception):  # noqa: N818 - never leaves this module
     """Ends `learn` between two updates."""
@@ -43,10 +45,10 @@ class _Stop(Exception):  # noqa: N818 - never leaves this module
 class SB3Trainer:
     """A run of one algorithm of stable-baselines3 or sb3-contrib; made by `create` or `load`."""
 
-    def __init__(self, settings: TrainSettings, model: Any, venv: VecEnv, signals: dict[str, Any], period: float | None) -> None:
+    def __init__(self, settings: TrainSettings, model: Any, venv: VecEnv) -> None:
         self.settings, self.model, self.venv = settings, model, venv
         self.notices: list[str] = []
-        self._signals, self._period = signals, period
+        self._signals, self._period = _meaning(venv)
         self._normaliser: VecNormalize | None = model.get_vec_normalize_env()
         self._waiting: resume.Waiting | None = None
         self._on_progress: OnProgress = lambda progress: True
@@ -57,41 +59,41 @@ class SB3Trainer:
     def complete(cls, settings: TrainSettings) -> TrainSettings:
         """Check the algorithm's own settings and fill in its defaults."""
         algorithm = ALGORITHMS[settings.algo]
-        env = make_env(settings.env, settings.env_kwargs)
-        try:
+        with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
             algorithm.require_actions(settings.env, type(env.action_space).__name__)
             values = hyperparameters.complete(algorithm, settings.hyperparameters, env.observation_space)
-        finally:
-            env.close()
         normalize = hyperparameters.complete_normalize(settings.normalize, values["gamma"])
         eval_every = settings.eval_every or max(1, settings.steps // 20)
         return dataclasses.replace(settings, hyperparameters=values, normalize=normalize, eval_every=eval_every)
 
     @classmethod
-    def create(cls, settings: TrainSettings, log_folder: Path | None = None) -> SB3Trainer:
-        """Set up a new run of complete settings; TensorBoard files go to `log_folder`."""
+    def create(cls, settings: TrainSettings) -> SB3Trainer:
+        """Set up a new run of complete settings."""
         torch.set_num_threads(settings.threads)
         venv = make_training_env(settings.env, settings.env_kwargs, settings.num_envs)
-        signals, period = _meaning(venv)
         with _notices() as notices, _refusals(settings):
             model = _make_model(settings, venv)
-        model.set_logger(configure(str(log_folder), ["tensorboard"]) if log_folder else Logger(None, []))
-        trainer = cls(settings, model, venv, signals, period)
+        model.set_logger(Logger(None, []))
+        trainer = cls(settings, model, venv)
         trainer.notices += notices
         return trainer
 
     @classmethod
-    def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None, log_folder: Path | None = None) -> SB3Trainer:
+    def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None) -> SB3Trainer:
         """Set up a run that goes on from a checkpoint, with its settings or with these."""
         settings = settings or TrainSettings.from_mapping(checkpoint.manifest.settings, str(checkpoint.path))
-        trainer = cls.create(settings, log_folder)
+        trainer = cls.create(settings)
         require_fit(checkpoint, _one_env(trainer.venv))
         trainer._waiting = resume.load(checkpoint, trainer.model, trainer.venv, trainer._normaliser)
         if not trainer._waiting.same_episodes:
             trainer.notices.append(
-                f"{settings.env} cannot save its running episodes: new ones begin, so the rest differs from a run without a stop"
+                f"{settings.env} cannot save running episodes: new ones begin, so the rest differs from an unbroken run"
             )
         return trainer
+
+    def log_to(self, folder: Path) -> None:
+        """Write TensorBoard files into a folder from now on."""
+        self.model.set_logger(configure(str(folder), ["tensorboard"]))
 
     @property
     def steps(self) -> int:
@@ -136,15 +138,16 @@ class SB3Trainer:
     def _require_finite_losses(self) -> None:
         for name, value in self.model.logger.name_to_value.items():
             if "loss" in name and not math.isfinite(value):
-                raise TrainingFailed(f"{name} is {value} at step {self.steps}; expected a finite number: try a smaller learning_rate")
+                raise TrainingFailed(f"{name} is {value} at step {self.steps}; {_FINITE}")
 
     def _require_finite_weights(self) -> None:
         if not all_finite(self.model):
-            raise TrainingFailed(f"the policy's weights are not finite at step {self.steps}: try a smaller learning_rate")
+            raise TrainingFailed(f"the policy's weights are NaN or infinite at step {self.steps}; {_FINITE}")
 
     def _statistics(self) -> Statistics:
         episodes, successes = self.model.ep_info_buffer or (), self.model.ep_success_buffer or ()
-        numbers = {name: float(value) for name, value in self.model.logger.name_to_value.items() if name.startswith("train/")}
+        logged = self.model.logger.name_to_value.items()
+        numbers = {name: float(value) for name, value in logged if name.startswith("train/")}
         return Statistics(
             episodes=len(episodes),
             return_mean=float(np.mean([one["r"] for one in episodes])) if episodes else None,
@@ -198,7 +201,7 @@ class SB3Trainer:
             graph = freeze(self.model, self._normaliser, observation_space, action_space)
         return FrozenPolicy.from_graph(graph, space_to_json(observation_space), space_to_json(action_space))
 
-    @contextmanager
+    @contextlib.contextmanager
     def undisturbed(self) -> Iterator[None]:
         """Do something between two updates that leaves training's random numbers as they were."""
         with undisturbed(self.model):
@@ -224,13 +227,26 @@ def _make_model(settings: TrainSettings, venv: VecEnv) -> Any:
         env = VecNormalize(venv, **arguments)
     arguments = hyperparameters.build(settings.hyperparameters, venv.action_space)
     policy = arguments.pop("policy")
-    device = settings.device
-    if device == "auto" and policy.startswith("Mlp"):
-        device = "cpu"  # copies to a GPU cost more than a small network computes
+    device = _device(settings.device, policy)
     return ALGORITHMS[settings.algo].load()(policy, env, seed=settings.seed, device=device, verbose=0, **arguments)
 
 
-@contextmanager
+def _device(name: str, policy: str) -> str:
+    """Where to compute: what was asked for if it is there.
+
+    Raises:
+        SettingsError: There is no such device.
+    """
+    if name == "auto":
+        # Copies to a GPU cost more than a small network computes.
+        return "cuda" if torch.cuda.is_available() and not policy.startswith("Mlp") else "cpu"
+    there = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
+    if name in there or (name == "cuda" and len(there) > 1):
+        return name
+    raise SettingsError(f"device: {name!r} is not there; expected auto or one of {', '.join(there)}")
+
+
+@contextlib.contextmanager
 def _refusals(settings: TrainSettings) -> Iterator[None]:
     """What stable-baselines3 and torch say about settings that cannot be, as our own error."""
     try:
@@ -238,22 +254,24 @@ def _refusals(settings: TrainSettings) -> Iterator[None]:
     except (AssertionError, ValueError, TypeError, RuntimeError, ZeroDivisionError, NotImplementedError) as error:
         if isinstance(error, SettingsError):
             raise
-        raise SettingsError(f"{settings.algo} on {settings.env} cannot be set up: {' '.join(str(error).split())}") from error
+        raise SettingsError(
+            f"{settings.algo} on {settings.env} cannot be set up: {' '.join(str(error).split())}"
+        ) from error
 
 
-@contextmanager
+@contextlib.contextmanager
 def _notices() -> Iterator[list[str]]:
     """Collect warnings as lines for the user."""
     lines: list[str] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         yield lines
-    lines += [" ".join(str(one.message).split()) for one in caught if issubclass(one.category, UserWarning)]
+    lines += [" ".join(str(one.message).split()) for one in caught]
 
 
 def _one_env(venv: VecEnv) -> Any:
     """What stands behind `venv`: our vector environment, or the first of the others."""
-    return venv.rows if isinstance(venv, RowsVecEnv) else venv.envs[0]  # type: ignore[attr-defined]
+    return venv.rows if isinstance(venv, RowsVecEnv) else venv.envs[0]
 
 
 def _meaning(venv: VecEnv) -> tuple[dict[str, Any], float | None]:

@@ -36,7 +36,7 @@ def can_restore(venv: VecEnv) -> bool:
     return isinstance(venv, RowsVecEnv)
 
 
-class RowsVecEnv(VecEnv):
+class RowsVecEnv(VecEnv):  # type: ignore[misc]
     """A Gymnasium vector environment whose rows restart in the same step, as a stable-baselines3 `VecEnv`.
 
     Args:
@@ -60,7 +60,7 @@ class RowsVecEnv(VecEnv):
 
     def reset(self) -> Observations:
         """Begin an episode on every row, with the seeds that `seed` left."""
-        seeds = None if all(seed is None for seed in self._seeds) else list(self._seeds)
+        seeds: Any = None if all(seed is None for seed in self._seeds) else list(self._seeds)
         observations, _ = self.rows.reset(seed=seeds)
         self._reset_seeds()
         self._returns[:], self._lengths[:] = 0, 0
