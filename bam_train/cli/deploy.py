@@ -54,6 +54,7 @@ def deploy_checkpoint(config: DeployConfig) -> int:
     startup.mark("python and arguments")
     _require_sane(config)
     from bam_train.checkpoint import Checkpoint
+    from bam_train.deploy.loop import connect
     from bam_train.environments import make_env, require_fit
     from bam_train.policy import FrozenPolicy
 
@@ -66,6 +67,7 @@ def deploy_checkpoint(config: DeployConfig) -> int:
     try:
         require_fit(checkpoint, env)
         period = period_of(config, checkpoint, env)
+        connect(env)
     except BaseException:
         env.close()  # type: ignore[no-untyped-call]
         raise

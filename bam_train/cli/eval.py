@@ -178,7 +178,7 @@ def _film(config: EvalConfig, subject: Subject, path: Path) -> None:
         count = write_video(path, frames(env, subject.policy, episodes, config.seed), 1 / period)
     finally:
         env.close()  # type: ignore[no-untyped-call]
-    say(f"bam-eval: {path}: {episodes} episodes, {count} pictures")
+    say(f"bam-eval: {path}: {episodes} episode{'' if episodes == 1 else 's'}, {count} pictures")
 
 
 def _progress(done: int, episodes: int) -> None:

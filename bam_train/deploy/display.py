@@ -18,7 +18,6 @@ from bam_train.deploy.report import lateness_text, rate_text
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
     from rich.live import Live
-    from rich.table import Table
 
 _MOST_NUMBERS = 16
 """Numbers of an action or a state signal that are shown; the rest (of an image, say) is left out."""
@@ -85,32 +84,28 @@ class LiveDisplay:
         self._live.console.print(episode_line(len(self._journal.records), self._journal.wanted, record))
 
     def _panel(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> RenderableType:
+        from rich.console import Group
         from rich.table import Table
+        from rich.text import Text
 
-        table = Table.grid(padding=(0, 1))
-        table.title, table.title_justify = self._title, "left"
-        for justify in ("left", "left", "right", "left"):
-            table.add_column(justify=justify, no_wrap=True)
-        number = len(self._journal.records)
-        table.add_row("episode", f"{number} of {self._journal.wanted}", "step", str(record.length))
-        table.add_row("return", f"{record.total:.2f}", "", "")
-        table.add_row("loop", rate_text(pacer), "", "")
+        table = Table.grid(padding=(0, 2))
+        for name, text in self.rows(record, action, pacer):
+            table.add_row(Text(name, style="dim"), Text(text, no_wrap=True, overflow="ellipsis"))
+        return Group(Text(self._title, style="bold"), table)
+
+    def rows(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> Iterator[tuple[str, str]]:
+        """What the panel says, line by line: a name and a text; few enough for a screen of 24 lines."""
+        number, successes = len(self._journal.records), self._journal.successes
+        yield (
+            "episode",
+            f"{number} of {self._journal.wanted}" + ("" if successes is None else f", {successes} succeeded"),
+        )
+        yield "step", f"{record.length}, return {record.total:.2f}"
+        yield "loop", rate_text(pacer)
         if pacer.period is not None:
-            table.add_row("lateness", lateness_text(pacer), "", "")
-        _add_numbers(table, "action", self._labels, np.ravel(action), bars=True)
-        for name, labels, units, values in state_rows(self._env):
-            _add_numbers(table, name, labels, values, units=units)
-        return table
-
-
-def _add_numbers(
-    table: Table, name: str, labels: tuple[str, ...], values: Any, units: tuple[str, ...] = (), *, bars: bool = False
-) -> None:
-    for i, value in enumerate(values[:_MOST_NUMBERS]):
-        label = labels[i] if i < len(labels) else str(i)
-        number = f"{value:+.3f}" if np.asarray(value).dtype.kind == "f" else str(value)
-        last = bar(float(value)) if bars else units[i] if i < len(units) else ""
-        table.add_row(name if i == 0 else "", label, number, last)
+            yield "lateness", lateness_text(pacer)
+        yield from action_rows(self._labels, action)
+        yield from state_rows(self._env)
 
 
 def bar(value: float) -> str:
@@ -132,14 +127,26 @@ def action_labels(env: gym.Env[Any, Any]) -> tuple[str, ...]:
     return () if describe is None else tuple(str(row["name"]) for row in describe()["action"])
 
 
-def state_rows(env: gym.Env[Any, Any]) -> Iterator[tuple[str, tuple[str, ...], tuple[str, ...], Any]]:
-    """Each signal that the robot measured last: its name, labels, units and numbers; none if it is no `RobotEnv`."""
+def action_rows(labels: tuple[str, ...], action: Any) -> Iterator[tuple[str, str]]:
+    """One line for each number of the action, with a bar if it is not a choice."""
+    numbers = np.ravel(action)
+    width = max((len(label) for label in labels), default=1)
+    for i, number in enumerate(numbers[:_MOST_NUMBERS]):
+        label = (labels[i] if i < len(labels) else str(i) if len(numbers) > 1 else "").ljust(width)
+        text = f"{bar(float(number))} {number:+.3f}" if numbers.dtype.kind == "f" else str(number)
+        yield "action" if i == 0 else "", f"{label} {text}".lstrip()
+
+
+def state_rows(env: gym.Env[Any, Any]) -> Iterator[tuple[str, str]]:
+    """One line for each signal that the robot measured last; none if the environment is no `RobotEnv`."""
     signals = getattr(getattr(env.unwrapped, "state", None), "signals", None)
     if signals is None:
         return
     for spec in env.unwrapped.robot.spec.signals:  # type: ignore[attr-defined]
         if spec.name in signals:
-            yield spec.name.replace("_", " "), spec.labels, spec.units, np.ravel(signals[spec.name][0])
+            numbers = " ".join(f"{number:+.3f}" for number in np.ravel(signals[spec.name][0])[:_MOST_NUMBERS])
+            unit = spec.units[0] if len(set(spec.units)) == 1 and spec.units[0] != "1" else ""
+            yield spec.name.replace("_", " "), f"{numbers} {unit}".rstrip()
 
 
 @contextmanager

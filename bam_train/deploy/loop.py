@@ -98,6 +98,13 @@ def play(env: Env, policy: Policy, pacer: Pacer, journal: Journal, watcher: Watc
     watcher.ended(record, pacer)
 
 
+def connect(env: Env) -> None:
+    """Open the link to the robot, if there is one, without moving it: what is missing shows before the loop."""
+    robot = getattr(env.unwrapped, "robot", None)
+    if robot is not None:
+        robot.connect()
+
+
 def halt(env: Env) -> None:
     """Stop the robot moving, if the environment has one."""
     robot = getattr(env.unwrapped, "robot", None)

@@ -73,7 +73,7 @@ class Pacer:
     def _wait_for(self, deadline: float) -> float:
         while (left := deadline - self._now()) > 0:
             self._sleep(left)
-        late = -left
+        late = max(0.0, -left)  # not -0.0, which would be printed
         self._late.append(late)
         return late
 

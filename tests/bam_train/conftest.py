@@ -61,7 +61,7 @@ def starting_cell_fixture():
 
 @pytest.fixture
 def corridor_checkpoint(corridor, tmp_path):
-    """A checkpoint.zip whose frozen policy always goes right, and that can be changed: ``make(name="x.zip", env="...")``."""
+    """Makes a checkpoint.zip whose frozen policy always goes right; fields of its manifest may be given."""
 
     def make(name="right.zip", **fields):
         manifest = {

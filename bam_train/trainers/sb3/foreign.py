@@ -1,4 +1,4 @@
-"""Zips that stable-baselines3 wrote without us: loading one runs whatever is pickled in it, so it has to be asked for."""
+"""Zips that stable-baselines3 wrote without us: loading one runs whatever is pickled in it, so it must be asked for."""
 
 from __future__ import annotations
 

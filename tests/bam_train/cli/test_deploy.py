@@ -8,6 +8,7 @@ import sys
 import gymnasium as gym
 import pytest
 
+from bam_envs.errors import MissingExtra
 from bam_train.cli.deploy import main
 
 
@@ -160,8 +161,8 @@ def test_nothing_moves_when_the_spaces_differ(corridor_checkpoint, corridor, run
     assert run(main, path, "--fast") == (
         1,
         "",
-        f"bam-deploy: {path}: observation_space.high is 9.0 in the checkpoint and 4.0 in test/Corridor-v0 as installed; "
-        "train it anew, or install the version it was trained with\n",
+        f"bam-deploy: {path}: observation_space.high is 9.0 in the checkpoint and 4.0 in test/Corridor-v0 "
+        "as installed; train it anew, or install the version it was trained with\n",
     )
 
 
@@ -170,6 +171,19 @@ def test_an_environment_that_is_not_here(corridor_checkpoint, run):
     status, out, err = run(main, path, "--fast")
     assert (status, out, err.count("\n")) == (1, "", 1)
     assert err.startswith("bam-deploy: bam/stack-v9 cannot be made: Environment `stack` doesn't exist in namespace bam")
+
+
+def test_a_robot_that_cannot_be_connected(corridor_checkpoint, corridor, run, monkeypatch):
+    class Robot:
+        def connect(self):
+            raise MissingExtra("mujoco", "sim", "A simulated robot")
+
+    monkeypatch.setattr(corridor_class(corridor), "robot", Robot(), raising=False)
+    assert run(main, corridor_checkpoint()) == (
+        1,
+        "",
+        'bam-deploy: A simulated robot needs mujoco, which is not installed. Run: pip install "bam-train[sim]"\n',
+    )
 
 
 def test_unknown_option_names_the_closest(run):

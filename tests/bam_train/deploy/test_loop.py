@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from bam_envs.errors import RobotFault
+from bam_envs.robot_env import RobotEnv
+from bam_envs.robots.fake import FakeRobot
+from bam_envs.tasks.pick import PickTask
 from bam_train.deploy.journal import Journal, Startup
-from bam_train.deploy.loop import Ending, deploy, fault_text
+from bam_train.deploy.loop import Ending, connect, deploy, fault_text
 from bam_train.deploy.pacer import Pacer
 
 
@@ -209,3 +212,15 @@ def test_successes_are_unknown_where_the_environment_does_not_say(corridor):
 
 def test_fault_text_of_nothing():
     assert fault_text(RobotFault()) == "RobotFault"
+
+
+def test_the_same_loop_drives_any_robot():
+    """A `RobotEnv` over a robot without physics: every action becomes one command, and the robot is halted."""
+    robot = FakeRobot()
+    env = gym.wrappers.TimeLimit(RobotEnv(robot, PickTask(1)), 7)
+    connect(env)
+    ending, journal, pacer = run(env, Right(np.array([1, 0, 0, 0, 1], np.float32)), episodes=2)
+    assert ending == Ending("episodes done", 0)
+    assert [(record.length, record.end) for record in journal.records] == [(7, "truncated")] * 2
+    assert len(robot.sent) == pacer.ticks == 14
+    assert robot.halts >= 1

@@ -1,0 +1,139 @@
+import io
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from rich.console import Console
+
+from bam_train.deploy.display import (
+    LiveDisplay,
+    PlainDisplay,
+    action_labels,
+    action_rows,
+    bar,
+    episode_line,
+    live_display,
+    state_rows,
+)
+from bam_train.deploy.journal import EpisodeRecord, Journal
+from bam_train.deploy.pacer import Pacer
+
+
+class Panel:
+    """Counts redraws."""
+
+    def __init__(self):
+        self.updates, self.console = 0, Console(file=io.StringIO())
+
+    def update(self, panel, refresh):
+        self.updates += 1
+
+
+class Slack:
+    """A pacer with so much time left."""
+
+    period, rate, lateness, missed = None, 10.0, None, 0
+
+    def __init__(self, slack):
+        self.slack = slack
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (-1.0, "#.........|.........."),
+        (0.0, "..........#.........."),
+        (0.5, "..........|....#....."),
+        (1.0, "..........|.........#"),
+        (7.0, "..........|.........#"),
+    ],
+)
+def test_bar(value, expected):
+    assert bar(value) == expected
+
+
+@pytest.mark.parametrize(
+    ("success", "end", "length", "line"),
+    [
+        (True, "terminated", 47, "episode 2/5 (seed 8): success after 47 steps, return 12.31"),
+        (False, "truncated", 100, "episode 2/5 (seed 8): no success after 100 steps, return 12.31"),
+        (None, "truncated", 1, "episode 2/5 (seed 8): truncated after 1 step, return 12.31"),
+    ],
+)
+def test_episode_line(success, end, length, line):
+    record = EpisodeRecord(8, total=12.3123, length=length, success=success, end=end)
+    assert episode_line(2, 5, record) == line
+
+
+def test_plain_display_writes_a_line_an_episode():
+    journal, lines = Journal(2), []
+    display = PlainDisplay(journal, lines.append)
+    record = journal.begin(3)
+    display.ticked(record, 1, Pacer(None))
+    assert lines == []
+    display.ended(record, Pacer(None))
+    assert lines == ["episode 1/2 (seed 3): stopped after 0 steps, return 0.00"]
+
+
+def test_redraws_are_rare_and_only_when_there_is_time(corridor):
+    times = iter([0.0, 0.05, 0.1, 0.3, 0.31, 0.4])
+    panel, journal = Panel(), Journal(1)
+    display = LiveDisplay(panel, gym.make(corridor), "title", journal, now=lambda: next(times))
+    record = journal.begin(0)
+    drawn = []
+    for slack in (0.04, 0.04, 0.04, 0.005, 0.04, 0.04):
+        display.ticked(record, 1, Slack(slack))
+        drawn.append(panel.updates)
+    assert drawn == [1, 1, 2, 2, 3, 3]
+
+
+def test_action_rows():
+    action = np.array([0.5, -1.0], np.float32)
+    assert list(action_rows(("dx", "grip"), action)) == [
+        ("action", "dx   ..........|....#..... +0.500"),
+        ("", "grip #.........|.......... -1.000"),
+    ]
+    assert list(action_rows((), np.int64(3))) == [("action", "3")]
+    assert list(action_rows((), np.array([1, 0]))) == [("action", "0 1"), ("", "1 0")]
+    assert len(list(action_rows((), np.zeros(100)))) == 16
+
+
+def test_rows_of_a_robot():
+    env = gym.make("bam/pick-v0")
+    assert list(state_rows(env)) == []
+    env.reset(seed=0)
+    rows = dict(state_rows(env))
+    assert list(rows) == ["joint position", "joint velocity", "gripper width", "object position", "object quaternion"]
+    assert rows["joint velocity"].endswith(" rad/s")
+    assert len(rows["joint position"].split()) == 7
+    assert len(rows["object quaternion"].split()) == 4
+    assert action_labels(env) == ("dx", "dy", "dz", "dyaw", "grip")
+    env.close()
+
+
+def test_another_environment_has_no_rows(corridor):
+    env = gym.make("CartPole-v1")
+    env.reset(seed=0)
+    assert list(state_rows(env)) == []
+    assert action_labels(env) == ()
+
+
+def test_panel_fits_a_screen_and_says_it_all():
+    env, journal, screen = gym.make("bam/pick-v0"), Journal(2), io.StringIO()
+    env.reset(seed=0)
+    console = Console(file=screen, force_terminal=True, width=100, height=24, color_system=None)
+    pacer = Pacer(0.05, now=lambda: 0.0, sleep=lambda seconds: None)
+    pacer.start()
+    pacer.wait()
+    with live_display(console, env, "pick.zip on bam/pick-v0", journal) as display:
+        record = journal.begin(4)
+        record.add(0.25, {"is_success": False})
+        display.ticked(record, np.zeros(5, np.float32), pacer)
+    env.close()
+    lines = [line.rstrip() for line in screen.getvalue().replace("\x1b[2K", "").splitlines()]
+    assert any(line.endswith("pick.zip on bam/pick-v0") for line in lines)
+    assert any(line.startswith("episode") and line.endswith("1 of 2, 0 succeeded") for line in lines)
+    assert any(line.startswith("step") and line.endswith("1, return 0.25") for line in lines)
+    assert any(line.startswith("loop") and line.endswith("no rate yet of 20") for line in lines)
+    assert any("p50 0.00 ms, p99 0.00 ms, max 0.00 ms, 0 missed" in line for line in lines)
+    assert not any(line.strip() == "..." for line in lines)

@@ -1,0 +1,84 @@
+import json
+
+from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.journal import Journal, Startup
+from bam_train.deploy.loop import Ending
+from bam_train.deploy.pacer import Pacer
+from bam_train.deploy.report import DeployReport, episodes_text, lateness_text, rate_text
+
+
+class Clock:
+    def __init__(self):
+        self.time = 0.0
+
+    def now(self):
+        return self.time
+
+    def sleep(self, seconds):
+        self.time += seconds + 0.001
+
+
+def driven_pacer(period):
+    """Ticks at 0, 0.051, 0.221 (instead of 0.1; the deadlines 0.15 and 0.2 are missed) and 0.251 s."""
+    clock = Clock()
+    pacer = Pacer(period, now=clock.now, sleep=clock.sleep)
+    pacer.start()
+    for work in (0.01, 0.17, 0.01, 0.01):
+        pacer.wait()
+        clock.time += work
+    return pacer
+
+
+def journal():
+    times = iter([0.5, 0.75])
+    journal = Journal(3, Startup(clock=lambda: next(times)))
+    journal.startup.mark("python")
+    journal.startup.finish("first action")
+    for success, end in ((True, "terminated"), (False, "truncated"), (False, "stopped")):
+        record = journal.begin(len(journal.records))
+        record.add(1.5, {"is_success": success})
+        record.end = end
+    return journal
+
+
+def test_everything_is_in_the_report(corridor_checkpoint):
+    path = corridor_checkpoint()
+    report = DeployReport(Checkpoint.open(path), 0, Ending("fault: link lost", 1), journal(), driven_pacer(0.05))
+    values = report.to_json()
+    assert json.loads(json.dumps(values, allow_nan=False)) == values
+    assert values["stop_reason"] == "fault: link lost"
+    assert (values["episodes"], values["successes"], values["ticks"], values["missed_ticks"]) == (2, 1, 4, 2)
+    assert values["target_rate_hz"] == 20
+    assert values["lateness_ms"] == {"p50": 1.0, "p99": 117.4, "max": 121.0}
+    assert values["startup_cpu_s"] == {"total": 0.75, "python": 0.5, "first action": 0.25}
+    assert values["per_episode"][2] == {"seed": 2, "length": 1, "return": 1.5, "success": False, "end": "stopped"}
+
+
+def test_lines(corridor_checkpoint):
+    checkpoint = Checkpoint.open(corridor_checkpoint())
+    first, second, third = DeployReport(
+        checkpoint, 0, Ending("episodes done", 0), journal(), driven_pacer(0.05)
+    ).lines()
+    assert first == "episodes done: 2 of 3 episodes, 1 success, 4 ticks, 11.95 Hz of 20"
+    assert second.startswith("lateness p50 1.00 ms, p99 ")
+    assert second.endswith(" ms, max 121.00 ms, 2 missed")
+    assert third == "first action after 0.75 s of CPU time: python 0.50, first action 0.25"
+
+
+def test_before_the_first_tick(corridor_checkpoint):
+    report = DeployReport(
+        Checkpoint.open(corridor_checkpoint()), 0, Ending("interrupted", 130), Journal(2), Pacer(0.05)
+    )
+    assert report.lines() == [
+        "interrupted: 0 of 2 episodes, 0 successes, 0 ticks, no rate yet of 20",
+        "lateness none yet, 0 missed",
+    ]
+    values = report.to_json()
+    assert (values["rate_hz"], values["lateness_ms"], values["startup_cpu_s"]) == (None, None, None)
+
+
+def test_running_free():
+    pacer = driven_pacer(None)
+    assert rate_text(pacer) == "15.79 Hz, no waiting"
+    assert lateness_text(pacer) == "none yet, 0 missed"
+    assert episodes_text(Journal(1)) == "0 of 1 episodes, 0 successes"

@@ -1,0 +1,131 @@
+import json
+import zipfile
+
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+
+from bam_train.cli.eval import main
+from bam_train.environments import make_env
+from bam_train.errors import CheckpointMismatch
+from bam_train.trainers.sb3.foreign import is_plain_sb3, load_trusted
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """A small PPO that stable-baselines3 saved by itself, and its file."""
+    model = PPO("MlpPolicy", "CartPole-v1", n_steps=64, batch_size=64, n_epochs=1, seed=0, device="cpu")
+    model.learn(64)
+    path = tmp_path_factory.mktemp("plain") / "plain.zip"
+    model.save(path)
+    return model, path
+
+
+def run(capsys, *arguments):
+    with pytest.raises(SystemExit) as done:
+        main([str(argument) for argument in arguments])
+    return done.value.code or 0, *capsys.readouterr()
+
+
+def test_plain_files_are_recognised(plain, corridor_checkpoint, tmp_path):
+    assert is_plain_sb3(plain[1])
+    assert not is_plain_sb3(corridor_checkpoint())
+    assert not is_plain_sb3(tmp_path)
+    assert not is_plain_sb3(tmp_path / "no.zip")
+    (tmp_path / "text.zip").write_text("no zip")
+    assert not is_plain_sb3(tmp_path / "text.zip")
+
+
+def test_the_frozen_policy_acts_as_the_model(plain):
+    model, path = plain
+    foreign = load_trusted(path, "ppo", "CartPole-v1")
+    observations = np.random.default_rng(0).normal(size=(200, 4)).astype(np.float32)
+    assert foreign.steps == 64
+    assert (
+        foreign.policy.act_batch(observations).tolist() == model.predict(observations, deterministic=True)[0].tolist()
+    )
+
+
+def test_refused_without_trust(plain, capsys):
+    _, path = plain
+    assert run(capsys, path, "--env", "CartPole-v1", "--algo", "ppo") == (
+        1,
+        "",
+        f"bam-eval: {path}: a plain stable-baselines3 file, not made by bam-train. Loading it runs whatever code is in "
+        "it: if you trust its maker, add --trust-pickle, --env and --algo\n",
+    )
+
+
+def test_nothing_is_unpickled_without_trust(plain, capsys, tmp_path):
+    """Its ``data`` would make a file when loaded."""
+    import base64
+
+    import cloudpickle
+
+    flag = tmp_path / "flag"
+
+    class Evil:
+        def __reduce__(self):
+            return open, (str(flag), "w")
+
+    code = base64.b64encode(cloudpickle.dumps(Evil())).decode()
+    path = tmp_path / "evil.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("data", json.dumps({"clip_range": {":type:": "x", ":serialized:": code}}))
+    status, _, _ = run(capsys, path, "--env", "CartPole-v1", "--algo", "ppo")
+    assert status == 1
+    assert not flag.exists()
+
+
+def test_what_it_is_has_to_be_said(plain, capsys):
+    _, path = plain
+    assert run(capsys, path, "--trust-pickle", "--algo", "ppo") == (
+        1,
+        "",
+        f"bam-eval: {path}: a plain stable-baselines3 file does not say what it is; give --env and --algo\n",
+    )
+
+
+def test_evaluated_with_a_warning(plain, capsys):
+    model, path = plain
+    arguments = ("--trust-pickle", "--env", "CartPole", "--algo", "ppo", "--episodes", 3, "--seed", 5, "--json")
+    status, out, err = run(capsys, path, *arguments)
+    report = json.loads(out)
+    assert status == 0
+    assert err == (
+        f"bam-eval: warning: loading {path} runs whatever code is in it (--trust-pickle). If its run normalised "
+        "observations, these figures are wrong: the normaliser is not in such a file.\n"
+    )
+    assert report["return_mean"] == np.mean([total(model, seed) for seed in (5, 6, 7)])
+    assert (report["env"], report["algorithm"], report["steps"]) == ("CartPole-v1", "ppo", 64)
+
+
+def total(model, seed):
+    """Return of one episode under SB3's own prediction."""
+    env = make_env("CartPole-v1")
+    observation, _ = env.reset(seed=seed)
+    result, ended = 0.0, False
+    while not ended:
+        observation, reward, terminated, truncated, _ = env.step(model.predict(observation, deterministic=True)[0])
+        result, ended = result + reward, terminated or truncated
+    return result
+
+
+def test_an_unknown_algorithm(plain, capsys):
+    status, _, err = run(capsys, plain[1], "--trust-pickle", "--env", "CartPole-v1", "--algo", "pppo")
+    assert (status, err) == (1, "bam-eval: Unknown algorithm 'pppo'. Did you mean 'ppo'?\n")
+
+
+@pytest.mark.parametrize(("algo", "env"), [("sac", "Pendulum-v1"), ("dqn", "CartPole-v1"), ("ppo", "Pendulum-v1")])
+def test_another_algorithm_or_environment(plain, algo, env):
+    with pytest.raises(CheckpointMismatch) as caught:
+        load_trusted(plain[1], algo, env)
+    text = str(caught.value)
+    assert text.startswith(f"{plain[1]}: {algo.upper()}.load cannot use it with {env}: ")
+    assert text.endswith(". Check --algo and --env")
+    assert "\n" not in text
+
+
+def test_kinds_that_share_a_policy_load_as_each_other(plain):
+    """An A2C file is not told from a PPO one by SB3 either; the frozen policy is the same."""
+    assert load_trusted(plain[1], "a2c", "CartPole-v1").steps == 64
