@@ -1,0 +1,116 @@
+"""A robot without physics, for tests: the joints are where they were told to be, no faster than the arm can go."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.errors import ResetNeeded
+from bam_envs.robots.robot import Initial, RobotState, Rows, checked_command
+from bam_envs.robots.ur5e import GRIPPER_OPEN, arm_spec
+
+Array = NDArray[np.float64]
+OBJECT_HEIGHT = 0.02
+"""Height of the object's middle above the table [m]."""
+
+
+class FakeRobot:
+    """Arms with the signals of a UR5e, moved exactly; the object, if there is one, stays where it is.
+
+    A command is cut to the limits and the `max_rate` of the spec, and reached within the period.
+
+    Args:
+        num_robots: How many are stepped together.
+        with_object: Whether there is an object, seen by a tracker.
+    """
+
+    def __init__(self, num_robots: int = 1, *, with_object: bool = True) -> None:
+        self.num_robots = num_robots
+        self.spec = arm_spec("fake", with_object=with_object)
+        self.sent: list[Array] = []
+        """Every command since the robot was made, as it was given. Shape: (n, 7) each."""
+        self.halts = 0
+        """How often `halt` was called."""
+        self._with_object = with_object
+        self._connected = False
+        self._low, self._high = np.array(self.spec.command.low), np.array(self.spec.command.high)
+        self._reach = np.array(self.spec.command.max_rate) * self.spec.period
+        self._position = np.tile([0.0] * 6 + [GRIPPER_OPEN], (num_robots, 1))
+        self._velocity = np.zeros((num_robots, 6))
+        self._object = np.tile([0.5, 0.0, OBJECT_HEIGHT, 1.0, 0.0, 0.0, 0.0], (num_robots, 1))
+        self._stamp = np.zeros(num_robots)
+        self._command = self._position
+
+    def connect(self) -> None:
+        """There is nothing to connect to; commands are taken from now on."""
+        self._connected = True
+
+    def reset(self, rows: Rows, initial: Initial) -> RobotState:
+        """Set `rows` to the initial joint positions and object pose, at rest, the gripper open."""
+        self._require_link()
+        self._position, self._object = self._position.copy(), self._object.copy()
+        self._velocity, self._stamp = self._velocity.copy(), self._stamp.copy()
+        self._position[rows, :6], self._position[rows, 6] = initial.signals["joint_position"], GRIPPER_OPEN
+        self._velocity[rows], self._stamp[rows] = 0.0, 0.0
+        self._command = self._command.copy()
+        self._command[rows] = self._position[rows]
+        if "object_pose" in initial.signals:
+            self._place_object(rows, initial.signals["object_pose"])
+        return self._measure()
+
+    def _place_object(self, rows: Rows, pose: Array) -> None:
+        """Put the object at x, y [m] and yaw [rad] of `pose` (k, 3)."""
+        self._object[rows, :2], self._object[rows, 2] = pose[:, :2], OBJECT_HEIGHT
+        self._object[rows, 3], self._object[rows, 6] = np.cos(pose[:, 2] / 2), np.sin(pose[:, 2] / 2)
+
+    def step(self, command: Array) -> RobotState:
+        """Send `command` (n, 7): six joint positions [rad] and the gripper's width [m]; one period later, measure."""
+        self._require_link()
+        self._command = checked_command(command, (self.num_robots, 7))
+        self.sent.append(self._command.copy())
+        target = np.clip(self._command, self._low, self._high)
+        near = np.abs(target - self._position) <= self._reach
+        travel = np.clip(target - self._position, -self._reach, self._reach)
+        self._position = np.where(near, target, self._position + travel)
+        self._velocity = travel[:, :6] / self.spec.period
+        self._stamp = self._stamp + self.spec.period
+        return self._measure()
+
+    def _measure(self) -> RobotState:
+        signals = {
+            "joint_position": self._position[:, :6],
+            "joint_velocity": self._velocity,
+            "gripper_width": self._position[:, 6:],
+        }
+        if self._with_object:
+            signals |= {"object_position": self._object[:, :3], "object_quaternion": self._object[:, 3:]}
+        return RobotState(signals, self._stamp, self._command)
+
+    def _require_link(self) -> None:
+        if not self._connected:
+            raise ResetNeeded("The fake robot is not connected. Call connect() first.")
+
+    def halt(self) -> None:
+        """It never moves between steps; the call is counted."""
+        self.halts += 1
+
+    def close(self) -> None:
+        """Halt; no command is taken until `connect`."""
+        self.halt()
+        self._connected = False
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything the future of the robots depends on."""
+        arrays = (self._position, self._velocity, self._object, self._stamp, self._command)
+        names = ("position", "velocity", "object", "stamp", "command")
+        return {name: array.copy() for name, array in zip(names, arrays, strict=True)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> RobotState:
+        """Go to what `state_dict` returned; the state there."""
+        self.connect()
+        self._position, self._velocity = np.array(state["position"]), np.array(state["velocity"])
+        self._object, self._stamp = np.array(state["object"]), np.array(state["stamp"])
+        self._command = np.array(state["command"])
+        return self._measure()
