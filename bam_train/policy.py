@@ -13,12 +13,11 @@ import numpy as np
 
 from bam_train import onnx_file
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint
-from bam_train.errors import BamTrainError, FormatError, PolicyError
+from bam_train.errors import FormatError, PolicyError
 from bam_train.onnx_mlp import MlpRunner, UnsupportedGraph
+from bam_train.policy_golden import TOLERANCE, worst_difference
 from bam_train.policy_spaces import Leaf, leaf, leaves
 
-TOLERANCE = 1e-5
-"""Largest difference from the trainer's own action, in the action's unit or half its range if that is more than 1."""
 _STATE = "state."
 
 
@@ -54,7 +53,6 @@ class FrozenPolicy:
         self._zero_state = {value.name: (tuple(n or 0 for n in value.shape[1:]), value.dtype) for value in states}
         self._state: dict[str, np.ndarray] | None = None
         self.recurrent = bool(states)
-        _require_fit(graph, self._leaves)
         self._try_once()
         self._buffer, self._calls, self._result = self._short_cut()
 
@@ -94,18 +92,10 @@ class FrozenPolicy:
         """
         try:
             graph = onnx_file.parse(onnx)
+            _require_fit(graph, leaves(observation_space))
+            return cls(graph, _runner(graph, onnx), observation_space, action_space)
         except FormatError as error:
             raise PolicyError(f"the policy cannot be read: {error}") from error
-        runner: Runner
-        try:
-            runner = MlpRunner(graph)
-        except UnsupportedGraph:
-            from bam_train.onnx_session import OnnxSession
-
-            runner = OnnxSession(onnx)
-        except FormatError as error:
-            raise PolicyError(f"the policy cannot be read: {error}") from error
-        return cls(graph, runner, observation_space, action_space)
 
     def reset(self, rows: Any = None) -> None:
         """Forget what was seen, at the start of an episode.
@@ -116,8 +106,11 @@ class FrozenPolicy:
         if rows is None:
             self._state = None
         elif self._state is not None:
-            for state in self._state.values():
-                state[rows] = 0
+            try:
+                for state in self._state.values():
+                    state[rows] = 0
+            except IndexError as error:
+                raise PolicyError(f"reset: rows {rows!r} do not fit a state of {len(state)} rows") from error
 
     def act(self, observation: Any) -> Any:
         """Return the action for one observation.
@@ -143,7 +136,7 @@ class FrozenPolicy:
         buffer[...] = observation
         for call in self._calls:
             call()
-        return self._result.copy()
+        return self._result.copy()[()]  # a number, not an array without axes, of a Discrete
 
     def act_batch(self, observations: Any) -> np.ndarray:
         """Return the actions for n observations, one a row.
@@ -213,10 +206,9 @@ class FrozenPolicy:
 
     def _check_golden(self, checkpoint: Checkpoint) -> None:
         """Act on the recorded observations, and compare with what the trainer did."""
-        arrays = checkpoint.arrays(GOLDEN)
         try:
-            worst, row = self._worst_difference(arrays)
-        except (KeyError, BamTrainError) as error:
+            worst, row = worst_difference(self, self._leaves, self._action, checkpoint.arrays(GOLDEN))
+        except PolicyError as error:
             raise PolicyError(f"{checkpoint.path}: {GOLDEN} does not fit the policy: {error}") from error
         if not worst <= TOLERANCE:  # NaN too
             raise PolicyError(
@@ -224,35 +216,19 @@ class FrozenPolicy:
                 f"{GOLDEN}, expected at most {TOLERANCE}. Save it again with this version of bam-train"
             )
 
-    def _worst_difference(self, arrays: dict[str, np.ndarray]) -> tuple[float, int]:
-        expected = arrays["action"]
-        parts = {part.name: arrays[part.name] for part in self._leaves}
-        rows = [self._row(parts, k) for k in range(len(expected) if self.recurrent else min(8, len(expected)))]
-        self.reset()
-        found = np.array([self.act(row) for row in rows])
-        self.reset()
-        if not self.recurrent:
-            found = np.concatenate([found, self._act(parts)[len(rows) :]])
-        difference = np.abs(found - expected.astype(np.float64)) / self._unit()
-        worst = difference.reshape(len(expected), -1).max(axis=1)
-        row = int(np.argmax(np.where(np.isnan(worst), np.inf, worst)))
-        return float(worst[row]), row
 
-    def _row(self, parts: dict[str, np.ndarray], k: int) -> Any:
-        if self._is_dict:
-            return {name.removeprefix("observation."): array[k] for name, array in parts.items()}
-        return parts["observation"][k]
+def _runner(graph: onnx_file.Graph, onnx: bytes) -> Runner:
+    """Choose NumPy for dense layers, onnxruntime for everything else."""
+    try:
+        return MlpRunner(graph)
+    except UnsupportedGraph:
+        from bam_train.onnx_session import OnnxSession
 
-    def _unit(self) -> Any:
-        """Half the range of each number of a bounded Box if that is more than 1: float32 has so many digits."""
-        if self._action.kind != "Box" or self._action.low is None or self._action.high is None:
-            return 1.0
-        half = (self._action.high - self._action.low) / 2
-        return np.where(np.isfinite(half), np.maximum(half, 1.0), 1.0)
+        return OnnxSession(onnx)
 
 
 def _require_fit(graph: onnx_file.Graph, parts: list[Leaf]) -> None:
-    """Refuse a graph whose inputs are not the observation space's arrays."""
+    """Refuse a graph whose inputs are not the observation space's arrays, or that lacks an output."""
     inputs = {value.name: value for value in graph.inputs if not value.name.startswith(_STATE)}
     if set(inputs) != {part.name for part in parts}:
         raise PolicyError(
@@ -263,7 +239,11 @@ def _require_fit(graph: onnx_file.Graph, parts: list[Leaf]) -> None:
         if value.shape[1:] != part.shape or value.dtype != part.dtype:
             found = f"{value.shape[1:]} ({value.dtype})"
             raise PolicyError(f"{part.name}: the space has {part.shape} ({part.dtype}), the policy takes {found}")
+    states = [value for value in graph.inputs if value.name.startswith(_STATE)]
+    for value in states:
+        if len(value.shape) < 2 or None in value.shape[1:]:
+            raise PolicyError(f"{value.name}: expected a fixed shape after the batch axis, found {value.shape}")
     names = {value.name for value in graph.outputs}
-    wanted = {"action", *(f"next_{value.name}" for value in graph.inputs if value.name.startswith(_STATE))}
+    wanted = {"action", *(f"next_{value.name}" for value in states)}
     if not wanted <= names:
         raise PolicyError(f"the policy's outputs are {sorted(names)}, expected {sorted(wanted)}")

@@ -2,10 +2,10 @@
 
 The graph holds the whole path of ``model.predict(..., deterministic=True)``, with what lies around it: `VecNormalize`,
 `VecTransposeImage`, one-hot codes, the network, squashing, and the action space's bounds. It is traced from a copy on
-the CPU, so the model is not touched and no random number is drawn.
+the CPU: the model is not touched and no random number is drawn.
 
 Inputs are ``observation`` (``observation.<key>`` of a Dict) in the environment's own dtype and layout, and for
-recurrent policies ``state.<name>``; outputs are ``action`` and ``next_state.<name>``. The first axis of each is the batch.
+recurrent policies ``state.<name>``; outputs are ``action`` and ``next_state.<name>``; the first axis is the batch.
 """
 
 from __future__ import annotations

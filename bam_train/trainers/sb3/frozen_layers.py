@@ -15,7 +15,6 @@ from torch import nn
 
 from bam_train.errors import PolicyError
 
-
 _KINDS = "Box, Discrete, MultiDiscrete or MultiBinary"
 
 

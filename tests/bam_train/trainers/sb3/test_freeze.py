@@ -1,0 +1,518 @@
+"""Every algorithm, frozen, against its own ``model.predict(..., deterministic=True)`` on 1,000 random observations."""
+
+from __future__ import annotations
+
+import os
+import random
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from sb3_contrib import QRDQN, TQC, TRPO, CrossQ, RecurrentPPO
+from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage
+
+from bam_envs.spaces import space_to_json
+from bam_train import onnx_file, safetensors_file
+from bam_train.checkpoint import write_checkpoint
+from bam_train.errors import PolicyError
+from bam_train.onnx_mlp import MlpRunner
+from bam_train.onnx_session import OnnxSession
+from bam_train.policy import FrozenPolicy
+from bam_train.trainers.sb3.freeze import FrozenModule, freeze, golden
+from bam_train.trainers.sb3.golden import draw, trainer_actions
+
+ROWS = 1000
+VECTOR = spaces.Box(-1, 1, (6,))
+ARM = spaces.Box(np.array([-1, 0, -30], np.float32), np.array([1, 0.5, 70], np.float32))
+IMAGE = spaces.Box(0, 255, (40, 36, 3), np.uint8)
+MIXED = spaces.Dict(
+    camera=spaces.Box(0, 255, (36, 36, 1), np.uint8),
+    joints=spaces.Box(-np.inf, np.inf, (2, 3), np.float64),
+    mode=spaces.Discrete(4, start=-1),
+    switches=spaces.MultiBinary(3),
+    tool=spaces.Box(-2, 2, (3,)),
+)
+
+
+class Blank(gym.Env[Any, Any]):
+    """An environment of any spaces in which nothing happens."""
+
+    def __init__(self, observation_space: gym.Space[Any], action_space: gym.Space[Any]) -> None:
+        self.observation_space, self.action_space = observation_space, action_space
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> Any:
+        return self.observation_space.sample(), 0.0, False, False, {}
+
+
+def make(
+    algorithm: type[BaseAlgorithm],
+    observation_space: gym.Space[Any],
+    action_space: gym.Space[Any],
+    normalise: dict[str, Any] | None = None,
+    **settings: Any,
+) -> tuple[BaseAlgorithm, VecNormalize | None]:
+    """Build a model whose weights and statistics are all random, so that every part of it matters."""
+    env: Any = DummyVecEnv([lambda: Blank(observation_space, action_space)])
+    normaliser = env = VecNormalize(env, **normalise) if normalise is not None else env
+    kind = "MultiInput" if isinstance(observation_space, spaces.Dict) else settings.pop("network", "Mlp")
+    policy = f"{kind}{'Lstm' if algorithm is RecurrentPPO else ''}Policy"
+    settings["policy_kwargs"] = {"net_arch": [16, 16], **settings.get("policy_kwargs", {})}
+    off_policy = issubclass(algorithm, OffPolicyAlgorithm)
+    small: dict[str, Any] = {"buffer_size": 10} if off_policy else {"n_steps": 4}
+    small |= {"batch_size": 4} if algorithm is not A2C else {}
+    if algorithm is RecurrentPPO:
+        settings["policy_kwargs"].setdefault("lstm_hidden_size", 8)
+    model = algorithm(policy, env, seed=0, device="cpu", **small, **settings)
+    rng = np.random.default_rng(1)
+    for name, tensor in model.policy.state_dict().items():
+        if tensor.dtype == torch.float32:
+            values = rng.normal(size=tensor.shape) * (np.sqrt(2 / tensor[0].numel()) if tensor.ndim > 1 else 0.02)
+            values = np.abs(values) + 1.0 if name.endswith(("var", "scale")) else values
+            tensor.copy_(torch.as_tensor(values))
+    if normalise is None:
+        return model, None
+    moments = normaliser.obs_rms.values() if isinstance(normaliser.obs_rms, dict) else [normaliser.obs_rms]
+    for rms in moments:
+        rms.mean, rms.var = rng.normal(size=rms.mean.shape) * 0.3, rng.random(rms.var.shape) + 0.01
+    return model, normaliser
+
+
+def freeze_it(
+    model: BaseAlgorithm, normaliser: Any, observation: gym.Space[Any], action: gym.Space[Any]
+) -> FrozenPolicy:
+    graph = freeze(model, normaliser, observation, action)
+    return FrozenPolicy.from_graph(graph, space_to_json(observation), space_to_json(action))
+
+
+def row(observation_space: gym.Space[Any], drawn: dict[str, np.ndarray], k: Any) -> Any:
+    chosen = {key: values[k] for key, values in drawn.items()}
+    return chosen if isinstance(observation_space, spaces.Dict) else chosen[""]
+
+
+def shaded(drawn: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Make some images darker: to a network, noise of equal brightness is all the same."""
+    light = np.random.default_rng(3).random((len(next(iter(drawn.values()))), 1, 1, 1))
+    return {key: (x * light).astype(x.dtype) if x.ndim == 4 else x for key, x in drawn.items()}
+
+
+def assert_parity(
+    model: BaseAlgorithm,
+    normaliser: VecNormalize | None,
+    observation_space: gym.Space[Any],
+    action_space: gym.Space[Any],
+    rows: int = ROWS,
+) -> FrozenPolicy:
+    policy = freeze_it(model, normaliser, observation_space, action_space)
+    drawn = shaded(draw(observation_space, rows, np.random.default_rng(2), normaliser))
+    expected = trainer_actions(model, normaliser, observation_space, action_space, drawn)
+    single = [policy.act(row(observation_space, drawn, k)) for k in range(rows)]
+    batch = policy.act_batch(row(observation_space, drawn, slice(None)))
+    unit = np.maximum((action_space.high - action_space.low) / 2, 1) if isinstance(action_space, spaces.Box) else 1
+    unit = np.where(np.isfinite(unit), unit, 1)
+    for found in (np.array(single), batch):
+        assert found.shape == (rows, *action_space.shape)
+        np.testing.assert_array_less(np.abs(found.astype(np.float64) - expected) / unit, 1e-5)
+    assert all(action_space.contains(action) for action in single)
+    assert len(np.unique(expected, axis=0)) > 1, "the actions must depend on the observations"
+    return policy
+
+
+@pytest.mark.parametrize("normalise", [None, {}], ids=["raw", "normalised"])
+@pytest.mark.parametrize("algorithm", [PPO, A2C, TRPO, SAC, TD3, DDPG, TQC, CrossQ])
+def test_continuous_actions(algorithm: type[BaseAlgorithm], normalise: dict[str, Any] | None):
+    policy = assert_parity(*make(algorithm, VECTOR, ARM, normalise), VECTOR, ARM)
+    assert isinstance(policy._runner, MlpRunner)
+
+
+@pytest.mark.parametrize("normalise", [None, {"clip_obs": 2.0}], ids=["raw", "normalised"])
+@pytest.mark.parametrize("algorithm", [PPO, A2C, TRPO, DQN, QRDQN])
+def test_discrete_actions(algorithm: type[BaseAlgorithm], normalise: dict[str, Any] | None):
+    policy = assert_parity(*make(algorithm, VECTOR, spaces.Discrete(4), normalise), VECTOR, spaces.Discrete(4))
+    assert isinstance(policy.act(np.zeros(6, np.float32)), np.int64)
+
+
+@pytest.mark.parametrize("space", [spaces.MultiDiscrete([3, 1, 4]), spaces.MultiBinary(3)], ids=str)
+@pytest.mark.parametrize("algorithm", [PPO, A2C, TRPO])
+def test_several_choices(algorithm: type[BaseAlgorithm], space: gym.Space[Any]):
+    assert_parity(*make(algorithm, VECTOR, space), VECTOR, space)
+
+
+@pytest.mark.parametrize(
+    "space", [spaces.Discrete(3, start=5), spaces.MultiDiscrete([3, 2], start=[7, -1], dtype=np.int32)], ids=str
+)
+def test_choices_that_do_not_start_at_zero(space: Any):
+    policy = assert_parity(*make(PPO, VECTOR, space), VECTOR, space)
+    assert policy.act_batch(np.zeros((3, 6), np.float32)).dtype == space.dtype
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Discrete(5),
+        spaces.Discrete(5, start=-2),
+        spaces.MultiDiscrete([3, 2, 4]),
+        spaces.MultiDiscrete([3, 2], start=[4, 5]),
+        spaces.MultiBinary(6),
+        spaces.MultiBinary([2, 3]),
+        spaces.Box(-1, 1, (2, 2, 2)),
+        spaces.Box(-np.inf, np.inf, (4,), np.float64),
+        spaces.Box(-3.4e38, 3.4e38, (4,), np.float32),
+        spaces.Box(0, 200, (3,), np.uint8),
+        spaces.Box(-9, 9, (3,), np.int64),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("algorithm", [PPO, SAC])
+def test_observations(algorithm: type[BaseAlgorithm], space: gym.Space[Any]):
+    policy = assert_parity(*make(algorithm, space, ARM), space, ARM)
+    assert isinstance(policy._runner, MlpRunner)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Box(np.array([-1, 0.1]), np.array([3, 7.3]), dtype=np.float64),
+        spaces.Box(-0.3, 0.7, (2, 2)),
+        spaces.Box(-1000, 1000, (2,)),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("algorithm", [PPO, SAC, TD3])
+def test_action_boxes(algorithm: type[BaseAlgorithm], space: spaces.Box):
+    policy = assert_parity(*make(algorithm, VECTOR, space), VECTOR, space)
+    assert policy.act(VECTOR.sample()).dtype == space.dtype
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "network"),
+    [
+        (PPO, {"squash_output": True}),
+        (PPO, {}),
+        (A2C, {"squash_output": True, "full_std": False}),
+        (SAC, {}),
+        (TQC, {}),
+    ],
+)
+def test_state_dependent_noise(algorithm: type[BaseAlgorithm], network: dict[str, Any]):
+    assert_parity(*make(algorithm, VECTOR, ARM, use_sde=True, policy_kwargs=network), VECTOR, ARM)
+
+
+@pytest.mark.parametrize("activation", ["Tanh", "ReLU", "ELU", "LeakyReLU", "SiLU", "Sigmoid", "Softplus"])
+def test_activations(activation: str):
+    network = {"activation_fn": getattr(torch.nn, activation)}
+    policy = assert_parity(*make(PPO, VECTOR, ARM, policy_kwargs=network), VECTOR, ARM)
+    assert isinstance(policy._runner, OnnxSession if activation == "Softplus" else MlpRunner)
+
+
+@pytest.mark.parametrize("network", [{"net_arch": []}, {"share_features_extractor": False}])
+def test_other_networks(network: dict[str, Any]):
+    assert_parity(*make(PPO, VECTOR, ARM, policy_kwargs=network), VECTOR, ARM)
+
+
+@pytest.mark.parametrize("shape", [(40, 36, 3), (3, 36, 40), (36, 36, 1)])
+@pytest.mark.parametrize("algorithm", [PPO, SAC, TD3, DQN, QRDQN, TQC])
+def test_images(algorithm: type[BaseAlgorithm], shape: tuple[int, ...]):
+    space = spaces.Box(0, 255, shape, np.uint8)
+    action_space = spaces.Discrete(4) if algorithm in (DQN, QRDQN) else ARM
+    network = {"features_extractor_kwargs": {"features_dim": 16}}
+    model, _ = make(algorithm, space, action_space, network="Cnn", policy_kwargs=network)
+    assert isinstance(model.get_env(), VecTransposeImage) == (shape[2] < 4)
+    policy = assert_parity(model, None, space, action_space)
+    assert isinstance(policy._runner, OnnxSession)
+
+
+def test_an_image_through_dense_layers():
+    assert_parity(*make(PPO, IMAGE, ARM), IMAGE, ARM, rows=200)
+
+
+@pytest.mark.parametrize("normalise", [None, {"norm_obs_keys": ["joints", "tool"]}], ids=["raw", "normalised"])
+@pytest.mark.parametrize("algorithm", [PPO, SAC, DQN])
+def test_dicts(algorithm: type[BaseAlgorithm], normalise: dict[str, Any] | None):
+    action_space = spaces.Discrete(4) if algorithm is DQN else ARM
+    network = {"features_extractor_kwargs": {"cnn_output_dim": 16}}
+    assert_parity(*make(algorithm, MIXED, action_space, normalise, policy_kwargs=network), MIXED, action_space)
+
+
+@pytest.mark.parametrize("algorithm", [PPO, TD3, TRPO, A2C, DDPG, TQC])
+def test_dicts_without_images_run_in_numpy(algorithm: type[BaseAlgorithm]):
+    space = spaces.Dict({key: MIXED[key] for key in ("joints", "mode", "switches", "tool")})
+    policy = assert_parity(*make(algorithm, space, ARM, {"norm_obs_keys": ["tool"]}), space, ARM)
+    assert isinstance(policy._runner, MlpRunner)
+
+
+def test_numbers_far_from_zero_are_normalised_in_float64():
+    space = spaces.Box(-np.inf, np.inf, (3,))
+    model, normaliser = make(PPO, space, ARM, {})
+    normaliser.obs_rms.mean, normaliser.obs_rms.var = np.full(3, 1234.567), np.full(3, 1e-6)
+    assert_parity(model, normaliser, space, ARM)
+
+
+def test_dicts_of_images_with_channels_first():
+    space = spaces.Dict(front=spaces.Box(0, 255, (3, 36, 40), np.uint8), tool=VECTOR)
+    network = {"features_extractor_kwargs": {"cnn_output_dim": 16}}
+    assert_parity(*make(PPO, space, ARM, {"norm_obs_keys": ["tool"]}, policy_kwargs=network), space, ARM)
+
+
+def test_normalised_images():
+    space = spaces.Box(0, 255, (3, 36, 40), np.uint8)
+    network = {"normalize_images": False, "features_extractor_kwargs": {"features_dim": 16}}
+    model, normaliser = make(PPO, space, ARM, {}, network="Cnn", policy_kwargs=network)
+    normaliser.obs_rms.mean, normaliser.obs_rms.var = normaliser.obs_rms.mean + 120, normaliser.obs_rms.var * 4000
+    assert_parity(model, normaliser, space, ARM, rows=200)
+
+
+def test_a_normaliser_of_rewards_only_changes_nothing():
+    model, normaliser = make(PPO, VECTOR, ARM)
+    env = VecNormalize(DummyVecEnv([lambda: Blank(VECTOR, ARM)]), norm_obs=False)
+    assert freeze(model, env, VECTOR, ARM) == freeze(model, normaliser, VECTOR, ARM)
+
+
+RECURRENT = {
+    "vector": (VECTOR, ARM, None, {}),
+    "normalised": (VECTOR, ARM, {}, {}),
+    "two layers": (VECTOR, ARM, None, {"policy_kwargs": {"n_lstm_layers": 2}}),
+    "shared": (VECTOR, ARM, None, {"policy_kwargs": {"shared_lstm": True, "enable_critic_lstm": False}}),
+    "discrete": (spaces.Discrete(5), spaces.Discrete(3), None, {}),
+    "image": (
+        IMAGE,
+        ARM,
+        None,
+        {"network": "Cnn", "policy_kwargs": {"features_extractor_kwargs": {"features_dim": 16}}},
+    ),
+    "dict": (spaces.Dict(joints=MIXED["joints"], mode=MIXED["mode"]), ARM, {"norm_obs_keys": ["joints"]}, {}),
+}
+
+
+@pytest.mark.parametrize("case", RECURRENT.values(), ids=RECURRENT)
+def test_recurrent_policies_carry_their_state_and_forget_it(case: Any):
+    observation_space, action_space, normalise, settings = case
+    model, normaliser = make(RecurrentPPO, observation_space, action_space, normalise, **settings)
+    policy = freeze_it(model, normaliser, observation_space, action_space)
+    assert policy.recurrent
+    drawn = draw(observation_space, ROWS, np.random.default_rng(2), normaliser)
+    episodes = np.split(np.arange(ROWS), [1, 300, 301])
+    expected = np.concatenate(
+        [
+            trainer_actions(
+                model, normaliser, observation_space, action_space, {key: x[steps] for key, x in drawn.items()}
+            )
+            for steps in episodes
+        ]
+    )
+    found = []
+    for steps in episodes:
+        policy.reset()
+        found += [policy.act(row(observation_space, drawn, k)) for k in steps]
+    np.testing.assert_array_less(np.abs(np.array(found, np.float64) - expected), 1e-5)
+    assert all(action_space.contains(action) for action in found)
+
+
+def test_recurrent_rows_are_kept_apart_and_reset_apart():
+    model, _ = make(RecurrentPPO, VECTOR, ARM)
+    policy = freeze_it(model, None, VECTOR, ARM)
+    rng = np.random.default_rng(0)
+    observations = rng.uniform(-1, 1, (50, 4, 6)).astype(np.float32)
+    starts = rng.random((50, 4)) < 0.1
+    state, expected, found = None, [], []
+    for k in range(50):
+        policy.reset(starts[k] if k % 2 else np.flatnonzero(starts[k]))
+        action, state = model.predict(observations[k], state, starts[k], deterministic=True)
+        expected.append(action)
+        found.append(policy.act_batch(observations[k]))
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_freezing_draws_no_random_number_and_leaves_the_model_as_it_was():
+    for algorithm, action_space in ((PPO, ARM), (CrossQ, ARM), (QRDQN, spaces.Discrete(3)), (RecurrentPPO, ARM)):
+        model, normaliser = make(algorithm, VECTOR, action_space, {})
+        model.policy.set_training_mode(True)
+        modes = [module.training for module in model.policy.modules()]
+        weights = {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
+        before = torch.get_rng_state(), np.random.get_state()[1].copy(), random.getstate()
+        first = freeze(model, normaliser, VECTOR, action_space), golden(model, normaliser, VECTOR)
+        assert torch.equal(torch.get_rng_state(), before[0])
+        np.testing.assert_array_equal(np.random.get_state()[1], before[1])
+        assert random.getstate() == before[2]
+        assert [module.training for module in model.policy.modules()] == modes
+        assert all(torch.equal(tensor, weights[name]) for name, tensor in model.policy.state_dict().items())
+        assert all(tensor.requires_grad for tensor in model.policy.parameters() if tensor.is_leaf)
+        assert first == (freeze(model, normaliser, VECTOR, action_space), golden(model, normaliser, VECTOR))
+
+
+def test_the_graph_says_what_it_takes_and_nothing_of_this_machine():
+    network = {"features_extractor_kwargs": {"cnn_output_dim": 16}}
+    graph_bytes = freeze(make(PPO, MIXED, ARM, policy_kwargs=network)[0], None, MIXED, ARM)
+    graph = onnx_file.parse(graph_bytes)
+    assert [(value.name, value.dtype, value.shape) for value in graph.inputs] == [
+        (f"observation.{key}", space.dtype, (None, *space.shape)) for key, space in MIXED.items()
+    ]
+    assert [value.name for value in graph.outputs] == ["action"]
+    assert b"site-packages" not in graph_bytes
+    assert b"/" + os.getcwd().split("/")[1].encode() + b"/" not in graph_bytes
+
+
+def test_numpy_onnxruntime_and_sb3_agree():
+    model, normaliser = make(PPO, VECTOR, ARM, {})
+    graph = freeze(model, normaliser, VECTOR, ARM)
+    drawn = draw(VECTOR, ROWS, np.random.default_rng(2), normaliser)
+    expected = trainer_actions(model, normaliser, VECTOR, ARM, drawn)
+    ours = MlpRunner(onnx_file.parse(graph)).run({"observation": drawn[""]})["action"]
+    theirs = OnnxSession(graph).run({"observation": drawn[""]})["action"]
+    np.testing.assert_allclose(ours, theirs, atol=1e-5)
+    np.testing.assert_allclose(ours, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("observation_space", "action_space", "text"),
+    [
+        (spaces.Box(-1, 1, (5,)), ARM, r"observation '': the policy takes shape \(6,\), the environment gives \(5,\)"),
+        (MIXED, ARM, r"observation: the policy takes \[''\], the environment gives \['camera', "),
+        (
+            spaces.Text(3),
+            ARM,
+            "observation '': a Text cannot be frozen; expected Box, Discrete, MultiDiscrete or Multi",
+        ),
+        (VECTOR, spaces.Dict(a=ARM), r"action space Dict\(.*\): expected Box, Discrete, MultiDiscrete or MultiBinary"),
+    ],
+)
+def test_spaces_that_do_not_fit(observation_space: gym.Space[Any], action_space: gym.Space[Any], text: str):
+    with pytest.raises(PolicyError, match=text):
+        freeze(make(PPO, VECTOR, ARM)[0], None, observation_space, action_space)
+
+
+def test_unknown_policies_and_lstms_are_refused():
+    model, _ = make(PPO, VECTOR, ARM)
+    model.policy = torch.nn.Module()
+    model.policy.observation_space = VECTOR
+    with pytest.raises(PolicyError, match="policy Module cannot be frozen; expected one of stable-baselines3's own"):
+        freeze(model, None, VECTOR, ARM)
+    model, _ = make(RecurrentPPO, VECTOR, ARM)
+    model.policy.lstm_actor = torch.nn.LSTM(6, 8, bidirectional=True)
+    with pytest.raises(PolicyError, match="an LSTM that is bidirectional, projects or has no bias cannot be frozen"):
+        freeze(model, None, VECTOR, ARM)
+
+
+# Golden actions
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "observation_space", "action_space", "rows"),
+    [
+        (PPO, VECTOR, ARM, 256),
+        (DQN, VECTOR, spaces.Discrete(3), 256),
+        (PPO, VECTOR, spaces.MultiDiscrete([2, 3]), 256),
+        (PPO, VECTOR, spaces.MultiBinary(2), 256),
+        (RecurrentPPO, VECTOR, ARM, 256),
+        (PPO, IMAGE, ARM, 46),
+        (PPO, MIXED, ARM, 146),
+    ],
+)
+def test_golden_actions_are_the_trainers(
+    algorithm: type[BaseAlgorithm], observation_space: Any, action_space: Any, rows: int, tmp_path: Path
+):
+    model, normaliser = make(algorithm, observation_space, action_space)
+    arrays = safetensors_file.parse(golden(model, normaliser, observation_space))
+    action = arrays.pop("action")
+    assert action.shape == (rows, *action_space.shape)
+    drawn = {name.removeprefix("observation").removeprefix("."): array for name, array in arrays.items()}
+    np.testing.assert_array_equal(trainer_actions(model, None, observation_space, action_space, drawn), action)
+    path = save(tmp_path / "a.zip", model, normaliser, observation_space, action_space)
+    FrozenPolicy.load(path)
+
+
+def test_golden_choices_are_clear_ones():
+    model, _ = make(DQN, VECTOR, spaces.Discrete(3))
+    module = FrozenModule(model, None, VECTOR, spaces.Discrete(3))
+    observation = torch.as_tensor(safetensors_file.parse(golden(model, None, VECTOR))["observation"])
+    best = module.scores(observation).topk(2)[0]
+    assert (best[:, 0] - best[:, 1]).min() > 0.01
+
+
+def save(path: Path, model: Any, normaliser: Any, observation_space: Any, action_space: Any, **members: bytes) -> Path:
+    fields = {
+        "env": "Blank-v0",
+        "env_kwargs": {},
+        "observation_space": space_to_json(observation_space),
+        "action_space": space_to_json(action_space),
+        "signals": {},
+        "period": None,
+        "algorithm": "ppo",
+        "trainer": "sb3",
+        "settings": {},
+        "steps": 0,
+        "seed": 0,
+        "scores": {},
+        "versions": {},
+        "git_commit": None,
+        "created": "",
+    }
+    frozen = {
+        "bam/policy.onnx": freeze(model, normaliser, observation_space, action_space),
+        "bam/golden.safetensors": golden(model, normaliser, observation_space),
+    }
+    return write_checkpoint(path, fields, {**frozen, **members}).path
+
+
+def test_weights_that_are_not_numbers_are_refused(tmp_path: Path):
+    model, _ = make(TD3, VECTOR, ARM)
+    next(model.policy.actor.parameters()).data[:] = float("nan")
+    path = save(tmp_path / "a.zip", model, None, VECTOR, model.action_space)
+    with pytest.raises(PolicyError, match="the frozen policy differs from the trainer's by nan in row 0"):
+        FrozenPolicy.load(path)
+
+
+BLOCK = """
+import sys
+BLOCKED = {blocked!r}
+class Block:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in BLOCKED:
+            raise ImportError(f"{{name}} must not be imported")
+sys.meta_path.insert(0, Block())
+import numpy as np
+from bam_train.policy import FrozenPolicy
+policy = FrozenPolicy.load({path!r})
+print(policy.act(np.zeros({shape!r}, {dtype!r})).tolist())
+"""
+
+
+@pytest.mark.parametrize("space", [VECTOR, IMAGE], ids=["dense layers", "convolutions"])
+def test_a_process_without_torch_needs_numpy_and_onnxruntime_only_for_convolutions(space: spaces.Box, tmp_path: Path):
+    settings = {"network": "Cnn", "policy_kwargs": {"features_extractor_kwargs": {"features_dim": 16}}}
+    model, _ = make(PPO, space, ARM, **(settings if space is IMAGE else {}))
+    path = save(tmp_path / "a.zip", model, None, space, ARM)
+    blocked = [
+        "torch",
+        "gymnasium",
+        "bam_envs",
+        "safetensors",
+        "onnx",
+        "stable_baselines3",
+        "cloudpickle",
+        "tyro",
+        "rich",
+    ]
+    blocked += [] if space is IMAGE else ["onnxruntime"]
+    script = BLOCK.format(blocked=blocked, path=str(path), shape=space.shape, dtype=str(space.dtype))
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    expected = model.predict(np.zeros(space.shape, space.dtype), deterministic=True)[0]
+    np.testing.assert_allclose(eval(done.stdout), expected, atol=1e-4)
