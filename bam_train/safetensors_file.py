@@ -119,7 +119,7 @@ def _array(
     name: str, body: memoryview, dtype: np.dtype[Any], shape: tuple[int, ...], start: int, stop: int
 ) -> np.ndarray:
     try:
-        return np.frombuffer(body[start:stop], dtype).reshape(shape).copy()
+        return np.array(np.frombuffer(body[start:stop], dtype).reshape(shape))
     except ValueError as error:  # more axes, or longer ones, than NumPy takes
         raise FormatError(f"array {name!r}: shape {shape} cannot be read ({error})") from error
 

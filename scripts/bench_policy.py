@@ -10,6 +10,7 @@ import argparse
 import os
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy and torch read it
@@ -28,10 +29,12 @@ def main() -> None:
     parser.add_argument("--normalise", action="store_true", help="with VecNormalize inside the frozen policy")
     parser.add_argument("--calls", type=int, default=10_000, help="timed calls of each contender")
     options = parser.parse_args()
+    if min(*options.layers, options.observation, options.action, options.calls) < 1:
+        parser.error("every number must be at least 1")
     report(measure(contenders(options), options.calls), options)
 
 
-def contenders(options: argparse.Namespace) -> dict[str, Callable[[Any], Any]]:
+def contenders(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
     """Build one policy, three ways to run it."""
     import numpy as np
     import torch
@@ -65,7 +68,7 @@ def contenders(options: argparse.Namespace) -> dict[str, Callable[[Any], Any]]:
     worst = max(float(np.abs(way(x) - predict(x)).max()) for way in ways.values())
     if not worst <= 1e-5:
         raise SystemExit(f"the contenders differ by {worst:.2g}: nothing to compare")
-    return {name: lambda way=way: way(x) for name, way in ways.items()}
+    return {name: partial(way, x) for name, way in ways.items()}
 
 
 def blank(observation: Any, action: Any) -> Any:
@@ -79,7 +82,7 @@ def blank(observation: Any, action: Any) -> Any:
     return DummyVecEnv([Blank])
 
 
-def measure(ways: dict[str, Any], calls: int) -> dict[str, list[float]]:
+def measure(ways: dict[str, Callable[[], Any]], calls: int) -> dict[str, list[float]]:
     """Time the contenders in turns, so that whatever else the machine does hits all of them.
 
     Returns:
@@ -109,11 +112,15 @@ def report(times: dict[str, list[float]], options: argparse.Namespace) -> None:
     for name, values in times.items():
         ratio = p50[name] / p50["FrozenPolicy.act"]
         print(f"{name:18}{p50[name]:10.1f}{np.percentile(values, 99):10.1f}{ratio:20.1f}")
-    ratio = p50["SB3 predict"] / p50["FrozenPolicy.act"]
+    if options.layers != [64, 64]:
+        print("targets are set for 64x64 only")
+        return
+    ours = p50["FrozenPolicy.act"]
+    ratio = p50["SB3 predict"] / ours
+    print(f"target p50 <= {TARGET_P50:.0f} us: {verdict(ours <= TARGET_P50)} ({ours:.1f} us)")
     print(
-        f"p50 <= {TARGET_P50:.0f} us: {verdict(p50['FrozenPolicy.act'] <= TARGET_P50)} ({p50['FrozenPolicy.act']:.1f} us)"
+        f"target at least {TARGET_RATIO:.0f} times as fast as SB3: {verdict(ratio >= TARGET_RATIO)} ({ratio:.1f} times)"
     )
-    print(f"at least {TARGET_RATIO:.0f} times as fast as SB3: {verdict(ratio >= TARGET_RATIO)} ({ratio:.1f} times)")
 
 
 def verdict(reached: bool) -> str:
