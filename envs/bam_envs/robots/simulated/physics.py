@@ -103,7 +103,7 @@ class Physics:
     @staticmethod
     def _mark_diverged(state: Array, time: Array) -> None:
         """Fill rows that did not get to `time` (n,) [s] with NaN: MuJoCo puts a diverged row back to its default."""
-        late = np.abs(state[:, 0] - time) > 1e-6
+        late = ~(np.abs(state[:, 0] - time) < 1e-6)  # also where time is NaN
         if late.any():
             state[late] = np.nan
 

@@ -1,0 +1,123 @@
+"""The simulated UR5e: set points, limits, gripper, halt."""
+
+import numpy as np
+import pytest
+
+from bam_envs.errors import ResetNeeded
+from bam_envs.robots.robot import Initial, Robot
+from bam_envs.robots.simulated.arm import SimulatedArm, arm_scene, cube_scene
+from bam_envs.testing import ARM_HOME
+
+
+@pytest.fixture
+def arm():
+    """One arm with a cube, at its start."""
+    robot = SimulatedArm(1)
+    robot.connect()
+    yield robot
+    robot.close()
+
+
+def begin(robot, object_pose=(0.5, 0.1, 0.3), joints=ARM_HOME):
+    n = robot.num_robots
+    signals = {"joint_position": np.tile(joints, (n, 1)), "object_pose": np.tile(object_pose, (n, 1))}
+    return robot.reset(np.arange(n), Initial(signals, np.arange(n, dtype=np.int64)))
+
+
+def hold(width=0.085):
+    return np.concatenate([ARM_HOME, [width]])[None]
+
+
+def test_scenes_are_robots_that_differ_in_the_object():
+    with_cube, without = cube_scene(2), arm_scene(2)
+    assert isinstance(with_cube, Robot)
+    assert [signal.name for signal in with_cube.spec.signals] == [
+        "joint_position", "joint_velocity", "gripper_width", "object_position", "object_quaternion",
+    ]
+    assert [signal.name for signal in without.spec.signals] == ["joint_position", "joint_velocity", "gripper_width"]
+    assert with_cube.spec.period == 0.05
+
+
+def test_reset_puts_everything_where_it_is_told(arm):
+    state = begin(arm)
+    np.testing.assert_array_equal(state.signals["joint_position"], [ARM_HOME])
+    np.testing.assert_array_equal(state.signals["joint_velocity"], np.zeros((1, 6)))
+    np.testing.assert_array_equal(state.signals["gripper_width"], [[0.085]])
+    np.testing.assert_allclose(state.signals["object_position"], [[0.5, 0.1, 0.02]])
+    np.testing.assert_allclose(state.signals["object_quaternion"], [[np.cos(0.15), 0, 0, np.sin(0.15)]])
+    np.testing.assert_array_equal(state.stamp, [0.0])
+    np.testing.assert_array_equal(state.command, hold())
+
+
+def test_it_holds_still(arm):
+    start = begin(arm)
+    for _ in range(40):
+        state = arm.step(hold())
+    assert np.abs(state.signals["joint_position"] - start.signals["joint_position"]).max() < 1e-3
+    assert np.abs(state.signals["object_position"] - start.signals["object_position"]).max() < 1e-3
+    np.testing.assert_allclose(state.stamp, [2.0], atol=1e-9)
+
+
+def test_joints_follow_a_slow_command_closely(arm):
+    begin(arm)
+    command = hold()
+    for _ in range(20):
+        command[0, 0] += 0.03
+        state = arm.step(command)
+    assert abs(state.signals["joint_position"][0, 0] - command[0, 0]) < 0.05
+    for _ in range(20):
+        state = arm.step(command)
+    assert abs(state.signals["joint_position"][0, 0] - command[0, 0]) < 1e-3
+
+
+def test_the_gripper_closes_at_its_speed(arm):
+    begin(arm, object_pose=(0.65, 0.2, 0.0))
+    widths = [float(arm.step(hold(0.0)).signals["gripper_width"][0, 0]) for _ in range(20)]
+    assert widths[0] > 0.085 - 1.5 * 0.15 * 0.05
+    assert abs(widths[-1]) < 1e-3
+    assert np.diff(widths).min() > -1.6 * 0.15 * 0.05
+
+
+def test_the_gripper_stops_at_the_cube(arm):
+    from bam_envs.robots.ur5e import GEOMETRY
+
+    joints = GEOMETRY.reach_down(np.array([[0.5, 0.0, 0.02]]), np.zeros(1))[0]
+    begin(arm, object_pose=(0.5, 0.0, 0.0), joints=joints)
+    for _ in range(20):
+        state = arm.step(np.concatenate([joints, [0.0]])[None])
+    assert 0.035 < state.signals["gripper_width"][0, 0] < 0.041
+
+
+def test_halt_holds_where_it_is(arm):
+    begin(arm)
+    moving = arm.step(hold() + 0.04)
+    arm.halt()
+    held = arm.physics.qpos[0, :6].copy()
+    np.testing.assert_array_equal(arm._command[0, :6], held)
+    state = arm.step(arm._command)
+    assert np.abs(state.signals["joint_position"][0] - moving.signals["joint_position"][0]).max() < 0.05
+
+
+def test_not_connected():
+    arm = SimulatedArm(1)
+    for act in (lambda: arm.step(hold()), lambda: begin(arm), lambda: arm.render("rgb_array", [])):
+        with pytest.raises(ResetNeeded) as caught:
+            act()
+        assert str(caught.value) == "The simulated robot is not connected. Call reset() first."
+
+
+def test_saved_and_restored_in_another_robot():
+    one, two = SimulatedArm(2, randomize=True), SimulatedArm(2, randomize=True)
+    one.connect()
+    begin(one)
+    command = np.repeat(hold(), 2, axis=0)
+    one.step(command + 0.02)
+    here = two.load_state_dict(one.state_dict())
+    there = one.load_state_dict(one.state_dict())
+    for name, array in there.signals.items():
+        np.testing.assert_array_equal(here.signals[name], array)
+    first, second = one.step(command), two.step(command)
+    for name, array in first.signals.items():
+        np.testing.assert_array_equal(second.signals[name], array)
+    one.close()
+    two.close()

@@ -1,0 +1,76 @@
+"""The robot without physics."""
+
+import numpy as np
+import pytest
+
+from bam_envs.errors import ResetNeeded
+from bam_envs.robots.fake import FakeRobot
+from bam_envs.robots.robot import Initial
+from bam_envs.testing import ARM_HOME
+
+
+def started(n=1):
+    robot = FakeRobot(n)
+    robot.connect()
+    signals = {"joint_position": np.tile(ARM_HOME, (n, 1)), "object_pose": np.tile([0.5, 0.1, 0.3], (n, 1))}
+    return robot, robot.reset(np.arange(n), Initial(signals, np.zeros(n, np.int64)))
+
+
+def test_joints_are_exactly_where_they_were_told_to_be():
+    robot, state = started()
+    command = state.command + 0.1
+    command[0, 6] = 0.085
+    state = robot.step(command)
+    np.testing.assert_array_equal(state.signals["joint_position"], command[:, :6])
+    np.testing.assert_allclose(state.signals["joint_velocity"], 2.0)
+    np.testing.assert_array_equal(state.stamp, [0.05])
+
+
+def test_no_joint_is_faster_than_its_max_rate():
+    robot, state = started()
+    after = robot.step(state.command + 1.0)
+    np.testing.assert_allclose(after.signals["joint_position"], ARM_HOME[None] + np.pi * 0.05)
+    np.testing.assert_allclose(robot.step(np.zeros((1, 7))).signals["gripper_width"], 0.085 - 0.15 * 0.05)
+
+
+def test_commands_are_cut_to_their_limits():
+    robot, state = started()
+    command = state.command.copy()
+    command[0, 6] = 1.0
+    np.testing.assert_array_equal(robot.step(command).signals["gripper_width"], [[0.085]])
+
+
+def test_the_object_stays_put():
+    robot, state = started()
+    np.testing.assert_allclose(state.signals["object_position"], [[0.5, 0.1, 0.02]])
+    np.testing.assert_allclose(state.signals["object_quaternion"], [[np.cos(0.15), 0, 0, np.sin(0.15)]])
+    after = robot.step(state.command)
+    np.testing.assert_array_equal(after.signals["object_position"], state.signals["object_position"])
+
+
+def test_it_tells_what_it_was_sent_and_how_often_it_was_halted():
+    robot, state = started()
+    robot.step(state.command)
+    robot.step(state.command + 1)
+    np.testing.assert_array_equal(robot.sent, [state.command, state.command + 1])
+    robot.halt()
+    robot.close()
+    assert robot.halts == 2
+
+
+def test_not_connected():
+    with pytest.raises(ResetNeeded) as caught:
+        FakeRobot().step(np.zeros((1, 7)))
+    assert str(caught.value) == "The fake robot is not connected. Call connect() first."
+
+
+def test_saved_and_restored():
+    robot, state = started(2)
+    robot.step(state.command + 0.01)
+    other = FakeRobot(2)
+    here = other.load_state_dict(robot.state_dict())
+    there = robot.load_state_dict(robot.state_dict())
+    for name, array in there.signals.items():
+        np.testing.assert_array_equal(here.signals[name], array)
+    np.testing.assert_array_equal(here.stamp, there.stamp)
+    np.testing.assert_array_equal(here.command, there.command)

@@ -1,0 +1,111 @@
+"""The one table of environments."""
+
+import gymnasium as gym
+import pytest
+
+from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.registry import ENVIRONMENTS, register, resolve, resolve_id
+from bam_envs.robot_env import RobotEnv, RobotVectorEnv
+
+
+def test_the_table():
+    assert {key: (entry.max_episode_steps, entry.period) for key, entry in ENVIRONMENTS.items()} == {
+        "bam/reach-v0": (100, 0.05),
+        "bam/pick-v0": (100, 0.05),
+        "bam/pick-place-v0": (200, 0.05),
+    }
+    for key, entry in ENVIRONMENTS.items():
+        assert entry.id == key
+        assert entry.summary
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_every_row_makes_what_it_says(env_id):
+    entry = ENVIRONMENTS[env_id]
+    robot, task = resolve(entry.robot)(2), resolve(entry.task)(2)
+    assert robot.num_robots == task.num_rows == 2
+    assert robot.spec.period == entry.period
+
+
+def test_registering_again_changes_nothing():
+    before = {env_id: gym.registry[env_id] for env_id in ENVIRONMENTS}
+    register()
+    assert all(gym.registry[env_id] is spec for env_id, spec in before.items())
+
+
+@pytest.mark.parametrize(
+    ("name", "env_id"),
+    [
+        ("bam/pick", "bam/pick-v0"),
+        ("bam/pick-v0", "bam/pick-v0"),
+        ("bam/pick-place", "bam/pick-place-v0"),
+        ("CartPole", "CartPole-v1"),
+        ("CartPole-v0", "CartPole-v0"),
+        ("gymnasium:CartPole-v1", "gymnasium:CartPole-v1"),
+        ("bam_envs:bam/reach", "bam_envs:bam/reach-v0"),
+    ],
+)
+def test_names_that_mean_something(name, env_id):
+    assert resolve_id(name) == env_id
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("bam/pik", "Unknown environment 'bam/pik'. Did you mean 'bam/pick-v0'?"),
+        ("bam/pick-v7", "Unknown environment 'bam/pick-v7'. Did you mean 'bam/pick-v0'?"),
+        ("CartPol-v1", "Unknown environment 'CartPol-v1'. Did you mean 'CartPole-v1'?"),
+        ("", "Unknown environment ''. Choose from: bam/reach-v0, bam/pick-v0, bam/pick-place-v0."),
+        ("Qwxyz", "Unknown environment 'Qwxyz'. Choose from: bam/reach-v0, bam/pick-v0, bam/pick-place-v0."),
+    ],
+)
+def test_names_that_mean_nothing(name, text):
+    with pytest.raises(UnknownName) as caught:
+        resolve_id(name)
+    assert str(caught.value) == text
+    assert caught.value.kind == "environment"
+
+
+@pytest.mark.parametrize("module", ["no_such_module", "gymnasium.no_such", "no_such_module.inside"])
+def test_a_module_that_is_not_there(module):
+    with pytest.raises(InvalidValue) as caught:
+        resolve_id(f"{module}:Env-v0")
+    assert str(caught.value) == (
+        f"Environment '{module}:Env-v0' needs the module '{module}', which is not installed."
+    )
+
+
+def test_a_module_that_lacks_another_one_says_which(tmp_path, monkeypatch):
+    (tmp_path / "needs_another.py").write_text("import no_such_module")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ModuleNotFoundError, match="no_such_module"):
+        resolve_id("needs_another:Env-v0")
+
+
+@pytest.mark.filterwarnings("ignore:.*Using the latest versioned environment.*:UserWarning")
+def test_gymnasium_makes_them_without_a_version():
+    env = gym.make("bam/pick")
+    assert isinstance(env.unwrapped, RobotEnv)
+    assert env.spec is not None
+    assert env.spec.id == "bam/pick-v0"
+    assert env.spec.max_episode_steps == 100
+    env.close()
+
+
+def test_gymnasium_makes_rows(make_rows):
+    envs = make_rows("bam/pick-v0", 5, randomize=True)
+    assert isinstance(envs.unwrapped, RobotVectorEnv)
+    assert envs.num_envs == 5
+    assert envs.unwrapped.robot.randomize
+    assert envs.unwrapped.max_episode_steps == 100
+
+
+def test_the_time_limit_of_rows_can_be_changed():
+    envs = gym.make_vec("bam/reach-v0", num_envs=2, max_episode_steps=7)
+    assert envs.unwrapped.max_episode_steps == 7
+    envs.close()
+
+
+def test_an_option_that_does_not_exist_is_an_error(make):
+    with pytest.raises(TypeError, match="randomise"):
+        make("bam/pick-v0", randomise=True)
