@@ -45,7 +45,7 @@ class TrainSettings:
     until_success: float | None = None
     """Stop once this share of evaluation episodes succeeds, in (0, 1]."""
     eval_every: int | None = None
-    """Steps between evaluations; by default a twentieth of the run."""
+    """Steps between evaluations; by default a twentieth of the run, and at least 1000."""
     eval_episodes: int = 20
     """Episodes of one evaluation."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)

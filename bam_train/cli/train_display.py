@@ -90,7 +90,9 @@ class LiveDisplay(PlainDisplay):
 
     def note(self, text: str) -> None:
         """Say something above the panel."""
-        self._console.print(text, markup=False, soft_wrap=True)
+        from rich.text import Text
+
+        self._console.print(Text(text), soft_wrap=True)
 
 
 def evaluation_line(steps: int, report: EvaluationReport, best: bool) -> str:
@@ -119,15 +121,16 @@ def _panel(title: str, progress: Progress, statistics: Statistics, rate: float, 
     from rich.progress_bar import ProgressBar
     from rich.table import Table
 
-    grid = Table.grid(padding=(0, 2))
-    rows = {
+    grid = Table.grid(padding=(0, 3))
+    columns = {
         "steps": _steps(progress),
         "speed": f"{rate:,.0f} steps/s",
         "success": percent(statistics.success_rate),
         "return": number(statistics.return_mean),
         "time left": duration(None if left is None else max(0.0, left)),
     }
-    grid.add_row(*(f"[dim]{name}[/dim] {value}" for name, value in rows.items()))
+    grid.add_row(*columns, style="dim")
+    grid.add_row(*columns.values())
     outer = Table.grid(expand=True)
     outer.add_row(ProgressBar(total=progress.total, completed=min(progress.steps, progress.total)))
     outer.add_row(grid)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -73,20 +74,29 @@ def load(checkpoint: Checkpoint, model: Any, venv: VecEnv, normaliser: VecNormal
     Raises:
         AlteredCheckpoint: A member is missing, or does not fit the model.
     """
-    state.load_weights(model, _read(checkpoint, MODEL))
+    with _fits(checkpoint, MODEL):
+        state.load_weights(model, _read(checkpoint, MODEL))
     tree = _read(checkpoint, STATE)
-    state.load_counters(model, tree["counters"])
-    if normaliser is not None and tree["normaliser"] is not None:
-        state.load_normaliser(normaliser, tree["normaliser"])
+    with _fits(checkpoint, STATE):
+        state.load_counters(model, tree["counters"])
+        if normaliser is not None:
+            state.load_normaliser(normaliser, tree["normaliser"])
+        same = _load_episodes(model, venv, tree["env"])
+        waiting = Waiting(tree["random"], tree["noise"], same)
     if checkpoint.has(f"{REPLAY}.json"):
-        state.load_replay(model, _read(checkpoint, REPLAY))
-    same = _load_episodes(model, venv, tree["env"])
-    return Waiting(tree["random"], tree["noise"], same)
+        with _fits(checkpoint, REPLAY):
+            state.load_replay(model, _read(checkpoint, REPLAY))
+    return waiting
 
 
-def read_notes(checkpoint: Checkpoint) -> dict[str, Any]:
-    """The notes that `members` kept."""
-    return dict(checkpoint.json(NOTES))
+@contextmanager
+def _fits(checkpoint: Checkpoint, name: str) -> Iterator[None]:
+    """What goes wrong when a state is put into a model that is not made like the saved one, in one line."""
+    try:
+        yield
+    except (RuntimeError, ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
+        reason = " ".join(str(error).split())
+        raise AlteredCheckpoint(checkpoint.path, name, f"{name} does not fit these settings: {reason:.200}") from error
 
 
 def _load_episodes(model: Any, venv: VecEnv, tree: Mapping[str, Any] | None) -> bool:

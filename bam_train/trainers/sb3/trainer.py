@@ -63,7 +63,7 @@ class SB3Trainer:
             algorithm.require_actions(settings.env, type(env.action_space).__name__)
             values = hyperparameters.complete(algorithm, settings.hyperparameters, env.observation_space)
         normalize = hyperparameters.complete_normalize(settings.normalize, values["gamma"])
-        eval_every = settings.eval_every or max(1, settings.steps // 20)
+        eval_every = settings.eval_every or max(1000, settings.steps // 20)
         return dataclasses.replace(settings, hyperparameters=values, normalize=normalize, eval_every=eval_every)
 
     @classmethod
@@ -111,6 +111,12 @@ class SB3Trainer:
             self._between()
         except _Stop:
             return
+        except (ValueError, RuntimeError) as error:  # torch refuses a distribution of NaN in the middle of an update
+            if all_finite(self.model):
+                raise
+            raise TrainingFailed(
+                f"the policy's weights are NaN or infinite after step {self.steps}; {_FINITE}"
+            ) from error
 
     def _log_interval(self) -> int:
         """Rollouts (on-policy) or episodes between two entries of the log."""

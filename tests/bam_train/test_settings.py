@@ -1,0 +1,121 @@
+"""Settings: layers, files, names and ranges."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from bam_train.errors import SettingsError
+from bam_train.settings import TrainSettings, differences, file_stem, merge, read_assignments, read_config
+
+BASE = {"env": "bam/pick-v0", "algo": "ppo"}
+
+
+def test_round_trip_through_json():
+    settings = TrainSettings.from_mapping(
+        {**BASE, "steps": 1e6, "hyperparameters": {"policy_kwargs": {"net_arch": [64]}}}
+    )
+    assert settings.steps == 1_000_000
+    assert TrainSettings.from_mapping(json.loads(json.dumps(settings.to_mapping()))) == settings
+
+
+def test_settings_share_nothing_with_what_they_are_made_from():
+    given = {**BASE, "hyperparameters": {"policy_kwargs": {"net_arch": [64]}}}
+    settings = TrainSettings.from_mapping(given)
+    settings.hyperparameters["policy_kwargs"]["net_arch"].append(1)
+    assert given["hyperparameters"]["policy_kwargs"]["net_arch"] == [64]
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        ({"stps": 3}, "settings: unknown setting 'stps'. Did you mean 'steps'?"),
+        ({"steps": "many"}, "steps: expected an int, found 'many' (text)"),
+        ({"steps": 0}, "steps: expected at least 1, found 0"),
+        ({"num_envs": 0}, "num_envs: expected at least 1, found 0"),
+        ({"seed": -1}, "seed: expected at least 0, found -1"),
+        ({"until_success": 1.5}, "until_success: expected a share above 0 and at most 1, such as 0.99, found 1.5"),
+        ({"normalize": 3}, "normalize: expected true or false or a table, found 3 (an int)"),
+        ({"env": None}, "env: expected a name, found nothing. Give --env NAME"),
+    ],
+)
+def test_bad_settings_say_what_is_wrong(extra, message):
+    with pytest.raises(SettingsError) as caught:
+        TrainSettings.from_mapping({**BASE, **extra})
+    assert str(caught.value) == message
+
+
+def test_merge_merges_tables_and_changes_no_layer():
+    low, high = {"a": 1, "t": {"x": 1, "y": 2}}, {"t": {"y": 3, "z": {"w": 1}}}
+    assert merge(low, high, {"a": 2}) == {"a": 2, "t": {"x": 1, "y": 3, "z": {"w": 1}}}
+    assert low == {"a": 1, "t": {"x": 1, "y": 2}}
+    assert high == {"t": {"y": 3, "z": {"w": 1}}}
+
+
+def test_assignments_go_to_settings_or_to_the_algorithm():
+    texts = ["steps=5", "gamma=0.9", "policy_kwargs.net_arch=[8]", "env_kwargs.randomize=true", "hyperparameters.tau=1"]
+    assert read_assignments(texts) == {
+        "steps": 5,
+        "hyperparameters": {"gamma": 0.9, "policy_kwargs": {"net_arch": [8]}, "tau": 1},
+        "env_kwargs": {"randomize": True},
+    }
+
+
+def test_an_assignment_into_something_that_is_no_table():
+    with pytest.raises(SettingsError, match=r"^--set steps\.x=3: steps is not a table; expected steps=value$"):
+        read_assignments(["steps.x=3"])
+
+
+def test_config_files_in_both_formats(tmp_path):
+    (tmp_path / "a.toml").write_text('env = "bam/pick-v0"\n[hyperparameters]\ngamma = 0.9\n')
+    (tmp_path / "a.json").write_text('{"env": "bam/pick-v0", "hyperparameters": {"gamma": 0.9}}')
+    wanted = {"env": "bam/pick-v0", "hyperparameters": {"gamma": 0.9}}
+    assert read_config(tmp_path / "a.toml") == wanted
+    assert read_config(tmp_path / "a.json") == wanted
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.json", '{"env": "bam/pi', "a.json: is not whole JSON: "),
+        ("a.toml", 'env = "bam', "a.toml: is not whole TOML: "),
+        ("a.json", "[1]", "a.json: expected a table of settings, found a list"),
+        ("a.toml", "stps = 3", "a.toml: unknown setting 'stps'. Did you mean 'steps'?"),
+        ("a.yaml", "", "a.yaml: expected a .toml or .json file, found .yaml"),
+    ],
+)
+def test_bad_config_files(tmp_path, name, text, message):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(SettingsError) as caught:
+        read_config(tmp_path / name)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_config_file_that_is_not_there_or_not_text(tmp_path):
+    with pytest.raises(SettingsError, match=r"a\.json: cannot be read: No such file or directory$"):
+        read_config(tmp_path / "a.json")
+    (tmp_path / "b.json").write_bytes(b"\xff\xfe")
+    with pytest.raises(SettingsError, match=r"b\.json: is not text"):
+        read_config(tmp_path / "b.json")
+
+
+def test_differences_look_into_tables_and_tell_true_from_one():
+    wanted = {"a": 1, "t": {"x": 1, "y": True}}
+    assert differences(wanted, {"a": 1, "t": {"x": 2, "y": 1}, "b": 3}) == [("t.x", 1, 2), ("t.y", True, 1)]
+    assert differences(wanted, wanted) == []
+
+
+@pytest.mark.parametrize(
+    ("env", "stem"),
+    [
+        ("bam/pick-v0", "pick-ppo"),
+        ("bam/pick-place-v0", "pick-place-ppo"),
+        ("CartPole-v1", "CartPole-v1-ppo"),
+        ("ALE/Pong-v5", "ALE-Pong-v5-ppo"),
+        ("../x:Env-v0", "x-Env-v0-ppo"),
+    ],
+)
+def test_file_stem(env, stem):
+    assert file_stem(env, "ppo") == stem

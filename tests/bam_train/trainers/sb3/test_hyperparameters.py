@@ -1,0 +1,128 @@
+"""Hyperparameters against the constructors of stable-baselines3."""
+
+from __future__ import annotations
+
+import copy
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+
+from bam_train.errors import SettingsError
+from bam_train.trainers.sb3.algorithms import ALGORITHMS
+from bam_train.trainers.sb3.hyperparameters import build, complete, complete_normalize, default_policy
+
+NUMBERS = gym.spaces.Box(-1, 1, (3,))
+IMAGE = gym.spaces.Box(0, 255, (36, 36, 3), np.uint8)
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_defaults_are_json_and_complete_twice_is_once(name):
+    values = complete(ALGORITHMS[name], {}, NUMBERS)
+    assert json.loads(json.dumps(values)) == values
+    assert complete(ALGORITHMS[name], values, NUMBERS) == values
+    assert not {"env", "seed", "device", "verbose", "tensorboard_log"} & values.keys()
+
+
+@pytest.mark.parametrize(
+    ("name", "space", "policy"),
+    [
+        ("ppo", NUMBERS, "MlpPolicy"),
+        ("dqn", IMAGE, "CnnPolicy"),
+        ("sac", gym.spaces.Dict({"a": NUMBERS}), "MultiInputPolicy"),
+        ("recurrent-ppo", NUMBERS, "MlpLstmPolicy"),
+        ("recurrent-ppo", gym.spaces.Dict({"a": IMAGE}), "MultiInputLstmPolicy"),
+        ("ppo", gym.spaces.Discrete(3), "MlpPolicy"),
+    ],
+)
+def test_the_policy_fits_what_is_observed(name, space, policy):
+    assert default_policy(ALGORITHMS[name], space) == policy
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "message"),
+    [
+        ("ppo", {"lerning_rate": 1}, "Unknown ppo hyperparameter 'lerning_rate'. Did you mean 'learning_rate'?"),
+        ("ppo", {"step": 1}, "Unknown ppo hyperparameter 'step'. Did you mean 'steps'?"),
+        ("ppo", {"batch_size": 1.5}, "batch_size: expected an int, found 1.5 (a float)"),
+        ("ppo", {"seed": 1}, "seed is not a hyperparameter here: use --seed"),
+        ("sac", {"replay_buffer_class": "x"}, "replay_buffer_class cannot be set: bam-train takes care of it"),
+        ("dqn", {"policy": "MlpPolcy"}, "policy: unknown policy 'MlpPolcy' of dqn. Did you mean 'MlpPolicy'?"),
+        (
+            "ppo",
+            {"policy_kwargs": {"net_arc": [8]}},
+            "Unknown policy_kwargs argument 'net_arc'. Did you mean 'net_arch'?",
+        ),
+        (
+            "ppo",
+            {"policy_kwargs": {"net_arch": ["a"]}},
+            "policy_kwargs.net_arch: expected a list of ints or a table or none, found ['a'] (a list)",
+        ),
+        (
+            "ppo",
+            {"policy_kwargs": {"activation_fn": "tan"}},
+            "policy_kwargs.activation_fn: unknown 'tan'. Did you mean 'tanh'?",
+        ),
+        (
+            "td3",
+            {"action_noise": "pink_0.1"},
+            'action_noise: expected "normal_0.1" or "ornstein-uhlenbeck_0.1", found \'pink_0.1\'',
+        ),
+    ],
+)
+def test_what_does_not_fit_is_one_line(name, given, message):
+    with pytest.raises(SettingsError) as caught:
+        complete(ALGORITHMS[name], given, NUMBERS)
+    assert str(caught.value) == message
+
+
+def test_build_makes_objects_and_changes_nothing():
+    given = {"learning_rate": "lin_3e-4", "policy_kwargs": {"activation_fn": "Tanh", "net_arch": [8]}}
+    values = complete(ALGORITHMS["ppo"], given, NUMBERS)
+    before = copy.deepcopy(values)
+    arguments = build(values, gym.spaces.Discrete(2))
+    assert values == before
+    assert arguments["policy_kwargs"]["activation_fn"] is torch.nn.Tanh
+    assert arguments["learning_rate"](1.0) == 3e-4
+    assert arguments["learning_rate"](0.25) == pytest.approx(0.75e-4)
+    assert arguments["learning_rate"](0.0) == 0.0
+
+
+def test_build_makes_tuples_and_noise():
+    given = {"train_freq": [2, "episode"], "action_noise": "normal_0.25"}
+    arguments = build(complete(ALGORITHMS["td3"], given, NUMBERS), gym.spaces.Box(-1, 1, (2,)))
+    assert arguments["train_freq"] == (2, "episode")
+    assert isinstance(arguments["action_noise"], NormalActionNoise)
+    assert arguments["action_noise"]._sigma.tolist() == [0.25, 0.25]
+    noisy = complete(ALGORITHMS["td3"], {"action_noise": "ornstein-uhlenbeck_0.1"}, NUMBERS)
+    assert isinstance(build(noisy, gym.spaces.Box(-1, 1, (2,)))["action_noise"], OrnsteinUhlenbeckActionNoise)
+
+
+def test_normalize():
+    assert complete_normalize(False, 0.9) is False
+    assert complete_normalize(True, 0.9) == {"gamma": 0.9}
+    assert complete_normalize({"norm_reward": False, "gamma": 0.5}, 0.9) == {"gamma": 0.5, "norm_reward": False}
+    with pytest.raises(
+        SettingsError, match=r"^Unknown normalize argument 'norm_rewards'\. Did you mean 'norm_reward'\?$"
+    ):
+        complete_normalize({"norm_rewards": False}, 0.9)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), [("sac", "Discrete"), ("dqn", "Box"), ("dqn", "MultiDiscrete"), ("ppo", "Text")]
+)
+def test_an_algorithm_that_does_not_fit_the_actions(name, kind):
+    with pytest.raises(SettingsError, match=rf"^{name} does not fit Some-v0: it takes .* actions, found {kind}\. "):
+        ALGORITHMS[name].require_actions("Some-v0", kind)
+
+
+def test_the_line_about_actions_names_what_fits():
+    with pytest.raises(SettingsError) as caught:
+        ALGORITHMS["dqn"].require_actions("bam/pick-v0", "Box")
+    assert str(caught.value) == (
+        "dqn does not fit bam/pick-v0: it takes Discrete actions, found Box. "
+        "Use one of: a2c, crossq, ddpg, ppo, recurrent-ppo, sac, td3, tqc, trpo."
+    )
