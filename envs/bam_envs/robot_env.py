@@ -186,6 +186,8 @@ class RobotVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.float3
             options: ``reset_mask`` or nothing.
         """
         mask = self._all if options is None else np.asarray(options.get("reset_mask", self._all), dtype=bool)
+        if mask.shape != self._all.shape:
+            raise InvalidValue(f"reset_mask must have shape {self._all.shape}, not {mask.shape}.")
         rows = np.flatnonzero(mask)
         for row, one in self._row_seeds(seed):
             if one is not None and mask[row]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from bam_envs.robots.robot import Initial, RobotState, Rows
 from bam_envs.robots.ur5e import GRIPPER_OPEN
-from bam_envs.tasks.pick import CUBE_AREA, TABLE_EDGE, CubeSense, PickTask
+from bam_envs.tasks.pick import CUBE_AREA, CUBE_EDGE, TABLE_EDGE, CubeSense, PickTask
 from bam_envs.tasks.task import Array, Floats, Label, Score
 
 GOAL_RADIUS = 0.02
@@ -20,12 +20,17 @@ REST_STEPS = 5
 """How long the object must lie there, let go: 0.25 s at 20 Hz."""
 CARRY = 0.05
 """How high the object is carried [m]."""
+PICKED = 0.03
+"""An object that was this high has been picked up, not pushed [m]."""
+FUNNEL = 0.08
+"""Distance from the goal at which it comes down [m]."""
 
 GOAL_LABELS = (
     Label("goal_dx", "goal from the object, forward", "m", "/ 0.2", -2, 2),
     Label("goal_dy", "goal from the object, to the left", "m", "/ 0.2", -2, 2),
     Label("goal_near_dx", "goal from the object, forward, close up", "m", "/ 0.04, clipped"),
     Label("goal_near_dy", "goal from the object, to the left, close up", "m", "/ 0.04, clipped"),
+    Label("picked", "1 when the object has been lifted 3 cm in this episode, else -1", "1"),
 )
 
 
@@ -42,6 +47,8 @@ class PickPlaceTask(PickTask):
         super().__init__(num_rows)
         self.goal = np.zeros((num_rows, 2))
         """Goals on the table [m]. Shape: (n, 2)."""
+        self.picked = np.zeros(num_rows, dtype=bool)
+        """Whether the object has been lifted by `PICKED` in this episode. Shape: (n,)."""
 
     def begin(self, rows: Rows, rngs: Sequence[np.random.Generator]) -> Initial:
         """As for picking, and a goal at least `GOAL_DISTANCE` from the cube."""
@@ -50,10 +57,16 @@ class PickPlaceTask(PickTask):
             self.goal[row] = sample_goal(rng, cube[:2])
         return initial
 
+    def start(self, rows: Rows, state: RobotState) -> None:
+        """As for picking; nothing has been picked up yet."""
+        super().start(rows, state)
+        self.picked[rows] = False
+
     def observe(self, state: RobotState) -> Floats:
-        """See `observation_labels`. Shape: (n, 22) float32."""
+        """See `observation_labels`. Shape: (n, 23) float32."""
         offset = self.goal - self.sense(state).object[:, :2]
-        goal = np.concatenate([offset / 0.2, offset / 0.04], axis=1).astype(np.float32)
+        picked = np.where(self.picked, 1.0, -1.0)[:, None]
+        goal = np.concatenate([offset / 0.2, offset / 0.04, picked], axis=1).astype(np.float32)
         observation = np.concatenate([self.observe_cube(state), goal], axis=1)
         return np.clip(observation, self.observation_space.low, self.observation_space.high)
 
@@ -67,24 +80,25 @@ class PickPlaceTask(PickTask):
         sense = self.sense(state)
         lift, grasped, distance = self.lift(sense), self.grasped(sense), self.goal_distance(sense)
         opening, width = ~self.control.closed, state.signals["gripper_width"][:, 0]
-        there = distance < GOAL_RADIUS
+        self.picked = self.picked | (grasped & (lift > PICKED))
+        there = self.picked & (distance < GOAL_RADIUS)
         self.held = np.where(there & opening & (width > 0.6 * GRIPPER_OPEN), self.held + 1, 0)
         success = self.held >= REST_STEPS
         fallen = sense.object[:, 2] < TABLE_EDGE
-        reward = np.where(there & opening, 0.8, self._shaping(sense, lift, grasped) + 0.04 * there)
-        reward = reward + 40.0 * success - 2.0 * fallen
+        openness = np.clip((width - CUBE_EDGE) / (GRIPPER_OPEN - CUBE_EDGE), 0.0, 1.0)
+        reward = np.where(there & opening, 0.9 + 0.6 * openness, self._shaping(sense, lift, grasped) + 0.04 * there)
+        reward = reward + 75.0 * success - 2.0 * fallen
         info = {"distance": sense.distance, "lift": lift, "goal_distance": distance}
         return Score(reward, success | fallen, success, info)
 
     def _shaping(self, sense: CubeSense, lift: Array, grasped: Any) -> Array:
-        """Reach, squeeze, lift to `CARRY`, move above the goal, go down there. Shape: (n,)."""
+        """Reach, squeeze, and carry along a funnel: `CARRY` high far from the goal, down to the table above it. Shape: (n,)."""
         offset = sense.object[:, :2] - self.goal
         across = np.sqrt(np.einsum("ij,ij->i", offset, offset))
-        near, over = 1 - np.tanh(5 * across), across < GOAL_RADIUS
-        height = np.clip(lift / CARRY, 0.0, 1.0)
-        carried = np.where(over, 1.0, height)  # over the goal, being low is as good as being high, and better
+        height = CARRY * np.clip((across - 0.01) / FUNNEL, 0.0, 1.0)
+        inside, near = 1 - np.tanh(25 * np.abs(lift - height)), 1 - np.tanh(5 * across)
         reach: Array = 0.04 * (1 - np.tanh(5 * sense.distance))
-        return reach + grasped * (0.04 + 0.08 * carried + 0.16 * carried * near + 0.12 * over * (1 - height))
+        return reach + grasped * (0.04 + 0.1 * inside + 0.25 * inside * near * self.picked)
 
     def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
         """The goal."""
@@ -92,12 +106,12 @@ class PickPlaceTask(PickTask):
 
     def state_dict(self) -> dict[str, Any]:
         """The memory, as plain arrays."""
-        return {**super().state_dict(), "goal": self.goal.copy()}
+        return {**super().state_dict(), "goal": self.goal.copy(), "picked": self.picked.copy()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go to what `state_dict` returned."""
         super().load_state_dict(state)
-        self.goal = np.array(state["goal"])
+        self.goal, self.picked = np.array(state["goal"]), np.array(state["picked"], dtype=bool)
 
 
 def sample_goal(rng: np.random.Generator, cube: Array) -> Array:

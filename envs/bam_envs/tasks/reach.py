@@ -121,7 +121,7 @@ def slow_step(joints: Array, wanted: Array) -> Array:
         Shape: (n, 6).
     """
     travel = wanted - joints
-    travel *= np.minimum(1.0, JOINT_STEP / np.maximum(np.abs(travel).max(axis=1), 1e-9))[:, None]
+    travel *= np.minimum(1.0, 0.999 * JOINT_STEP / np.maximum(np.abs(travel).max(axis=1), 1e-9))[:, None]
     tool = GEOMETRY.tool_position(joints)
     for _ in range(3):
         step = GEOMETRY.tool_position(joints + travel) - tool

@@ -16,8 +16,8 @@ from bam_envs.robots.robot import RobotState, Rows
 from bam_envs.robots.ur5e import GEOMETRY, GRIPPER_OPEN
 from bam_envs.tasks.task import Array, Floats, Label
 
-TOOL_STEP = 0.0125
-"""Farthest the tool goes in a period of 0.05 s [m]: 0.25 m/s, the speed limit of a UR's recovery mode."""
+TOOL_STEP = 0.0124
+"""Farthest the tool target goes in a period of 0.05 s [m]. With it the measured tool stays below 0.25 m/s, the limit of a UR's recovery mode."""
 JOINT_STEP = 0.05
 """Farthest a joint goes in a period of 0.05 s [rad]: 1.0 rad/s."""
 YAW_STEP = 0.05
@@ -30,9 +30,9 @@ YAW_LIMIT = 1.2
 """Farthest the gripper turns from straight ahead [rad]; a cube needs pi/4."""
 
 ACTION_LABELS = (
-    Label("dx", "move the tool target forward", "m", "/ 0.0125"),
-    Label("dy", "move the tool target to the left", "m", "/ 0.0125"),
-    Label("dz", "move the tool target up", "m", "/ 0.0125"),
+    Label("dx", "move the tool target forward", "m", "/ 0.0124"),
+    Label("dy", "move the tool target to the left", "m", "/ 0.0124"),
+    Label("dz", "move the tool target up", "m", "/ 0.0124"),
     Label("dyaw", "turn the gripper anticlockwise, seen from above", "rad", "/ 0.05"),
     Label("grip", "close the gripper when positive, open it otherwise", "1"),
 )

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+GRIPPER_LEASH = 0.011
+"""Farthest the gripper's set point runs ahead of its fingers [m]: as far as full force needs, so that it opens at once."""
 PHYSICS_STEPS = 10
 """Physics steps a control period."""
 
@@ -97,11 +99,17 @@ class SimulatedArm:
         self._command = checked_command(command, (self.num_robots, 7))
         arriving = self._command if self._imperfection is None else self._imperfection.delayed(self._command)
         travel = arriving - self._setpoint
-        limit = GRIPPER_SPEED * self.spec.period
-        travel[:, 6] = np.clip(travel[:, 6], -limit, limit)
+        travel[:, 6] = self._gripper_travel(arriving[:, 6])
         physics.step(self._setpoint[:, None] + travel[:, None] * self._ramp)
         self._setpoint = self._setpoint + travel
         return self._measure(self._all_rows)
+
+    def _gripper_travel(self, width: Array) -> Array:
+        """How far the gripper's set point goes towards `width` (n,) [m]: at its speed, and near where the fingers are."""
+        measured, limit = self.physics.qpos[:, 6] + self.physics.qpos[:, 7], GRIPPER_SPEED * self.spec.period
+        setpoint = self._setpoint[:, 6] + np.clip(width - self._setpoint[:, 6], -limit, limit)
+        travel: Array = np.clip(setpoint, measured - GRIPPER_LEASH, measured + GRIPPER_LEASH) - self._setpoint[:, 6]
+        return travel
 
     def _measure(self, fresh: Rows) -> RobotState:
         """The state of all rows; a noisy tracker looks again at the `fresh` ones only."""
