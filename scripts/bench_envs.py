@@ -102,7 +102,7 @@ def measure(env_id: str, rows: int, rounds: int, steps: int) -> dict[str, list[f
     envs.reset(seed=0)
     for _ in range(20):
         envs.step(envs.action_space.sample())
-    env = gym.make(env_id, disable_env_checker=True)
+    env: Any = gym.make(env_id, disable_env_checker=True)
     env.reset(seed=0)
     work = {
         "vector": (vector_steps(envs, steps), rows * steps),

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 GRIPPER_LEASH = 0.011
-"""Farthest the gripper's set point runs ahead of its fingers [m]: as far as full force needs, so that it opens at once."""
+"""Farthest the gripper's set point runs ahead of its fingers [m]: what full force needs, so that it opens at once."""
 PHYSICS_STEPS = 10
 """Physics steps a control period."""
 
@@ -105,7 +105,7 @@ class SimulatedArm:
         return self._measure(self._all_rows)
 
     def _gripper_travel(self, width: Array) -> Array:
-        """How far the gripper's set point goes towards `width` (n,) [m]: at its speed, and near where the fingers are."""
+        """How far the gripper's set point goes towards `width` (n,) [m]: at its speed, and near the fingers."""
         measured, limit = self.physics.qpos[:, 6] + self.physics.qpos[:, 7], GRIPPER_SPEED * self.spec.period
         setpoint = self._setpoint[:, 6] + np.clip(width - self._setpoint[:, 6], -limit, limit)
         travel: Array = np.clip(setpoint, measured - GRIPPER_LEASH, measured + GRIPPER_LEASH) - self._setpoint[:, 6]
