@@ -32,7 +32,8 @@ def draw_curve(records: Sequence[dict[str, Any]], title: str, path: Path) -> Non
     for axes, name in zip(plots, names, strict=True):
         _draw(axes, records, name)
     plots[0].set_title(title)
-    plots[0].legend(loc="lower right")
+    if plots[0].get_legend_handles_labels()[0]:
+        plots[0].legend(loc="lower right")
     plots[-1].set_xlabel("steps")
     try:
         figure.savefig(path, dpi=110)

@@ -60,17 +60,12 @@ def resolve_env(name: str) -> str:
 
     Raises:
         UnknownName: No such environment; it carries the closest match.
-        SettingsError: ``module:Env-v0`` whose module is not there.
+        InvalidValue: ``module:Env-v0`` whose module is not there.
     """
     import bam_envs  # noqa: F401 - registers our environments
     from bam_envs.registry import resolve_id
 
-    try:
-        return resolve_id(name)
-    except ModuleNotFoundError as error:
-        raise SettingsError(
-            f"env {name!r}: no module {error.name!r}; expected module:Env-v0 with a module that can be imported"
-        ) from error
+    return resolve_id(name)
 
 
 def _require_same(asked: Mapping[str, Any], own: Mapping[str, Any], checkpoint: Checkpoint) -> None:

@@ -191,6 +191,8 @@ class TrainingRun:
         """Evaluate; if that reaches ``until_success``, as many fresh episodes must confirm it."""
         report = self._episodes(policy, 0)
         wanted = self.settings.until_success
+        if wanted is not None and report.success_rate is None and self._report is None:
+            self.watcher.note(f"{self.settings.env} reports no is_success: --until-success {wanted} has no effect")
         if wanted is None or report.success_rate is None or report.success_rate < wanted:
             return report
         again = self._episodes(policy, self.settings.eval_episodes)

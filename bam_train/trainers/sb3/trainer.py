@@ -107,7 +107,8 @@ class SB3Trainer:
         self._on_progress, self._total, self._reported = on_progress, steps, self.steps
         try:
             # reset_num_timesteps=False: the total is what is left, and a restored episode goes on.
-            self.model.learn(steps - self.steps, log_interval=self._log_interval(), reset_num_timesteps=False)
+            with np.errstate(over="ignore", invalid="ignore"):  # NaN is looked for, and said once
+                self.model.learn(steps - self.steps, log_interval=self._log_interval(), reset_num_timesteps=False)
             self._between()
         except _Stop:
             return

@@ -1,0 +1,148 @@
+"""What every program shares."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+
+import pytest
+
+from bam_envs.errors import MissingExtra, UnknownName
+from bam_train.cli.console import count, duration, number, percent
+from bam_train.cli.program import guarded, run_program
+from bam_train.errors import OutputError
+
+
+@dataclass(frozen=True)
+class Flags:
+    """Some flags."""
+
+    steps: int = 3
+    """How many."""
+    force: bool = False
+    """Whether."""
+
+
+def ended(arguments, main=lambda flags: 0):
+    with pytest.raises(SystemExit) as caught:
+        run_program(main, Flags, prog="prog", description="Does things.", arguments=arguments)
+    return caught.value.code
+
+
+def test_flags_reach_the_program_and_its_status_the_shell():
+    seen = []
+    assert ended(["--steps", "5", "--force"], lambda flags: seen.append(flags) or 7) == 7
+    assert seen == [Flags(5, True)]
+    assert ended([], lambda flags: None) == 0
+
+
+def test_help_and_a_typo(capsys):
+    assert ended(["--help"]) == 0
+    shown = capsys.readouterr().out
+    assert "Does things." in shown
+    assert "--no-force" not in shown
+    assert ended(["--stps", "5"]) == 2
+    assert "--steps" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("error", "line", "status"),
+    [
+        (OutputError("a.zip: cannot be written"), "prog: a.zip: cannot be written\n", 1),
+        (UnknownName("environment", "pik", ["pick"]), "prog: Unknown environment 'pik'. Did you mean 'pick'?\n", 1),
+        (
+            MissingExtra("mujoco", "sim", "The simulated robot"),
+            'prog: The simulated robot needs mujoco, which is not installed. Run: pip install "bam-train[sim]"\n',
+            1,
+        ),
+        (
+            ModuleNotFoundError("No module named 'torch'", name="torch"),
+            'prog: needs torch, which is not installed. Run: pip install "bam-train[train]"\n',
+            1,
+        ),
+        (
+            ModuleNotFoundError("No module named 'mujoco.rollout'", name="mujoco.rollout"),
+            'prog: needs mujoco, which is not installed. Run: pip install "bam-train[sim]"\n',
+            1,
+        ),
+        (KeyboardInterrupt(), "prog: interrupted\n", 130),
+        (KeyboardInterrupt("quit at once"), "prog: quit at once\n", 130),
+        (OutputError("two\nlines"), "prog: two lines\n", 1),
+    ],
+)
+def test_what_is_expected_to_go_wrong_is_one_line(capsys, error, line, status):
+    def fail():
+        raise error
+
+    assert guarded(fail, "prog") == status
+    assert capsys.readouterr() == ("", line)
+
+
+@pytest.mark.parametrize("error", [ValueError("a bug"), ModuleNotFoundError("No module named 'x'", name="x")])
+def test_a_bug_keeps_its_traceback(error):
+    def fail():
+        raise error
+
+    with pytest.raises(type(error)):
+        guarded(fail, "prog")
+
+
+def test_a_reader_that_went_away_is_no_error():
+    code = (
+        "from bam_train.cli.program import guarded\n"
+        "import sys\n"
+        "def main():\n"
+        "    for _ in range(100000): print('x' * 80)\n"
+        "sys.exit(guarded(main, 'prog'))\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment
+    ) as process:
+        process.stdout.readline()
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 1
+
+
+def test_help_imports_nothing_heavy():
+    code = (
+        "import sys\n"
+        "sys.argv = ['bam-train', '--help']\n"
+        "from bam_train.cli.train import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "heavy = {'torch', 'stable_baselines3', 'gymnasium', 'mujoco', 'numpy', 'rich'} & set(sys.modules)\n"
+        "sys.exit(', '.join(heavy) or 0)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL, env=environment)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(950, "950"), (9_999, "9999"), (12_345, "12.35k"), (300_000, "300k"), (1_250_000, "1.25M")]
+)
+def test_count(value, text):
+    assert count(value) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (None, "-"),
+        (float("inf"), "-"),
+        (4.21, "4.2 s"),
+        (65, "1 min 05 s"),
+        (3599.8, "1 h 00 min"),
+        (7500, "2 h 05 min"),
+    ],
+)
+def test_duration(value, text):
+    assert duration(value) == text
+
+
+def test_shares_and_numbers():
+    assert [percent(value) for value in (None, 1.0, 0.985, 0.0)] == ["-", "100 %", "98.5 %", "0 %"]
+    assert [number(value) for value in (None, 1234.56, 0.5)] == ["-", "1235", "0.5"]

@@ -1,0 +1,273 @@
+"""`bam-train` from its flags to its files, its lines and its status."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from stable_baselines3 import PPO
+
+from bam_train.checkpoint import Checkpoint
+from bam_train.cli.program import guarded
+from bam_train.cli.train import TrainConfig, train
+from bam_train.policy import FrozenPolicy
+
+SHORT = ("n_steps=32", "batch_size=32", "n_epochs=2", "policy_kwargs.net_arch=[8]")
+BASE = {"env": "CartPole-v1", "algo": "ppo", "steps": 128, "eval_every": 64, "eval_episodes": 2, "set": SHORT}
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def bam_train(capsys):
+    """Runs the program in this process; its status, standard output and standard error."""
+
+    def run(**flags):
+        status = guarded(lambda: train(TrainConfig(**{**BASE, **flags})), "bam-train")
+        out, err = capsys.readouterr()
+        return status, out, err
+
+    return run
+
+
+def test_a_whole_run(bam_train, here):
+    status, out, err = bam_train()
+    assert (status, out) == (0, "")
+    checkpoint = Checkpoint.open("checkpoints/CartPole-v1-ppo.zip")
+    assert checkpoint.manifest.steps in (64, 128)
+    assert checkpoint.manifest.scores["episodes"] == 2
+    assert checkpoint.manifest.settings["hyperparameters"]["policy_kwargs"] == {"net_arch": [8]}
+    assert FrozenPolicy.load(checkpoint.path).act([0, 0, 0, 0]) in (0, 1)
+    assert PPO.load(checkpoint.path).num_timesteps == checkpoint.manifest.steps
+    folder = here / "runs" / "CartPole-v1-ppo"
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "config.json",
+        "last.zip",
+        "learning-curve.png",
+        "progress.jsonl",
+        "tensorboard",
+    ]
+    assert Checkpoint.open(folder / "last.zip").manifest.steps == 128
+    lines = err.splitlines()
+    assert lines[0] == "ppo on CartPole-v1, seed 0"
+    assert any(line.startswith("evaluation at 64 steps: return ") for line in lines)
+    assert any(line.startswith("ppo on CartPole-v1: all steps done at 128 steps, ") for line in lines)
+    assert lines[-2:] == ["next:", "  bam-eval checkpoints/CartPole-v1-ppo.zip"]
+
+
+def test_print_config_is_read_back(bam_train, here):
+    status, printed, err = bam_train(print_config=True)
+    assert (status, err) == (0, "")
+    assert json.loads(printed)["hyperparameters"]["n_steps"] == 32
+    (here / "a.json").write_text(printed)
+    again = guarded(lambda: train(TrainConfig(config=Path("a.json"), print_config=True)), "bam-train")
+    assert again == 0
+    assert not (here / "runs").exists()
+
+
+def test_print_config_twice_is_once(bam_train, here, capsys):
+    printed = bam_train(print_config=True)[1]
+    (here / "a.json").write_text(printed)
+    train(TrainConfig(config=Path("a.json"), print_config=True))
+    assert capsys.readouterr().out == printed
+
+
+def test_flags_win_over_set_over_files(bam_train, here):
+    (here / "a.toml").write_text(
+        "steps = 5\nseed = 6\nnum_envs = 2\n[hyperparameters]\ngamma = 0.5\ngae_lambda = 0.5\n"
+    )
+    printed = bam_train(config=Path("a.toml"), set=("gamma=0.25", "seed=7"), steps=8, print_config=True)[1]
+    values = json.loads(printed)
+    assert (values["steps"], values["seed"], values["num_envs"]) == (8, 7, 2)
+    assert (values["hyperparameters"]["gamma"], values["hyperparameters"]["gae_lambda"]) == (0.25, 0.5)
+
+
+def test_an_existing_checkpoint_is_not_overwritten(bam_train, here):
+    bam_train()
+    before = Path("checkpoints/CartPole-v1-ppo.zip").read_bytes()
+    _, _, err = bam_train(seed=1)
+    assert Path("checkpoints/CartPole-v1-ppo.zip").read_bytes() == before
+    assert Path("checkpoints/CartPole-v1-ppo-2.zip").exists()
+    stem = "checkpoints/CartPole-v1-ppo"
+    line = f"{stem}.zip exists: the checkpoint goes to {stem}-2.zip (--force overwrites)"
+    assert line in err.splitlines()
+    bam_train(seed=1, force=True)
+    assert Path("checkpoints/CartPole-v1-ppo.zip").read_bytes() != before
+    assert (here / "runs" / "CartPole-v1-ppo-3" / "last.zip").exists()
+
+
+def test_resume_counts_from_the_first_step(bam_train):
+    bam_train(out=Path("a.zip"))
+    last = Path("runs/CartPole-v1-ppo/last.zip")
+    status, _, err = bam_train(resume=last, steps=192)
+    assert status == 0
+    assert Checkpoint.open("runs/CartPole-v1-ppo-2/last.zip").manifest.steps == 192
+    assert "CartPole-v1 cannot save running episodes: new ones begin" in err
+    status, _, err = bam_train(resume=last)
+    assert (status, err) == (
+        1,
+        f"bam-train: {last}: has trained 128 of 128 steps already; give a larger total with --steps\n",
+    )
+
+
+def test_resume_needs_nothing_else(bam_train, here):
+    bam_train(steps=100, eval_every=1000)
+    nothing = dict.fromkeys(("env", "algo", "eval_every", "eval_episodes"))
+    assert bam_train(**{**nothing, "resume": Path("checkpoints/CartPole-v1-ppo.zip"), "steps": 160, "set": ()})[0] == 0
+    assert Checkpoint.open("runs/CartPole-v1-ppo-2/last.zip").manifest.steps == 160
+
+
+ERRORS = [
+    ({"env": "CartPol-v1"}, "Unknown environment 'CartPol-v1'. Did you mean 'CartPole-v1'?"),
+    ({"algo": "pop"}, "Unknown algorithm 'pop'. Did you mean 'ppo'?"),
+    (
+        {"algo": "sac"},
+        "sac does not fit CartPole-v1: it takes Box actions, found Discrete. "
+        "Use one of: a2c, dqn, ppo, qrdqn, recurrent-ppo, trpo.",
+    ),
+    ({"set": ("lerning_rate=1",)}, "Unknown ppo hyperparameter 'lerning_rate'. Did you mean 'learning_rate'?"),
+    ({"set": ("n_steps=1.5",)}, "n_steps: expected an int, found 1.5 (a float)"),
+    ({"set": ("n_steps",)}, "--set n_steps: expected name=value, such as --set learning_rate=3e-4, found 'n_steps'"),
+    ({"out": Path("policy")}, "policy: expected a file name that ends in .zip. Choose another one with --out"),
+    (
+        {"out": Path("/proc/a.zip")},
+        "/proc/a.zip: cannot be written: No such file or directory. Choose another place with --out",
+    ),
+    ({"resume": Path("no.zip")}, "no.zip: no such file. Train one with bam-train, or check the name"),
+    ({"config": Path("no.toml")}, "no.toml: cannot be read: No such file or directory"),
+    ({"until_success": 2.0}, "until_success: expected a share above 0 and at most 1, such as 0.99, found 2.0"),
+    ({"steps": 0}, "steps: expected at least 1, found 0"),
+]
+
+
+@pytest.mark.parametrize(("flags", "line"), ERRORS)
+def test_bad_input_is_one_line_and_leaves_nothing(bam_train, here, flags, line):
+    assert bam_train(**flags) == (1, "", f"bam-train: {line}\n")
+    assert list(here.iterdir()) == []
+
+
+def test_resume_with_other_settings(bam_train):
+    bam_train(out=Path("a.zip"))
+    status, _, err = bam_train(resume=Path("a.zip"), seed=5)
+    assert (status, err) == (
+        1,
+        "bam-train: a.zip: was trained with seed 0, not 5. Leave seed out to go on with it, or train anew\n",
+    )
+
+
+def test_resume_of_a_truncated_checkpoint(bam_train):
+    bam_train(out=Path("a.zip"))
+    whole = Path("a.zip").read_bytes()
+    Path("a.zip").write_bytes(whole[: len(whole) // 2])
+    status, out, err = bam_train(resume=Path("a.zip"))
+    assert (status, out, len(err.splitlines())) == (1, "", 1)
+    assert err.startswith("bam-train: a.zip: not a whole zip file")
+
+
+def test_a_nan_keeps_the_last_good_checkpoint(bam_train):
+    status, _, err = bam_train(set=(*SHORT, "learning_rate=1e30"))
+    assert status == 1
+    end = "expected finite numbers: try a smaller learning_rate; no checkpoint had been saved yet"
+    assert err.splitlines()[-1].startswith("bam-train: t")
+    assert err.splitlines()[-1].endswith(end)
+    assert not Path("checkpoints/CartPole-v1-ppo.zip").exists()
+
+
+# In a process of its own
+
+
+def started(here, *arguments):
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
+    flags = ["--env", "CartPole-v1", "--algo", "ppo", "--set", "n_steps=64", "--set", "policy_kwargs.net_arch=[8]"]
+    return subprocess.Popen(
+        [sys.executable, "-m", "bam_train.cli.train", *flags, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=here,
+        env=environment,
+    )
+
+
+def wait_for(process, words):
+    """Read standard error up to a line that holds `words`."""
+    for line in process.stderr:
+        if words in line:
+            return
+    raise AssertionError(f"never said {words!r}")
+
+
+LONG = ("--steps", "10000000", "--eval-every", "256", "--eval-episodes", "1")
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_saves_and_ends_cleanly(here, number, status):
+    process = started(here, *LONG)
+    wait_for(process, "evaluation at 512 steps")
+    process.send_signal(number)
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out) == (status, "")
+    assert "finishing the update and saving; Ctrl-C again quits at once" in err
+    assert "Traceback" not in err
+    last = Checkpoint.open(here / "runs" / "CartPole-v1-ppo" / "last.zip")
+    assert last.manifest.steps >= 512
+    assert err.splitlines()[-1] == "  bam-train --resume runs/CartPole-v1-ppo/last.zip"
+
+
+def test_two_signals_quit_at_once(here):
+    process = started(here, *LONG, "--set", "n_epochs=100000")
+    wait_for(process, "ppo on CartPole-v1, seed 0")
+    time.sleep(1.0)  # into the first update, which takes minutes
+    process.send_signal(signal.SIGINT)
+    wait_for(process, "finishing the update")
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert err == "bam-train: quit at once; no checkpoint had been saved yet\n"
+
+
+def test_kill_leaves_a_whole_checkpoint_that_can_be_gone_on_from(here):
+    process = started(here, *LONG)
+    wait_for(process, "evaluation at 1024 steps")
+    process.kill()
+    process.communicate(timeout=20)
+    last = Checkpoint.open(here / "runs" / "CartPole-v1-ppo" / "last.zip")
+    steps = last.manifest.steps + 64
+    resumed = started(here, "--resume", str(last.path), "--steps", str(steps), "--eval-episodes", "1")
+    _, err = resumed.communicate(timeout=60)
+    assert resumed.returncode == 0, err
+    assert Checkpoint.open(here / "runs" / "CartPole-v1-ppo-2" / "last.zip").manifest.steps == steps
+    assert Checkpoint.open(here / "checkpoints" / "CartPole-v1-ppo.zip").manifest.steps <= steps
+
+
+def test_a_missing_extra_says_what_to_install(here):
+    hidden = (
+        "import sys\n"
+        "class Hidden:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'torch': raise ModuleNotFoundError(\"No module named 'torch'\", name='torch')\n"
+        "sys.meta_path.insert(0, Hidden())\n"
+        "from bam_train.cli.train import main\n"
+        "main()\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
+    done = subprocess.run(
+        [sys.executable, "-c", hidden, "--env", "CartPole-v1", "--algo", "ppo"],
+        capture_output=True,
+        text=True,
+        cwd=here,
+        env=environment,
+        check=False,
+    )
+    expected = 'bam-train: needs torch, which is not installed. Run: pip install "bam-train[train]"\n'
+    assert (done.returncode, done.stderr) == (1, expected)

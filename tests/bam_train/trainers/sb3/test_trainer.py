@@ -1,0 +1,228 @@
+"""One run of stable-baselines3: what it saves, what it freezes, how it fails."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import PPO
+
+from bam_train.checkpoint import Checkpoint
+from bam_train.errors import SettingsError, TrainingFailed
+from bam_train.policy import FrozenPolicy
+from bam_train.settings import TrainSettings
+from bam_train.trainers.sb3.trainer import SB3Trainer
+
+FIRST = {"n_steps": 32, "batch_size": 32, "n_epochs": 2}
+
+
+def completed(env, algo="ppo", **given):
+    return SB3Trainer.complete(
+        TrainSettings.from_mapping({"env": env, "algo": algo, "steps": 96, "num_envs": 2, **given})
+    )
+
+
+@pytest.fixture
+def trained(walk, tmp_path):
+    trainer = SB3Trainer.create(completed(walk, hyperparameters=FIRST, seed=4))
+    trainer.train(96, lambda progress: True)
+    trainer.save(tmp_path / "a.zip", {"success_rate": 0.5}, {"best": None})
+    return trainer, Checkpoint.open(tmp_path / "a.zip")
+
+
+def test_the_manifest_says_where_it_comes_from(walk, trained):
+    trainer, checkpoint = trained
+    manifest = checkpoint.manifest
+    assert (manifest.env, manifest.algorithm, manifest.trainer, manifest.seed) == (walk, "ppo", "sb3", 4)
+    assert manifest.steps == trainer.steps == 128
+    assert manifest.scores == {"success_rate": 0.5}
+    assert manifest.period == pytest.approx(1 / 20)
+    assert manifest.action_space["type"] == "Box"
+    assert TrainSettings.from_mapping(manifest.settings) == trainer.settings
+    assert {"python", "torch", "stable-baselines3", "gymnasium"} <= manifest.versions.keys()
+    assert manifest.created.endswith("+00:00")
+
+
+def test_stable_baselines3_loads_it(trained):
+    trainer, checkpoint = trained
+    model = PPO.load(checkpoint.path)
+    observations = np.random.default_rng(0).uniform(-1, 1, (50, 2)).astype(np.float32)
+    assert np.array_equal(
+        model.predict(observations, deterministic=True)[0], trainer.model.predict(observations, deterministic=True)[0]
+    )
+    assert model.num_timesteps == 128
+
+
+def test_stable_baselines3_can_train_it_on(corridor, tmp_path):
+    trainer = SB3Trainer.create(
+        completed(corridor, "dqn", hyperparameters={"learning_starts": 20, "learning_rate": "lin_1e-3"})
+    )
+    trainer.train(96, lambda progress: True)
+    trainer.save(tmp_path / "a.zip", {}, {})
+    model = type(trainer.model).load(tmp_path / "a.zip", env=gym.make(corridor))
+    model.learn(20, reset_num_timesteps=False)
+    assert model.num_timesteps == 96 + 20
+
+
+def test_its_members_are_those_of_stable_baselines3_and_ours(trained):
+    trainer, checkpoint = trained
+    stream = io.BytesIO()
+    trainer.model.save(stream, exclude=["collect_rollouts"])
+    theirs = set(zipfile.ZipFile(stream).namelist())
+    ours = {name for name in checkpoint.manifest.sha256 if name.startswith("bam/")}
+    assert set(checkpoint.manifest.sha256) == theirs | ours
+    assert ours == {
+        "bam/policy.onnx",
+        "bam/golden.safetensors",
+        "bam/resume/model.json",
+        "bam/resume/model.safetensors",
+        "bam/resume/state.json",
+        "bam/resume/state.safetensors",
+        "bam/resume/notes.json",
+    }
+
+
+def test_the_frozen_policy_is_the_policy(trained):
+    trainer, checkpoint = trained
+    observations = np.random.default_rng(0).uniform(-1, 1, (200, 2)).astype(np.float32)
+    wanted = trainer.model.predict(observations, deterministic=True)[0]
+    for policy in (trainer.freeze(), FrozenPolicy.load(checkpoint.path)):
+        assert np.abs(policy.act_batch(observations) - wanted).max() <= 1e-5
+
+
+def test_progress_and_statistics(walk):
+    trainer = SB3Trainer.create(completed(walk, hyperparameters=FIRST))
+    seen = []
+    trainer.train(128, lambda progress: seen.append((progress.steps, progress.total, progress.statistics())) or True)
+    assert [row[:2] for row in seen] == [(64, 128), (128, 128)]
+    statistics = seen[-1][2]
+    assert statistics.episodes > 0
+    assert 0 <= statistics.success_rate <= 1
+    assert 1 <= statistics.length_mean <= 12
+    assert {"train/loss", "train/value_loss"} <= statistics.metrics.keys()
+
+
+def test_stopping_between_updates(walk):
+    trainer = SB3Trainer.create(completed(walk, "sac", hyperparameters={"learning_starts": 10}))
+    trainer.train(96, lambda progress: progress.steps < 20)
+    assert trainer.steps == 20
+    trainer.train(20, lambda progress: pytest.fail("there is nothing to train"))
+
+
+def test_one_seed_one_result_and_another_seed_another(walk):
+    def weights(seed):
+        trainer = SB3Trainer.create(completed(walk, hyperparameters=FIRST, seed=seed))
+        trainer.train(96, lambda progress: True)
+        return torch.cat([parameter.detach().flatten() for parameter in trainer.model.policy.parameters()])
+
+    assert torch.equal(weights(1), weights(1))
+    assert not torch.equal(weights(1), weights(2))
+
+
+@pytest.mark.parametrize(
+    ("algo", "hyperparameters", "message"),
+    [
+        ("ppo", {**FIRST, "learning_rate": 1e30}, "NaN or infinite"),
+        ("a2c", {"learning_rate": 1e30}, "NaN or infinite|is nan|is -?inf"),
+        ("sac", {"learning_rate": 1e30, "learning_starts": 10}, "_loss is (nan|inf)"),
+    ],
+)
+def test_a_loss_that_is_not_finite_ends_training(walk, tmp_path, algo, hyperparameters, message):
+    trainer = SB3Trainer.create(completed(walk, algo, steps=1000, hyperparameters=hyperparameters))
+    with pytest.raises(TrainingFailed, match=message) as caught:
+        trainer.train(1000, lambda progress: True)
+    assert "expected finite numbers: try a smaller learning_rate" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_weights_that_are_not_finite_are_never_saved(walk, tmp_path):
+    trainer = SB3Trainer.create(completed(walk, hyperparameters=FIRST))
+    with torch.no_grad():
+        next(trainer.model.policy.parameters())[0] = float("nan")
+    for act in (lambda: trainer.save(tmp_path / "a.zip", {}, {}), trainer.freeze):
+        with pytest.raises(TrainingFailed, match=r"^the policy's weights are NaN or infinite at step 0; "):
+            act()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (
+            {"hyperparameters": {"batch_size": 1}},
+            "ppo on test/Walk-v0 cannot be set up: `batch_size` must be greater than 1",
+        ),
+        ({"device": "cuda:99"}, "device: 'cuda:99' is not there; expected auto or one of cpu"),
+        ({"device": "tpu"}, "device: 'tpu' is not there; expected auto or one of cpu"),
+        ({"hyperparameters": {"policy": "CnnPolicy"}}, "ppo on test/Walk-v0 cannot be set up: "),
+    ],
+)
+def test_settings_that_the_library_refuses(walk, given, message):
+    settings = completed(walk, **given)
+    with pytest.raises(SettingsError) as caught:
+        SB3Trainer.create(settings)
+    assert str(caught.value).startswith(message)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_the_library_warns_about_becomes_a_notice(walk):
+    trainer = SB3Trainer.create(completed(walk, hyperparameters={"n_steps": 10, "batch_size": 64}))
+    assert len(trainer.notices) == 1
+    assert trainer.notices[0].startswith("You have specified a mini-batch size of 64")
+
+
+def test_complete_refuses_an_environment_that_does_not_take_the_arguments(corridor):
+    with pytest.raises(SettingsError, match=r"test/Corridor-v0 cannot be made with these arguments: "):
+        completed(corridor, env_kwargs={"slwo": True})
+
+
+@pytest.mark.parametrize(("steps", "every"), [(500, 1000), (100_000, 5000)])
+def test_evaluations_by_default(corridor, steps, every):
+    assert completed(corridor, steps=steps).eval_every == every
+
+
+def test_tensorboard_files(walk, tmp_path):
+    trainer = SB3Trainer.create(completed(walk, hyperparameters=FIRST))
+    trainer.log_to(tmp_path)
+    trainer.train(128, lambda progress: trainer.log({"eval/return_mean": 1.5}) or True)
+    trainer.close()
+    events = b"".join(path.read_bytes() for path in tmp_path.iterdir())
+    assert b"eval/return_mean" in events
+    assert b"train/value_loss" in events
+
+
+def test_images_and_dictionaries(tmp_path):
+    class Seen(gym.Env):
+        metadata = {"render_modes": []}  # noqa: RUF012
+        observation_space = gym.spaces.Dict(
+            {"image": gym.spaces.Box(0, 255, (36, 36, 3), np.uint8), "x": gym.spaces.Box(-1, 1, (2,), np.float32)}
+        )
+        action_space = gym.spaces.MultiDiscrete([2, 3])
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return self.look(), {}
+
+        def look(self):
+            image = self.np_random.integers(0, 256, (36, 36, 3), dtype=np.uint8)
+            return {"image": image, "x": self.np_random.uniform(-1, 1, 2).astype(np.float32)}
+
+        def step(self, action):
+            return self.look(), 1.0, bool(self.np_random.random() < 0.1), False, {}
+
+    gym.register("test/Seen-v0", entry_point=Seen)
+    try:
+        trainer = SB3Trainer.create(
+            completed("test/Seen-v0", hyperparameters={"n_steps": 8, "batch_size": 8, "n_epochs": 1})
+        )
+        trainer.train(16, lambda progress: True)
+        trainer.save(tmp_path / "a.zip", {}, {})
+        SB3Trainer.load(Checkpoint.open(tmp_path / "a.zip")).train(32, lambda progress: True)
+        env = gym.make("test/Seen-v0")
+        assert env.action_space.contains(FrozenPolicy.load(tmp_path / "a.zip").act(env.reset(seed=1)[0]))
+    finally:
+        del gym.registry["test/Seen-v0"]

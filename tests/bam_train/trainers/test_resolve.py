@@ -1,0 +1,258 @@
+"""From what was asked for to complete settings, and to the place of the checkpoint."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from bam_envs.errors import InvalidValue, UnknownName
+from bam_train.checkpoint import Checkpoint, write_checkpoint
+from bam_train.errors import CheckpointMismatch, OutputError, SettingsError
+from bam_train.settings import TrainSettings
+from bam_train.trainers import load_trainer, require_algorithm
+from bam_train.trainers import presets as presets_module
+from bam_train.trainers.output import choose_output
+from bam_train.trainers.presets import list_presets, read_preset
+from bam_train.trainers.resolve import resolve, resolve_resumed
+from bam_train.trainers.run import Best
+
+
+@pytest.fixture
+def preset(monkeypatch):
+    """One preset, of CartPole-v1 and ppo."""
+    values = {"steps": 7000, "num_envs": 4, "hyperparameters": {"gamma": 0.9, "policy_kwargs": {"net_arch": [8]}}}
+    monkeypatch.setattr(
+        "bam_train.trainers.resolve.read_preset",
+        lambda env, algo: values if (env, algo) == ("CartPole-v1", "ppo") else {},
+    )
+
+
+def test_later_layers_win(preset):
+    given = {
+        "env": "CartPole-v1",
+        "algo": "ppo",
+        "num_envs": 2,
+        "hyperparameters": {"policy_kwargs": {"ortho_init": False}},
+    }
+    settings = resolve(given)
+    assert (settings.steps, settings.num_envs, settings.eval_every) == (7000, 2, 1000)
+    assert settings.hyperparameters["gamma"] == 0.9
+    assert settings.hyperparameters["policy_kwargs"] == {"net_arch": [8], "ortho_init": False}
+    assert settings.hyperparameters["gae_lambda"] == 0.95
+
+
+def test_without_a_preset_there_are_the_defaults():
+    settings = resolve({"env": "CartPole-v1", "algo": "dqn"})
+    assert (settings.steps, settings.num_envs, settings.trainer) == (100_000, 1, "sb3")
+    assert settings.hyperparameters["learning_rate"] == 1e-4
+
+
+def test_names_are_completed_and_unknown_ones_refused():
+    assert resolve({"env": "bam/reach", "algo": "sac"}).env == "bam/reach-v0"
+    with pytest.raises(UnknownName, match=r"^Unknown environment 'bam/pik'\. Did you mean 'bam/pick-v0'\?$"):
+        resolve({"env": "bam/pik", "algo": "ppo"})
+    with pytest.raises(SettingsError, match=r"^Unknown algorithm 'sacc'\. Did you mean 'sac'\?$"):
+        resolve({"env": "bam/pick", "algo": "sacc"})
+    with pytest.raises(
+        SettingsError, match=r"^sac does not fit CartPole-v1: it takes Box actions, found Discrete\. Use one of: "
+    ):
+        resolve({"env": "CartPole-v1", "algo": "sac"})
+    with pytest.raises(InvalidValue, match=r"needs the module 'no_such_module', which is not installed"):
+        resolve({"env": "no_such_module:A-v0", "algo": "ppo"})
+    with pytest.raises(SettingsError, match=r"^algo: expected a name, found nothing\. Give --algo NAME$"):
+        resolve({"env": "CartPole-v1"})
+    with pytest.raises(SettingsError, match=r"^Unknown trainer 'sb'\. Did you mean 'sb3'\?$"):
+        resolve({"env": "CartPole-v1", "algo": "ppo", "trainer": "sb"})
+
+
+def test_the_tables_agree():
+    with pytest.raises(SettingsError, match=r"^Unknown trainer 'x'\. Choose from: sb3\.$"):
+        load_trainer("x")
+    require_algorithm("sb3", "recurrent-ppo")
+    assert load_trainer("sb3").__name__ == "SB3Trainer"
+
+
+@pytest.mark.parametrize("name", list_presets())
+def test_every_preset_is_complete_and_of_an_environment_of_ours(name):
+    from bam_envs.registry import ENVIRONMENTS
+    from bam_train.settings import file_stem
+    from bam_train.trainers.sb3.algorithms import ALGORITHMS
+
+    pairs = [(env, algo) for env in ENVIRONMENTS for algo in ALGORITHMS if f"{file_stem(env, algo)}.toml" == name]
+    assert len(pairs) == 1
+    env, algo = pairs[0]
+    assert read_preset(env, algo)
+    resolve({"env": env, "algo": algo})
+
+
+def test_there_is_no_preset_of_a_foreign_environment():
+    assert read_preset("CartPole-v1", "ppo") == {}
+    assert presets_module.preset_name("bam/pick-v0", "ppo") == "pick-ppo.toml"
+
+
+def fields(settings, steps, **extra):
+    space = {"type": "Discrete", "n": 2, "start": 0, "dtype": "int64"}
+    base = {
+        "env": settings.env,
+        "env_kwargs": {},
+        "observation_space": space,
+        "action_space": space,
+        "signals": {},
+        "period": None,
+        "algorithm": settings.algo,
+        "trainer": "sb3",
+        "settings": settings.to_mapping(),
+        "steps": steps,
+        "seed": settings.seed,
+        "scores": {},
+        "versions": {},
+        "git_commit": None,
+        "created": "2025-01-01T00:00:00+00:00",
+    }
+    return {**base, **extra}
+
+
+@pytest.fixture
+def saved(tmp_path):
+    """A checkpoint that trained 3000 of 6000 steps, and a function that writes more like it."""
+    settings = resolve({"env": "CartPole-v1", "algo": "ppo", "steps": 6000, "normalize": True, "seed": 3})
+
+    def write(path, steps=3000, best=None, **changes):
+        from dataclasses import replace
+
+        members = {"bam/resume/notes.json": json.dumps({"best": best}).encode()}
+        return write_checkpoint(path, fields(replace(settings, **changes), steps), members)
+
+    write.settings = settings
+    write.checkpoint = write(tmp_path / "half.zip")
+    return write
+
+
+def test_a_resumed_run_has_its_own_settings(saved):
+    assert resolve_resumed({}, saved.checkpoint) == saved.settings
+
+
+def test_what_is_said_again_is_no_difference(saved):
+    again = {
+        "env": "CartPole-v1",
+        "algo": "ppo",
+        "seed": 3,
+        "normalize": True,
+        "hyperparameters": {"gamma": 0.99, "policy_kwargs": {}},
+    }
+    assert resolve_resumed(again, saved.checkpoint) == saved.settings
+
+
+def test_when_to_stop_and_how_to_measure_may_change(saved):
+    asked = {"steps": 9000, "until_success": 0.9, "eval_every": 50, "eval_episodes": 3, "device": "cpu", "threads": 2}
+    resumed = resolve_resumed(asked, saved.checkpoint)
+    assert {name: getattr(resumed, name) for name in asked} == asked
+
+
+@pytest.mark.parametrize(
+    ("asked", "name", "found", "wanted"),
+    [
+        ({"env": "MountainCar-v0"}, "env", "CartPole-v1", "MountainCar-v0"),
+        ({"algo": "a2c"}, "algo", "ppo", "a2c"),
+        ({"seed": 4}, "seed", 3, 4),
+        ({"num_envs": 2}, "num_envs", 1, 2),
+        ({"normalize": False}, "normalize", {"gamma": 0.99}, False),
+        ({"hyperparameters": {"gamma": 0.9}}, "hyperparameters.gamma", 0.99, 0.9),
+        ({"hyperparameters": {"target_kl": 0.9}}, "hyperparameters.target_kl", None, 0.9),
+        (
+            {"hyperparameters": {"policy_kwargs": {"net_arch": [4]}}},
+            "hyperparameters.policy_kwargs.net_arch",
+            None,
+            [4],
+        ),
+    ],
+)
+def test_what_is_learnt_may_not_change(saved, asked, name, found, wanted):
+    with pytest.raises(CheckpointMismatch) as caught:
+        resolve_resumed(asked, saved.checkpoint)
+    assert str(caught.value) == (
+        f"{saved.checkpoint.path}: was trained with {name} {found!r}, not {wanted!r}. "
+        f"Leave {name} out to go on with it, or train anew"
+    )
+
+
+def test_an_unknown_setting_is_unknown_also_when_resuming(saved):
+    with pytest.raises(SettingsError, match=r"^Unknown ppo hyperparameter 'gama'\. Did you mean 'gamma'\?$"):
+        resolve_resumed({"hyperparameters": {"gama": 1}}, saved.checkpoint)
+    with pytest.raises(SettingsError, match=r"^settings: unknown setting 'stps'\. Did you mean 'steps'\?$"):
+        resolve_resumed({"stps": 1}, saved.checkpoint)
+
+
+def test_a_run_that_is_done_says_so(saved, tmp_path):
+    done = saved(tmp_path / "done.zip", steps=6144)
+    with pytest.raises(SettingsError) as caught:
+        resolve_resumed({}, done)
+    assert str(caught.value) == (
+        f"{done.path}: has trained 6144 of 6000 steps already; give a larger total with --steps"
+    )
+    assert resolve_resumed({"steps": 6145}, done).steps == 6145
+
+
+# Where the checkpoint goes
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_default_place(saved, here):
+    output = choose_output(saved.settings, None, False, None)
+    assert (str(output.path), output.best, output.notices) == ("checkpoints/CartPole-v1-ppo.zip", None, ())
+
+
+def test_an_existing_checkpoint_is_kept(saved, here):
+    saved(here / "checkpoints" / "CartPole-v1-ppo.zip")
+    saved(here / "checkpoints" / "CartPole-v1-ppo-2.zip")
+    output = choose_output(saved.settings, None, False, None)
+    assert str(output.path) == "checkpoints/CartPole-v1-ppo-3.zip"
+    assert output.notices == (
+        "checkpoints/CartPole-v1-ppo.zip exists: "
+        "the checkpoint goes to checkpoints/CartPole-v1-ppo-3.zip (--force overwrites)",
+    )
+    assert str(choose_output(saved.settings, None, True, None).path) == "checkpoints/CartPole-v1-ppo.zip"
+
+
+def test_a_name_without_zip(saved, here):
+    with pytest.raises(
+        OutputError, match=r"^policy: expected a file name that ends in \.zip\. Choose another one with --out$"
+    ):
+        choose_output(saved.settings, type(here)("policy"), False, None)
+
+
+def test_a_resumed_run_goes_on_improving_its_own_best(saved, here):
+    best = {"steps": 2000, "success_rate": None, "return_mean": 90.0, "path": str(here / "best.zip")}
+    saved(here / "best.zip", steps=2000, best=best)
+    last = saved(here / "last.zip", steps=3000, best=best)
+    output = choose_output(saved.settings, None, False, last)
+    assert output.path == here / "best.zip"
+    assert output.best == Best(2000, None, 90.0)
+    assert choose_output(saved.settings, here / "other.zip", False, last).best is None
+
+
+@pytest.mark.parametrize("there", ["nothing", "another run", "another time", "no checkpoint"])
+def test_what_is_not_its_own_best_is_left_alone(saved, here, there):
+    best = {"steps": 2000, "success_rate": None, "return_mean": 90.0, "path": str(here / "best.zip")}
+    if there == "another run":
+        saved(here / "best.zip", steps=2000, seed=9)
+    elif there == "another time":
+        saved(here / "best.zip", steps=1000)
+    elif there == "no checkpoint":
+        (here / "best.zip").write_text("x")
+    output = choose_output(saved.settings, None, False, saved(here / "last.zip", best=best))
+    assert (str(output.path), output.best) == ("checkpoints/CartPole-v1-ppo.zip", None)
+
+
+def test_settings_of_another_time_to_stop_are_the_same_run(saved, here):
+    best = {"steps": 2000, "success_rate": None, "return_mean": 90.0, "path": str(here / "best.zip")}
+    saved(here / "best.zip", steps=2000, best=best)
+    longer = TrainSettings.from_mapping({**saved.settings.to_mapping(), "steps": 9000})
+    assert choose_output(longer, None, False, saved(here / "last.zip", best=best)).path == here / "best.zip"
+    assert isinstance(saved.checkpoint, Checkpoint)

@@ -1,0 +1,274 @@
+"""One run from its first step to its checkpoint, with a trainer that only counts."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+from bam_train.errors import OutputError, TrainingFailed
+from bam_train.evaluation import EvaluationReport
+from bam_train.settings import TrainSettings
+from bam_train.trainers import run as run_module
+from bam_train.trainers.run import Best, TrainingRun
+from bam_train.trainers.run_folder import RunFolder
+from bam_train.trainers.trainer import Progress, Statistics
+
+STATISTICS = Statistics(episodes=3, return_mean=1.5, length_mean=4.0, success_rate=None, metrics={"train/loss": 0.25})
+
+
+def report(success, total=0.0, episodes=10, seed=0):
+    return EvaluationReport(
+        env="test/Count-v0",
+        episodes=episodes,
+        seed=seed,
+        successes=None if success is None else round(success * episodes),
+        success_rate=success,
+        success_interval=None,
+        return_mean=total,
+        return_std=0.0,
+        return_min=total,
+        return_max=total,
+        length_mean=1.0,
+        length_std=0.0,
+    )
+
+
+class Counter:
+    """Trains by counting, ten steps an update; writes its steps into the files it saves."""
+
+    def __init__(self, settings, clock=None):
+        self.settings, self.steps, self.clock = settings, 0, clock
+        self.saved, self.refuse, self.fails_at, self.logged = [], [], None, []
+
+    def train(self, steps, on_progress):
+        while self.steps < steps:
+            self.steps += 10
+            if self.clock is not None:
+                self.clock.now += 1.0
+            if self.fails_at is not None and self.steps >= self.fails_at:
+                raise TrainingFailed("train/loss is nan at step 60; expected finite numbers")
+            if not on_progress(Progress(self.steps, steps, lambda: STATISTICS)):
+                return
+
+    def save(self, path, scores, notes):
+        if path.name in self.refuse:
+            raise OutputError(f"{path}: cannot be written: No space left on device")
+        if self.clock is not None:
+            self.clock.now += self.clock.save_takes
+        path.write_text(str(self.steps))
+        self.saved.append((path.name, self.steps, dict(scores), notes))
+
+    def freeze(self):
+        return SimpleNamespace(steps=self.steps)
+
+    def undisturbed(self):
+        return nullcontext()
+
+    def log(self, metrics):
+        self.logged.append(dict(metrics))
+
+
+class Clock:
+    def __init__(self, save_takes=0.0):
+        self.now, self.save_takes = 0.0, save_takes
+
+    def __call__(self):
+        return self.now
+
+
+class Watcher:
+    def __init__(self):
+        self.notes, self.evaluations, self.rates = [], [], []
+
+    def training(self, progress, statistics, steps_per_second, seconds_left):
+        self.rates.append((progress.steps, steps_per_second, seconds_left))
+
+    def evaluated(self, steps, report, best):
+        self.evaluations.append((steps, report.success_rate, report.return_mean, best))
+
+    def note(self, text):
+        self.notes.append(text)
+
+
+@pytest.fixture
+def start(tmp_path, monkeypatch):
+    """Makes a run whose evaluations are looked up by step; asks for seeds are in ``start.seeds``."""
+
+    def start(results, clock=None, best=None, **extra):
+        given = {"env": "test/Count-v0", "algo": "ppo", "steps": 100, "eval_every": 30, "eval_episodes": 10, "seed": 7}
+        settings = TrainSettings.from_mapping({**given, **extra})
+        start.seeds = []
+
+        def evaluate(policy, env_id, env_kwargs, *, episodes, seed):
+            start.seeds.append((policy.steps, seed))
+            found = results[policy.steps]
+            return found.pop(0) if isinstance(found, list) else found
+
+        monkeypatch.setattr(run_module, "evaluate", evaluate)
+        trainer, watcher = Counter(settings, clock), Watcher()
+        folder = RunFolder(tmp_path / "runs", "count-ppo")
+        run = TrainingRun(trainer, folder, tmp_path / "out.zip", watcher, best, clock or Clock())
+        return run, trainer, watcher
+
+    return start
+
+
+def test_evaluations_are_due_every_so_many_steps_and_at_the_end(start):
+    run, trainer, watcher = start({step: report(0.1) for step in (30, 60, 90, 100)})
+    outcome = run.run()
+    assert [row[0] for row in watcher.evaluations] == [30, 60, 90, 100]
+    assert start.seeds == [(step, 1_000_007) for step in (30, 60, 90, 100)]
+    assert (outcome.reason, outcome.steps) == ("steps", 100)
+    assert trainer.logged[0] == {"eval/return_mean": 0.0, "eval/success_rate": 0.1}
+
+
+def test_a_run_too_short_for_an_evaluation_is_evaluated_once(start):
+    run, _, watcher = start({100: report(0.5)}, eval_every=1000)
+    outcome = run.run()
+    assert watcher.evaluations == [(100, 0.5, 0.0, True)]
+    assert outcome.checkpoint.read_text() == "100"
+
+
+@pytest.mark.parametrize(
+    ("results", "best"),
+    [
+        ([(0.5, 1), (0.9, 0), (0.8, 9), (0.9, 0)], 60),
+        ([(0.5, 1), (0.5, 2), (0.5, 1.5), (0.4, 9)], 60),
+        ([(None, -5), (None, -7), (None, -2), (None, -3)], 90),
+        ([(0.0, None), (0.0, 1), (0.0, None), (0.0, 0)], 60),
+    ],
+)
+def test_the_best_is_by_success_then_by_return(start, results, best):
+    steps = (30, 60, 90, 100)
+    run, trainer, _ = start({step: report(*result) for step, result in zip(steps, results, strict=True)})
+    outcome = run.run()
+    assert outcome.best.steps == best
+    assert outcome.checkpoint.read_text() == str(best)
+    assert outcome.last.read_text() == "100"
+    assert trainer.saved[-1][0] == "last.zip"
+
+
+def test_scores_name_the_steps_at_which_they_were_found(start):
+    run, trainer, _ = start({30: report(0.5), 60: report(0.4), 90: report(0.4), 100: report(0.4)})
+    outcome = run.run()
+    assert (outcome.scores["success_rate"], outcome.scores["steps"]) == (0.5, 30)
+    name, steps, scores, notes = trainer.saved[-1]
+    assert (name, steps, scores["success_rate"], scores["steps"]) == ("last.zip", 100, 0.4, 100)
+    assert notes["best"] == {"steps": 30, "success_rate": 0.5, "return_mean": 0.0, "path": str(outcome.checkpoint)}
+
+
+def test_success_must_be_confirmed_by_fresh_episodes(start):
+    lucky = [report(1.0), report(0.8)]
+    run, _, watcher = start({30: lucky, 60: [report(1.0), report(0.99)], 90: report(0.0)}, until_success=0.95)
+    outcome = run.run()
+    assert start.seeds == [(30, 1_000_007), (30, 1_000_017), (60, 1_000_007), (60, 1_000_017)]
+    assert [row[:2] for row in watcher.evaluations] == [(30, 0.8), (60, 0.99)]
+    assert (outcome.reason, outcome.steps, outcome.best.steps) == ("success", 60, 60)
+
+
+def test_success_that_nobody_reports_never_ends_a_run(start):
+    run, _, watcher = start({step: report(None, 1.0) for step in (30, 60, 90, 100)}, until_success=0.9)
+    assert run.run().reason == "steps"
+    assert watcher.notes == ["test/Count-v0 reports no is_success: --until-success 0.9 has no effect"]
+
+
+def test_asked_to_stop_it_saves_and_ends_without_an_evaluation(start, monkeypatch):
+    run, _, watcher = start({30: report(0.5)})
+    watcher.training = lambda progress, *rest: run.stop() if progress.steps == 50 else None
+    monkeypatch.setattr(run_module, "RECORD_EVERY", 0.0)
+    outcome = run.run()
+    assert (outcome.reason, outcome.steps) == ("stopped", 50)
+    assert outcome.last.read_text() == "50"
+    assert outcome.best.steps == 30
+
+
+def test_it_saves_every_half_minute_without_evaluations(start):
+    run, trainer, _ = start({1000: report(0.5)}, Clock(), steps=1000, eval_every=1000)
+    run.run()
+    assert [row[1] for row in trainer.saved if row[0] == "last.zip"] == [310, 620, 930, 1000, 1000]
+
+
+def test_slow_saving_is_done_less_often(start):
+    run, trainer, _ = start({2000: report(0.5)}, Clock(save_takes=2.0), steps=2000, eval_every=2000)
+    run.run()
+    assert [row[1] for row in trainer.saved if row[0] == "last.zip"] == [310, 1320, 2000, 2000]
+
+
+def test_a_nan_names_the_last_good_checkpoint(start, tmp_path):
+    run, trainer, _ = start({30: report(0.5)})
+    trainer.fails_at = 60
+    with pytest.raises(TrainingFailed) as caught:
+        run.run()
+    last = tmp_path / "runs" / "count-ppo" / "last.zip"
+    assert str(caught.value) == (
+        f"train/loss is nan at step 60; expected finite numbers; the last good checkpoint is {last}"
+    )
+    assert last.read_text() == "30"
+
+
+def test_a_nan_before_anything_was_saved(start):
+    run, trainer, _ = start({})
+    trainer.fails_at = 10
+    with pytest.raises(TrainingFailed, match=r"; no checkpoint had been saved yet$"):
+        run.run()
+
+
+def test_a_full_disk_at_out_loses_nothing(start, tmp_path):
+    run, trainer, watcher = start({30: report(0.1), 60: report(0.9), 90: report(0.1), 100: report(0.1)})
+    trainer.refuse = ["out.zip"]
+    with pytest.raises(OutputError, match=r"out\.zip: cannot be written: No space left on device$"):
+        run.run()
+    rescued = tmp_path / "runs" / "count-ppo" / "best.zip"
+    assert rescued.read_text() == "60"
+    assert (tmp_path / "runs" / "count-ppo" / "last.zip").read_text() == "100"
+    assert watcher.notes[0].endswith(f"No space left on device. The best policy is kept as {rescued} instead")
+
+
+def test_a_full_disk_in_the_run_folder_does_not_end_training(start):
+    run, trainer, watcher = start({30: report(0.1), 60: report(0.9), 90: report(0.1), 100: report(0.1)})
+    trainer.refuse = ["last.zip"]
+    with pytest.raises(OutputError, match=r"last\.zip"):
+        run.run()
+    assert trainer.steps == 100
+    assert run.out.read_text() == "60"
+    assert watcher.notes[0].endswith("Training goes on; the checkpoint before this one is whole")
+
+
+def test_a_resumed_run_keeps_a_better_best(start):
+    run, trainer, _ = start({60: report(0.5), 90: report(0.7), 100: report(0.6)}, best=Best(20, 0.8, 3.0))
+    run.out.write_text("20")
+    trainer.steps = run._evaluated_at = 30
+    outcome = run.run()
+    assert (outcome.best.steps, outcome.checkpoint.read_text()) == (20, "20")
+
+
+def test_records(start):
+    clock = Clock()
+    run, _, watcher = start({step: report(0.5) for step in (30, 60, 90, 100)}, clock)
+    run.run()
+    records = run.folder.records()
+    assert [record["steps"] for record in records if record["kind"] == "training"] == list(range(10, 101, 10))
+    assert records[0] == {
+        "kind": "training",
+        "steps": 10,
+        "seconds": 1.0,
+        "steps_per_second": 10.0,
+        "episodes": 3,
+        "return_mean": 1.5,
+        "length_mean": 4.0,
+        "success_rate": None,
+        "train/loss": 0.25,
+    }
+    assert records[3]["kind"] == "evaluation"
+    assert (records[3]["steps"], records[3]["success_rate"], records[3]["seconds"]) == (30, 0.5, 3.0)
+    assert watcher.rates[0] == (10, 10.0, 9.0)
+
+
+def test_settings_without_a_number_of_steps_between_evaluations(start):
+    run, _, watcher = start({100: report(0.5)})
+    run.settings = replace(run.settings, eval_every=None)
+    run.run()
+    assert [row[0] for row in watcher.evaluations] == [100]
