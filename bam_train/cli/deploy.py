@@ -152,3 +152,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     run_program(
         deploy_checkpoint, DeployConfig, prog="bam-deploy", description=DeployConfig.__doc__ or "", arguments=arguments
     )
+
+
+if __name__ == "__main__":
+    main()

@@ -123,3 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the console script."""
     description = EnvsConfig.__doc__ or ""
     run_program(show_environments, EnvsConfig, prog="bam-envs", description=description, arguments=arguments)
+
+
+if __name__ == "__main__":
+    main()

@@ -191,3 +191,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     run_program(
         evaluate_checkpoint, EvalConfig, prog="bam-eval", description=EvalConfig.__doc__ or "", arguments=arguments
     )
+
+
+if __name__ == "__main__":
+    main()
