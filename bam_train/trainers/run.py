@@ -7,6 +7,7 @@ The best policy by evaluation (success rate, ties by return) goes to ``out``, th
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -153,13 +154,21 @@ class TrainingRun:
         if self._stop:
             return False
         self._record(progress)
-        every = self.settings.eval_every or self.settings.steps
-        if progress.steps // every > self._evaluated_at // every:
+        if self._due(progress):
             self._evaluate()
             self._save_last()
         elif self._clock() - self._saved > self._save_pause:
             self._save_last()
         return not (self._stop or self._reached)
+
+    def _due(self, progress: Progress) -> bool:
+        """Whether to evaluate: every so many steps, and early once training itself succeeds as often as wanted."""
+        every, wanted = self.settings.eval_every or self.settings.steps, self.settings.until_success
+        if progress.steps // every > self._evaluated_at // every:
+            return True
+        if wanted is None or progress.steps - self._evaluated_at < every / 4:
+            return False
+        return (progress.statistics().success_rate or 0.0) >= wanted
 
     def _record(self, progress: Progress) -> None:
         now = self._clock()
@@ -176,7 +185,7 @@ class TrainingRun:
         """Evaluate the frozen policy; the best is kept."""
         steps = self._evaluated_at = self.trainer.steps
         with self.trainer.undisturbed():
-            report = self._report = self._confirmed(self.trainer.freeze())
+            report = self._report = self._report_on(self.trainer.freeze())
         found = Best(steps, report.success_rate, report.return_mean)
         better = self.best is None or found.rank() > self.best.rank()
         seconds = round(self._clock() - self._start, 3)
@@ -187,22 +196,30 @@ class TrainingRun:
         if better:
             self._keep(found)
 
-    def _confirmed(self, policy: Any) -> EvaluationReport:
-        """Evaluate; if that reaches ``until_success``, as many fresh episodes must confirm it."""
-        report = self._episodes(policy, 0)
-        wanted = self.settings.until_success
-        if wanted is not None and report.success_rate is None and self._report is None:
+    def _report_on(self, policy: Any) -> EvaluationReport:
+        """Evaluate. Towards ``until_success``: a quarter first, all if that may do, as many fresh ones if that did.
+
+        The quarter spares early, hopeless policies their long evaluation; the fresh episodes keep luck from ending the run.
+        """
+        episodes, wanted = self.settings.eval_episodes, self.settings.until_success
+        if wanted is None:
+            return self._episodes(policy, 0, episodes)
+        look = self._episodes(policy, 0, math.ceil(episodes / 4))
+        if look.success_rate is None and self._report is None:
             self.watcher.note(f"{self.settings.env} reports no is_success: --until-success {wanted} has no effect")
-        if wanted is None or report.success_rate is None or report.success_rate < wanted:
+        if _failures(look) > (1 - wanted) * episodes + 1e-9 and self.trainer.steps < self.settings.steps:
+            return look
+        report = self._episodes(policy, 0, episodes)
+        if report.success_rate is None or report.success_rate < wanted:
             return report
-        again = self._episodes(policy, self.settings.eval_episodes)
+        again = self._episodes(policy, episodes, episodes)
         self._reached = again.success_rate is not None and again.success_rate >= wanted
         return min(report, again, key=lambda one: one.success_rate or 0.0)
 
-    def _episodes(self, policy: Any, skip: int) -> EvaluationReport:
+    def _episodes(self, policy: Any, skip: int, count: int) -> EvaluationReport:
         settings = self.settings
         seed = FIRST_SEED + settings.seed + skip
-        return evaluate(policy, settings.env, settings.env_kwargs, episodes=settings.eval_episodes, seed=seed)
+        return evaluate(policy, settings.env, settings.env_kwargs, episodes=count, seed=seed)
 
     def _keep(self, found: Best) -> None:
         """Save the policy as the best so far; if `out` cannot be written, in the run's folder, and training goes on."""
@@ -237,6 +254,10 @@ class TrainingRun:
         if self.best is None or kept is None:
             return {"best": None}
         return {"best": {**asdict(self.best), "path": str(kept.resolve())}}
+
+
+def _failures(report: EvaluationReport) -> int:
+    return 0 if report.successes is None else report.episodes - report.successes
 
 
 def _training_record(steps: int, seconds: float, rate: float, statistics: Statistics) -> dict[str, Any]:

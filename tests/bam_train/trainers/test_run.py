@@ -42,6 +42,7 @@ class Counter:
     def __init__(self, settings, clock=None):
         self.settings, self.steps, self.clock = settings, 0, clock
         self.saved, self.refuse, self.fails_at, self.logged = [], [], None, []
+        self.statistics = STATISTICS
 
     def train(self, steps, on_progress):
         while self.steps < steps:
@@ -50,7 +51,7 @@ class Counter:
                 self.clock.now += 1.0
             if self.fails_at is not None and self.steps >= self.fails_at:
                 raise TrainingFailed("train/loss is nan at step 60; expected finite numbers")
-            if not on_progress(Progress(self.steps, steps, lambda: STATISTICS)):
+            if not on_progress(Progress(self.steps, steps, lambda: self.statistics)):
                 return
 
     def save(self, path, scores, notes):
@@ -103,7 +104,7 @@ def start(tmp_path, monkeypatch):
         start.seeds = []
 
         def evaluate(policy, env_id, env_kwargs, *, episodes, seed):
-            start.seeds.append((policy.steps, seed))
+            start.seeds.append((policy.steps, seed, episodes))
             found = results[policy.steps]
             return found.pop(0) if isinstance(found, list) else found
 
@@ -120,7 +121,7 @@ def test_evaluations_are_due_every_so_many_steps_and_at_the_end(start):
     run, trainer, watcher = start({step: report(0.1) for step in (30, 60, 90, 100)})
     outcome = run.run()
     assert [row[0] for row in watcher.evaluations] == [30, 60, 90, 100]
-    assert start.seeds == [(step, 1_000_007) for step in (30, 60, 90, 100)]
+    assert start.seeds == [(step, 1_000_007, 10) for step in (30, 60, 90, 100)]
     assert (outcome.reason, outcome.steps) == ("steps", 100)
     assert trainer.logged[0] == {"eval/return_mean": 0.0, "eval/success_rate": 0.1}
 
@@ -161,12 +162,37 @@ def test_scores_name_the_steps_at_which_they_were_found(start):
 
 
 def test_success_must_be_confirmed_by_fresh_episodes(start):
-    lucky = [report(1.0), report(0.8)]
-    run, _, watcher = start({30: lucky, 60: [report(1.0), report(0.99)], 90: report(0.0)}, until_success=0.95)
+    look, all_of_them = report(1.0, episodes=3), report(1.0)
+    lucky, lasting = [look, all_of_them, report(0.8)], [look, all_of_them, report(0.9)]
+    run, _, watcher = start({30: [report(0.0, episodes=3)], 60: lucky, 90: lasting}, until_success=0.9)
     outcome = run.run()
-    assert start.seeds == [(30, 1_000_007), (30, 1_000_017), (60, 1_000_007), (60, 1_000_017)]
-    assert [row[:2] for row in watcher.evaluations] == [(30, 0.8), (60, 0.99)]
-    assert (outcome.reason, outcome.steps, outcome.best.steps) == ("success", 60, 60)
+    quarter, whole, fresh = (1_000_007, 3), (1_000_007, 10), (1_000_017, 10)
+    assert start.seeds == [(30, *quarter)] + [(step, *asked) for step in (60, 90) for asked in (quarter, whole, fresh)]
+    assert [row[:2] for row in watcher.evaluations] == [(30, 0.0), (60, 0.8), (90, 0.9)]
+    assert (outcome.reason, outcome.steps, outcome.best.steps) == ("success", 90, 90)
+
+
+def test_a_quarter_with_few_failures_is_followed_by_the_rest(start):
+    look, rest = report(2 / 3, episodes=3), report(0.7)
+    results = {step: [look, rest] for step in (30, 60, 90, 100)}
+    run, _, watcher = start(results, until_success=0.9)
+    run.run()
+    assert [row[:2] for row in watcher.evaluations] == [(step, 0.7) for step in (30, 60, 90, 100)]
+
+
+def test_the_last_evaluation_is_a_whole_one(start):
+    look = report(0.0, episodes=3)
+    run, _, _ = start({30: [look], 60: [look], 90: [look], 100: [look, report(0.1)]}, until_success=0.9)
+    assert run.run().scores["episodes"] == 10
+
+
+@pytest.mark.parametrize(("share", "steps"), [(0.95, [10, 20, 30]), (0.9, [40, 80, 100])])
+def test_training_that_succeeds_is_evaluated_early(start, share, steps):
+    results = dict.fromkeys(range(10, 101, 10), report(0.9)) | {30: [report(1.0), report(1.0), report(1.0)]}
+    run, trainer, watcher = start(results, until_success=0.95, eval_every=40)
+    trainer.statistics = replace(STATISTICS, success_rate=share)
+    run.run()
+    assert [row[0] for row in watcher.evaluations] == steps
 
 
 def test_success_that_nobody_reports_never_ends_a_run(start):
