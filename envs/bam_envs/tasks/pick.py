@@ -12,7 +12,7 @@ from bam_envs.kinematics import cube_yaw_phase
 from bam_envs.robots.robot import Initial, RobotState, Rows
 from bam_envs.robots.ur5e import GEOMETRY
 from bam_envs.tasks.task import Array, Floats, Label, Score, labelled_box
-from bam_envs.tasks.tool_control import ACTION_LABELS, HAND_LABELS, LEASH, WORKSPACE, ToolControl, hand_state
+from bam_envs.tasks.tool_control import ACTION_LABELS, HAND_LABELS, WORKSPACE, ToolControl, hand_state
 
 CUBE_AREA = np.array([[0.35, -0.20], [0.65, 0.20]])
 """Where the cube starts: lowest and highest x, y [m]."""
@@ -34,7 +34,7 @@ OBJECT_LABELS = (
     Label("object_dx", "object from the tool, forward", "m", "/ 0.1", -2, 2),
     Label("object_dy", "object from the tool, to the left", "m", "/ 0.1", -2, 2),
     Label("object_dz", "object from the tool, up", "m", "/ 0.1", -2, 2),
-    Label("object_yaw_cos", "cos(4 yaw) of the object seen from the gripper; a cube looks the same every 90 degrees", "1"),
+    Label("object_yaw_cos", "cos(4 yaw) of the object seen from the gripper; a cube repeats every 90 degrees", "1"),
     Label("object_yaw_sin", "sin(4 yaw) of the object seen from the gripper", "1"),
 )
 
@@ -63,7 +63,7 @@ class PickTask:
     """
 
     action_labels = ACTION_LABELS
-    observation_labels = HAND_LABELS + OBJECT_LABELS
+    observation_labels: tuple[Label, ...] = HAND_LABELS + OBJECT_LABELS
 
     def __init__(self, num_rows: int = 1) -> None:
         self.num_rows = num_rows

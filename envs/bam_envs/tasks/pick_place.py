@@ -68,15 +68,17 @@ class PickPlaceTask(PickTask):
         picked = np.where(self.picked, 1.0, -1.0)[:, None]
         goal = np.concatenate([offset / 0.2, offset / 0.04, picked], axis=1).astype(np.float32)
         observation = np.concatenate([self.observe_cube(state), goal], axis=1)
-        return np.clip(observation, self.observation_space.low, self.observation_space.high)
+        clipped: Floats = np.clip(observation, self.observation_space.low, self.observation_space.high)
+        return clipped
 
     def goal_distance(self, sense: CubeSense) -> Array:
         """Distance of the object from where it would lie at the goal [m]. Shape: (n,)."""
         offset = np.concatenate([sense.object[:, :2] - self.goal, self.lift(sense)[:, None]], axis=1)
-        return np.sqrt(np.einsum("ij,ij->i", offset, offset))
+        distance: Array = np.sqrt(np.einsum("ij,ij->i", offset, offset))
+        return distance
 
     def score(self, state: RobotState, action: Floats) -> Score:
-        """Near the cube, squeezing it, carrying it to the goal, letting go there; at success the worth of staying there."""
+        """Near the cube, squeezing it, carrying it to the goal, letting go there; at success the worth of staying."""
         sense = self.sense(state)
         lift, grasped, distance = self.lift(sense), self.grasped(sense), self.goal_distance(sense)
         opening, width = ~self.control.closed, state.signals["gripper_width"][:, 0]
@@ -92,13 +94,14 @@ class PickPlaceTask(PickTask):
         return Score(reward, success | fallen, success, info)
 
     def _shaping(self, sense: CubeSense, lift: Array, grasped: Any) -> Array:
-        """Reach, squeeze, and carry along a funnel: `CARRY` high far from the goal, down to the table above it. Shape: (n,)."""
+        """Reach, squeeze, carry along a funnel: `CARRY` high far from the goal, down to the table there. (n,)."""
         offset = sense.object[:, :2] - self.goal
         across = np.sqrt(np.einsum("ij,ij->i", offset, offset))
         height = CARRY * np.clip((across - 0.01) / FUNNEL, 0.0, 1.0)
         inside, near = 1 - np.tanh(25 * np.abs(lift - height)), 1 - np.tanh(5 * across)
         reach: Array = 0.04 * (1 - np.tanh(5 * sense.distance))
-        return reach + grasped * (0.04 + 0.1 * inside + 0.25 * inside * near * self.picked)
+        shaping: Array = reach + grasped * (0.04 + 0.1 * inside + 0.25 * inside * near * self.picked)
+        return shaping
 
     def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
         """The goal."""

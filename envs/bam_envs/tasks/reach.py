@@ -41,10 +41,10 @@ class ReachTask:
     action_labels = tuple(Label(f"d_{joint}", f"turn {joint}", "rad", "/ 0.05") for joint in JOINTS)
     observation_labels = (
         *(Label(joint, "joint position from the home pose", "rad", "- home", -4, 4) for joint in JOINTS),
-        *(Label(f"target_{joint}", "commanded joint position from the measured one", "rad", "/ 0.15", -2, 2) for joint in JOINTS),
+        *(Label(f"target_{one}", "commanded joint position from measured", "rad", "/ 0.15", -2, 2) for one in JOINTS),
         *(Label(f"tool_{axis}", f"tool, {axis}", "m", "(from the middle of the goals) / 0.3", -4, 4) for axis in "xyz"),
         *(Label(f"goal_d{axis}", f"goal from the tool, {axis}", "m", "/ 0.3", -4, 4) for axis in "xyz"),
-        *(Label(f"goal_near_d{axis}", f"goal from the tool, {axis}, close up", "m", "/ 0.05, clipped") for axis in "xyz"),
+        *(Label(f"goal_near_d{axis}", f"goal from the tool, {axis}, near", "m", "/ 0.05, clipped") for axis in "xyz"),
     )
 
     def __init__(self, num_rows: int = 1) -> None:
@@ -82,7 +82,7 @@ class ReachTask:
         return np.clip(observation, self.observation_space.low, self.observation_space.high)
 
     def command(self, action: Floats, state: RobotState) -> Array:
-        """Joint positions [rad], at most `TOOL_STEP` of tool and `JOINT_STEP` of joint on, and the open gripper. Shape: (n, 7)."""
+        """Joint positions [rad], at most `TOOL_STEP` and `JOINT_STEP` on, and the open gripper. Shape: (n, 7)."""
         measured = state.signals["joint_position"]
         wanted = self._joints + np.clip(action, -1.0, 1.0).astype(np.float64) * JOINT_STEP
         wanted = np.clip(np.clip(wanted, measured - LEASH, measured + LEASH), _LOW, -_LOW)
@@ -128,6 +128,6 @@ def slow_step(joints: Array, wanted: Array) -> Array:
         length = np.sqrt(np.einsum("ij,ij->i", step, step))
         if length.max() <= TOOL_STEP:
             break
-        travel *= np.minimum(1.0, 0.99 * TOOL_STEP / np.maximum(length, 1e-9))[:, None]
+        travel *= np.where(length > TOOL_STEP, 0.99 * TOOL_STEP / np.maximum(length, 1e-9), 1.0)[:, None]
     sinks = (tool[:, 2] + step[:, 2] < LOWEST_TOOL) & (step[:, 2] < 0)
     return joints + np.where(sinks[:, None], 0.0, travel)

@@ -47,7 +47,7 @@ class Score:
 
 @runtime_checkable
 class Task(Protocol):
-    """Observation, command, reward and end for `num_rows` rows; the same code for one live robot and many simulated ones."""
+    """Observation, command, reward and end for `num_rows` rows; the same code for one live robot and many simulated."""
 
     num_rows: int
     observation_space: spaces.Box

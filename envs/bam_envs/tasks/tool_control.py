@@ -1,8 +1,8 @@
 """From tool actions (dx, dy, dz, dyaw, grip) to joint commands, slow enough for a robot near people.
 
-The actions move a tool *target*, not the measured tool, which sags and lags; the target stays within `LEASH` of the measured tool and
-inside the workspace. The tool always points straight down, so the joints follow in closed form. From one command to the next the tool
-target moves at most `TOOL_STEP` and no joint more than `JOINT_STEP`.
+The actions move a tool *target*, not the measured tool, which sags and lags; the target stays within `LEASH` of the
+measured tool and inside the workspace. The tool always points straight down, so the joints follow in closed form. From
+one command to the next the tool target moves at most `TOOL_STEP` and no joint more than `JOINT_STEP`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from bam_envs.robots.ur5e import GEOMETRY, GRIPPER_OPEN
 from bam_envs.tasks.task import Array, Floats, Label
 
 TOOL_STEP = 0.0124
-"""Farthest the tool target goes in a period of 0.05 s [m]. With it the measured tool stays below 0.25 m/s, the limit of a UR's recovery mode."""
+"""Farthest the tool target goes in 0.05 s [m]; the measured tool stays below 0.25 m/s, as in a UR's recovery mode."""
 JOINT_STEP = 0.05
 """Farthest a joint goes in a period of 0.05 s [rad]: 1.0 rad/s."""
 YAW_STEP = 0.05
@@ -80,9 +80,9 @@ class ToolControl:
         Returns:
             Shape: (n, 7).
         """
-        action = np.clip(action, -1.0, 1.0).astype(np.float64)
-        travel = self._travel(action[:, :3] * TOOL_STEP, tool)
-        turn = np.clip(self.yaw + action[:, 3] * YAW_STEP, -YAW_LIMIT, YAW_LIMIT) - self.yaw
+        moves: Array = np.clip(action, -1.0, 1.0).astype(np.float64)
+        travel = self._travel(moves[:, :3] * TOOL_STEP, tool)
+        turn = np.clip(self.yaw + moves[:, 3] * YAW_STEP, -YAW_LIMIT, YAW_LIMIT) - self.yaw
         self._move(travel, turn)
         self.closed = action[:, 4] > 0
         width = np.where(self.closed, 0.0, GRIPPER_OPEN)
@@ -93,17 +93,18 @@ class ToolControl:
         target = np.clip(self.target + step, tool - LEASH, tool + LEASH)
         travel = np.clip(target, WORKSPACE[0], WORKSPACE[1]) - self.target
         length = np.sqrt(np.einsum("ij,ij->i", travel, travel))
-        return travel * np.minimum(1.0, TOOL_STEP / np.maximum(length, 1e-9))[:, None]
+        slow: Array = travel * np.minimum(1.0, TOOL_STEP / np.maximum(length, 1e-9))[:, None]
+        return slow
 
     def _move(self, travel: Array, turn: Array) -> None:
         """Move target and joints by as much of `travel` and `turn` as the joint speed allows."""
         share = np.ones(len(turn))
         for _ in range(3):
             joints = GEOMETRY.reach_down(self.target + travel * share[:, None], self.yaw + turn * share)
-            fastest = np.abs(joints - self._joints).max(axis=1)
+            fastest = np.maximum(np.abs(joints - self._joints).max(axis=1), 1e-9)
             if fastest.max() <= JOINT_STEP:
                 break
-            share *= np.minimum(1.0, 0.98 * JOINT_STEP / np.maximum(fastest, 1e-9))
+            share *= np.where(fastest > JOINT_STEP, 0.98 * JOINT_STEP / fastest, 1.0)
         else:
             joints = self._joints + (joints - self._joints) * np.minimum(1.0, JOINT_STEP / fastest)[:, None]
         self.target = self.target + travel * share[:, None]
@@ -112,7 +113,8 @@ class ToolControl:
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
         """The memory, as plain arrays."""
-        return {"target": self.target, "yaw": self.yaw, "closed": self.closed, "joints": self._joints}
+        memory = {"target": self.target, "yaw": self.yaw, "closed": self.closed, "joints": self._joints}
+        return {name: array.copy() for name, array in memory.items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go to what `state_dict` returned."""

@@ -1,0 +1,44 @@
+# Two commands: `make demo` trains, evaluates and deploys; `make test` runs the whole test suite. Both install what they need in .venv.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+DEMO := build/demo
+
+.PHONY: demo test lint format docs clean
+
+demo: $(VENV)/.run
+	$(BIN)/bam-train --env bam/pick --algo ppo --out $(DEMO)/pick-ppo.zip --runs $(DEMO)/runs --force
+	$(BIN)/bam-eval $(DEMO)/pick-ppo.zip
+	$(BIN)/bam-deploy $(DEMO)/pick-ppo.zip
+
+test: $(VENV)/.dev
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(VENV)/.dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+docs: $(VENV)/.dev
+	$(BIN)/python scripts/make_docs.py
+
+clean:
+	rm -rf $(VENV) build dist runs .pytest_cache .mypy_cache .ruff_cache .hypothesis
+
+$(VENV)/.run: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "Installing bam-train with simulation and training in $(VENV); the first time takes a few minutes."
+	$(PIP_INSTALL) -e ".[sim,train]"
+	@touch $@
+
+$(VENV)/.dev: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "Installing bam-train and the tools of its tests in $(VENV); the first time takes a few minutes."
+	$(PIP_INSTALL) -e ".[dev]"
+	@touch $@ $(VENV)/.run
+
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)

@@ -1,0 +1,85 @@
+"""The wheel: what it holds, what it asks for, what it installs."""
+
+import email
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation"]
+    environment = {**os.environ, "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
+    subprocess.run([*command, "--wheel-dir", str(folder), str(ROOT)], check=True, env=environment)
+    with zipfile.ZipFile(next(folder.glob("*.whl"))) as archive:
+        yield archive
+
+
+@pytest.fixture(scope="module")
+def metadata(wheel):
+    name = next(name for name in wheel.namelist() if name.endswith(".dist-info/METADATA"))
+    return email.message_from_string(wheel.read(name).decode())
+
+
+def base_requirements(metadata):
+    return [one for one in metadata.get_all("Requires-Dist") if "extra ==" not in one]
+
+
+def test_the_wheel_holds_two_packages_and_nothing_else(wheel):
+    tops = {name.split("/")[0] for name in wheel.namelist()}
+    assert {name for name in tops if not name.endswith(".dist-info")} == {"bam_envs", "bam_train"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "bam_envs/py.typed",
+        "bam_train/py.typed",
+        "bam_envs/robots/simulated/models/ur5e_gripper.xml",
+        "bam_envs/robots/simulated/models/ur5e_cube.xml",
+        "bam_train/trainers/presets/pick-ppo.toml",
+        "bam_train/trainers/presets/reach-ppo.toml",
+        "bam_train/trainers/presets/pick-place-ppo.toml",
+    ],
+)
+def test_the_wheel_holds_types_models_and_presets(wheel, name):
+    assert name in wheel.namelist()
+
+
+def test_every_source_file_is_in_the_wheel(wheel):
+    sources = [*(ROOT / "bam_train").rglob("*.py"), *(ROOT / "envs" / "bam_envs").rglob("*.py")]
+    names = {str(path.relative_to(ROOT)).removeprefix("envs/") for path in sources}
+    assert names <= set(wheel.namelist())
+
+
+def test_console_scripts(wheel):
+    name = next(name for name in wheel.namelist() if name.endswith("entry_points.txt"))
+    lines = sorted(line for line in wheel.read(name).decode().splitlines() if " = " in line)
+    assert lines == [
+        "bam-deploy = bam_train.cli.deploy:main",
+        "bam-envs = bam_train.cli.envs:main",
+        "bam-eval = bam_train.cli.eval:main",
+        "bam-train = bam_train.cli.train:main",
+    ]
+
+
+def test_the_base_install_is_small(metadata):
+    names = sorted(one.split(";")[0].rstrip("<>=,.0123456789 ") for one in base_requirements(metadata))
+    assert names == ["gymnasium", "numpy", "onnxruntime", "rich", "roslibpy", "tomli", "tyro"]
+
+
+def test_extras(metadata):
+    assert sorted(metadata.get_all("Provides-Extra")) == ["all", "dev", "sim", "train", "video"]
+
+
+def test_licence_and_versions(metadata):
+    assert metadata["License-Expression"] == "MIT"
+    assert metadata["Requires-Python"] == ">=3.10"
+    assert any(one.startswith("gymnasium") and ">=1.1" in one for one in base_requirements(metadata))
