@@ -7,7 +7,6 @@ The best policy by evaluation (success rate, ties by return) goes to ``out``, th
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -15,13 +14,11 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from bam_train.errors import OutputError, TrainingFailed
-from bam_train.evaluation import EvaluationReport, evaluate
+from bam_train.evaluation import EvaluationReport
 from bam_train.settings import TrainSettings
+from bam_train.trainers.judge import judge
 from bam_train.trainers.run_folder import RunFolder
 from bam_train.trainers.trainer import Progress, Statistics, Trainer
-
-FIRST_SEED = 1_000_000
-"""Evaluation episode k during training is seeded FIRST_SEED + seed + k: never one of training's."""
 
 SAVE_EVERY = 30.0
 """Seconds between two saves at least, unless an evaluation comes first."""
@@ -185,7 +182,10 @@ class TrainingRun:
         """Evaluate the frozen policy; the best is kept."""
         steps = self._evaluated_at = self.trainer.steps
         with self.trainer.undisturbed():
-            report = self._report = self._report_on(self.trainer.freeze())
+            report, self._reached = judge(self.trainer.freeze(), self.settings, last=steps >= self.settings.steps)
+        if report.success_rate is None and self.settings.until_success is not None and self._report is None:
+            self.watcher.note(f"{self.settings.env} reports no is_success, so --until-success has no effect")
+        self._report = report
         found = Best(steps, report.success_rate, report.return_mean)
         better = self.best is None or found.rank() > self.best.rank()
         seconds = round(self._clock() - self._start, 3)
@@ -196,54 +196,32 @@ class TrainingRun:
         if better:
             self._keep(found)
 
-    def _report_on(self, policy: Any) -> EvaluationReport:
-        """Evaluate. Towards ``until_success``: a quarter first, all if that may do, as many fresh ones if that did.
-
-        The quarter spares early, hopeless policies their long evaluation; the fresh episodes keep luck from ending the run.
-        """
-        episodes, wanted = self.settings.eval_episodes, self.settings.until_success
-        if wanted is None:
-            return self._episodes(policy, 0, episodes)
-        look = self._episodes(policy, 0, math.ceil(episodes / 4))
-        if look.success_rate is None and self._report is None:
-            self.watcher.note(f"{self.settings.env} reports no is_success: --until-success {wanted} has no effect")
-        if _failures(look) > (1 - wanted) * episodes + 1e-9 and self.trainer.steps < self.settings.steps:
-            return look
-        report = self._episodes(policy, 0, episodes)
-        if report.success_rate is None or report.success_rate < wanted:
-            return report
-        again = self._episodes(policy, episodes, episodes)
-        self._reached = again.success_rate is not None and again.success_rate >= wanted
-        return min(report, again, key=lambda one: one.success_rate or 0.0)
-
-    def _episodes(self, policy: Any, skip: int, count: int) -> EvaluationReport:
-        settings = self.settings
-        seed = FIRST_SEED + settings.seed + skip
-        return evaluate(policy, settings.env, settings.env_kwargs, episodes=count, seed=seed)
-
     def _keep(self, found: Best) -> None:
-        """Save the policy as the best so far; if `out` cannot be written, in the run's folder, and training goes on."""
+        """Save the policy as the best so far; if `out` cannot be written, in the run's folder. Training goes on."""
+        before = self.best, self._best_scores
         self.best, self._best_scores = found, self._scores()
-        try:
-            self.trainer.save(self.out, self._best_scores, self._notes(self.out))
-            self._kept = self.out
-        except OutputError as error:
-            self._failure = error
-            rescue = self.folder.path / "best.zip"
-            self.trainer.save(rescue, self._best_scores, self._notes(rescue))
-            self._kept = rescue
-            self.watcher.note(f"{error}. The best policy is kept as {rescue} instead")
+        for path in (self.out, self.folder.path / "best.zip"):
+            if self._write(path, path, "the best policy is kept elsewhere if it can be"):
+                self._kept = path
+                return
+        self.best, self._best_scores = before  # the next evaluation tries again
 
     def _save_last(self) -> None:
         """Save the newest state; the next save is put off while saving is slow."""
         before = self._clock()
-        try:
-            self.trainer.save(self.folder.last, self._scores(), self._notes(self._kept))
-        except OutputError as error:
-            self._failure = error
-            self.watcher.note(f"{error}. Training goes on; the checkpoint before this one is whole")
+        self._write(self.folder.last, self._kept, "the checkpoint before this one is whole")
         self._saved = self._clock()
         self._save_pause = max(SAVE_EVERY, (self._saved - before) / SAVE_SHARE)
+
+    def _write(self, path: Path, kept: Path | None, comfort: str) -> bool:
+        """Write a checkpoint, which notes that the best one is at `kept`; whether it could be."""
+        try:
+            self.trainer.save(path, self._scores(), self._notes(kept))
+        except OutputError as error:
+            self._failure = error
+            self.watcher.note(f"{error}. Training goes on, and {comfort}")
+            return False
+        return True
 
     def _scores(self) -> dict[str, Any]:
         """The newest evaluation and the steps at which it was made, for a manifest."""
@@ -254,10 +232,6 @@ class TrainingRun:
         if self.best is None or kept is None:
             return {"best": None}
         return {"best": {**asdict(self.best), "path": str(kept.resolve())}}
-
-
-def _failures(report: EvaluationReport) -> int:
-    return 0 if report.successes is None else report.episodes - report.successes
 
 
 def _training_record(steps: int, seconds: float, rate: float, statistics: Statistics) -> dict[str, Any]:

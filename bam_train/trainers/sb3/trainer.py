@@ -8,10 +8,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import io
 import math
-import warnings
-import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -23,16 +20,17 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from bam_envs.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint, write_checkpoint
-from bam_train.environments import control_period, make_env, require_fit
-from bam_train.errors import SettingsError, TrainingFailed
+from bam_train.environments import make_env, require_fit
+from bam_train.errors import TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.provenance import git_commit, now, versions
 from bam_train.trainers.sb3 import hyperparameters, resume
 from bam_train.trainers.sb3.algorithms import ALGORITHMS
 from bam_train.trainers.sb3.freeze import freeze, golden
+from bam_train.trainers.sb3.model import library_notices, make_model, meaning, one_env, refusals, sb3_members
 from bam_train.trainers.sb3.state import all_finite, undisturbed
-from bam_train.trainers.sb3.vec_env import RowsVecEnv, make_training_env
+from bam_train.trainers.sb3.vec_env import make_training_env
 from bam_train.trainers.trainer import OnProgress, Progress, Statistics
 
 _FINITE = "expected finite numbers: try a smaller learning_rate"
@@ -48,7 +46,7 @@ class SB3Trainer:
     def __init__(self, settings: TrainSettings, model: Any, venv: VecEnv) -> None:
         self.settings, self.model, self.venv = settings, model, venv
         self.notices: list[str] = []
-        self._signals, self._period = _meaning(venv)
+        self._signals, self._period = meaning(venv)
         self._normaliser: VecNormalize | None = model.get_vec_normalize_env()
         self._waiting: resume.Waiting | None = None
         self._on_progress: OnProgress = lambda progress: True
@@ -71,8 +69,8 @@ class SB3Trainer:
         """Set up a new run of complete settings."""
         torch.set_num_threads(settings.threads)
         venv = make_training_env(settings.env, settings.env_kwargs, settings.num_envs)
-        with _notices() as notices, _refusals(settings):
-            model = _make_model(settings, venv)
+        with library_notices() as notices, refusals(settings):
+            model = make_model(settings, venv)
         model.set_logger(Logger(None, []))
         trainer = cls(settings, model, venv)
         trainer.notices += notices
@@ -83,7 +81,7 @@ class SB3Trainer:
         """Set up a run that goes on from a checkpoint, with its settings or with these."""
         settings = settings or TrainSettings.from_mapping(checkpoint.manifest.settings, str(checkpoint.path))
         trainer = cls.create(settings)
-        require_fit(checkpoint, _one_env(trainer.venv))
+        require_fit(checkpoint, one_env(trainer.venv))
         trainer._waiting = resume.load(checkpoint, trainer.model, trainer.venv, trainer._normaliser)
         if not trainer._waiting.same_episodes:
             trainer.notices.append(
@@ -169,7 +167,7 @@ class SB3Trainer:
         spaces = self._spaces()
         with undisturbed(self.model):
             members = {
-                **_sb3_members(self.model),
+                **sb3_members(self.model),
                 "bam/policy.onnx": freeze(self.model, self._normaliser, *spaces),
                 "bam/golden.safetensors": golden(self.model, self._normaliser, spaces[0]),
             }
@@ -224,73 +222,3 @@ class SB3Trainer:
         self.model.logger.dump(self.steps)
         self.model.logger.close()
         self.model.env.close()
-
-
-def _make_model(settings: TrainSettings, venv: VecEnv) -> Any:
-    """The algorithm's model; its constructor seeds everything and initialises the weights."""
-    env: VecEnv = venv
-    if settings.normalize:
-        arguments = settings.normalize if isinstance(settings.normalize, dict) else {}
-        env = VecNormalize(venv, **arguments)
-    arguments = hyperparameters.build(settings.hyperparameters, venv.action_space)
-    policy = arguments.pop("policy")
-    device = _device(settings.device, policy)
-    return ALGORITHMS[settings.algo].load()(policy, env, seed=settings.seed, device=device, verbose=0, **arguments)
-
-
-def _device(name: str, policy: str) -> str:
-    """Where to compute: what was asked for if it is there.
-
-    Raises:
-        SettingsError: There is no such device.
-    """
-    if name == "auto":
-        # Copies to a GPU cost more than a small network computes.
-        return "cuda" if torch.cuda.is_available() and not policy.startswith("Mlp") else "cpu"
-    there = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
-    if name in there or (name == "cuda" and len(there) > 1):
-        return name
-    raise SettingsError(f"device: {name!r} is not there; expected auto or one of {', '.join(there)}")
-
-
-@contextlib.contextmanager
-def _refusals(settings: TrainSettings) -> Iterator[None]:
-    """What stable-baselines3 and torch say about settings that cannot be, as our own error."""
-    try:
-        yield
-    except (AssertionError, ValueError, TypeError, RuntimeError, ZeroDivisionError, NotImplementedError) as error:
-        if isinstance(error, SettingsError):
-            raise
-        raise SettingsError(
-            f"{settings.algo} on {settings.env} cannot be set up: {' '.join(str(error).split())}"
-        ) from error
-
-
-@contextlib.contextmanager
-def _notices() -> Iterator[list[str]]:
-    """Collect warnings as lines for the user."""
-    lines: list[str] = []
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)
-        yield lines
-    lines += [" ".join(str(one.message).split()) for one in caught]
-
-
-def _one_env(venv: VecEnv) -> Any:
-    """What stands behind `venv`: our vector environment, or the first of the others."""
-    return venv.rows if isinstance(venv, RowsVecEnv) else venv.envs[0]
-
-
-def _meaning(venv: VecEnv) -> tuple[dict[str, Any], float | None]:
-    """Signals (labels, units, limits) and control period [s], as far as the environment says."""
-    env = _one_env(venv)
-    describe = getattr(env.unwrapped, "describe", None)
-    return (describe() if describe else {}), control_period(env)
-
-
-def _sb3_members(model: Any) -> dict[str, bytes]:
-    """What stable-baselines3 itself writes, so that its own `load` opens the checkpoint."""
-    stream = io.BytesIO()
-    model.save(stream, exclude=["collect_rollouts"])
-    with zipfile.ZipFile(stream) as archive:
-        return {name: archive.read(name) for name in archive.namelist()}

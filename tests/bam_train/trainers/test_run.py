@@ -11,6 +11,7 @@ import pytest
 from bam_train.errors import OutputError, TrainingFailed
 from bam_train.evaluation import EvaluationReport
 from bam_train.settings import TrainSettings
+from bam_train.trainers import judge as judge_module
 from bam_train.trainers import run as run_module
 from bam_train.trainers.run import Best, TrainingRun
 from bam_train.trainers.run_folder import RunFolder
@@ -108,7 +109,7 @@ def start(tmp_path, monkeypatch):
             found = results[policy.steps]
             return found.pop(0) if isinstance(found, list) else found
 
-        monkeypatch.setattr(run_module, "evaluate", evaluate)
+        monkeypatch.setattr(judge_module, "evaluate", evaluate)
         trainer, watcher = Counter(settings, clock), Watcher()
         folder = RunFolder(tmp_path / "runs", "count-ppo")
         run = TrainingRun(trainer, folder, tmp_path / "out.zip", watcher, best, clock or Clock())
@@ -174,7 +175,7 @@ def test_success_must_be_confirmed_by_fresh_episodes(start):
 
 def test_a_quarter_with_few_failures_is_followed_by_the_rest(start):
     look, rest = report(2 / 3, episodes=3), report(0.7)
-    results = {step: [look, rest] for step in (30, 60, 90, 100)}
+    results = {step: [look, rest] for step in (30, 60, 90)} | {100: rest}
     run, _, watcher = start(results, until_success=0.9)
     run.run()
     assert [row[:2] for row in watcher.evaluations] == [(step, 0.7) for step in (30, 60, 90, 100)]
@@ -182,7 +183,7 @@ def test_a_quarter_with_few_failures_is_followed_by_the_rest(start):
 
 def test_the_last_evaluation_is_a_whole_one(start):
     look = report(0.0, episodes=3)
-    run, _, _ = start({30: [look], 60: [look], 90: [look], 100: [look, report(0.1)]}, until_success=0.9)
+    run, _, _ = start({30: [look], 60: [look], 90: [look], 100: report(0.1)}, until_success=0.9)
     assert run.run().scores["episodes"] == 10
 
 
@@ -198,7 +199,7 @@ def test_training_that_succeeds_is_evaluated_early(start, share, steps):
 def test_success_that_nobody_reports_never_ends_a_run(start):
     run, _, watcher = start({step: report(None, 1.0) for step in (30, 60, 90, 100)}, until_success=0.9)
     assert run.run().reason == "steps"
-    assert watcher.notes == ["test/Count-v0 reports no is_success: --until-success 0.9 has no effect"]
+    assert watcher.notes == ["test/Count-v0 reports no is_success, so --until-success has no effect"]
 
 
 def test_asked_to_stop_it_saves_and_ends_without_an_evaluation(start, monkeypatch):
@@ -250,7 +251,8 @@ def test_a_full_disk_at_out_loses_nothing(start, tmp_path):
     rescued = tmp_path / "runs" / "count-ppo" / "best.zip"
     assert rescued.read_text() == "60"
     assert (tmp_path / "runs" / "count-ppo" / "last.zip").read_text() == "100"
-    assert watcher.notes[0].endswith(f"No space left on device. The best policy is kept as {rescued} instead")
+    end = "No space left on device. Training goes on, and the best policy is kept elsewhere if it can be"
+    assert watcher.notes[0].endswith(end)
 
 
 def test_a_full_disk_in_the_run_folder_does_not_end_training(start):
@@ -260,7 +262,19 @@ def test_a_full_disk_in_the_run_folder_does_not_end_training(start):
         run.run()
     assert trainer.steps == 100
     assert run.out.read_text() == "60"
-    assert watcher.notes[0].endswith("Training goes on; the checkpoint before this one is whole")
+    assert watcher.notes[0].endswith("Training goes on, and the checkpoint before this one is whole")
+
+
+def test_full_disks_everywhere_do_not_end_training_either(start):
+    run, trainer, _ = start({30: report(0.1), 60: report(0.9), 90: report(0.1), 100: report(0.1)})
+    trainer.refuse = ["out.zip", "best.zip", "last.zip"]
+    trainer.train = lambda steps, on_progress, train=trainer.train: train(
+        steps, lambda progress: (trainer.refuse.clear() if progress.steps == 90 else None) or on_progress(progress)
+    )
+    with pytest.raises(OutputError):
+        run.run()
+    assert run.out.read_text() == "90"
+    assert run.folder.last.read_text() == "100"
 
 
 def test_a_resumed_run_keeps_a_better_best(start):

@@ -1,0 +1,90 @@
+"""The model of a run: made from settings, refused in one line, written the way stable-baselines3 writes it."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import warnings
+import zipfile
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from bam_train.environments import control_period
+from bam_train.errors import SettingsError
+from bam_train.settings import TrainSettings
+from bam_train.trainers.sb3 import hyperparameters
+from bam_train.trainers.sb3.algorithms import ALGORITHMS
+from bam_train.trainers.sb3.vec_env import RowsVecEnv
+
+
+def make_model(settings: TrainSettings, venv: VecEnv) -> Any:
+    """The algorithm's model; its constructor seeds everything and initialises the weights."""
+    env: VecEnv = venv
+    if settings.normalize:
+        arguments = settings.normalize if isinstance(settings.normalize, dict) else {}
+        env = VecNormalize(venv, **arguments)
+    arguments = hyperparameters.build(settings.hyperparameters, venv.action_space)
+    policy = arguments.pop("policy")
+    device = _device(settings.device, policy)
+    return ALGORITHMS[settings.algo].load()(policy, env, seed=settings.seed, device=device, verbose=0, **arguments)
+
+
+def _device(name: str, policy: str) -> str:
+    """Where to compute: what was asked for if it is there.
+
+    Raises:
+        SettingsError: There is no such device.
+    """
+    if name == "auto":
+        # Copies to a GPU cost more than a small network computes.
+        return "cuda" if torch.cuda.is_available() and not policy.startswith("Mlp") else "cpu"
+    there = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
+    if name in there or (name == "cuda" and len(there) > 1):
+        return name
+    raise SettingsError(f"device: {name!r} is not there; expected auto or one of {', '.join(there)}")
+
+
+@contextlib.contextmanager
+def refusals(settings: TrainSettings) -> Iterator[None]:
+    """What stable-baselines3 and torch say about settings that cannot be, as our own error."""
+    try:
+        yield
+    except (AssertionError, ValueError, TypeError, RuntimeError, ZeroDivisionError, NotImplementedError) as error:
+        if isinstance(error, SettingsError):
+            raise
+        raise SettingsError(
+            f"{settings.algo} on {settings.env} cannot be set up: {' '.join(str(error).split())}"
+        ) from error
+
+
+@contextlib.contextmanager
+def library_notices() -> Iterator[list[str]]:
+    """Collect warnings as lines for the user."""
+    lines: list[str] = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        yield lines
+    lines += [" ".join(str(one.message).split()) for one in caught]
+
+
+def one_env(venv: VecEnv) -> Any:
+    """What stands behind `venv`: our vector environment, or the first of the others."""
+    return venv.rows if isinstance(venv, RowsVecEnv) else venv.envs[0]
+
+
+def meaning(venv: VecEnv) -> tuple[dict[str, Any], float | None]:
+    """Signals (labels, units, limits) and control period [s], as far as the environment says."""
+    env = one_env(venv)
+    describe = getattr(env.unwrapped, "describe", None)
+    return (describe() if describe else {}), control_period(env)
+
+
+def sb3_members(model: Any) -> dict[str, bytes]:
+    """What stable-baselines3 itself writes, so that its own `load` opens the checkpoint."""
+    stream = io.BytesIO()
+    model.save(stream, exclude=["collect_rollouts"])
+    with zipfile.ZipFile(stream) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
