@@ -58,6 +58,25 @@ class CubeSense:
 class PickTask:
     """Grasp the cube, lift it by `LIFT` and hold it for `HOLD_STEPS`.
 
+    Start:
+        The tool is between x 0.45 and 0.55 m, y -0.05 and 0.05 m, z 0.17 and 0.23 m, pointing straight down, the
+        gripper open. The cube (edge 4 cm) lies flat between x 0.35 and 0.65 m, y -0.20 and 0.20 m, with any yaw.
+
+    Reward:
+        Each step 0.1 (1 - tanh(5 d)), where d is the distance of the tool from the cube [m]; while the cube is
+        squeezed between the pads, 0.1 more, and 0.5 times the share of 10 cm that it is lifted. At success 30, which is
+        about what holding the cube up for the rest of the episode would bring, so that ending early never costs; -5
+        when the cube leaves the table.
+
+    Success:
+        The cube is at least 10 cm above where it lay for 5 steps on end (0.25 s).
+
+    End:
+        Terminated at success, and when the cube is lower than 3 cm below the table top: it has left the table.
+
+    Info:
+        `distance` of the tool from the cube [m], `lift` of the cube above where it lay [m].
+
     Args:
         num_rows: How many robots are scored together.
     """

@@ -34,6 +34,23 @@ _LOW = np.array([-2 * np.pi, -2 * np.pi, -np.pi, -2 * np.pi, -2 * np.pi, -2 * np
 class ReachTask:
     """Bring the tool within `GOAL_RADIUS` of a goal.
 
+    Start:
+        Each joint is within 0.1 rad of the home pose, in which the tool is at about (0.5, 0, 0.2) m and points down.
+        The goal is between x 0.30 and 0.65 m, y -0.30 and 0.30 m, z 0.10 and 0.45 m.
+
+    Reward:
+        Each step 0.2 (1 - tanh(3 d)), where d is the distance of the tool from the goal [m]. At success 10, about the
+        worth of staying there.
+
+    Success:
+        The tool is within 2 cm of the goal.
+
+    End:
+        Terminated at success.
+
+    Info:
+        `distance` of the tool from the goal [m].
+
     Args:
         num_rows: How many robots are scored together.
     """
