@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 
-from bam_train.evaluation import FIRST_SEED, BatchPolicy, EvaluationReport, evaluate
+from bam_train.evaluation import BatchPolicy, EvaluationReport, evaluate
 from bam_train.settings import TrainSettings
+
+JUDGE_SEED = 2_000_000
+"""Where these seeds start: apart from training's small ones and from bam-eval's, whose episodes must be fresh."""
 
 
 def judge(policy: BatchPolicy, settings: TrainSettings, last: bool = False) -> tuple[EvaluationReport, bool]:
@@ -16,7 +19,7 @@ def judge(policy: BatchPolicy, settings: TrainSettings, last: bool = False) -> t
 
     Args:
         policy: What acts.
-        settings: Of the run; episode k is seeded FIRST_SEED + seed + k, never one of training's.
+        settings: Of the run; episode k is seeded JUDGE_SEED + seed + k.
         last: Whether this is the run's last evaluation, which is never cut short.
 
     Returns:
@@ -38,7 +41,7 @@ def judge(policy: BatchPolicy, settings: TrainSettings, last: bool = False) -> t
 
 
 def _episodes(policy: BatchPolicy, settings: TrainSettings, skip: int, count: int) -> EvaluationReport:
-    seed = FIRST_SEED + settings.seed + skip
+    seed = JUDGE_SEED + settings.seed + skip
     return evaluate(policy, settings.env, settings.env_kwargs, episodes=count, seed=seed)
 
 

@@ -122,7 +122,7 @@ def test_evaluations_are_due_every_so_many_steps_and_at_the_end(start):
     run, trainer, watcher = start({step: report(0.1) for step in (30, 60, 90, 100)})
     outcome = run.run()
     assert [row[0] for row in watcher.evaluations] == [30, 60, 90, 100]
-    assert start.seeds == [(step, 1_000_007, 10) for step in (30, 60, 90, 100)]
+    assert start.seeds == [(step, 2_000_007, 10) for step in (30, 60, 90, 100)]
     assert (outcome.reason, outcome.steps) == ("steps", 100)
     assert trainer.logged[0] == {"eval/return_mean": 0.0, "eval/success_rate": 0.1}
 
@@ -167,7 +167,7 @@ def test_success_must_be_confirmed_by_fresh_episodes(start):
     lucky, lasting = [look, all_of_them, report(0.8)], [look, all_of_them, report(0.9)]
     run, _, watcher = start({30: [report(0.0, episodes=3)], 60: lucky, 90: lasting}, until_success=0.9)
     outcome = run.run()
-    quarter, whole, fresh = (1_000_007, 3), (1_000_007, 10), (1_000_017, 10)
+    quarter, whole, fresh = (2_000_007, 3), (2_000_007, 10), (2_000_017, 10)
     assert start.seeds == [(30, *quarter)] + [(step, *asked) for step in (60, 90) for asked in (quarter, whole, fresh)]
     assert [row[:2] for row in watcher.evaluations] == [(30, 0.0), (60, 0.8), (90, 0.9)]
     assert (outcome.reason, outcome.steps, outcome.best.steps) == ("success", 90, 90)
