@@ -1,0 +1,252 @@
+"""Write the generated parts of ``docs/*.md`` from the code; with ``--check``, only say whether they are current.
+
+A generated part stands between ``<!-- generated: NAME -->`` and ``<!-- /generated -->``; NAME may carry an argument,
+as in ``environment bam/pick-v0``. The rest of a page is written by hand.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import dataclasses
+import importlib
+import inspect
+import itertools
+import re
+import textwrap
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from bam_envs.registry import ENVIRONMENTS, resolve
+from bam_envs.robot_env import describe
+from bam_envs.robots.robot import SignalSpec
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+_PART = re.compile(r"(<!-- generated: (?P<name>\S+)(?: (?P<argument>\S+))? -->\n)(.*?)(<!-- /generated -->)", re.DOTALL)
+SECTIONS = ("Start", "Reward", "Success", "End", "Info")
+"""Parts of a task's docstring that its page shows."""
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(_cell(value) for value in line) + " |" for line in lines)
+
+
+def _cell(value: object) -> str:
+    text = f"{value:.5g}" if isinstance(value, float) else str(value)
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+def field_docs(kind: type) -> dict[str, str]:
+    """The string below each field of a dataclass."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
+    body = tree.body if isinstance(tree, ast.ClassDef) else []
+    docs = {}
+    for field, text in itertools.pairwise(body):
+        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+            docs[ast.unparse(field.target)] = code(str(text.value.value))
+    return docs
+
+
+def code(text: str) -> str:
+    """Docstring prose as Markdown: one line, double backquotes made single."""
+    return " ".join(text.replace("``", "`").split())
+
+
+def sections(docstring: str) -> dict[str, str]:
+    """``Name:`` and the indented text below it, as in a Google docstring."""
+    found = re.findall(r"^(\w+):\n((?:[ ]{4}.*\n?|\n)+)", inspect.cleandoc(docstring), re.MULTILINE)
+    return {name: code(text) for name, text in found}
+
+
+def environments() -> str:
+    """The table of environments."""
+    rows = []
+    for entry in ENVIRONMENTS.values():
+        task = resolve(entry.task)(1)
+        shapes = [f"{len(task.observation_labels)} numbers", f"{len(task.action_labels)} numbers"]
+        seconds = f"{entry.max_episode_steps * entry.period:g} s"
+        rows.append([f"[`{entry.id}`](#{anchor(entry.id)})", entry.summary, *shapes, entry.max_episode_steps, seconds])
+    header = ["id", "what to do", "observation", "action", "steps an episode", "which is"]
+    return table(header, rows)
+
+
+def anchor(heading: str) -> str:
+    """The link to a heading, as GitHub makes it."""
+    return re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-")
+
+
+def environment(env_id: str) -> str:
+    """Everything about one environment."""
+    entry = ENVIRONMENTS[env_id]
+    docs = sections(resolve(entry.task).__doc__ or "")
+    signals = describe(resolve(entry.robot)(1), resolve(entry.task)(1))
+    parts = [f"{entry.summary[0].upper()}{entry.summary[1:]}. One step is {entry.period:g} s of robot time."]
+    parts += [f"**{name}.** {docs[name]}" for name in SECTIONS]
+    end = f"Truncated after {entry.max_episode_steps} steps ({entry.max_episode_steps * entry.period:g} s)."
+    parts[1 + SECTIONS.index("End")] += f" {end}"
+    parts[1 + SECTIONS.index("Info")] += " `is_success`, as everywhere."
+    for kind in ("observation", "action"):
+        rows = signals[kind]
+        numbers = [
+            [i, f"`{row['name']}`", row["meaning"], row["unit"], row["scale"], row["low"], row["high"]]
+            for i, row in enumerate(rows)
+        ]
+        parts.append(f"**{kind.capitalize()}**: float32, shape ({len(rows)},)")
+        parts.append(table(["index", "name", "meaning", "unit", "scale", "min", "max"], numbers))
+    return "\n\n".join(parts)
+
+
+def robot_signals() -> str:
+    """What the arm measures and what it is sent."""
+    spec = resolve(ENVIRONMENTS["bam/pick-v0"].robot)(1).spec
+    rows = [row for signal in spec.signals for row in _signal_rows(signal)]
+    header = ["signal", "index", "name", "unit", "min", "max"]
+    measured = table(header, [row[:-1] for row in rows])
+    sent = table([*header, "fastest change"], _signal_rows(spec.command))
+    return f"**State**: what it measures\n\n{measured}\n\n**Command**: what it is sent\n\n{sent}"
+
+
+def _signal_rows(signal: SignalSpec) -> list[list[object]]:
+    rates = signal.max_rate or (0.0,) * len(signal.labels)
+    columns = zip(signal.labels, signal.units, signal.low, signal.high, rates, strict=True)
+    return [
+        [f"`{signal.name}`", i, f"`{label}`", unit, float(low), float(high), f"{rate:.5g} {unit}/s"]
+        for i, (label, unit, low, high, rate) in enumerate(columns)
+    ]
+
+
+def fields_of(reference: str) -> str:
+    """Name, type and meaning of every field of the dataclass ``"module:Class"``."""
+    kind = resolve(reference)
+    docs = field_docs(kind)
+    rows = [[f"`{field.name}`", f"`{field.type}`", docs[field.name]] for field in dataclasses.fields(kind)]
+    return table(["field", "type", "meaning"], rows)
+
+
+def defaults_of(reference: str) -> str:
+    """Name, default and meaning of every field of the dataclass ``"module:Class"``."""
+    kind = resolve(reference)
+    docs = field_docs(kind)
+    rows = [[f"`{field.name}`", default_of(field), docs[field.name]] for field in dataclasses.fields(kind)]
+    return table(["name", "default", "meaning"], rows)
+
+
+def default_of(field: dataclasses.Field[Any]) -> str:
+    """A field's default as it would be written, or nothing."""
+    value = field.default
+    if field.default_factory is not dataclasses.MISSING:
+        value = field.default_factory()
+    if value is dataclasses.MISSING:
+        return "required"
+    if value is None or value == ():
+        return ""
+    return f"`{str(value).lower() if isinstance(value, bool) else value}`"
+
+
+def flags_of(reference: str) -> str:
+    """The flags of a program whose configuration is the dataclass ``"module:Class"``."""
+    kind = resolve(reference)
+    docs = field_docs(kind)
+    rows = [[flag(field), flag_default(field), docs[field.name]] for field in dataclasses.fields(kind)]
+    return table(["flag", "default", "meaning"], rows)
+
+
+def flag_default(field: dataclasses.Field[Any]) -> str:
+    """What a flag is when it is not given; a switch is then off, which need not be said."""
+    return "" if field.default is False else default_of(field)
+
+
+def flag(field: dataclasses.Field[Any]) -> str:
+    """How a field is given on the command line."""
+    if "Positional" in str(field.type):
+        return f"`{field.name.upper() if field.name != 'env' else 'ID'}`"
+    return f"`--{field.name.replace('_', '-')}`"
+
+
+def algorithms() -> str:
+    """The table of algorithms."""
+    from bam_train.trainers.sb3.algorithms import ALGORITHMS
+
+    rows = []
+    for row in ALGORITHMS.values():
+        memory = "fresh rollouts" if row.on_policy else "replay buffer"
+        policy = f"{memory}, recurrent policy" if row.recurrent else memory
+        rows.append([f"`{row.name}`", f"`{row.reference.replace(':', '.')}`", ", ".join(row.actions), policy])
+    return table(["--algo", "class", "action spaces", "learns from"], rows)
+
+
+def presets() -> str:
+    """The settings of every preset."""
+    from bam_train.trainers import presets as package
+
+    folder = Path(str(package.__file__)).parent
+    blocks = [f"`{name}`\n\n```toml\n{(folder / name).read_text().strip()}\n```" for name in package.list_presets()]
+    return "\n\n".join(blocks)
+
+
+def run_folder() -> str:
+    """The listing in the docstring of the run folder's module."""
+    return listing("bam_train.trainers.run_folder")
+
+
+def members() -> str:
+    """The listing in the docstring of the checkpoint's module."""
+    return listing("bam_train.checkpoint")
+
+
+def listing(module: str) -> str:
+    """The literal block of a module's docstring."""
+    docstring = inspect.cleandoc(importlib.import_module(module).__doc__ or "")
+    match = re.search(r"::\n\n((?:[ ]{4}.*\n|\n)+)", docstring + "\n")
+    text = textwrap.dedent(match[1]).strip() if match else ""
+    return f"```\n{text}\n```"
+
+
+PARTS: dict[str, Callable[..., str]] = {
+    "environments": environments,
+    "environment": environment,
+    "robot-signals": robot_signals,
+    "fields": fields_of,
+    "defaults": defaults_of,
+    "flags": flags_of,
+    "algorithms": algorithms,
+    "presets": presets,
+    "run-folder": run_folder,
+    "members": members,
+}
+"""Name of a generated part to what writes it."""
+
+
+def generate(text: str) -> str:
+    """A page with its generated parts as they should be."""
+
+    def part(match: re.Match[str]) -> str:
+        arguments = [match["argument"]] if match["argument"] else []
+        return f"{match[1]}\n{PARTS[match['name']](*arguments)}\n\n{match[5]}"
+
+    return _PART.sub(part, text)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if a page is not current")
+    check = parser.parse_args().check
+    stale = []
+    for page in sorted(DOCS.glob("*.md")):
+        text = page.read_text(encoding="utf-8")
+        current = generate(text)
+        if current == text:
+            continue
+        stale.append(page.name)
+        if not check:
+            page.write_text(current, encoding="utf-8")
+    if stale:
+        print(f"{', '.join(stale)}: {'not current; run scripts/make_docs.py' if check else 'written'}")
+    return int(check and bool(stale))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
