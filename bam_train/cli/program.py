@@ -5,7 +5,10 @@ Only tyro is imported before the flags are parsed, so that ``--help`` is quick.
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from typing import TypeVar
@@ -49,12 +52,46 @@ def run_program(
     Raises:
         SystemExit: Always.
     """
+    sys.path.append(os.getcwd())  # --env my_module:Env-v0, as with python -m; last, so that it hides nothing
+    parsed = parse(config, prog, description, arguments)
+    sys.exit(guarded(lambda: main(parsed), prog))
+
+
+def parse(config: type[Config], prog: str, description: str, arguments: Sequence[str] | None) -> Config:
+    """The command line as a `config`; what is wrong with it becomes one line, with status 2.
+
+    Raises:
+        SystemExit: After ``--help`` (0), or a command line that cannot be read (2).
+    """
     import tyro
 
-    sys.path.append(os.getcwd())  # --env my_module:Env-v0, as with python -m; last, so that it hides nothing
     one_way = (tyro.conf.FlagCreatePairsOff,)  # --force, no --no-force
-    parsed = tyro.cli(config, prog=prog, description=description, args=arguments, config=one_way)
-    sys.exit(guarded(lambda: main(parsed), prog))
+    box = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(box):
+            return tyro.cli(config, prog=prog, description=description, args=arguments, config=one_way)
+    except SystemExit as stop:
+        if stop.code:
+            _complain(prog, f"{usage_error(box.getvalue())} Run {prog} --help")
+        raise
+
+
+def usage_error(box: str) -> str:
+    """What tyro's box of several lines says, in one.
+
+    Examples: ``unknown option --enb, did you mean --env?``, ``--steps cannot be 'x'.``
+    """
+    text = " ".join(re.sub(r"[─│╭╮╰╯]+", " ", box).split())
+    text = re.split(r" For full helptext| Argument helptext", text)[0]
+    if match := re.search(r"Unrecognized options: (.*?)(?: Perhaps you meant: .*?(--[\w-]+).*)?$", text):
+        return f"unknown option {match[1].split(',')[0]}{f', did you mean {match[2]}?' if match[2] else '.'}"
+    if match := re.search(r"Error parsing (\S+?):? .*(?:from \[|: )('.*?')", text):
+        return f"{match[1]} cannot be {match[2]}."
+    if match := re.search(r"Missing value for argument ('\S+')", text):
+        return f"{match[1]} needs a value."
+    if match := re.search(r"Missing from \S+: (\S+)", text):
+        return f"{match[1]} is missing."
+    return f"{text}."
 
 
 def guarded(main: Callable[[], int | None], prog: str) -> int:

@@ -43,8 +43,21 @@ def test_help_and_a_typo(capsys):
     shown = capsys.readouterr().out
     assert "Does things." in shown
     assert "--no-force" not in shown
-    assert ended(["--stps", "5"]) == 2
-    assert "--steps" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["--stps", "5"], "prog: unknown option --stps, did you mean --steps? Run prog --help\n"),
+        (["--qqq"], "prog: unknown option --qqq. Run prog --help\n"),
+        (["--steps", "many"], "prog: --steps cannot be 'many'. Run prog --help\n"),
+        (["--steps"], "prog: '--steps' needs a value. Run prog --help\n"),
+        (["stray"], "prog: unknown option stray. Run prog --help\n"),
+    ],
+)
+def test_a_command_line_that_cannot_be_read_is_one_line(arguments, line, capsys):
+    assert ended(arguments) == 2
+    assert capsys.readouterr().err == line
 
 
 @pytest.mark.parametrize(
