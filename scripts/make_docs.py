@@ -51,8 +51,8 @@ def field_docs(kind: type) -> dict[str, str]:
 
 
 def code(text: str) -> str:
-    """Docstring prose as Markdown: one line, double backquotes made single."""
-    return " ".join(text.replace("``", "`").split())
+    """Docstring prose as Markdown: one line, double backquotes made single, no tags."""
+    return " ".join(text.replace("``", "`").replace("<", "&lt;").split())
 
 
 def sections(docstring: str) -> dict[str, str]:
