@@ -1,0 +1,253 @@
+"""The pages say what is true: generated parts are current, examples run, commands and links exist."""
+
+import importlib.util
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from bam_envs.registry import ENVIRONMENTS
+from bam_envs.robots.simulated.imperfection import Ranges
+from bam_envs.tasks import pick, pick_place, reach
+from bam_train.checkpoint import Checkpoint
+from bam_train.cli import train
+from bam_train.settings import tomllib
+
+ROOT = Path(__file__).parents[1]
+DOCS = sorted((ROOT / "docs").glob("*.md"))
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "checkpoints" / "README.md", *DOCS]
+PROGRAMS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+EXAMPLES = {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "envs")]), "OMP_NUM_THREADS": "1"}
+
+
+def name_of(page):
+    return str(page.relative_to(ROOT))
+
+
+def load_script(name):
+    spec = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def blocks(page, language):
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+
+
+def commands(page):
+    """Every command line of a page's console blocks, without comments."""
+    lines = [line for block in blocks(page, "console") for line in block.splitlines()]
+    return [words for line in lines if (words := shlex.split(line, comments=True))]
+
+
+def python(*arguments, folder):
+    """Run Python in `folder`, where our packages and the folder's modules are found; its standard output."""
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        cwd=folder,
+        env={**os.environ, **EXAMPLES},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def make_docs():
+    return load_script("make_docs")
+
+
+@pytest.mark.parametrize("page", DOCS, ids=name_of)
+def test_generated_parts_are_current(make_docs, page):
+    text = page.read_text()
+    assert make_docs.generate(text) == text, f"run: python scripts/make_docs.py ({page.name})"
+
+
+def test_a_stale_page_is_found(make_docs, tmp_path, monkeypatch, capsys):
+    page = tmp_path / "page.md"
+    page.write_text("Before\n<!-- generated: algorithms -->\nold\n<!-- /generated -->\nafter\n")
+    monkeypatch.setattr(make_docs, "DOCS", tmp_path)
+    for arguments, status, said in (
+        (["--check"], 1, "page.md: not current; run scripts/make_docs.py\n"),
+        ([], 0, "page.md: written\n"),
+        (["--check"], 0, ""),
+    ):
+        monkeypatch.setattr(sys, "argv", ["make_docs.py", *arguments])
+        assert make_docs.main() == status
+        assert capsys.readouterr().out == said
+    assert page.read_text().startswith("Before\n<!-- generated: algorithms -->\n\n| --algo |")
+    assert page.read_text().endswith("|\n\n<!-- /generated -->\nafter\n")
+
+
+def test_every_environment_has_a_section_and_a_version():
+    text = (ROOT / "docs" / "environments.md").read_text()
+    for env_id in ENVIRONMENTS:
+        assert f"## {env_id}\n\n<!-- generated: environment {env_id} -->" in text
+        assert f"| `{env_id}` | " in text.partition("## Version history")[2]
+
+
+def test_every_number_of_an_environment_is_in_its_table(make_docs):
+    text = make_docs.environment("bam/pick-v0")
+    assert "| 2 | `tool_z` | tool, above the table | m | (z - 0.183) / 0.167 | -2 | 2 |" in text
+    assert "| 4 | `grip` | close the gripper when positive, open it otherwise | 1 | 1 | -1 | 1 |" in text
+    assert text.count("\n| ") == 18 + 5 + 2 * 2
+    for name in make_docs.SECTIONS:
+        assert f"**{name}.** " in text
+
+
+def metres(value):
+    return f"{100 * value:g} cm"
+
+
+@pytest.mark.parametrize(
+    ("task", "section", "facts"),
+    [
+        (reach.ReachTask, "Success", [metres(reach.GOAL_RADIUS)]),
+        (reach.ReachTask, "Start", [f"{reach.START_NOISE} rad", *(f"{x:.2f}" for x in reach.GOAL_AREA.ravel())]),
+        (pick.PickTask, "Success", [metres(pick.LIFT), f"{pick.HOLD_STEPS} steps", f"{pick.HOLD_STEPS / 20} s"]),
+        (pick.PickTask, "Start", [metres(pick.CUBE_EDGE), *(f"{x:.2f}" for x in pick.CUBE_AREA.ravel())]),
+        (pick.PickTask, "Start", [f"{x:.2f}" for x in pick.START_AREA.ravel()]),
+        (pick.PickTask, "End", [f"{metres(-pick.TABLE_EDGE)} below"]),
+        (pick_place.PickPlaceTask, "Start", [metres(pick_place.GOAL_DISTANCE)]),
+        (pick_place.PickPlaceTask, "Success", [metres(pick_place.GOAL_RADIUS), metres(pick_place.PICKED)]),
+        (pick_place.PickPlaceTask, "Success", [f"{pick_place.REST_STEPS} steps", f"{pick_place.REST_STEPS / 20} s"]),
+        (pick_place.PickPlaceTask, "Reward", [metres(pick_place.CARRY), metres(pick_place.PICKED)]),
+    ],
+)
+def test_prose_has_the_numbers_of_the_code(make_docs, task, section, facts):
+    text = make_docs.sections(task.__doc__)[section]
+    assert [fact for fact in facts if fact not in text] == []
+
+
+def test_every_field_of_a_table_has_its_meaning(make_docs):
+    assert "| `max_delay` | `2` | Commands arrive 0 to this many periods late" in make_docs.defaults_of(
+        f"{Ranges.__module__}:Ranges"
+    )
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_flags_in_the_tables_are_those_of_the_programs(program, monkeypatch, capsys):
+    module, _, name = PROGRAMS[program].partition(":")
+    main = getattr(importlib.import_module(module), name)
+    monkeypatch.setattr(sys, "argv", [program, "--help"])
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    with pytest.raises(SystemExit) as caught:
+        main()
+    assert caught.value.code == 0
+    there = set(re.findall(r"--[a-z][a-z-]*", capsys.readouterr().out)) - {"--help"}
+    page = (ROOT / "docs" / ("training.md" if program == "bam-train" else "deploying.md")).read_text()
+    table = re.search(rf"generated: flags {module}:.*?<!-- /generated -->", page, re.DOTALL)[0]
+    assert set(re.findall(r"^\| `(--[a-z-]+)`", table, re.MULTILINE)) == there
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_commands_exist(page):
+    targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    for words in commands(page):
+        if words[0] == "make":
+            assert words[1] in targets
+        elif words[0] == "python":
+            assert (ROOT / words[1]).exists() or f"`{words[1]}`" in page.read_text()
+        else:
+            assert words[0] in {*PROGRAMS, "pip", "pytest"}
+
+
+TRAINING = [words for page in PAGES for words in commands(page) if words[0] == "bam-train" and "--resume" not in words]
+
+
+@pytest.mark.parametrize("words", [one for one in TRAINING if ":" not in " ".join(one)], ids=" ".join)
+def test_settings_in_commands_are_accepted(words, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [*words, *([] if "--print-config" in words else ["--print-config"])])
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    with pytest.raises(SystemExit) as caught:
+        train.main()
+    output = capsys.readouterr()
+    assert caught.value.code == 0, output.err
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_links_lead_somewhere(make_docs, page):
+    for target in re.findall(r"\]\(([^)]+)\)", page.read_text()):
+        if target.startswith("https://"):
+            continue
+        path, _, anchor = target.partition("#")
+        file = page.parent / path if path else page
+        assert file.exists(), f"{page.name}: {target}"
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", file.read_text(), re.MULTILINE)
+            assert anchor in [make_docs.anchor(heading.replace("`", "")) for heading in headings], target
+
+
+def test_the_picture_is_small_and_moves():
+    image = pytest.importorskip("PIL.Image")
+    path = ROOT / "docs" / "pick.webp"
+    assert path.stat().st_size < 2_000_000
+    with image.open(path) as picture:
+        assert picture.n_frames > 50
+
+
+WITH_PROGRAMS = [page for page in PAGES if blocks(page, "python") and page.name != "adding.md"]
+
+
+@pytest.mark.parametrize("page", WITH_PROGRAMS, ids=name_of)
+def test_python_examples_run(page):
+    """The blocks of `adding.md` are files, which are tested below."""
+    for example in blocks(page, "python"):
+        python("-W", "error", "-c", example, folder=ROOT)
+
+
+def test_the_table_of_checkpoints_is_of_the_files():
+    script = load_script("evaluate_checkpoints")
+    known = script.old_wall_times((ROOT / "checkpoints" / "README.md").read_text())
+    del known["checkpoint", "command", "seed", "steps"], known[("---",) * 4]
+    names = [row[0].partition("]")[0].removeprefix("[") for row in known]
+    assert {name.removesuffix(".zip").rpartition("-")[0] for name in names} == {"reach", "pick", "pick-place"}
+    for name, (_, command, seed, steps) in zip(names, known, strict=True):
+        path = ROOT / "checkpoints" / name
+        manifest = Checkpoint.open(path).manifest
+        assert command == f"`{script.command(manifest, name)}`"
+        assert (seed, steps) == (str(manifest.seed), f"{manifest.steps:,}")
+        assert path.stat().st_size < 500_000
+
+
+@pytest.fixture(scope="module")
+def added(tmp_path_factory):
+    """A folder with the files of `adding.md`."""
+    folder = tmp_path_factory.mktemp("added")
+    text = (ROOT / "docs" / "adding.md").read_text()
+    files = re.findall(r"^`(\S+)`\n\n```\w+\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    assert len(files) == len(re.findall(r"^```(?:python|toml)$", text, re.MULTILINE))
+    for name, content in files:
+        (folder / name).write_text(content)
+    return folder
+
+
+@pytest.mark.parametrize("name", ["test_hover.py", "test_lagged.py"])
+def test_added_contracts_hold(added, name):
+    assert " passed" in python("-m", "pytest", "-q", "-p", "no:cacheprovider", name, folder=added)
+
+
+ADDED = [words for words in commands(ROOT / "docs" / "adding.md") if words[0] in ("bam-train", "python")]
+
+
+@pytest.mark.parametrize("words", ADDED, ids=" ".join)
+def test_added_things_train_and_deploy(added, words):
+    """The commands of the page, over one rollout."""
+    program = ["-m", "bam_train.cli.train"] if words[0] == "bam-train" else [words[1]]
+    arguments = words[1:] if words[0] == "bam-train" else words[2:]
+    out = f"{arguments[1].replace(':', '-').replace('/', '-')}.zip"
+    python(*program, *arguments, "--steps", "4096", "--eval-episodes", "2", "--out", out, folder=added)
+    text = python("-m", "bam_train.cli.deploy", out, "--episodes", "1", "--fast", folder=added)
+    assert text.startswith("episodes done: 1 of 1 episodes")
+
+
+def test_added_environments_are_described(added):
+    assert "goal_dx" in python("-m", "bam_train.cli.envs", "hover:my/hover", folder=added)
