@@ -2,7 +2,7 @@
 
 Command, seed and steps come from each checkpoint's manifest, wall time from the run that made it (`--runs`) or, without
 that, from the table as it is; the success rate is measured here, over episodes that neither training nor its
-evaluations have seen.
+evaluations have seen: those of ``bam-eval --episodes 1000``.
 """
 
 from __future__ import annotations
@@ -19,14 +19,12 @@ from bam_envs.errors import BamEnvsError
 from bam_train.checkpoint import Checkpoint, Manifest
 from bam_train.cli.console import duration
 from bam_train.errors import BamTrainError
-from bam_train.evaluation import EvaluationReport, evaluate
+from bam_train.evaluation import FIRST_SEED, EvaluationReport, evaluate
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import differences
 from bam_train.trainers.resolve import resolve
 
 FOLDER = Path(__file__).resolve().parents[1] / "checkpoints"
-SEED = 2_000_000
-"""Of the first episode; training's own evaluations start at 1,000,000."""
 HEADER = ("checkpoint", "command", "seed", "steps", "wall time", "success", "size")
 FLAGS = ("steps", "seed", "num_envs", "device", "threads", "until_success", "eval_every", "eval_episodes")
 """Settings that have a flag of their own."""
@@ -81,7 +79,7 @@ def row(path: Path, episodes: int, runs: Path, known: dict[tuple[str, ...], str]
     checkpoint = Checkpoint.open(path)
     manifest = checkpoint.manifest
     policy = FrozenPolicy.from_checkpoint(checkpoint)
-    report = evaluate(policy, manifest.env, manifest.env_kwargs, episodes=episodes, seed=SEED)
+    report = evaluate(policy, manifest.env, manifest.env_kwargs, episodes=episodes, seed=FIRST_SEED)
     made = [f"`{command(manifest, path.name)}`", str(manifest.seed), f"{manifest.steps:,}"]
     first = [f"[{path.name}]({path.name})", *made]
     seconds = wall_time(manifest, runs) or known.get(tuple(first), "not recorded")
