@@ -8,11 +8,11 @@ from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import gymnasium as gym
-from bam_envs.spaces import space_to_json
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 import bam_envs  # noqa: F401 - registers our environments with Gymnasium
 from bam_envs.registry import ENVIRONMENTS
+from bam_envs.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint
 from bam_train.errors import CheckpointMismatch, SettingsError
 
@@ -22,7 +22,7 @@ AnyEnv = gym.Env[Any, Any] | VectorEnv[Any, Any, Any]
 
 def is_batched(env_id: str) -> bool:
     """Whether `env_id` is one of ours, whose rows share one batched simulation."""
-    return env_id in ENVIRONMENTS
+    return env_id.rpartition(":")[2] in ENVIRONMENTS
 
 
 def make_env(

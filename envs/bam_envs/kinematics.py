@@ -58,9 +58,7 @@ class ArmGeometry:
         position = np.empty((len(q), 3))
         position[:, 0] = -(radial * c1 + sideways * s1)
         position[:, 1] = sideways * c1 - radial * s1
-        position[:, 2] = (
-            self.d1 + self.a2 * s[:, 1] + self.a3 * np.sin(q23) - self.d5 * c234 - end * s5 * s234
-        )
+        position[:, 2] = self.d1 + self.a2 * s[:, 1] + self.a3 * np.sin(q23) - self.d5 * c234 - end * s5 * s234
         # x6 = c6 (c5 e + s5 z1) - s6 z4 with e = (c234, 0, s234) and z4 = (s234, 0, -c234) in that plane.
         x_radial, x_sideways = c6 * c5 * c234 - s6 * s234, c6 * s5
         x_axis = np.empty((len(q), 3))

@@ -93,9 +93,7 @@ class RobotEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             self.render()
         return self.task.observe(self.state)[0], {"is_success": False}
 
-    def step(
-        self, action: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Send the command of `action`; one period later, observe and score."""
         if self.state is None:
             raise ResetNeeded("No episode is running: it ended, or never began. Call reset() first.")

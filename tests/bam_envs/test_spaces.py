@@ -90,25 +90,44 @@ def test_a_box_keeps_every_bit(space: spaces.Box) -> None:
 def test_json_forms() -> None:
     inf = np.inf
     assert space_to_json(spaces.Box(-1, 1, (3,))) == {
-        "type": "Box", "shape": [3], "dtype": "float32", "low": -1.0, "high": 1.0,
+        "type": "Box",
+        "shape": [3],
+        "dtype": "float32",
+        "low": -1.0,
+        "high": 1.0,
     }
     assert space_to_json(spaces.Box(np.array([-inf, 0.1]), np.array([inf, 2.0]), dtype=np.float64)) == {
-        "type": "Box", "shape": [2], "dtype": "float64", "low": ["-inf", 0.1], "high": ["inf", 2.0],
+        "type": "Box",
+        "shape": [2],
+        "dtype": "float64",
+        "low": ["-inf", 0.1],
+        "high": ["inf", 2.0],
     }
     assert space_to_json(spaces.Box(0, 255, (2, 2, 3), np.uint8)) == {
-        "type": "Box", "shape": [2, 2, 3], "dtype": "uint8", "low": 0, "high": 255,
+        "type": "Box",
+        "shape": [2, 2, 3],
+        "dtype": "uint8",
+        "low": 0,
+        "high": 255,
     }
     assert space_to_json(spaces.Discrete(4)) == {"type": "Discrete", "n": 4, "start": 0, "dtype": "int64"}
     assert space_to_json(spaces.MultiDiscrete([3, 2], start=[1, 0])) == {
-        "type": "MultiDiscrete", "nvec": [3, 2], "start": [1, 0], "dtype": "int64",
+        "type": "MultiDiscrete",
+        "nvec": [3, 2],
+        "start": [1, 0],
+        "dtype": "int64",
     }
     assert space_to_json(spaces.MultiBinary(5)) == {"type": "MultiBinary", "n": [5]}
     assert space_to_json(spaces.MultiBinary([2, 3])) == {"type": "MultiBinary", "n": [2, 3]}
     assert space_to_json(spaces.Text(5, charset="ba")) == {
-        "type": "Text", "min_length": 1, "max_length": 5, "charset": "ba",
+        "type": "Text",
+        "min_length": 1,
+        "max_length": 5,
+        "charset": "ba",
     }
     assert space_to_json(spaces.Tuple([spaces.Discrete(2)])) == {
-        "type": "Tuple", "spaces": [{"type": "Discrete", "n": 2, "start": 0, "dtype": "int64"}],
+        "type": "Tuple",
+        "spaces": [{"type": "Discrete", "n": 2, "start": 0, "dtype": "int64"}],
     }
 
 

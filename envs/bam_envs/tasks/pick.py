@@ -20,6 +20,8 @@ CUBE_EDGE = 0.04
 """Edge of the cube [m]."""
 START_AREA = np.array([[0.45, -0.05, 0.17], [0.55, 0.05, 0.23]])
 """Where the tool starts: lowest and highest x, y, z [m]."""
+NEAR = 0.03
+"""The object is within the gripper's reach at this distance from the tool [m]."""
 LIFT = 0.10
 """How high the cube must be lifted [m]."""
 HOLD_STEPS = 5
@@ -63,8 +65,8 @@ class PickTask:
         gripper open. The cube (edge 4 cm) lies flat between x 0.35 and 0.65 m, y -0.20 and 0.20 m, with any yaw.
 
     Reward:
-        Each step 0.1 (1 - tanh(5 d)), where d is the distance of the tool from the cube [m]; while the cube is
-        squeezed between the pads, 0.1 more, and 0.5 times the share of 10 cm that it is lifted. At success 30, which is
+        Each step 0.1 (1 - tanh(5 d)), where d is the distance of the tool from the cube [m]; -0.05 while the gripper is
+        told to close 3 cm or more from the cube, so that it comes open; while the cube is squeezed between the pads, 0.1 more, and 0.5 times the share of 10 cm that it is lifted. At success 30, which is
         about what holding the cube up for the rest of the episode would bring, so that ending early never costs; -5
         when the cube leaves the table.
 
@@ -150,7 +152,7 @@ class PickTask:
     def grasped(self, sense: CubeSense) -> Any:
         """Whether the closed gripper is stopped by the object between its pads. Shape: (n,) bool."""
         width = sense.state.signals["gripper_width"][:, 0]
-        return self.control.closed & (width > 0.6 * CUBE_EDGE) & (width < 1.6 * CUBE_EDGE) & (sense.distance < 0.03)
+        return self.control.closed & (width > 0.6 * CUBE_EDGE) & (width < 1.6 * CUBE_EDGE) & (sense.distance < NEAR)
 
     def score(self, state: RobotState, action: Floats) -> Score:
         """Near the cube, squeezing it, lifting it; at success the worth of staying there."""
@@ -159,7 +161,12 @@ class PickTask:
         self.held = np.where(lift >= LIFT, self.held + 1, 0)
         success = self.held >= HOLD_STEPS
         fallen = sense.object[:, 2] < TABLE_EDGE
-        reward = 0.1 * (1 - np.tanh(5 * sense.distance)) + grasped * (0.1 + 0.5 * np.clip(lift / LIFT, 0.0, 1.0))
+        early = self.control.closed & (sense.distance > NEAR)
+        reward = (
+            0.1 * (1 - np.tanh(5 * sense.distance))
+            - 0.05 * early
+            + grasped * (0.1 + 0.5 * np.clip(lift / LIFT, 0.0, 1.0))
+        )
         reward = reward + 30.0 * success - 5.0 * fallen
         return Score(reward, success | fallen, success, {"distance": sense.distance, "lift": lift})
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from bam_envs.robots.robot import Initial, RobotState, Rows
 from bam_envs.robots.ur5e import GRIPPER_OPEN
-from bam_envs.tasks.pick import CUBE_AREA, CUBE_EDGE, TABLE_EDGE, CubeSense, PickTask
+from bam_envs.tasks.pick import CUBE_AREA, CUBE_EDGE, NEAR, TABLE_EDGE, CubeSense, PickTask
 from bam_envs.tasks.task import Array, Floats, Label, Score
 
 GOAL_RADIUS = 0.02
@@ -41,8 +41,8 @@ class PickPlaceTask(PickTask):
         As for picking. The goal is anywhere in the cube's area, at least 10 cm from the cube.
 
     Reward:
-        Each step 0.04 (1 - tanh(5 d)), where d is the distance of the tool from the cube [m]. While the cube is
-        squeezed, 0.04 more; up to 0.1 for carrying it at the right height, which is 5 cm far from the goal and comes
+        Each step 0.04 (1 - tanh(5 d)), where d is the distance of the tool from the cube [m]; -0.02 while the
+        gripper is told to close 3 cm or more from the cube. While the cube is squeezed, 0.04 more; up to 0.1 for carrying it at the right height, which is 5 cm far from the goal and comes
         down to the table over the last 9 cm; and, once it has been lifted 3 cm, up to 0.25 for being near the goal
         too. 0.04 for a cube that was lifted and is at the goal, still squeezed; once the gripper is told to open
         there, 0.9 to 1.5 by how far it is open, instead of all that. At success 75, about the worth of staying there;
@@ -122,7 +122,8 @@ class PickPlaceTask(PickTask):
         height = CARRY * np.clip((across - 0.01) / FUNNEL, 0.0, 1.0)
         inside, near = 1 - np.tanh(25 * np.abs(lift - height)), 1 - np.tanh(5 * across)
         reach: Array = 0.04 * (1 - np.tanh(5 * sense.distance))
-        shaping: Array = reach + grasped * (0.04 + 0.1 * inside + 0.25 * inside * near * self.picked)
+        early = 0.02 * (self.control.closed & (sense.distance > NEAR))
+        shaping: Array = reach - early + grasped * (0.04 + 0.1 * inside + 0.25 * inside * near * self.picked)
         return shaping
 
     def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:

@@ -22,7 +22,7 @@ JOINT_STEP = 0.05
 """Farthest a joint goes in a period of 0.05 s [rad]: 1.0 rad/s."""
 YAW_STEP = 0.05
 """Farthest the gripper turns in a period [rad]."""
-LEASH = 0.04
+LEASH = 0.03
 """Farthest the tool target is from the measured tool, along each axis [m]."""
 WORKSPACE = np.array([[0.30, -0.25, 0.016], [0.70, 0.25, 0.35]])
 """Box for the tool target: lowest and highest x, y, z [m]."""
@@ -40,9 +40,9 @@ HAND_LABELS = (
     Label("tool_x", "tool, forward", "m", "(x - 0.5) / 0.2", -2, 2),
     Label("tool_y", "tool, to the left", "m", "y / 0.25", -2, 2),
     Label("tool_z", "tool, above the table", "m", "(z - 0.183) / 0.167", -2, 2),
-    Label("target_dx", "tool target from the tool, forward", "m", "/ 0.04", -2, 2),
-    Label("target_dy", "tool target from the tool, to the left", "m", "/ 0.04", -2, 2),
-    Label("target_dz", "tool target from the tool, up", "m", "/ 0.04", -2, 2),
+    Label("target_dx", "tool target from the tool, forward", "m", "/ 0.03", -2, 2),
+    Label("target_dy", "tool target from the tool, to the left", "m", "/ 0.03", -2, 2),
+    Label("target_dz", "tool target from the tool, up", "m", "/ 0.03", -2, 2),
     Label("yaw", "gripper, anticlockwise from straight ahead", "rad", "/ 1.2", -2, 2),
     Label("target_dyaw", "commanded yaw from the measured one", "rad", "/ 0.05", -2, 2),
     Label("gripper_width", "opening of the gripper", "m", "/ 0.0425 - 1", -2, 2),

@@ -32,7 +32,11 @@ def test_scenes_are_robots_that_differ_in_the_object():
     with_cube, without = cube_scene(2), arm_scene(2)
     assert isinstance(with_cube, Robot)
     assert [signal.name for signal in with_cube.spec.signals] == [
-        "joint_position", "joint_velocity", "gripper_width", "object_position", "object_quaternion",
+        "joint_position",
+        "joint_velocity",
+        "gripper_width",
+        "object_position",
+        "object_quaternion",
     ]
     assert [signal.name for signal in without.spec.signals] == ["joint_position", "joint_velocity", "gripper_width"]
     assert with_cube.spec.period == 0.05
