@@ -65,10 +65,11 @@ class PickTask:
         gripper open. The cube (edge 4 cm) lies flat between x 0.35 and 0.65 m, y -0.20 and 0.20 m, with any yaw.
 
     Reward:
-        Each step 0.1 (1 - tanh(5 d)), where d is the distance of the tool from the cube [m]; -0.05 while the gripper is
-        told to close 3 cm or more from the cube, so that it comes open; while the cube is squeezed between the pads, 0.1 more, and 0.5 times the share of 10 cm that it is lifted. At success 30, which is
-        about what holding the cube up for the rest of the episode would bring, so that ending early never costs; -5
-        when the cube leaves the table.
+        Each step 0.1 (1 - tanh(5 d)), where d is the distance of the tool from the cube [m]; -0.05 while the
+        gripper is told to close 3 cm or more from the cube; while the cube is squeezed between the pads, 0.1
+        more, and 0.5 times the share of 10 cm that it is lifted. At success 30, which is about what holding the
+        cube up for the rest of the episode would bring, so that ending early never costs; -5 when the cube
+        leaves the table.
 
     Success:
         The cube is at least 10 cm above where it lay for 5 steps on end (0.25 s).

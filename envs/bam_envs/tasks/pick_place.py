@@ -42,11 +42,12 @@ class PickPlaceTask(PickTask):
 
     Reward:
         Each step 0.04 (1 - tanh(5 d)), where d is the distance of the tool from the cube [m]; -0.02 while the
-        gripper is told to close 3 cm or more from the cube. While the cube is squeezed, 0.04 more; up to 0.1 for carrying it at the right height, which is 5 cm far from the goal and comes
-        down to the table over the last 9 cm; and, once it has been lifted 3 cm, up to 0.25 for being near the goal
-        too. 0.04 for a cube that was lifted and is at the goal, still squeezed; once the gripper is told to open
-        there, 0.9 to 1.5 by how far it is open, instead of all that. At success 75, about the worth of staying there;
-        -2 when the cube leaves the table.
+        gripper is told to close 3 cm or more from the cube. While the cube is squeezed, 0.04 more; up to 0.1
+        for carrying it at the right height, which is 5 cm far from the goal and comes down to the table over
+        the last 9 cm; and, once it has been lifted 3 cm, up to 0.25 for being near the goal too. 0.04 for a
+        cube that was lifted and is at the goal, still squeezed; once the gripper is told to open there, 0.9 to
+        1.5 by how far it is open, instead of all that. At success 75, about the worth of staying there; -2 when
+        the cube leaves the table.
 
     Success:
         The cube has been lifted 3 cm in this episode, is within 2 cm of where it would lie at the goal, and the
