@@ -1,0 +1,26 @@
+"""The committed checkpoints do what their table says: each over 200 episodes."""
+
+from pathlib import Path
+
+import pytest
+
+from bam_train.checkpoint import Checkpoint
+from bam_train.evaluation import evaluate
+from bam_train.policy import FrozenPolicy
+
+FOLDER = Path(__file__).parent.parent / "checkpoints"
+LEAST = {"reach-ppo": 0.99, "pick-ppo": 0.99, "pick-place-ppo": 0.95}
+
+
+def test_the_committed_checkpoints():
+    assert {path.stem for path in FOLDER.glob("*.zip")} >= set(LEAST)
+
+
+@pytest.mark.parametrize(("name", "least"), LEAST.items())
+def test_a_committed_checkpoint_succeeds_and_is_small(name, least):
+    path = FOLDER / f"{name}.zip"
+    assert path.stat().st_size < 500_000
+    manifest = Checkpoint.open(path).manifest
+    report = evaluate(FrozenPolicy.load(path), manifest.env, manifest.env_kwargs, episodes=200, seed=7_000_000)
+    assert report.episodes == 200
+    assert report.success_rate >= least
