@@ -43,8 +43,8 @@ def contenders(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
     from stable_baselines3.common.vec_env import VecNormalize
 
     from bam_envs.spaces import space_to_json
-    from bam_train.onnx_session import OnnxSession
     from bam_train.policy import FrozenPolicy
+    from bam_train.policy.onnx_session import OnnxSession
     from bam_train.trainers.sb3.freeze import freeze
 
     torch.set_num_threads(1)

@@ -194,7 +194,7 @@ def run_folder() -> str:
 
 def members() -> str:
     """The listing in the docstring of the checkpoint's module."""
-    return listing("bam_train.checkpoint")
+    return listing("bam_train.checkpoint.checkpoint")
 
 
 def listing(module: str) -> str:

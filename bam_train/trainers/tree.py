@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from bam_train.checkpoint.safetensors_file import dump, parse
 from bam_train.errors import FormatError
-from bam_train.safetensors_file import dump, parse
 
 _MARKS = {"$array", "$scalar", "$tensor", "$tuple", "$items", "$float"}
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from bam_envs.spaces import space_to_json
-from bam_train import safetensors_file
-from bam_train.checkpoint import GOLDEN, POLICY, write_checkpoint
+from bam_train.checkpoint import GOLDEN, POLICY, safetensors_file, write_checkpoint
 
 
 class Corridor(gym.Env):

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from bam_envs.spaces import space_to_json
+from bam_train.checkpoint.manifest import MANIFEST
 from bam_train.environments import make_env
 from bam_train.errors import CheckpointMismatch
-from bam_train.manifest import MANIFEST
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.sb3.algorithms import ALGORITHMS
 

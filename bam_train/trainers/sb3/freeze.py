@@ -23,9 +23,8 @@ from torch import nn
 
 from bam_train.errors import PolicyError
 from bam_train.trainers.sb3.frozen_layers import Layer, encoder, head, network, torch_dtype
-from bam_train.trainers.sb3.golden import golden
 
-__all__ = ["FrozenModule", "freeze", "golden"]
+__all__ = ["FrozenModule", "freeze"]
 
 _OPSET = 17
 # The TorchScript exporter says that it will go; it is 20 times as fast as its successor and needs no onnxscript.

@@ -14,7 +14,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from bam_train import safetensors_file
+from bam_train.checkpoint import safetensors_file
 
 _BUDGET = 200_000  # bytes of observations; images are random and do not pack
 _FAR = 1e6  # a bound beyond this says nothing about the values that occur

@@ -27,7 +27,8 @@ from bam_train.settings import TrainSettings
 from bam_train.trainers.provenance import git_commit, now, versions
 from bam_train.trainers.sb3 import hyperparameters, resume
 from bam_train.trainers.sb3.algorithms import ALGORITHMS
-from bam_train.trainers.sb3.freeze import freeze, golden
+from bam_train.trainers.sb3.freeze import freeze
+from bam_train.trainers.sb3.golden import golden
 from bam_train.trainers.sb3.model import library_notices, make_model, meaning, one_env, refusals, sb3_members
 from bam_train.trainers.sb3.state import all_finite, undisturbed
 from bam_train.trainers.sb3.vec_env import make_training_env

@@ -21,14 +21,13 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage
 
 from bam_envs.spaces import space_to_json
-from bam_train import onnx_file, safetensors_file
-from bam_train.checkpoint import write_checkpoint
+from bam_train.checkpoint import safetensors_file, write_checkpoint
 from bam_train.errors import PolicyError
-from bam_train.onnx_mlp import MlpRunner
-from bam_train.onnx_session import OnnxSession
-from bam_train.policy import FrozenPolicy
-from bam_train.trainers.sb3.freeze import FrozenModule, freeze, golden
-from bam_train.trainers.sb3.golden import draw, trainer_actions
+from bam_train.policy import FrozenPolicy, onnx_file
+from bam_train.policy.onnx_mlp import MlpRunner
+from bam_train.policy.onnx_session import OnnxSession
+from bam_train.trainers.sb3.freeze import FrozenModule, freeze
+from bam_train.trainers.sb3.golden import draw, golden, trainer_actions
 
 ROWS = 1000
 VECTOR = spaces.Box(-1, 1, (6,))

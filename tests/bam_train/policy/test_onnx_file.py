@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 
 from bam_train.errors import FormatError
-from bam_train.onnx_file import DTYPES, parse
+from bam_train.policy.onnx_file import DTYPES, parse
 
 
 def model(nodes: list[Any], constants: dict[str, np.ndarray], **changes: Any) -> bytes:

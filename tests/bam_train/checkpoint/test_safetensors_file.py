@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors import numpy as library
 
+from bam_train.checkpoint.safetensors_file import dump, parse
 from bam_train.errors import FormatError
-from bam_train.safetensors_file import dump, parse
 
 DTYPES = [
     "bool",

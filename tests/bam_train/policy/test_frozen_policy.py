@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from bam_train import safetensors_file
-from bam_train.checkpoint import write_checkpoint
+from bam_train.checkpoint import safetensors_file, write_checkpoint
 from bam_train.errors import CheckpointError, NotACheckpoint, PolicyError
-from bam_train.onnx_mlp import MlpRunner
-from bam_train.onnx_session import OnnxSession
 from bam_train.policy import FrozenPolicy
+from bam_train.policy.onnx_mlp import MlpRunner
+from bam_train.policy.onnx_session import OnnxSession
 
 BOX3 = {"type": "Box", "shape": [3], "dtype": "float32", "low": "-inf", "high": [1.0, "inf", 2.0]}
 BOX2 = {"type": "Box", "shape": [2], "dtype": "float32", "low": -1.0, "high": 1.0}

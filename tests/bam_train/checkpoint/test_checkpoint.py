@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bam_train import checkpoint as module
-from bam_train import safetensors_file
-from bam_train.checkpoint import MANIFEST, Checkpoint, next_free_path, write_checkpoint
+from bam_train.checkpoint import MANIFEST, Checkpoint, next_free_path, safetensors_file, write_checkpoint
+from bam_train.checkpoint import checkpoint as module
 from bam_train.errors import (
     AlteredCheckpoint,
     CheckpointError,
@@ -266,7 +265,7 @@ def test_sizes_that_only_an_attack_has_are_refused(path: Path, monkeypatch: pyte
     with pytest.raises(NotACheckpoint, match=r"(claims \d+ bytes of members in a file of|Overlapped entries)"):
         Checkpoint.open(path)
     path.write_bytes(whole)
-    monkeypatch.setattr("bam_train.zip_members._TOTAL_LIMIT", 1000)
+    monkeypatch.setattr("bam_train.checkpoint.zip_members._TOTAL_LIMIT", 1000)
     with pytest.raises(NotACheckpoint, match=r"would unpack to \d+ bytes, expected at most 1000"):
         Checkpoint.open(path)
 
@@ -380,7 +379,7 @@ def test_the_next_free_path(tmp_path: Path):
 
 def test_killed_while_writing_leaves_the_old_file_whole(path: Path):
     script = (
-        "import os, sys; from bam_train import checkpoint; from tests_fields import *\n"
+        "import os, sys; from bam_train.checkpoint import checkpoint; from tests_fields import *\n"
         "os.fsync = lambda d: os.kill(os.getpid(), 9); checkpoint.write_checkpoint(sys.argv[1], FIELDS, {})"
     )
     (path.parent / "tests_fields.py").write_text(f"FIELDS = {FIELDS!r}")

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from bam_train.errors import PolicyError
-from bam_train.policy_spaces import Leaf
+from bam_train.policy.spaces import Leaf
 
 TOLERANCE = 1e-5
 """Largest difference from the trainer's own action; a Box wider than 2 is measured in half its range."""

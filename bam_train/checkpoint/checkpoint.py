@@ -27,10 +27,9 @@ from typing import Any
 
 import numpy as np
 
-from bam_train import safetensors_file
-from bam_train.errors import AlteredCheckpoint, CheckpointError, CheckpointMismatch, FormatError, OutputError
-from bam_train.manifest import AGAIN, FORMAT, MANIFEST, Manifest, manifest_bytes, parse_manifest
-from bam_train.zip_members import (
+from bam_train.checkpoint import safetensors_file
+from bam_train.checkpoint.manifest import AGAIN, MANIFEST, Manifest, manifest_bytes, parse_manifest
+from bam_train.checkpoint.zip_members import (
     CHUNK,
     digest,
     list_members,
@@ -39,17 +38,7 @@ from bam_train.zip_members import (
     require_same_members,
     unpack,
 )
-
-__all__ = [
-    "FORMAT",
-    "GOLDEN",
-    "MANIFEST",
-    "POLICY",
-    "Checkpoint",
-    "Manifest",
-    "next_free_path",
-    "write_checkpoint",
-]
+from bam_train.errors import AlteredCheckpoint, CheckpointError, CheckpointMismatch, FormatError, OutputError
 
 POLICY = "bam/policy.onnx"
 GOLDEN = "bam/golden.safetensors"

@@ -10,8 +10,8 @@ import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from bam_train.checkpoint.manifest import AGAIN, MANIFEST
 from bam_train.errors import AlteredCheckpoint, NotACheckpoint
-from bam_train.manifest import AGAIN, MANIFEST
 
 CHUNK = 2**20  # bytes read at once
 _MANIFEST_LIMIT = 64 * 2**20  # bytes; it is read before anything vouches for it

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bam_train.errors import FormatError
-from bam_train.onnx_file import DTYPES, Graph, Node
+from bam_train.policy.onnx_file import DTYPES, Graph, Node
 
 
 class UnsupportedGraph(FormatError):  # noqa: N818 - not an error: the graph is for onnxruntime

@@ -11,12 +11,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from bam_train import onnx_file
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint
 from bam_train.errors import FormatError, PolicyError
-from bam_train.onnx_mlp import MlpRunner, UnsupportedGraph
-from bam_train.policy_golden import TOLERANCE, worst_difference
-from bam_train.policy_spaces import Leaf, leaf, leaves
+from bam_train.policy import onnx_file
+from bam_train.policy.golden import TOLERANCE, worst_difference
+from bam_train.policy.onnx_mlp import MlpRunner, UnsupportedGraph
+from bam_train.policy.spaces import Leaf, leaf, leaves
 
 _STATE = "state."
 
@@ -222,7 +222,7 @@ def _runner(graph: onnx_file.Graph, onnx: bytes) -> Runner:
     try:
         return MlpRunner(graph)
     except UnsupportedGraph:
-        from bam_train.onnx_session import OnnxSession
+        from bam_train.policy.onnx_session import OnnxSession
 
         return OnnxSession(onnx)
 

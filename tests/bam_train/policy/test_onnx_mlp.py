@@ -9,9 +9,9 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from bam_train.errors import FormatError
-from bam_train.onnx_file import parse
-from bam_train.onnx_mlp import OPERATIONS, MlpRunner, Plan, UnsupportedGraph
-from bam_train.onnx_session import OnnxSession
+from bam_train.policy.onnx_file import parse
+from bam_train.policy.onnx_mlp import OPERATIONS, MlpRunner, Plan, UnsupportedGraph
+from bam_train.policy.onnx_session import OnnxSession
 
 RNG = np.random.default_rng(0)
 W = RNG.normal(size=(6, 4)).astype(np.float32)
