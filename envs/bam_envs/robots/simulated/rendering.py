@@ -11,6 +11,7 @@ import importlib
 import os
 import subprocess
 import sys
+import threading
 from functools import cache
 from typing import Any
 
@@ -93,7 +94,9 @@ class Window:
         viewer = importlib.import_module("mujoco.viewer")
         self._model = physics.model_of(0)
         self._data = mujoco.MjData(self._model)
+        before = set(threading.enumerate())
         self._viewer: Any = viewer.launch_passive(self._model, self._data, show_left_ui=False, show_right_ui=False)
+        self._threads = set(threading.enumerate()) - before
         self._viewer.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._viewer.cam.fixedcamid = self._model.camera(CAMERA).id
 
@@ -107,8 +110,10 @@ class Window:
         self._viewer.sync()
 
     def close(self) -> None:
-        """Close the window."""
+        """Close the window, and wait for the viewer's thread: a process that ends before it crashes."""
         self._viewer.close()
+        for thread in self._threads:
+            thread.join(timeout=5)
 
 
 def add_marks(scene: Any, marks: list[Mark]) -> None:

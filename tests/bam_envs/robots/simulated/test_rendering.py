@@ -1,6 +1,9 @@
 """Pictures: which backend, what is said when there is none, and a real one."""
 
+import os
+import shutil
 import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -133,3 +136,18 @@ def test_without_a_mode_render_warns(make):
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="render"):
         assert env.unwrapped.render() is None
+
+
+@pytest.mark.skipif(shutil.which("xvfb-run") is None, reason="no virtual display: xvfb-run is not installed")
+def test_a_window_opens_shows_and_closes_with_the_process():
+    script = (
+        "import gymnasium as gym, bam_envs\n"
+        "env = gym.make('bam/pick-place-v0', render_mode='human')\n"
+        "env.reset(seed=0)\n"
+        "for _ in range(3): env.step(env.action_space.sample())\n"
+        "env.close()\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = ["xvfb-run", "-a", sys.executable, "-c", script]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
