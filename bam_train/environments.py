@@ -136,12 +136,19 @@ def _made(env_id: str, make: Callable[[], T]) -> T:
     except gym.error.Error as error:
         raise SettingsError(f"{env_id} cannot be made: {_first_line(error)}") from error
     except ModuleNotFoundError as error:
-        raise SettingsError(
-            f"{env_id} cannot be made: {_first_line(error)}; install the package that has it"
-        ) from error
+        raise SettingsError(f"{env_id} cannot be made: {_missing(error)}") from error
     except TypeError as error:
         raise SettingsError(f"{env_id} cannot be made with these arguments: {_first_line(error)}") from error
 
 
+def _missing(error: Exception) -> str:
+    """Which module is missing, and what to do about it."""
+    # Gymnasium raises one of its own for module:Env-v0, which names no module; its cause does.
+    name = getattr(error, "name", None) or getattr(error.__cause__, "name", None) or _first_line(error)
+    if name.partition(".")[0] == "imageio":  # Gymnasium's MuJoCo environments import it for their pictures
+        return 'it needs imageio. Run: pip install "bam-train[video]"'
+    return f"it needs the module {name!r}; install it, or run this in the folder that has it"
+
+
 def _first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+    return str(error).strip().splitlines()[0].rstrip(".") if str(error).strip() else type(error).__name__

@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.errors import MissingExtra
+from bam_envs.errors import InvalidValue, MissingExtra
 from bam_train.errors import OutputError, SettingsError
 
 Frame = NDArray[np.uint8]
@@ -45,7 +45,8 @@ def require_video_path(path: Path) -> Path:
     if not path.parent.is_dir():
         raise OutputError(f"{path}: there is no folder {path.parent}; make it first")
     if path.is_dir() or not os.access(path.parent, os.W_OK):
-        raise OutputError(f"{path}: cannot be written: {'it is a folder' if path.is_dir() else 'no permission'}")
+        why = "it is a folder" if path.is_dir() else "no permission"
+        raise OutputError(f"{path}: cannot be written: {why}; choose another file")
     _require_writer(path.suffix.lower())
     return path
 
@@ -76,11 +77,13 @@ def picture(env: gym.Env[Any, Any]) -> Frame:
     Raises:
         SettingsError: It gives no picture.
     """
-    image: Any = env.render()
+    name = env.spec.id if env.spec else env
+    try:
+        image: Any = env.render()
+    except (gym.error.Error, InvalidValue) as error:  # a package that draws is missing; a robot without a picture
+        raise SettingsError(f"{name}: no film can be made of it: {' '.join(str(error).split())}") from error
     if not isinstance(image, np.ndarray) or image.ndim != 3:
-        raise SettingsError(
-            f"{env.spec.id if env.spec else env}: render() gives no picture; a film cannot be made of it"
-        )
+        raise SettingsError(f"{name}: render() gives no picture; a film cannot be made of it")
     return image.astype(np.uint8, copy=False)
 
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 class DeployConfig:
     """Run the frozen policy of a checkpoint on its (simulated) robot, at the rate it was made for."""
 
-    checkpoint: tyro.conf.Positional[Path]
+    checkpoint: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CHECKPOINT")]
     """The checkpoint.zip that bam-train wrote."""
     episodes: int = 5
     """How many episodes."""
@@ -86,16 +86,18 @@ def _run(
     from bam_train.deploy.loop import deploy
     from bam_train.deploy.pacer import Pacer
     from bam_train.deploy.report import DeployReport
+    from bam_train.deploy.signals import stop_signals
 
     pacer = Pacer(period)
-    with _display(f"{checkpoint.path} on {checkpoint.manifest.env}", env, journal) as watcher:
-        journal.startup.mark("display")
-        ending = deploy(env, policy, pacer, journal, watcher, seed=config.seed)
-    if ending.status:
-        say(f"bam-deploy: {ending.reason}")
-    report = DeployReport(checkpoint, config.seed, ending, journal, pacer)
-    text = json_module.dumps(report.to_json(), allow_nan=False) if config.json else "\n".join(report.lines())
-    print(text, flush=True)
+    with stop_signals():  # a second Ctrl-C must not lose the report
+        with _display(f"{checkpoint.path} on {checkpoint.manifest.env}", env, journal) as watcher:
+            journal.startup.mark("display")
+            ending = deploy(env, policy, pacer, journal, watcher, seed=config.seed)
+        if ending.status:
+            say(f"bam-deploy: {ending.reason}")
+        report = DeployReport(checkpoint, config.seed, ending, journal, pacer)
+        text = json_module.dumps(report.to_json(), allow_nan=False) if config.json else "\n".join(report.lines())
+        print(text, flush=True)
     return ending.status
 
 

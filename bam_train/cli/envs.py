@@ -78,13 +78,14 @@ def details(name: str) -> dict[str, Any]:
     from bam_train.environments import control_period, make_env
 
     env_id = resolve_id(name)
+    own = env_id.rpartition(":")[2]
     env = make_env(env_id)
     try:
         describe = getattr(env.unwrapped, "describe", None)
         period = control_period(env)
         return {
             "id": env_id,
-            "summary": ENVIRONMENTS[env_id].summary if env_id in ENVIRONMENTS else None,
+            "summary": ENVIRONMENTS[own].summary if own in ENVIRONMENTS else None,
             "episode_steps": None if env.spec is None else env.spec.max_episode_steps,
             "rate_hz": None if period is None else 1 / period,
             "observation_space": space_to_json(env.observation_space),

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 class EvalConfig:
     """Evaluate the frozen policy of a checkpoint over seeded episodes."""
 
-    checkpoint: tyro.conf.Positional[Path]
+    checkpoint: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CHECKPOINT")]
     """The checkpoint.zip that bam-train wrote."""
     episodes: int = 100
     """How many episodes."""
@@ -67,6 +67,8 @@ def evaluate_checkpoint(config: EvalConfig) -> int:
     require_range(config.episodes, config.seed, config.num_envs, video_episodes=config.video_episodes)
     video = None if config.video is None else require_video_path(config.video)
     subject = _subject(config)
+    if video is not None:
+        _require_picture(subject)
     rows = make_rows(subject.env, subject.env_kwargs, config.num_envs or default_rows(subject.env, config.episodes))
     try:
         if subject.checkpoint is not None:
@@ -165,6 +167,19 @@ def _range(report: EvaluationReport) -> str:
     if report.return_min is None or report.return_max is None:
         return "range not finite"
     return f"from {report.return_min:.2f} to {report.return_max:.2f}"
+
+
+def _require_picture(subject: Subject) -> None:
+    """Take one picture, before the work is done."""
+    from bam_train.environments import make_env
+    from bam_train.video import picture
+
+    env = make_env(subject.env, subject.env_kwargs, render_mode="rgb_array")
+    try:
+        env.reset(seed=0)
+        picture(env)
+    finally:
+        env.close()  # type: ignore[no-untyped-call]
 
 
 def _film(config: EvalConfig, subject: Subject, path: Path) -> None:

@@ -6,12 +6,16 @@ Only tyro is imported before the flags are parsed, so that ``--help`` is quick.
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import os
 import re
+import signal
 import sys
-from collections.abc import Callable, Sequence
-from typing import TypeVar
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from types import FrameType
+from typing import TextIO, TypeVar
 
 Config = TypeVar("Config")
 
@@ -81,14 +85,14 @@ def usage_error(box: str) -> str:
 
     Examples: ``unknown option --enb, did you mean --env?``, ``--steps cannot be 'x'.``
     """
-    text = " ".join(re.sub(r"[─│╭╮╰╯]+", " ", box).split())
+    text = " ".join(re.sub(r"[─│╭╮╰╯]+|-{4,}|(?<!\S)[|+](?!\S)", " ", box).split())  # drawn in ASCII where it must be
     text = re.split(r" For full helptext| Argument helptext", text)[0]
     if match := re.search(r"Unrecognized options: (.*?)(?: Perhaps you meant: .*?(--[\w-]+).*)?$", text):
         return f"unknown option {match[1].split(',')[0]}{f', did you mean {match[2]}?' if match[2] else '.'}"
     if match := re.search(r"Error parsing (\S+?):? .*(?:from \[|: )('.*?')", text):
         return f"{match[1]} cannot be {match[2]}."
-    if match := re.search(r"Missing value for argument ('\S+')", text):
-        return f"{match[1]} needs a value."
+    if match := re.search(r"Missing value for argument '(\S+)'", text):
+        return f"{match[1]} needs a value." if match[1].startswith("--") else f"{match[1].upper()} is missing."
     if match := re.search(r"Missing from \S+: (\S+)", text):
         return f"{match[1]} is missing."
     return f"{text}."
@@ -97,21 +101,72 @@ def usage_error(box: str) -> str:
 def guarded(main: Callable[[], int | None], prog: str) -> int:
     """Run `main`; what is expected to go wrong becomes one line on standard error and a status other than 0."""
     try:
-        return main() or 0
+        with _terminable():
+            return main() or 0
     except KeyboardInterrupt as stop:
         _complain(prog, str(stop) or "interrupted")
         return INTERRUPTED
+    except Terminated as stop:
+        _complain(prog, f"ended by {stop.signal.name}")
+        return 128 + stop.signal
     except BrokenPipeError:  # somebody closed our standard output, such as head
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _silence(sys.stdout)
         return 1
     except ModuleNotFoundError as error:
         _complain(prog, missing_extra(error))
         return 1
-    except Exception as error:
-        if not is_expected(error):
-            raise
-        _complain(prog, str(error))
+    except OSError as error:
+        if error.errno != errno.ENOSPC or is_expected(error):
+            return _expected(prog, error)
+        _silence(sys.stdout)
+        _complain(prog, "standard output cannot be written: no space left on its device")
         return 1
+    except Exception as error:
+        return _expected(prog, error)
+
+
+def _expected(prog: str, error: Exception) -> int:
+    """One line for an error of our own; any other is raised again."""
+    if not is_expected(error):
+        raise error
+    _complain(prog, str(error))
+    return 1
+
+
+class Terminated(BaseException):
+    """A signal other than Ctrl-C asked for the end.
+
+    Attributes:
+        signal: Which.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.signal = signal.Signals(number)
+        super().__init__(self.signal.name)
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """Within this, SIGTERM and SIGHUP raise `Terminated`, so that what is open is closed; in the main thread only."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(number: int, _: FrameType | None) -> None:
+        raise Terminated(number)
+
+    names = [name for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]  # Windows has no SIGHUP
+    before = [(getattr(signal, name), signal.signal(getattr(signal, name), stop)) for name in names]
+    try:
+        yield
+    finally:
+        for number, handler in before:
+            signal.signal(number, handler)
+
+
+def _silence(stream: TextIO) -> None:
+    """Let what is still to be written to `stream` go nowhere, or Python complains about it at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def is_expected(error: Exception) -> bool:

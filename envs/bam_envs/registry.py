@@ -99,7 +99,9 @@ def _import_for(module: str, name: str) -> None:
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise  # the module is there, and one that it imports is not
-        raise InvalidValue(f"Environment {name!r} needs the module {module!r}, which is not installed.") from error
+        raise InvalidValue(
+            f"Environment {name!r} needs the module {module!r}, which is neither installed nor in this folder."
+        ) from error
 
 
 def resolve(reference: str) -> Any:
@@ -131,6 +133,8 @@ def make_vector_env(
     from bam_envs.robot_env import RobotVectorEnv
 
     entry = ENVIRONMENTS[env_id]
+    if num_envs < 1:
+        raise InvalidValue(f"num_envs must be at least 1, not {num_envs}.")
     return RobotVectorEnv(
         resolve(entry.robot)(num_envs, randomize=randomize),
         resolve(entry.task)(num_envs, **task_options),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import os
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
@@ -19,6 +21,12 @@ from bam_envs.robots.robot import Robot, RobotState, Rows
 from bam_envs.tasks.task import Score, Task
 
 RENDER_MODES = ["rgb_array", "human"]
+
+
+def render_modes() -> list[str]:
+    """The render modes of this machine: a window needs a display."""
+    headless = sys.platform.startswith("linux") and not os.environ.keys() & {"DISPLAY", "WAYLAND_DISPLAY"}
+    return ["rgb_array"] if headless else list(RENDER_MODES)
 
 
 def start_rows(robot: Robot, task: Task, rows: Rows, rngs: Sequence[np.random.Generator]) -> RobotState:
@@ -69,7 +77,7 @@ class RobotEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         check_render_mode(render_mode)
         self.robot, self.task, self.render_mode = robot, task, render_mode
         self.observation_space, self.action_space = task.observation_space, task.action_space
-        self.metadata = {**self.metadata, "render_fps": round(1 / robot.spec.period)}
+        self.metadata = {"render_modes": render_modes(), "render_fps": round(1 / robot.spec.period)}
         self.state: RobotState | None = None
         """The last state, or None when no episode runs."""
         self._first = np.zeros(1, dtype=np.int64)
@@ -152,7 +160,7 @@ class RobotVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.float3
         self.num_envs = robot.num_robots
         self.max_episode_steps = max_episode_steps
         self.metadata = {
-            "render_modes": RENDER_MODES,
+            "render_modes": render_modes(),
             "render_fps": round(1 / robot.spec.period),
             "autoreset_mode": AutoresetMode.SAME_STEP,
         }
@@ -256,9 +264,10 @@ class RobotVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.float3
             raise InvalidValue(f"The actions must be finite; rows {bad_rows(array)} are not.")
         return array
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
-        """An image of row 0."""
-        return render(self.robot, self.task, self.render_mode)
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
+        """A tuple with one image, of row 0; None for ``human``. The other rows are not drawn."""
+        image = render(self.robot, self.task, self.render_mode)
+        return None if image is None else (image,)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Halt the robots and drop the physics."""

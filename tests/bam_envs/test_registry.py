@@ -70,7 +70,9 @@ def test_names_that_mean_nothing(name, text):
 def test_a_module_that_is_not_there(module):
     with pytest.raises(InvalidValue) as caught:
         resolve_id(f"{module}:Env-v0")
-    assert str(caught.value) == (f"Environment '{module}:Env-v0' needs the module '{module}', which is not installed.")
+    assert str(caught.value) == (
+        f"Environment '{module}:Env-v0' needs the module '{module}', which is neither installed nor in this folder."
+    )
 
 
 def test_a_module_that_lacks_another_one_says_which(tmp_path, monkeypatch):

@@ -41,7 +41,7 @@ def assert_same(one, two):
 @pytest.mark.parametrize("randomize", [False, True])
 def test_gymnasiums_checker_has_nothing_to_say(env_id, randomize):
     env = gym.make(env_id, randomize=randomize, render_mode="rgb_array")
-    check_env(env.unwrapped, skip_render_check=True)
+    check_env(env.unwrapped)
     env.close()
 
 

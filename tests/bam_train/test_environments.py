@@ -31,9 +31,13 @@ def test_only_ours_are_batched(corridor):
 @pytest.mark.parametrize(
     ("env_id", "kwargs", "message"),
     [
-        ("bam/nothing-v0", {}, "bam/nothing-v0 cannot be made: Environment `nothing` doesn't exist in namespace bam."),
+        ("bam/nothing-v0", {}, "bam/nothing-v0 cannot be made: Environment `nothing` doesn't exist in namespace bam"),
         ("test/Corridor-v0", {"fast": True}, "test/Corridor-v0 cannot be made with these arguments: "),
-        ("not_a_module:Env-v0", {}, "not_a_module:Env-v0 cannot be made: "),
+        (
+            "not_a_module:Env-v0",
+            {},
+            "not_a_module:Env-v0 cannot be made: it needs the module 'not_a_module'; install it, or run",
+        ),
     ],
 )
 def test_what_cannot_be_made(corridor, env_id, kwargs, message):

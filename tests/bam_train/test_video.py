@@ -74,7 +74,7 @@ def test_paths_are_refused_before_the_work(tmp_path):
     (tmp_path / "folder.gif").mkdir()
     with pytest.raises(OutputError) as taken:
         require_video_path(tmp_path / "folder.gif")
-    assert str(taken.value) == f"{tmp_path}/folder.gif: cannot be written: it is a folder"
+    assert str(taken.value) == f"{tmp_path}/folder.gif: cannot be written: it is a folder; choose another file"
     assert require_video_path(tmp_path / "ok.GIF") == tmp_path / "ok.GIF"
 
 

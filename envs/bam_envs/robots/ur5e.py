@@ -42,7 +42,7 @@ _OBJECT_POSITION = SignalSpec(
 _OBJECT_QUATERNION = SignalSpec(
     "object_quaternion", ("object_qw", "object_qx", "object_qy", "object_qz"), ("1",) * 4, (-1.0,) * 4, (1.0,) * 4
 )
-_COMMAND = SignalSpec(
+COMMAND = SignalSpec(
     "command",
     (*JOINTS, "gripper_width"),
     (*("rad",) * 6, "m"),
@@ -56,4 +56,4 @@ def arm_spec(name: str, *, with_object: bool) -> RobotSpec:
     """The signals of a UR5e with a gripper, and of a tracked object where there is one."""
     signals = (_POSITION, _VELOCITY, _WIDTH)
     tracked = (_OBJECT_POSITION, _OBJECT_QUATERNION) if with_object else ()
-    return RobotSpec(name, (*signals, *tracked), _COMMAND, period=0.05)
+    return RobotSpec(name, (*signals, *tracked), COMMAND, period=0.05)

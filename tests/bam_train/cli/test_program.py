@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 
 from bam_envs.errors import MissingExtra, UnknownName
 from bam_train.cli.console import count, duration, number, percent
-from bam_train.cli.program import guarded, run_program
+from bam_train.cli.program import guarded, run_program, usage_error
 from bam_train.errors import OutputError
 
 
@@ -51,7 +53,7 @@ def test_help_and_a_typo(capsys):
         (["--stps", "5"], "prog: unknown option --stps, did you mean --steps? Run prog --help\n"),
         (["--qqq"], "prog: unknown option --qqq. Run prog --help\n"),
         (["--steps", "many"], "prog: --steps cannot be 'many'. Run prog --help\n"),
-        (["--steps"], "prog: '--steps' needs a value. Run prog --help\n"),
+        (["--steps"], "prog: --steps needs a value. Run prog --help\n"),
         (["stray"], "prog: unknown option stray. Run prog --help\n"),
     ],
 )
@@ -159,3 +161,29 @@ def test_duration(value, text):
 def test_shares_and_numbers():
     assert [percent(value) for value in (None, 1.0, 0.985, 0.0)] == ["-", "100 %", "98.5 %", "0 %"]
     assert [number(value) for value in (None, 1234.56, 0.5)] == ["-", "1235", "0.5"]
+
+
+def test_sigterm_is_one_line_and_its_status(capsys):
+    def main(flags):
+        signal.raise_signal(signal.SIGTERM)
+
+    assert ended([], main) == 143
+    assert capsys.readouterr().err == "prog: ended by SIGTERM\n"
+
+
+def test_the_box_of_a_terminal_without_unicode_is_one_line_too():
+    lines = ["+- Unrecognized options ---+", "| Unrecognized options: --qqq |", "| -------- |", "| For full helptext |"]
+    box = "\n".join([*lines, "+------+"])
+    assert usage_error(box) == "unknown option --qqq."
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+def test_a_full_device_behind_standard_output_is_one_line():
+    script = "from bam_train.cli.envs import main; main([])"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", script], stdout=full, stderr=subprocess.PIPE, text=True, env=environment, check=False
+        )
+    assert done.returncode == 1
+    assert done.stderr == "bam-envs: standard output cannot be written: no space left on its device\n"

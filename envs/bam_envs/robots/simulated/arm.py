@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bam_envs.errors import PhysicsDiverged, ResetNeeded
 from bam_envs.robots.robot import Initial, RobotState, Rows, checked_command
-from bam_envs.robots.ur5e import GRIPPER_OPEN, GRIPPER_SPEED, arm_spec
+from bam_envs.robots.ur5e import COMMAND, GRIPPER_OPEN, GRIPPER_SPEED, arm_spec
 
 if TYPE_CHECKING:
     from bam_envs.robots.simulated.imperfection import Imperfection
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+LOWEST, HIGHEST = np.array(COMMAND.low), np.array(COMMAND.high)
+MAX_RATE = np.array(COMMAND.max_rate)
 GRIPPER_LEASH = 0.011
 """Farthest the gripper's set point runs ahead of its fingers [m]: what full force needs, so that it opens at once."""
 PHYSICS_STEPS = 10
@@ -96,7 +98,11 @@ class SimulatedArm:
     def step(self, command: Array) -> RobotState:
         """Send `command` (n, 7): six joint positions [rad] and the gripper's width [m]; one period later, measure."""
         physics = self.physics
-        self._command = checked_command(command, (self.num_robots, 7))
+        command = checked_command(command, (self.num_robots, 7))
+        reach = MAX_RATE * self.spec.period
+        within = np.clip(command, self._command - reach, self._command + reach)  # no faster than the arm can
+        within[:, 6] = command[:, 6]  # the gripper takes a width and goes there at its own speed
+        self._command = np.clip(within, LOWEST, HIGHEST)
         arriving = self._command if self._imperfection is None else self._imperfection.delayed(self._command)
         travel = arriving - self._setpoint
         travel[:, 6] = self._gripper_travel(arriving[:, 6])

@@ -15,13 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.errors import MissingExtra
+from bam_envs.errors import InvalidValue, MissingExtra
 
 try:
     import mujoco
     from mujoco import rollout
 except ImportError as error:
     raise MissingExtra("mujoco", "sim", "A simulated robot") from error
+except RuntimeError as error:  # a MUJOCO_GL that it does not know
+    raise InvalidValue(f"MuJoCo cannot be imported: {error}. Unset MUJOCO_GL, or set it to egl or osmesa.") from error
 
 Array = NDArray[np.float64]
 FULL = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)

@@ -7,11 +7,13 @@ wins where it is set.
 
 from __future__ import annotations
 
+import atexit
 import importlib
 import os
 import subprocess
 import sys
 import threading
+import warnings
 from functools import cache
 from typing import Any
 
@@ -58,6 +60,7 @@ class OffScreen:
         self._model = physics.model_of(0)
         self._gl: Any = gl_context(find_backend())
         self._gl.make_current()
+        atexit.register(self.close)  # while OpenGL is still there
         self._scene = mujoco.MjvScene(self._model, maxgeom=200)
         self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
@@ -77,10 +80,14 @@ class OffScreen:
         return np.ascontiguousarray(image[::-1])  # OpenGL's first line is the lowest
 
     def close(self) -> None:
-        """Free the context."""
+        """Free the context; doing it twice is once."""
+        if self._gl is None:
+            return
+        atexit.unregister(self.close)
         self._gl.make_current()
         self._context.free()
         self._gl.free()
+        self._gl = None
 
 
 class Window:
@@ -91,6 +98,7 @@ class Window:
             raise RenderingUnavailable(
                 'A window needs a display, and DISPLAY is not set. Use render_mode="rgb_array", or run under xvfb-run.'
             )
+        require_display()
         viewer = importlib.import_module("mujoco.viewer")
         self._model = physics.model_of(0)
         self._data = mujoco.MjData(self._model)
@@ -116,6 +124,18 @@ class Window:
             thread.join(timeout=5)
 
 
+def require_display() -> None:
+    """Try the display first: MuJoCo's viewer ends the whole process when it cannot open one."""
+    glfw = importlib.import_module("glfw")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        opened = glfw.init()
+    if not opened:
+        display = os.environ.get("WAYLAND_DISPLAY") or os.environ.get("DISPLAY")
+        raise RenderingUnavailable(f'The display {display} cannot be opened. Check it, or use render_mode="rgb_array".')
+    glfw.terminate()
+
+
 def add_marks(scene: Any, marks: list[Mark]) -> None:
     """Append a sphere for each mark to `scene`."""
     size, upright = np.array([MARK_RADIUS, 0.0, 0.0]), np.eye(3).ravel()
@@ -127,7 +147,10 @@ def add_marks(scene: Any, marks: list[Mark]) -> None:
 
 def gl_context(backend: str) -> Any:
     """An OpenGL context of `backend`, for images of `WIDTH` x `HEIGHT`."""
-    return importlib.import_module(f"mujoco.{backend}").GLContext(WIDTH, HEIGHT)
+    try:
+        return importlib.import_module(f"mujoco.{backend}").GLContext(WIDTH, HEIGHT)
+    except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
+        raise RenderingUnavailable(f"MUJOCO_GL={backend} does not work here: {error}. Unset it, or try egl.") from error
 
 
 @cache

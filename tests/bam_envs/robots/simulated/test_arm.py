@@ -125,3 +125,17 @@ def test_saved_and_restored_in_another_robot():
         np.testing.assert_array_equal(second.signals[name], array)
     one.close()
     two.close()
+
+
+def test_a_command_beyond_the_data_sheet_is_followed_as_far_as_the_arm_can():
+    arm = cube_scene()
+    arm.connect()
+    start = begin(arm).command.copy()
+    far = start.copy()
+    far[0, :6] += 10.0
+    sent = arm.step(far).command
+    np.testing.assert_allclose(sent[0, :6] - start[0, :6], np.pi * 0.05, rtol=1e-12)
+    for _ in range(100):
+        sent = arm.step(far).command
+    assert (sent <= np.array(arm.spec.command.high)).all()
+    assert sent[0, 2] == np.pi

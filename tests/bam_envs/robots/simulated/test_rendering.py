@@ -118,7 +118,7 @@ def test_rows_are_drawn_after_close_and_reset(make_rows):
     envs = make_rows("bam/pick-v0", 3, render_mode="rgb_array", randomize=True)
     envs.reset(seed=0)
     try:
-        assert envs.render().shape == (480, 640, 3)
+        assert envs.render()[0].shape == (480, 640, 3)
     except RenderingUnavailable as error:
         pytest.skip(str(error))
 
