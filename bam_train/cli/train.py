@@ -10,11 +10,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from bam_train.cli.console import count
 from bam_train.cli.program import run_program
 
 if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
     from bam_train.settings import TrainSettings
+    from bam_train.trainers.output import Output
+    from bam_train.trainers.run_folder import RunFolder
+    from bam_train.trainers.trainer import Trainer
 
 _STARTED = time.monotonic()
 
@@ -108,13 +112,10 @@ def _settings(config: TrainConfig, checkpoint: Checkpoint | None) -> TrainSettin
 
 def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint | None) -> int:
     """Train with complete settings; returns the exit status."""
-    from bam_train.cli.stop_signals import StopSignals
-    from bam_train.cli.train_display import make_display
-    from bam_train.cli.train_summary import summarise
+    from bam_train.cli.train_display import nobody_need_read
     from bam_train.settings import file_stem
     from bam_train.trainers import load_trainer
     from bam_train.trainers.output import choose_output
-    from bam_train.trainers.run import TrainingRun
     from bam_train.trainers.run_folder import RunFolder
 
     output = choose_output(settings, config.out, config.force, checkpoint)
@@ -123,16 +124,36 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
     folder = RunFolder(config.runs, file_stem(settings.env, settings.algo))
     folder.write_config(settings.to_mapping())
     made.log_to(folder.tensorboard)
-    try:
-        with make_display(f"{settings.algo} on {settings.env}, seed {settings.seed}") as display:
-            for notice in [*output.notices, *made.notices]:
-                display.note(notice)
-            run = TrainingRun(made, folder, output.path, display, output.best)
-            with StopSignals(run) as signals:
+    with nobody_need_read():
+        return _run(made, folder, output, _title(settings, checkpoint))
+
+
+def _title(settings: TrainSettings, checkpoint: Checkpoint | None) -> str:
+    """What is trained, and from where."""
+    title = f"{settings.algo} on {settings.env}, seed {settings.seed}"
+    return (
+        title if checkpoint is None else f"{title}, from {checkpoint.path} at {count(checkpoint.manifest.steps)} steps"
+    )
+
+
+def _run(trainer: Trainer, folder: RunFolder, output: Output, title: str) -> int:
+    """Train to the end and say how it went; returns the exit status."""
+    from bam_train.cli.stop_signals import StopSignals
+    from bam_train.cli.train_display import make_display
+    from bam_train.cli.train_summary import summarise
+    from bam_train.trainers.run import TrainingRun
+
+    display = make_display(title)
+    run = TrainingRun(trainer, folder, output.path, display, output.best)
+    with StopSignals(run) as signals:
+        try:
+            with display:
+                for notice in [*output.notices, *trainer.notices]:
+                    display.note(notice)
                 outcome = run.run()
-    finally:
-        made.close()
-    summarise(settings, outcome, folder, time.monotonic() - _STARTED)
+        finally:
+            trainer.close()
+        summarise(trainer.settings, outcome, folder, time.monotonic() - _STARTED)
     return signals.status
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import sys
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, TextIO
 
 from bam_train.cli.console import count, duration, is_terminal, make_console, number, percent, say
 
@@ -16,6 +19,49 @@ if TYPE_CHECKING:
 
 LINE_EVERY = 1.0
 """Seconds between two plain lines about training at least."""
+
+
+class Forgiving:
+    """A text stream that may go away, as a closed pipe or terminal does: from then on, what is written is dropped.
+
+    Args:
+        stream: Where text goes as long as it can.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """Write `text` if somebody reads."""
+        try:
+            return self._stream.write(text)
+        except OSError:
+            self._give_up()
+            return len(text)
+
+    def flush(self) -> None:
+        """Pass on what was written if somebody reads."""
+        try:
+            self._stream.flush()
+        except OSError:
+            self._give_up()
+
+    def _give_up(self) -> None:
+        """Put the null device in its place, so that what is still buffered goes there too."""
+        with contextlib.suppress(OSError):  # a stream that is no file
+            null = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null, self._stream.fileno())
+            os.close(null)
+
+
+@contextlib.contextmanager
+def nobody_need_read() -> Iterator[None]:
+    """Within, the run goes on whether or not somebody still reads standard error."""
+    with contextlib.redirect_stderr(Forgiving(sys.stderr)):
+        yield
 
 
 def make_display(title: str) -> PlainDisplay:

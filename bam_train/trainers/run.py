@@ -89,6 +89,9 @@ class TrainingRun:
         watcher: Who is told.
         best: The best evaluation of the part of this run that was trained before, whose checkpoint is at `out`.
         clock: Monotonic time [s].
+
+    Attributes:
+        done: Whether everything is saved.
     """
 
     def __init__(
@@ -106,6 +109,7 @@ class TrainingRun:
         self._start = self._recorded = self._saved = clock()
         self._first_step = trainer.steps
         self._save_pause = SAVE_EVERY
+        self.done = False
         self._stop = self._reached = False
         self._evaluated_at = trainer.steps if best else 0
         self._report: EvaluationReport | None = None
@@ -137,6 +141,7 @@ class TrainingRun:
             kept = f"the last good checkpoint is {self.last}" if self.last else "no checkpoint had been saved yet"
             raise TrainingFailed(f"{error}; {kept}") from error
         self._save_last()
+        self.done = True
         if self._failure is not None:
             raise self._failure
         return self._outcome()

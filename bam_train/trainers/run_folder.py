@@ -56,6 +56,12 @@ class RunFolder:
         return [json.loads(line) for line in self._progress.read_text(encoding="utf-8").splitlines()]
 
 
+    def remove_unfinished(self) -> None:
+        """Remove what an interrupted save left behind."""
+        for path in self.path.glob(".*.tmp"):
+            path.unlink(missing_ok=True)
+
+
 class _writing:  # noqa: N801 - reads as `with _writing(path)`
     """Maps failures to write `path` to `OutputError`."""
 

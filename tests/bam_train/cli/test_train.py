@@ -210,14 +210,21 @@ def wait_for(process, words):
 LONG = ("--steps", "10000000", "--eval-every", "256", "--eval-episodes", "1")
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_saves_and_ends_cleanly(here, number, status):
+@pytest.mark.parametrize(
+    ("number", "status", "again"),
+    [
+        (signal.SIGINT, 130, "Ctrl-C again"),
+        (signal.SIGTERM, 143, "another signal"),
+        (signal.SIGHUP, 129, "another signal"),
+    ],
+)
+def test_a_signal_saves_and_ends_cleanly(here, number, status, again):
     process = started(here, *LONG)
     wait_for(process, "evaluation at 512 steps")
     process.send_signal(number)
     out, err = process.communicate(timeout=60)
     assert (process.returncode, out) == (status, "")
-    assert "finishing the update and saving; Ctrl-C again quits at once" in err
+    assert f"finishing the update and saving; {again} quits at once" in err
     assert "Traceback" not in err
     last = Checkpoint.open(here / "runs" / "CartPole-v1-ppo" / "last.zip")
     assert last.manifest.steps >= 512
@@ -234,6 +241,33 @@ def test_two_signals_quit_at_once(here):
     _, err = process.communicate(timeout=20)
     assert process.returncode == 130
     assert err == "bam-train: quit at once; no checkpoint had been saved yet\n"
+
+
+@pytest.mark.parametrize("pause", [0.05, 0.2])
+def test_two_signals_while_saving_quit_at_once_too(here, pause):
+    process = started(here, *LONG)
+    wait_for(process, "evaluation at 512 steps")
+    process.send_signal(signal.SIGINT)
+    time.sleep(pause)
+    process.send_signal(signal.SIGINT)
+    before = time.monotonic()
+    _, err = process.communicate(timeout=20)
+    assert time.monotonic() - before < 2.0
+    assert process.returncode == 130
+    last = "runs/CartPole-v1-ppo/last.zip"
+    assert err.splitlines()[-1] == f"bam-train: quit at once; the last checkpoint on the disk is {last}"
+    assert Checkpoint.open(here / last).manifest.steps >= 256
+    assert not list((here / "runs" / "CartPole-v1-ppo").glob(".*"))
+
+
+def test_nobody_need_read(here):
+    process = started(here, "--steps", "2048", "--eval-every", "256", "--eval-episodes", "1")
+    wait_for(process, "ppo on CartPole-v1, seed 0")
+    process.stderr.close()
+    process.stdout.close()
+    assert process.wait(timeout=60) == 0
+    assert Checkpoint.open(here / "runs" / "CartPole-v1-ppo" / "last.zip").manifest.steps == 2048
+    assert (here / "checkpoints" / "CartPole-v1-ppo.zip").exists()
 
 
 def test_kill_leaves_a_whole_checkpoint_that_can_be_gone_on_from(here):
