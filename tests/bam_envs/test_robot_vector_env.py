@@ -2,6 +2,7 @@
 
 import copy
 import json
+import pickle
 
 import gymnasium as gym
 import numpy as np
@@ -258,3 +259,23 @@ def test_a_time_limit_of_none_never_truncates():
 def test_limits_of_steps_are_those_of_the_table(make_rows):
     for env_id, entry in ENVIRONMENTS.items():
         assert make_rows(env_id, 1).unwrapped.max_episode_steps == entry.max_episode_steps
+
+
+@pytest.mark.parametrize("randomize", [False, True])
+def test_a_pickled_environment_goes_on_as_the_first(randomize):
+    first = gym.make_vec("bam/pick-v0", num_envs=3, randomize=randomize)
+    first.reset(seed=0)
+    rng = np.random.default_rng(0)
+    first.step(rng.uniform(-1, 1, (3, 5)).astype(np.float32))
+    second = pickle.loads(pickle.dumps(first))
+    for _ in range(110):
+        actions = rng.uniform(-1, 1, (3, 5)).astype(np.float32)
+        np.testing.assert_array_equal(first.step(actions)[0], second.step(actions)[0])
+    first.close()
+    second.close()
+
+
+def test_at_least_one_row():
+    with pytest.raises(InvalidValue) as caught:
+        gym.make_vec("bam/pick-v0", num_envs=0)
+    assert str(caught.value) == "num_envs must be at least 1, not 0."

@@ -44,13 +44,18 @@ class Physics:
         self.rows = rows
         self._models = [copy.copy(self.model) if varied else self.model for _ in range(rows)]
         threads = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, rows)
-        self._data = [mujoco.MjData(self.model) for _ in range(threads)]
+        self._threads = threads
         self._chunk = max(1, rows // (4 * threads))
-        self._scratch = mujoco.MjData(self.model)
-        self._rollout: Any = rollout.Rollout(nthread=threads if threads > 1 else 0)
+        self._start()
         self._buffers: dict[int, tuple[Array, Array]] = {}
         self.state: Array = np.tile(self._default_state(), (rows, 1))
         """Time, joint positions, joint velocities. Shape: (n, 1 + nq + nv)."""
+
+    def _start(self) -> None:
+        """Make what belongs to this process: the threads and their working memory."""
+        self._data = [mujoco.MjData(self.model) for _ in range(self._threads)]
+        self._scratch = mujoco.MjData(self.model)
+        self._rollout: Any = rollout.Rollout(nthread=self._threads if self._threads > 1 else 0)
 
     def _default_state(self) -> Array:
         state = np.empty(mujoco.mj_stateSize(self.model, FULL))
@@ -120,6 +125,15 @@ class Physics:
         mujoco.mj_setState(self.model_of(row), self._scratch, np.ascontiguousarray(self.state[row]), FULL)
         mujoco.mj_forward(self.model_of(row), self._scratch)
         return self._scratch
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what belongs to this process."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("_rollout", "_data", "_scratch")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Go to what `__getstate__` returned."""
+        self.__dict__.update(state)
+        self._start()
 
     def close(self) -> None:
         """Stop the threads."""
