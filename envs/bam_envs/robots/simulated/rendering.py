@@ -60,13 +60,13 @@ class OffScreen:
         self._model = physics.model_of(0)
         self._gl: Any = gl_context(find_backend())
         self._gl.make_current()
-        atexit.register(self.close)  # while OpenGL is still there
         self._scene = mujoco.MjvScene(self._model, maxgeom=200)
         self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._camera.fixedcamid = self._model.camera(CAMERA).id
         self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        atexit.register(self.close)  # while OpenGL is still there
 
     def show(self, data: Any, marks: list[Mark]) -> NDArray[np.uint8]:
         """Draw and read back an image (480, 640, 3)."""
@@ -94,10 +94,6 @@ class Window:
     """Draws into a window of MuJoCo's own viewer."""
 
     def __init__(self, physics: Physics) -> None:
-        if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-            raise RenderingUnavailable(
-                'A window needs a display, and DISPLAY is not set. Use render_mode="rgb_array", or run under xvfb-run.'
-            )
         require_display()
         viewer = importlib.import_module("mujoco.viewer")
         self._model = physics.model_of(0)
@@ -126,6 +122,10 @@ class Window:
 
 def require_display() -> None:
     """Try the display first: MuJoCo's viewer ends the whole process when it cannot open one."""
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise RenderingUnavailable(
+            'A window needs a display, and DISPLAY is not set. Use render_mode="rgb_array", or run under xvfb-run.'
+        )
     glfw = importlib.import_module("glfw")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -161,6 +161,8 @@ def find_backend() -> str:
         RenderingUnavailable: None does; the text says what to install.
     """
     named = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if named == "glfw":
+        require_display()
     if named in ("glfw", *BACKENDS):
         return named
     for backend in BACKENDS:

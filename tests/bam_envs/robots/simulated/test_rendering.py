@@ -151,3 +151,23 @@ def test_a_window_opens_shows_and_closes_with_the_process():
     command = ["xvfb-run", "-a", sys.executable, "-c", script]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_backend_that_needs_a_display_without_one(monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(rendering.sys, "platform", "linux")
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    find_backend.cache_clear()
+    with pytest.raises(RenderingUnavailable, match="A window needs a display, and DISPLAY is not set"):
+        find_backend()
+    find_backend.cache_clear()
+
+
+def test_a_display_that_cannot_be_opened(monkeypatch):
+    monkeypatch.setattr(rendering.sys, "platform", "linux")
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setenv("DISPLAY", ":77")
+    with pytest.raises(RenderingUnavailable) as caught:
+        rendering.require_display()
+    assert str(caught.value) == 'The display :77 cannot be opened. Check it, or use render_mode="rgb_array".'
