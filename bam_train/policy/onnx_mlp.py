@@ -2,7 +2,7 @@
 
 A `Plan` is the graph made ready for one batch size: every array is allocated, every view taken and everything that does
 not depend on the inputs computed. Running it is a list of NumPy calls that write into those arrays, one thread at a
-time. An array that cannot be written to is a constant.
+time. An array that cannot be written to is a constant. Most of the file is the table of operations.
 """
 
 from __future__ import annotations

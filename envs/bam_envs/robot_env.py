@@ -1,4 +1,7 @@
-"""A Robot and a Task joined as a Gymnasium environment: `RobotEnv` for one, `RobotVectorEnv` for n stepped together."""
+"""A Robot and a Task joined as a Gymnasium environment: `RobotEnv` for one, `RobotVectorEnv` for n stepped together.
+
+Longer than most files here: the two stand side by side because they must agree row by row.
+"""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from bam_envs.robots.simulated.physics import Physics
 Array = NDArray[np.float64]
 ARM_COORDINATES = 8
 """Six joints and two fingers; what comes after is the object."""
-TAPE = 128
+TAPE = 256
 """Steps of noise drawn at once."""
 
 
