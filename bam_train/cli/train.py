@@ -116,12 +116,13 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
     from bam_train.settings import file_stem
     from bam_train.trainers import load_trainer
     from bam_train.trainers.output import choose_output
-    from bam_train.trainers.run_folder import RunFolder
+    from bam_train.trainers.run_folder import RunFolder, require_room
 
+    require_room(config.runs.expanduser())
     output = choose_output(settings, config.out, config.force, checkpoint)
     kind = load_trainer(settings.trainer)
     made = kind.create(settings) if checkpoint is None else kind.load(checkpoint, settings)
-    folder = RunFolder(config.runs, file_stem(settings.env, settings.algo))
+    folder = RunFolder(config.runs.expanduser(), file_stem(settings.env, settings.algo))
     folder.write_config(settings.to_mapping())
     made.log_to(folder.tensorboard)
     with nobody_need_read():
@@ -154,6 +155,8 @@ def _run(trainer: Trainer, folder: RunFolder, output: Output, title: str) -> int
         finally:
             trainer.close()
         summarise(trainer.settings, outcome, folder, time.monotonic() - _STARTED)
+    if outcome.failure is not None:
+        raise outcome.failure
     return signals.status
 
 

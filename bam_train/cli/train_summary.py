@@ -32,19 +32,22 @@ def summarise(settings: TrainSettings, outcome: Outcome, folder: RunFolder, seco
     say(f"{settings.algo} on {settings.env}: {end}")
     for name, text in _rows(outcome, folder):
         say(f"  {name:<12}{text}")
-    say("next:")
-    for command in _next_commands(settings, outcome):
-        say(f"  {command}")
+    commands = _next_commands(settings, outcome)
+    for line in ["next:", *(f"  {command}" for command in commands)] if commands else []:
+        say(line)
 
 
 def _rows(outcome: Outcome, folder: RunFolder) -> list[tuple[str, str]]:
     rows = []
-    if outcome.checkpoint is not None and outcome.best is not None:
+    if outcome.checkpoint is not None and outcome.best is not None and outcome.checkpoint.exists():
         rows.append(("best", _score_text(outcome)))
         size = outcome.checkpoint.stat().st_size / 1000
         rows.append(("checkpoint", f"{_short(outcome.checkpoint)} ({size:,.0f} kB)"))
+    elif outcome.reason == "stopped":
+        rows.append(("best", "none: the run was stopped before its first evaluation"))
     if outcome.last is not None:
-        rows.append(("last state", f"{_short(outcome.last)}"))
+        older = "" if outcome.last_steps == outcome.steps else f" (after {count(outcome.last_steps)} steps)"
+        rows.append(("last state", f"{_short(outcome.last)}{older}"))
     rows.append(("run", f"{_short(folder.path)}/: learning-curve.png, progress.jsonl, config.json, tensorboard/"))
     return rows
 

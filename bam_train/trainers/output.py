@@ -42,7 +42,7 @@ def choose_output(settings: TrainSettings, out: Path | None, force: bool, resume
     """
     own = None if resumed is None else _own_best(resumed, settings)
     wanted = (out or (own.path if own else FOLDER / f"{file_stem(settings.env, settings.algo)}.zip")).expanduser()
-    if wanted.suffix != ".zip":
+    if wanted.suffix != ".zip" and not wanted.is_dir():
         raise OutputError(f"{wanted}: expected a file name that ends in .zip. Choose another one with --out")
     require_writable(wanted)
     if own is not None and wanted.resolve() == own.path:

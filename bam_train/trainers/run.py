@@ -17,7 +17,7 @@ from bam_train.errors import OutputError, TrainingFailed
 from bam_train.evaluation import EvaluationReport
 from bam_train.settings import TrainSettings
 from bam_train.trainers.judge import judge
-from bam_train.trainers.run_folder import RunFolder
+from bam_train.trainers.run_folder import RunFolder, unwritable
 from bam_train.trainers.trainer import Progress, Statistics, Trainer
 
 SAVE_EVERY = 30.0
@@ -76,7 +76,11 @@ class Outcome:
     checkpoint: Path | None
     """Where the best policy is."""
     last: Path | None
-    """Where the newest state is."""
+    """Where the newest state is that could be saved in the run's folder."""
+    last_steps: int = 0
+    """Steps of that state."""
+    failure: OutputError | None = None
+    """Why something is not where it should be; None if all is."""
 
 
 class TrainingRun:
@@ -115,7 +119,8 @@ class TrainingRun:
         self._report: EvaluationReport | None = None
         self._best_scores: dict[str, Any] = {}
         self._kept: Path | None = out if best else None
-        self._failure: OutputError | None = None
+        self._last_steps = 0
+        self._failures: dict[str, OutputError] = {}
 
     def stop(self) -> None:
         """Ask for an end after the update in progress; may be called from a signal handler."""
@@ -131,7 +136,6 @@ class TrainingRun:
 
         Raises:
             TrainingFailed: The loss or a weight is no longer finite; its text names the last good checkpoint.
-            OutputError: A checkpoint could not be written; what could be saved elsewhere was.
         """
         try:
             self.trainer.train(self.settings.steps, self._between)
@@ -142,14 +146,15 @@ class TrainingRun:
             raise TrainingFailed(f"{error}; {kept}") from error
         self._save_last()
         self.done = True
-        if self._failure is not None:
-            raise self._failure
         return self._outcome()
 
     def _outcome(self) -> Outcome:
         reason = "stopped" if self._stop else "success" if self._reached else "steps"
         seconds = self._clock() - self._start
-        return Outcome(reason, self.trainer.steps, seconds, self.best, self._best_scores, self._kept, self.last)
+        last = self.folder.last if self._last_steps else None
+        failure = next(iter(self._failures.values()), None)
+        best, kept, scores = self.best, self._kept, self._best_scores
+        return Outcome(reason, self.trainer.steps, seconds, best, scores, kept, last, self._last_steps, failure)
 
     def _between(self, progress: Progress) -> bool:
         """What happens between two updates; False ends training."""
@@ -180,7 +185,7 @@ class TrainingRun:
         statistics = progress.statistics()
         rate = (progress.steps - self._first_step) / max(now - self._start, 1e-9)
         left = (progress.total - progress.steps) / rate if rate > 0 else None
-        self.folder.add(_training_record(progress.steps, now - self._start, rate, statistics))
+        self._add(_training_record(progress.steps, now - self._start, rate, statistics))
         self.watcher.training(progress, statistics, rate, left)
 
     def _evaluate(self) -> None:
@@ -194,39 +199,64 @@ class TrainingRun:
         found = Best(steps, report.success_rate, report.return_mean)
         better = self.best is None or found.rank() > self.best.rank()
         seconds = round(self._clock() - self._start, 3)
-        self.folder.add({"kind": "evaluation", "steps": steps, "seconds": seconds, **report.to_json()})
+        self._add({"kind": "evaluation", "steps": steps, "seconds": seconds, **report.to_json()})
         numbers = {"eval/return_mean": report.return_mean, "eval/success_rate": report.success_rate}
         self.trainer.log({name: value for name, value in numbers.items() if value is not None})
         self.watcher.evaluated(steps, report, better)
         if better:
             self._keep(found)
 
+    def _add(self, record: dict[str, Any]) -> None:
+        """Add a record; training does not depend on it."""
+        try:
+            self.folder.add(record)
+        except OutputError as error:
+            if "progress" not in self._failures:
+                self.watcher.note(f"{error}. Training goes on, and some records are missing")
+            self._failures["progress"] = error
+
     def _keep(self, found: Best) -> None:
         """Save the policy as the best so far; if `out` cannot be written, in the run's folder. Training goes on."""
         before = self.best, self._best_scores
         self.best, self._best_scores = found, self._scores()
-        for path in (self.out, self.folder.path / "best.zip"):
-            if self._write(path, path, "the best policy is kept elsewhere if it can be"):
-                self._kept = path
-                return
+        if self._write(self.out, self.out, "--out"):
+            self._kept = self.out
+            self._failures.pop("best.zip", None)
+            return
+        rescue = self.folder.path / "best.zip"
+        if self._write(rescue, rescue, "--runs"):
+            self._kept = rescue
+            self.watcher.note(f"the best policy is in {rescue} instead")
+            return
         self.best, self._best_scores = before  # the next evaluation tries again
+        kept = f"the best one that is saved is {self._kept}" if self._kept else "no best policy is saved yet"
+        self.watcher.note(f"the best policy could not be saved; {kept}")
 
     def _save_last(self) -> None:
         """Save the newest state; the next save is put off while saving is slow."""
         before = self._clock()
-        self._write(self.folder.last, self._kept, "the checkpoint before this one is whole")
+        if self._write(self.folder.last, self._kept, "--runs"):
+            self._last_steps = self.trainer.steps
+        else:
+            whole = f"{self.folder.last} still has step {self._last_steps}, whole"
+            self.watcher.note(whole if self._last_steps else f"{self.folder.last} does not exist yet")
         self._saved = self._clock()
         self._save_pause = max(SAVE_EVERY, (self._saved - before) / SAVE_SHARE)
 
-    def _write(self, path: Path, kept: Path | None, comfort: str) -> bool:
+    def _write(self, path: Path, kept: Path | None, flag: str) -> bool:
         """Write a checkpoint, which notes that the best one is at `kept`; whether it could be."""
         try:
             self.trainer.save(path, self._scores(), self._notes(kept))
         except OutputError as error:
-            self._failure = error
-            self.watcher.note(f"{error}. Training goes on, and {comfort}")
+            self._failures[path.name] = unwritable(path, error, flag)
+            self.watcher.note(f"{self._failures[path.name]}{'. Training goes on' if self._goes_on else ''}")
             return False
+        self._failures.pop(path.name, None)
         return True
+
+    @property
+    def _goes_on(self) -> bool:
+        return not (self._stop or self._reached) and self.trainer.steps < self.settings.steps
 
     def _scores(self) -> dict[str, Any]:
         """The newest evaluation and the steps at which it was made, for a manifest."""

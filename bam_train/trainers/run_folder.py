@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 import tempfile
@@ -19,6 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from bam_train.errors import OutputError
+
+LEAST_FREE = 20_000_000
+"""Bytes that a disk must have free before training."""
 
 
 class RunFolder:
@@ -50,11 +54,14 @@ class RunFolder:
             file.write(json.dumps(record, allow_nan=False) + "\n")
 
     def records(self) -> list[dict[str, Any]]:
-        """All records so far."""
+        """All records so far, but for lines that a full disk cut off."""
         if not self._progress.exists():
             return []
-        return [json.loads(line) for line in self._progress.read_text(encoding="utf-8").splitlines()]
-
+        records = []
+        for line in self._progress.read_text(encoding="utf-8").splitlines():
+            with contextlib.suppress(ValueError):
+                records.append(json.loads(line))
+        return records
 
     def remove_unfinished(self) -> None:
         """Remove what an interrupted save left behind."""
@@ -73,7 +80,23 @@ class _writing:  # noqa: N801 - reads as `with _writing(path)`
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         if isinstance(error, OSError) and not isinstance(error, OutputError):
-            raise OutputError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+            raise unwritable(self.path, error, "--runs") from error
+
+
+def unwritable(path: Path, error: Exception, flag: str) -> OutputError:
+    """The error for a file that cannot be written.
+
+    Args:
+        path: The file.
+        error: What the system, or who wrote it, said.
+        flag: What chooses another place.
+    """
+    cause = error.__cause__ if isinstance(error.__cause__, OSError) else error
+    why = getattr(cause, "strerror", None) or cause
+    if isinstance(cause, (NotADirectoryError, FileExistsError)):
+        in_the_way = next((one for one in (path, *path.parents) if one.is_file()), None)
+        why = f"{in_the_way or path} is a file, expected a folder"
+    return OutputError(f"{path}: cannot be written: {why}. Choose another place with {flag}")
 
 
 def _make_folder(root: Path, name: str) -> Path:
@@ -94,25 +117,38 @@ def _make_folder(root: Path, name: str) -> Path:
         return path
 
 
-def require_writable(path: Path, least: int = 20_000_000) -> None:
-    """Find out before training whether a checkpoint can be written to `path`; missing folders are made.
+def require_writable(path: Path) -> None:
+    """Find out before training whether a checkpoint can be written to `path`; nothing is left behind.
 
     Args:
         path: Where the checkpoint will go.
-        least: Free bytes that the disk must have.
 
     Raises:
-        OutputError: It is a folder, the folder cannot be made or written to, or the disk is full.
+        OutputError: It is a folder, its folder cannot be written to, or the disk is full.
     """
-    remedy = "Choose another place with --out"
     if path.is_dir():
         raise OutputError(f"{path}: is a folder; give the name of a file in it, such as --out {path / 'policy.zip'}")
+    _require_room(path, path.parent, "--out")
+
+
+def require_room(root: Path) -> None:
+    """Find out before training whether the folder that runs are kept in can be written to; it is not made yet.
+
+    Raises:
+        OutputError: It cannot be written to, or the disk is full.
+    """
+    _require_room(root, root, "--runs")
+
+
+def _require_room(path: Path, folder: Path, flag: str) -> None:
+    there = next(one for one in (folder, *folder.absolute().parents) if one.exists())
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path.parent):
-            free = shutil.disk_usage(path.parent).free
+        with tempfile.TemporaryFile(dir=there):
+            free = shutil.disk_usage(there).free
     except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror or error}. {remedy}") from error
-    if free < least:
-        found, expected = f"{free / 1e6:.1f} MB", f"{least / 1e6:.0f} MB"
-        raise OutputError(f"{path}: the disk has {found} free, expected at least {expected}. {remedy}")
+        raise unwritable(path, error, flag) from error
+    if free < LEAST_FREE:
+        found, expected = f"{free / 1e6:.1f} MB", f"{LEAST_FREE / 1e6:.0f} MB"
+        raise OutputError(
+            f"{path}: the disk has {found} free, expected at least {expected}. Choose another place with {flag}"
+        )

@@ -143,6 +143,20 @@ ERRORS = [
         {"out": Path("/proc/a.zip")},
         "/proc/a.zip: cannot be written: No such file or directory. Choose another place with --out",
     ),
+    (
+        {"out": Path("/proc/version/a.zip")},
+        "/proc/version/a.zip: cannot be written: /proc/version is a file, expected a folder. "
+        "Choose another place with --out",
+    ),
+    (
+        {"out": Path("/proc")},
+        "/proc: is a folder; give the name of a file in it, such as --out /proc/policy.zip",
+    ),
+    (
+        {"runs": Path("/proc/version")},
+        "/proc/version: cannot be written: /proc/version is a file, expected a folder. "
+        "Choose another place with --runs",
+    ),
     ({"resume": Path("no.zip")}, "no.zip: no such file. Train one with bam-train, or check the name"),
     ({"config": Path("no.toml")}, "no.toml: cannot be read: No such file or directory"),
     ({"until_success": 2.0}, "until_success: expected a share above 0 and at most 1, such as 0.99, found 2.0"),

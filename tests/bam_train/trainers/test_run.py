@@ -57,7 +57,8 @@ class Counter:
 
     def save(self, path, scores, notes):
         if path.name in self.refuse:
-            raise OutputError(f"{path}: cannot be written: No space left on device")
+            no_space = OSError(28, "No space left on device")
+            raise OutputError(f"{path}: cannot be written: No space left on device") from no_space
         if self.clock is not None:
             self.clock.now += self.clock.save_takes
         path.write_text(str(self.steps))
@@ -243,38 +244,65 @@ def test_a_nan_before_anything_was_saved(start):
         run.run()
 
 
+FULL = "cannot be written: No space left on device. Choose another place with"
+
+
 def test_a_full_disk_at_out_loses_nothing(start, tmp_path):
     run, trainer, watcher = start({30: report(0.1), 60: report(0.9), 90: report(0.1), 100: report(0.1)})
     trainer.refuse = ["out.zip"]
-    with pytest.raises(OutputError, match=r"out\.zip: cannot be written: No space left on device$"):
-        run.run()
+    outcome = run.run()
+    assert str(outcome.failure) == f"{run.out}: {FULL} --out"
     rescued = tmp_path / "runs" / "count-ppo" / "best.zip"
-    assert rescued.read_text() == "60"
+    assert (outcome.checkpoint, rescued.read_text()) == (rescued, "60")
     assert (tmp_path / "runs" / "count-ppo" / "last.zip").read_text() == "100"
-    end = "No space left on device. Training goes on, and the best policy is kept elsewhere if it can be"
-    assert watcher.notes[0].endswith(end)
+    assert watcher.notes[:2] == [
+        f"{run.out}: {FULL} --out. Training goes on",
+        f"the best policy is in {rescued} instead",
+    ]
 
 
 def test_a_full_disk_in_the_run_folder_does_not_end_training(start):
     run, trainer, watcher = start({30: report(0.1), 60: report(0.9), 90: report(0.1), 100: report(0.1)})
     trainer.refuse = ["last.zip"]
-    with pytest.raises(OutputError, match=r"last\.zip"):
-        run.run()
-    assert trainer.steps == 100
+    outcome = run.run()
+    last = run.folder.last
+    assert str(outcome.failure) == f"{last}: {FULL} --runs"
+    assert (trainer.steps, outcome.checkpoint, outcome.last) == (100, run.out, None)
     assert run.out.read_text() == "60"
-    assert watcher.notes[0].endswith("Training goes on, and the checkpoint before this one is whole")
+    missing = f"{last} does not exist yet"
+    assert watcher.notes[:2] == [f"{last}: {FULL} --runs. Training goes on", missing]
+    assert watcher.notes[-2:] == [f"{last}: {FULL} --runs", missing]
+
+
+def test_a_disk_that_fills_up_later_leaves_an_older_state(start):
+    run, trainer, watcher = start({30: report(0.9), 60: report(0.1), 90: report(0.1), 100: report(0.1)})
+    watcher.evaluated = lambda steps, *rest: trainer.refuse.append("last.zip") if steps == 60 else None
+    outcome = run.run()
+    assert (outcome.last, outcome.last_steps, outcome.last.read_text()) == (run.folder.last, 30, "30")
+    assert watcher.notes[-1] == f"{run.folder.last} still has step 30, whole"
 
 
 def test_full_disks_everywhere_do_not_end_training_either(start):
-    run, trainer, _ = start({30: report(0.1), 60: report(0.9), 90: report(0.1), 100: report(0.1)})
+    run, trainer, watcher = start({30: report(0.1), 60: report(0.9), 90: report(0.1), 100: report(0.1)})
     trainer.refuse = ["out.zip", "best.zip", "last.zip"]
     trainer.train = lambda steps, on_progress, train=trainer.train: train(
         steps, lambda progress: (trainer.refuse.clear() if progress.steps == 90 else None) or on_progress(progress)
     )
-    with pytest.raises(OutputError):
-        run.run()
+    outcome = run.run()
+    assert "the best policy could not be saved; no best policy is saved yet" in watcher.notes
     assert run.out.read_text() == "90"
     assert run.folder.last.read_text() == "100"
+    assert outcome.failure is None
+
+
+def test_records_that_cannot_be_written_do_not_end_training(start, monkeypatch):
+    def full(record):
+        raise OutputError("progress.jsonl: full")
+
+    run, _, watcher = start({step: report(0.1) for step in (30, 60, 90, 100)})
+    monkeypatch.setattr(run.folder, "add", full)
+    assert str(run.run().failure) == "progress.jsonl: full"
+    assert watcher.notes == ["progress.jsonl: full. Training goes on, and some records are missing"]
 
 
 def test_a_resumed_run_keeps_a_better_best(start):

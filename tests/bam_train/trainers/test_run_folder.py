@@ -10,7 +10,7 @@ import pytest
 
 from bam_train.errors import OutputError
 from bam_train.trainers.curve import draw_curve
-from bam_train.trainers.run_folder import RunFolder, require_writable
+from bam_train.trainers.run_folder import RunFolder, require_room, require_writable
 
 
 def test_each_run_has_a_folder_of_its_own(tmp_path):
@@ -30,22 +30,29 @@ def test_config_and_records(tmp_path):
 
 def test_a_folder_that_cannot_be_made(tmp_path):
     (tmp_path / "runs").write_text("")
-    with pytest.raises(OutputError, match=r"runs: cannot be written: File exists$"):
+    with pytest.raises(
+        OutputError, match=r"runs: cannot be written: \S+runs is a file, expected a folder\. .* --runs$"
+    ):
         RunFolder(tmp_path / "runs", "a")
-    with pytest.raises(OutputError, match=r"deeper: cannot be written: Not a directory$"):
+    with pytest.raises(
+        OutputError, match=r"deeper: cannot be written: \S+runs is a file, expected a folder\. .* --runs$"
+    ):
         RunFolder(tmp_path / "runs" / "deeper", "a")
 
 
 def test_records_that_cannot_be_written(tmp_path):
     folder = RunFolder(tmp_path, "a")
     shutil.rmtree(folder.path)
-    with pytest.raises(OutputError, match=r"progress\.jsonl: cannot be written: No such file or directory$"):
+    with pytest.raises(
+        OutputError, match=r"progress\.jsonl: cannot be written: No such file or directory\. Choose another"
+    ):
         folder.add({"steps": 1})
 
 
 def test_a_place_that_can_be_written(tmp_path):
     require_writable(tmp_path / "deep" / "er" / "a.zip")
-    assert list((tmp_path / "deep" / "er").iterdir()) == []
+    require_room(tmp_path / "runs")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_places_that_cannot(tmp_path, monkeypatch):
@@ -60,6 +67,16 @@ def test_places_that_cannot(tmp_path, monkeypatch):
     expected = r"the disk has 1\.5 MB free, expected at least 20 MB\. Choose another place with --out$"
     with pytest.raises(OutputError, match=expected):
         require_writable(tmp_path / "a.zip")
+    with pytest.raises(OutputError, match=r"runs: the disk has 1\.5 MB free, .*\. Choose another place with --runs$"):
+        require_room(tmp_path / "runs")
+
+
+def test_a_record_that_a_full_disk_cut_off_is_left_out(tmp_path):
+    folder = RunFolder(tmp_path, "a")
+    folder.add({"steps": 1})
+    with (folder.path / "progress.jsonl").open("a") as file:
+        file.write('{"kind": "trai')
+    assert folder.records() == [{"steps": 1}]
 
 
 @pytest.mark.parametrize("success", [None, 0.5])
