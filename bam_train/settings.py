@@ -159,6 +159,9 @@ def parse_config(name: str, text: str) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise SettingsError(f"{name}: expected a table of settings, found a {type(values).__name__}")
     check_names(values, name)
+    for setting, value in values.items():
+        if value is not None:  # a flag may give it
+            fit(f"{name}: {setting}", value, HINTS[setting])
     return values
 
 
@@ -167,6 +170,9 @@ def _read_text(path: Path) -> str:
         raise SettingsError(f"{path}: expected a .toml or .json file, found {path.suffix or 'no suffix'}")
     try:
         return path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        remedy = "Check the name after --config, or make one with --print-config"
+        raise SettingsError(f"{path}: no such file. {remedy}") from error
     except OSError as error:
         raise SettingsError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:

@@ -132,9 +132,9 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
 def _title(settings: TrainSettings, checkpoint: Checkpoint | None) -> str:
     """What is trained, and from where."""
     title = f"{settings.algo} on {settings.env}, seed {settings.seed}"
-    return (
-        title if checkpoint is None else f"{title}, from {checkpoint.path} at {count(checkpoint.manifest.steps)} steps"
-    )
+    if checkpoint is None:
+        return title
+    return f"{title}, going on from {checkpoint.path} at {count(checkpoint.manifest.steps)} steps"
 
 
 def _run(trainer: Trainer, folder: RunFolder, output: Output, title: str) -> int:

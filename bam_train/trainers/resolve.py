@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,6 +11,7 @@ from bam_train.errors import CheckpointMismatch, SettingsError
 from bam_train.settings import TrainSettings, check_names, differences, merge
 from bam_train.trainers import load_trainer, require_algorithm
 from bam_train.trainers.presets import read_preset
+from bam_train.values import closest
 
 CHANGEABLE = frozenset({"steps", "until_success", "eval_every", "eval_episodes", "device", "threads"})
 """Settings that a resumed run may have otherwise: when to stop, how to measure, where to compute; not what to learn."""
@@ -29,6 +31,7 @@ def resolve(given: Mapping[str, Any]) -> TrainSettings:
     env = resolve_env(given["env"])
     require_algorithm(given.get("trainer", "sb3"), given["algo"])
     settings = TrainSettings.from_mapping(merge(read_preset(env, given["algo"]), given, {"env": env}))
+    require_env_kwargs(env, settings.env_kwargs)
     return load_trainer(settings.trainer).complete(settings)
 
 
@@ -66,6 +69,26 @@ def resolve_env(name: str) -> str:
     from bam_envs.registry import resolve_id
 
     return resolve_id(name)
+
+
+def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
+    """Refuse an argument that one of our environments does not have; others are asked when they are made.
+
+    Raises:
+        SettingsError: Carries the closest match.
+    """
+    from bam_envs.registry import ENVIRONMENTS, make_env
+    from bam_envs.registry import resolve as resolve_reference
+
+    entry = ENVIRONMENTS.get(env.rpartition(":")[2])
+    if entry is None or not given:
+        return
+    own = set(inspect.signature(make_env).parameters) - {"env_id", "render_mode", "task_options"}
+    of_task = set(inspect.signature(resolve_reference(entry.task)).parameters) - {"num_rows"}
+    for name in given:
+        if name not in own | of_task | {"max_episode_steps"}:
+            known = closest(name, own | of_task | {"max_episode_steps"})
+            raise SettingsError(f"env_kwargs: unknown setting {name!r} of {env}. {known}")
 
 
 def _require_same(asked: Mapping[str, Any], own: Mapping[str, Any], checkpoint: Checkpoint) -> None:

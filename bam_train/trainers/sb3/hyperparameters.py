@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from bam_train.errors import SettingsError
 from bam_train.settings import HINTS
 from bam_train.trainers.sb3.algorithms import Algorithm
+from bam_train.trainers.sb3.ranges import check_ranges
 from bam_train.values import closest, fit, linear_start
 
 ELSEWHERE = {
@@ -79,6 +80,7 @@ def complete(algorithm: Algorithm, given: Mapping[str, Any], observation_space: 
         raise SettingsError(f"policy: unknown policy {policy!r} of {algorithm.name}. {closest(policy, policies)}")
     values["policy_kwargs"] = _checked_policy(policies[policy], values["policy_kwargs"] or {})
     _check_noise(values.get("action_noise"))
+    check_ranges(values)
     return values
 
 
@@ -101,6 +103,7 @@ def complete_normalize(given: bool | Mapping[str, Any], gamma: float) -> bool | 
     for name in given:
         _require_known(name, known, "normalize argument")
     fitted = {name: fit(f"normalize.{name}", value, known[name].annotation) for name, value in given.items()}
+    check_ranges(fitted)
     return {"gamma": gamma, **fitted}
 
 

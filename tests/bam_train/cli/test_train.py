@@ -129,6 +129,11 @@ def test_resume_needs_nothing_else(bam_train, here):
 
 ERRORS = [
     ({"env": "CartPol-v1"}, "Unknown environment 'CartPol-v1'. Did you mean 'CartPole-v1'?"),
+    (
+        {"env": "bam/pick", "set": ("env_kwargs.randomise=true",)},
+        "env_kwargs: unknown setting 'randomise' of bam/pick-v0. Did you mean 'randomize'?",
+    ),
+    ({"set": ("gamma=1.5",)}, "gamma: expected a number from 0 to 1, found 1.5"),
     ({"algo": "pop"}, "Unknown algorithm 'pop'. Did you mean 'ppo'?"),
     (
         {"algo": "sac"},
@@ -158,7 +163,10 @@ ERRORS = [
         "Choose another place with --runs",
     ),
     ({"resume": Path("no.zip")}, "no.zip: no such file. Train one with bam-train, or check the name"),
-    ({"config": Path("no.toml")}, "no.toml: cannot be read: No such file or directory"),
+    (
+        {"config": Path("no.toml")},
+        "no.toml: no such file. Check the name after --config, or make one with --print-config",
+    ),
     ({"until_success": 2.0}, "until_success: expected a share above 0 and at most 1, such as 0.99, found 2.0"),
     ({"steps": 0}, "steps: expected at least 1, found 0"),
 ]
@@ -168,6 +176,19 @@ ERRORS = [
 def test_bad_input_is_one_line_and_leaves_nothing(bam_train, here, flags, line):
     assert bam_train(**flags) == (1, "", f"bam-train: {line}\n")
     assert list(here.iterdir()) == []
+
+
+def test_a_wrong_value_in_a_file_names_the_file(bam_train, here):
+    (here / "a.toml").write_text("steps = 'many'\n")
+    line = "bam-train: a.toml: steps: expected an int, found 'many' (text)\n"
+    assert bam_train(config=Path("a.toml"), steps=None) == (1, "", line)
+
+
+def test_resume_says_from_where(bam_train):
+    bam_train()
+    last = Path("runs/CartPole-v1-ppo/last.zip")
+    _, _, err = bam_train(resume=last, steps=192)
+    assert err.splitlines()[0] == f"ppo on CartPole-v1, seed 0, going on from {last} at 128 steps"
 
 
 def test_resume_with_other_settings(bam_train):

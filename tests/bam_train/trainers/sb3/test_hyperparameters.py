@@ -126,3 +126,30 @@ def test_the_line_about_actions_names_what_fits():
         "dqn does not fit bam/pick-v0: it takes Discrete actions, found Box. "
         "Use one of: a2c, crossq, ddpg, ppo, recurrent-ppo, sac, td3, tqc, trpo."
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "line"),
+    [
+        ("ppo", {"gamma": 1.5}, "gamma: expected a number from 0 to 1, found 1.5"),
+        ("ppo", {"gae_lambda": -0.1}, "gae_lambda: expected a number from 0 to 1, found -0.1"),
+        ("sac", {"tau": 2}, "tau: expected a number from 0 to 1, found 2"),
+        ("ppo", {"learning_rate": 0}, "learning_rate: expected a number above 0, found 0"),
+        ("ppo", {"learning_rate": "lin_0"}, "learning_rate: expected a number above 0, found 'lin_0'"),
+        ("ppo", {"learning_rate": float("nan")}, "learning_rate: expected a finite number, found nan"),
+        ("ppo", {"n_steps": 0}, "n_steps: expected at least 1, found 0"),
+        ("ppo", {"batch_size": -4}, "batch_size: expected at least 1, found -4"),
+        ("ppo", {"n_epochs": 0}, "n_epochs: expected at least 1, found 0"),
+        ("td3", {"train_freq": [0, "step"]}, "train_freq: expected at least 1, found [0, 'step']"),
+        ("sac", {"learning_starts": -1}, "learning_starts: expected at least 0, found -1"),
+    ],
+)
+def test_numbers_that_cannot_be(name, given, line):
+    with pytest.raises(SettingsError) as caught:
+        complete(ALGORITHMS[name], given, NUMBERS)
+    assert str(caught.value) == line
+
+
+def test_schedules_and_auto_are_in_range():
+    values = complete(ALGORITHMS["sac"], {"learning_rate": "lin_1e-3", "ent_coef": "auto_0.1"}, NUMBERS)
+    assert (values["learning_rate"], values["ent_coef"]) == ("lin_1e-3", "auto_0.1")
