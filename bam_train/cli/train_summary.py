@@ -44,7 +44,7 @@ def _rows(outcome: Outcome, folder: RunFolder) -> list[tuple[str, str]]:
         size = outcome.checkpoint.stat().st_size / 1000
         rows.append(("checkpoint", f"{_short(outcome.checkpoint)} ({size:,.0f} kB)"))
     elif outcome.reason == "stopped":
-        rows.append(("best", "none: the run was stopped before its first evaluation"))
+        rows.append(("best", "none yet: stopped before the first evaluation; go on with --resume"))
     if outcome.last is not None:
         older = "" if outcome.last_steps == outcome.steps else f" (after {count(outcome.last_steps)} steps)"
         rows.append(("last state", f"{_short(outcome.last)}{older}"))

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3.common.logger import Logger, configure
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from bam_envs.spaces import space_to_json
@@ -31,6 +31,7 @@ from bam_train.trainers.sb3.freeze import freeze
 from bam_train.trainers.sb3.golden import golden
 from bam_train.trainers.sb3.model import library_notices, make_model, meaning, one_env, refusals, sb3_members
 from bam_train.trainers.sb3.state import all_finite, undisturbed
+from bam_train.trainers.sb3.tensorboard import ForgivingTensorBoard
 from bam_train.trainers.sb3.vec_env import make_training_env
 from bam_train.trainers.trainer import OnProgress, Progress, Statistics
 
@@ -92,7 +93,7 @@ class SB3Trainer:
 
     def log_to(self, folder: Path) -> None:
         """Write TensorBoard files into a folder from now on."""
-        self.model.set_logger(configure(str(folder), ["tensorboard"]))
+        self.model.set_logger(Logger(str(folder), [ForgivingTensorBoard(folder)]))
 
     @property
     def steps(self) -> int:

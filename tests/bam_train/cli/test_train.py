@@ -295,6 +295,33 @@ def test_two_signals_while_saving_quit_at_once_too(here, pause):
     assert not list((here / "runs" / "CartPole-v1-ppo").glob(".*"))
 
 
+def test_stopped_before_the_first_evaluation(here):
+    process = started(here, "--steps", "10000000")
+    wait_for(process, "steps/s")
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    lines = [" ".join(line.split()) for line in err.splitlines()]
+    assert "best none yet: stopped before the first evaluation; go on with --resume" in lines
+    assert lines[-1] == "bam-train --resume runs/CartPole-v1-ppo/last.zip"
+    assert not (here / "checkpoints").exists()
+
+
+def test_a_run_folder_that_fills_up(here):
+    """A limit on the size of files stands in for a full disk."""
+    import resource
+
+    process = started(here, "--steps", "4096", "--eval-every", "1024", "--eval-episodes", "1")
+    wait_for(process, "evaluation at 1024 steps")
+    _, hard = resource.prlimit(process.pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (1, hard))
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "Traceback" not in err
+    assert any("all steps done at 4096 steps" in line for line in err.splitlines())
+    assert err.splitlines()[-1].startswith("bam-train: ")
+    assert "cannot be written: File too large" in err.splitlines()[-1]
+
+
 def test_nobody_need_read(here):
     process = started(here, "--steps", "2048", "--eval-every", "256", "--eval-episodes", "1")
     wait_for(process, "ppo on CartPole-v1, seed 0")
