@@ -155,8 +155,9 @@ def _terminable() -> Iterator[None]:
     def stop(number: int, _: FrameType | None) -> None:
         raise Terminated(number)
 
-    names = [name for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]  # Windows has no SIGHUP
-    before = [(getattr(signal, name), signal.signal(getattr(signal, name), stop)) for name in names]
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]  # not on Windows
+    heard = [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]  # nohup ignores SIGHUP
+    before = [(number, signal.signal(number, stop)) for number in heard]
     try:
         yield
     finally:

@@ -39,12 +39,13 @@ def summarise(settings: TrainSettings, outcome: Outcome, folder: RunFolder, seco
 
 def _rows(outcome: Outcome, folder: RunFolder) -> list[tuple[str, str]]:
     rows = []
-    if outcome.checkpoint is not None and outcome.best is not None and outcome.checkpoint.exists():
-        rows.append(("best", _score_text(outcome)))
+    if outcome.best is None and outcome.reason == "stopped":
+        rows.append(("best", "none yet: stopped before the first evaluation; the checkpoint is the newest state"))
+    if outcome.checkpoint is not None and outcome.checkpoint.exists():
+        if outcome.best is not None:
+            rows.append(("best", _score_text(outcome)))
         size = outcome.checkpoint.stat().st_size / 1000
         rows.append(("checkpoint", f"{_short(outcome.checkpoint)} ({size:,.0f} kB)"))
-    elif outcome.reason == "stopped":
-        rows.append(("best", "none yet: stopped before the first evaluation; go on with --resume"))
     if outcome.last is not None:
         older = "" if outcome.last_steps == outcome.steps else f" (after {count(outcome.last_steps)} steps)"
         rows.append(("last state", f"{_short(outcome.last)}{older}"))

@@ -23,6 +23,9 @@ from bam_train.trainers.trainer import Progress, Statistics, Trainer
 SAVE_EVERY = 30.0
 """Seconds between two saves at least, unless an evaluation comes first."""
 
+FIRST_SAVE = 2.0
+"""Seconds until the first save: a run that is killed early has something to go on from."""
+
 SAVE_SHARE = 0.02
 """Share of the time that saving may take: a large replay buffer is saved less often."""
 
@@ -112,7 +115,7 @@ class TrainingRun:
         self._clock = clock
         self._start = self._recorded = self._saved = clock()
         self._first_step = trainer.steps
-        self._save_pause = SAVE_EVERY
+        self._save_pause = FIRST_SAVE
         self.done = False
         self._stop = self._reached = False
         self._evaluated_at = trainer.steps if best else 0
@@ -145,6 +148,8 @@ class TrainingRun:
             kept = f"the last good checkpoint is {self.last}" if self.last else "no checkpoint had been saved yet"
             raise TrainingFailed(f"{error}; {kept}") from error
         self._save_last()
+        if self._stop and self._kept is None and not self.out.exists():
+            self._kept = self.out if self._write(self.out, None, "--out") else None  # the newest: none was evaluated
         self.done = True
         return self._outcome()
 

@@ -10,7 +10,7 @@ from typing import Any
 from stable_baselines3.common.logger import KVWriter, TensorBoardOutputFormat
 
 
-class ForgivingTensorBoard(KVWriter):
+class ForgivingTensorBoard(KVWriter):  # type: ignore[misc]
     """Writes event files into a folder until it cannot.
 
     Args:

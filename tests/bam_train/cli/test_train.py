@@ -301,9 +301,11 @@ def test_stopped_before_the_first_evaluation(here):
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     lines = [" ".join(line.split()) for line in err.splitlines()]
-    assert "best none yet: stopped before the first evaluation; go on with --resume" in lines
+    assert "best none yet: stopped before the first evaluation; the checkpoint is the newest state" in lines
     assert lines[-1] == "bam-train --resume runs/CartPole-v1-ppo/last.zip"
-    assert not (here / "checkpoints").exists()
+    newest = Checkpoint.open(here / "checkpoints" / "CartPole-v1-ppo.zip").manifest
+    assert newest.steps == Checkpoint.open(here / "runs" / "CartPole-v1-ppo" / "last.zip").manifest.steps
+    assert newest.scores == {}
 
 
 def test_a_run_folder_that_fills_up(here):

@@ -58,7 +58,7 @@ def test_names_are_completed_and_unknown_ones_refused():
         SettingsError, match=r"^sac does not fit CartPole-v1: it takes Box actions, found Discrete\. Use one of: "
     ):
         resolve({"env": "CartPole-v1", "algo": "sac"})
-    with pytest.raises(InvalidValue, match=r"needs the module 'no_such_module', which is not installed"):
+    with pytest.raises(InvalidValue, match=r"needs the module 'no_such_module', which is neither installed"):
         resolve({"env": "no_such_module:A-v0", "algo": "ppo"})
     with pytest.raises(SettingsError, match=r"^algo: expected a name, found nothing\. Give --algo NAME$"):
         resolve({"env": "CartPole-v1"})

@@ -216,13 +216,13 @@ def test_asked_to_stop_it_saves_and_ends_without_an_evaluation(start, monkeypatc
 def test_it_saves_every_half_minute_without_evaluations(start):
     run, trainer, _ = start({1000: report(0.5)}, Clock(), steps=1000, eval_every=1000)
     run.run()
-    assert [row[1] for row in trainer.saved if row[0] == "last.zip"] == [310, 620, 930, 1000, 1000]
+    assert [row[1] for row in trainer.saved if row[0] == "last.zip"] == [30, 340, 650, 960, 1000, 1000]
 
 
 def test_slow_saving_is_done_less_often(start):
     run, trainer, _ = start({2000: report(0.5)}, Clock(save_takes=2.0), steps=2000, eval_every=2000)
     run.run()
-    assert [row[1] for row in trainer.saved if row[0] == "last.zip"] == [310, 1320, 2000, 2000]
+    assert [row[1] for row in trainer.saved if row[0] == "last.zip"] == [30, 1040, 2000, 2000]
 
 
 def test_a_nan_names_the_last_good_checkpoint(start, tmp_path):
