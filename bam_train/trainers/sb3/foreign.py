@@ -32,8 +32,11 @@ def is_plain_sb3(path: Path) -> bool:
     """Whether the file is a zip as stable-baselines3 writes it, without our manifest; opens nothing in it."""
     if not path.is_file() or not zipfile.is_zipfile(path):
         return False
-    with zipfile.ZipFile(path) as archive:
-        names = set(archive.namelist())
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = set(archive.namelist())
+    except (zipfile.BadZipFile, NotImplementedError, ValueError, OSError):
+        return False  # damaged; `Checkpoint.open` says how
     return "data" in names and MANIFEST not in names
 
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import torch
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from bam_train.environments import control_period
@@ -17,7 +18,7 @@ from bam_train.errors import SettingsError
 from bam_train.settings import TrainSettings
 from bam_train.trainers.sb3 import hyperparameters
 from bam_train.trainers.sb3.algorithms import ALGORITHMS
-from bam_train.trainers.sb3.vec_env import RowsVecEnv
+from bam_train.trainers.sb3.vec_env import FromZero, RowsVecEnv
 
 
 def make_model(settings: TrainSettings, venv: VecEnv) -> Any:
@@ -72,7 +73,12 @@ def library_notices() -> Iterator[list[str]]:
 
 def one_env(venv: VecEnv) -> Any:
     """What stands behind `venv`: our vector environment, or the first of the others."""
-    return venv.rows if isinstance(venv, RowsVecEnv) else venv.envs[0]
+    if isinstance(venv, RowsVecEnv):
+        return venv.rows
+    env = venv.envs[0]
+    while isinstance(env, (Monitor, FromZero)):
+        env = env.env
+    return env
 
 
 def meaning(venv: VecEnv) -> tuple[dict[str, Any], float | None]:

@@ -56,6 +56,12 @@ def all_finite(model: Any) -> bool:
     return all(bool(torch.isfinite(parameter).all()) for parameter in model.policy.parameters())
 
 
+def refused_distribution(error: Exception) -> bool:
+    """Whether torch refused a distribution: weights that are finite can still overflow on their way to it."""
+    text = str(error)
+    return "Expected parameter" in text or "expects all elements of std" in text or "probability tensor" in text
+
+
 def counters(model: Any) -> Tree:
     """How far the run is, what it saw last, and the last episodes' returns."""
     tree: Tree = {name: getattr(model, name) for name in COUNTERS if hasattr(model, name)}

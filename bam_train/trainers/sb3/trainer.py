@@ -30,9 +30,9 @@ from bam_train.trainers.sb3.algorithms import ALGORITHMS
 from bam_train.trainers.sb3.freeze import freeze
 from bam_train.trainers.sb3.golden import golden
 from bam_train.trainers.sb3.model import library_notices, make_model, meaning, one_env, refusals, sb3_members
-from bam_train.trainers.sb3.state import all_finite, undisturbed
+from bam_train.trainers.sb3.state import all_finite, refused_distribution, undisturbed
 from bam_train.trainers.sb3.tensorboard import ForgivingTensorBoard
-from bam_train.trainers.sb3.vec_env import make_training_env
+from bam_train.trainers.sb3.vec_env import RowsVecEnv, make_training_env
 from bam_train.trainers.trainer import OnProgress, Progress, Statistics
 
 _FINITE = "expected finite numbers: try a smaller learning_rate"
@@ -113,7 +113,7 @@ class SB3Trainer:
         except _Stop:
             return
         except (ValueError, RuntimeError) as error:  # torch refuses a distribution of NaN in the middle of an update
-            if all_finite(self.model):
+            if all_finite(self.model) and not refused_distribution(error):
                 raise
             raise TrainingFailed(
                 f"the policy's weights are NaN or infinite after step {self.steps}; {_FINITE}"
@@ -171,7 +171,7 @@ class SB3Trainer:
             members = {
                 **sb3_members(self.model),
                 "bam/policy.onnx": freeze(self.model, self._normaliser, *spaces),
-                "bam/golden.safetensors": golden(self.model, self._normaliser, spaces[0]),
+                "bam/golden.safetensors": golden(self.model, self._normaliser, spaces[0], action_space=spaces[1]),
             }
         members |= resume.members(self.model, self.venv, self._normaliser, self._waiting, notes)
         return write_checkpoint(path, self._manifest(scores), members)
@@ -198,7 +198,10 @@ class SB3Trainer:
 
     def _spaces(self) -> tuple[Any, Any]:
         """The environment's own, before normalisation and image transposition."""
-        return self.venv.observation_space, self.venv.action_space
+        if isinstance(self.venv, RowsVecEnv):
+            return self.venv.observation_space, self.venv.action_space
+        env = one_env(self.venv)
+        return env.observation_space, env.action_space
 
     def freeze(self) -> FrozenPolicy:
         """The policy as it is now."""

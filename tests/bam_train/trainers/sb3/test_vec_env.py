@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from bam_train.errors import SettingsError
-from bam_train.trainers.sb3.vec_env import RowsVecEnv, can_restore, make_training_env
+from bam_train.trainers.sb3.vec_env import RowsVecEnv, make_training_env
 
 
 def right(venv):
@@ -129,7 +129,6 @@ def test_one_value_for_all_rows(rows):
 def test_other_environments_take_turns(corridor):
     venv = make_training_env(corridor, {}, 2)
     assert isinstance(venv, DummyVecEnv)
-    assert not can_restore(venv)
     venv.reset()
     done = [venv.step([1, 1]) for _ in range(3)][-1]
     assert done[3][0]["is_success"] in (True, False)

@@ -1,0 +1,66 @@
+"""Spaces that count from another number than 0, as stable-baselines3 takes them: it ignores ``start``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+_Counted = (spaces.Discrete, spaces.MultiDiscrete)
+
+
+def from_zero(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+    """The environment with every Discrete and MultiDiscrete counted from 0; itself if they all are already."""
+    shifted = _shifted(env.action_space) or _shifted(env.observation_space)
+    return FromZero(env) if shifted else env
+
+
+class FromZero(gym.Wrapper[Any, Any, Any, Any]):
+    """Gives observations less their space's ``start``, and takes actions less theirs; leaves of a Dict too."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.observation_space = _from_zero(env.observation_space)
+        self.action_space = _from_zero(env.action_space)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        return less_start(self.env.observation_space, observation), info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Take an action that is counted from 0."""
+        observation, *rest = self.env.step(plus_start(self.env.action_space, action))
+        return less_start(self.env.observation_space, observation), *rest  # type: ignore[return-value]
+
+
+def plus_start(space: spaces.Space[Any], value: Any) -> Any:
+    """A value counted from 0 as the space has it, in the space's dtype; other kinds as they are."""
+    if not isinstance(space, _Counted):
+        return value
+    return np.asarray(np.asarray(value) + space.start).astype(space.dtype)[()]
+
+
+def less_start(space: spaces.Space[Any], value: Any) -> Any:
+    """A value of the space, or a batch of them, counted from 0; other kinds as they are."""
+    if isinstance(space, spaces.Dict):
+        return {key: less_start(space.spaces[key], one) for key, one in value.items()}
+    return value - space.start if isinstance(space, _Counted) else value
+
+
+def _shifted(space: spaces.Space[Any]) -> bool:
+    if isinstance(space, spaces.Dict):
+        return any(_shifted(leaf) for leaf in space.spaces.values())
+    return isinstance(space, _Counted) and bool(np.any(space.start))
+
+
+def _from_zero(space: spaces.Space[Any]) -> spaces.Space[Any]:
+    if isinstance(space, spaces.Dict):
+        return spaces.Dict({key: _from_zero(leaf) for key, leaf in space.spaces.items()})
+    if isinstance(space, spaces.Discrete):
+        return spaces.Discrete(int(space.n), dtype=space.dtype)
+    if isinstance(space, spaces.MultiDiscrete):
+        return spaces.MultiDiscrete(space.nvec, dtype=space.dtype)
+    return space

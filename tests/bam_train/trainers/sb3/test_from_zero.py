@@ -1,0 +1,57 @@
+"""Choices that do not count from 0: stable-baselines3 does, the environment and the frozen policy do not."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from bam_train.evaluation import evaluate
+from bam_train.policy import FrozenPolicy
+from bam_train.settings import TrainSettings
+from bam_train.trainers.sb3.trainer import SB3Trainer
+
+ID = "test/Shifted-v0"
+
+
+class Shifted(gym.Env):
+    """Rewards the action that is one less than the observation; both count from 2."""
+
+    observation_space = spaces.Discrete(3, start=3)
+    action_space = spaces.Discrete(3, start=2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps, self.seen = 0, int(self.np_random.integers(3)) + 3
+        return np.int64(self.seen), {}
+
+    def step(self, action):
+        if not self.action_space.contains(action):
+            raise AssertionError(f"{action!r} is not in {self.action_space}")
+        reward = float(int(action) == self.seen - 1)
+        self.steps, self.seen = self.steps + 1, int(self.np_random.integers(3)) + 3
+        return np.int64(self.seen), reward, False, self.steps >= 10, {}
+
+
+@pytest.fixture
+def shifted():
+    gym.register(ID, entry_point=Shifted)
+    yield ID
+    del gym.registry[ID]
+
+
+@pytest.mark.parametrize(
+    ("algo", "hyperparameters"),
+    [
+        ("ppo", {"n_steps": 128, "batch_size": 64, "learning_rate": 0.01}),
+        ("dqn", {"learning_starts": 50, "learning_rate": 0.01, "train_freq": 1, "buffer_size": 1000}),
+    ],
+)
+def test_what_is_trained_is_what_is_deployed(shifted, tmp_path, algo, hyperparameters):
+    given = {"env": shifted, "algo": algo, "steps": 1500, "hyperparameters": hyperparameters}
+    trainer = SB3Trainer.create(SB3Trainer.complete(TrainSettings.from_mapping(given)))
+    trainer.train(1500, lambda progress: True)
+    trainer.save(tmp_path / "shifted.zip", {}, {})
+    trainer.close()
+    policy = FrozenPolicy.load(tmp_path / "shifted.zip")
+    assert [int(policy.act(np.int64(seen))) for seen in (3, 4, 5)] == [2, 3, 4]
+    assert evaluate(policy, shifted, episodes=5).return_mean == 10.0
