@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
+import textwrap
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,13 +13,16 @@ from typing import Any
 
 from bam_envs.spaces import space_to_json
 from bam_train.checkpoint.manifest import MANIFEST
+from bam_train.checkpoint.zip_members import open_zip
 from bam_train.environments import make_env
-from bam_train.errors import CheckpointMismatch
+from bam_train.errors import CheckpointMismatch, NotACheckpoint
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.sb3.algorithms import ALGORITHMS
+from bam_train.trainers.sb3.from_zero import from_zero
 
-# What SB3's load lets out for a file of another algorithm or another version.
+# What SB3's load lets out for a file of another algorithm or another version, then what it does for a damaged one.
 _MISFIT = (ValueError, TypeError, KeyError, AttributeError, RuntimeError, AssertionError, ImportError)
+_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, pickle.UnpicklingError)
 
 
 @dataclass(frozen=True)
@@ -30,13 +36,11 @@ class ForeignModel:
 
 def is_plain_sb3(path: Path) -> bool:
     """Whether the file is a zip as stable-baselines3 writes it, without our manifest; opens nothing in it."""
-    if not path.is_file() or not zipfile.is_zipfile(path):
-        return False
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_zip(path) as archive:
             names = set(archive.namelist())
-    except (zipfile.BadZipFile, NotImplementedError, ValueError, OSError):
-        return False  # damaged; `Checkpoint.open` says how
+    except NotACheckpoint:
+        return False  # missing or damaged; `Checkpoint.open` says how
     return "data" in names and MANIFEST not in names
 
 
@@ -59,13 +63,17 @@ def load_trusted(path: Path, algo: str, env_id: str, env_kwargs: Mapping[str, An
     algorithm = ALGORITHMS[algo].load()
     env = make_env(env_id, env_kwargs)
     try:
-        model = algorithm.load(path, env=env, device="cpu")
+        model = algorithm.load(path, env=from_zero(env), device="cpu")
         graph = freeze(model, None, env.observation_space, env.action_space)
-    except _MISFIT as error:
-        reason = " ".join(str(error).split())[:200]
-        raise CheckpointMismatch(
-            path, f"{algorithm.__name__}.load cannot use it with {env_id}: {reason}. Check --algo and --env"
-        ) from error
+    except (*_MISFIT, *_DAMAGE) as error:
+        text = f"{algorithm.__name__}.load cannot use it with {env_id}: {_sentence(error)} Check --algo and --env"
+        raise CheckpointMismatch(path, text) from error
     policy = FrozenPolicy.from_graph(graph, space_to_json(env.observation_space), space_to_json(env.action_space))
     env.close()  # type: ignore[no-untyped-call]
     return ForeignModel(policy, int(model.num_timesteps))
+
+
+def _sentence(error: Exception, most: int = 160) -> str:
+    """What an error says, as one line; what is too long ends at a word and with dots."""
+    text = textwrap.shorten(str(error) or type(error).__name__, most, placeholder=" ...")
+    return text if text.endswith("...") else f"{text.rstrip('.')}."

@@ -8,7 +8,7 @@ from stable_baselines3 import PPO
 from bam_train.cli.eval import main
 from bam_train.environments import make_env
 from bam_train.errors import CheckpointMismatch
-from bam_train.trainers.sb3.foreign import is_plain_sb3, load_trusted
+from bam_train.trainers.sb3.foreign import _sentence, is_plain_sb3, load_trusted
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +34,52 @@ def test_plain_files_are_recognised(plain, corridor_checkpoint, tmp_path):
     assert not is_plain_sb3(tmp_path / "no.zip")
     (tmp_path / "text.zip").write_text("no zip")
     assert not is_plain_sb3(tmp_path / "text.zip")
+
+
+def damaged(path, offset, data):
+    """The same file with other bytes in the last entry of its central directory."""
+    whole = bytearray(path.read_bytes())
+    start = whole.rindex(b"PK\x01\x02")
+    whole[start + offset : start + offset + len(data)] = data
+    return bytes(whole)
+
+
+@pytest.mark.parametrize(
+    ("offset", "data", "reason"),
+    [
+        (0, b"XX", "Bad magic number for central directory"),
+        (6, b"\xff\x00", "zip file version 25.5"),
+        (28, b"\x05\x00\x0a\x00", "Corrupt extra field"),  # ten letters of the name become an extra field
+    ],
+)
+def test_a_damaged_directory_is_one_line(plain, tmp_path, capsys, offset, data, reason):
+    path = tmp_path / "damaged.zip"
+    path.write_bytes(damaged(plain[1], offset, data))
+    assert not is_plain_sb3(path)
+    status, out, err = run(capsys, path, "--trust-pickle", "--env", "CartPole-v1", "--algo", "ppo")
+    assert (status, out) == (1, "")
+    assert err.startswith(f"bam-eval: {path}: not a whole zip file ({reason}")
+    assert err.count("\n") == 1
+
+
+def test_a_damaged_member_is_one_line(plain, tmp_path):
+    path = tmp_path / "damaged.zip"
+    whole = bytearray(plain[1].read_bytes())
+    middle = whole.index(b"policy.pth") + 2000
+    whole[middle : middle + 50] = bytes(50)
+    path.write_bytes(bytes(whole))
+    with pytest.raises(
+        CheckpointMismatch, match=r"PPO\.load cannot use it with CartPole-v1: .*Check --algo and --env$"
+    ):
+        load_trusted(path, "ppo", "CartPole-v1")
+
+
+def test_a_long_reason_ends_at_a_word():
+    text = _sentence(ValueError("spaces\n do not match: " + "-0.125 " * 100))
+    assert text.endswith(" -0.125 ...")
+    assert len(text) <= 160
+    assert _sentence(ValueError("short.")) == "short."
+    assert _sentence(EOFError()) == "EOFError."
 
 
 def test_the_frozen_policy_acts_as_the_model(plain):
