@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from bam_train.errors import PolicyError
-from bam_train.trainers.sb3.frozen_layers import Layer, encoder, head, network, torch_dtype
+from bam_train.trainers.sb3.frozen_layers import Layer, encoder, head, leaves, network, torch_dtype
 
 __all__ = ["FrozenModule", "freeze"]
 
@@ -81,8 +81,8 @@ class FrozenModule(Layer):
     ) -> None:
         super().__init__()
         policy = model.policy
-        self.raw = _leaves(observation_space)
-        seen = _leaves(policy.observation_space)
+        self.raw = leaves(observation_space)
+        seen = leaves(policy.observation_space)
         if set(seen) != set(self.raw):
             raise PolicyError(f"observation: the policy takes {sorted(seen)}, the environment gives {sorted(self.raw)}")
         owner, extractor, layers, self.lstm = network(policy)
@@ -122,10 +122,6 @@ class FrozenModule(Layer):
     def _features(self, observation: Any) -> torch.Tensor:
         encoded = [encoder(tensor) for encoder, tensor in zip(self.encoders, observation, strict=True)]
         return self.extractor(dict(zip(self.raw, encoded, strict=True)) if self.is_dict else encoded[0])
-
-
-def _leaves(space: Any) -> dict[str, Any]:
-    return dict(space.spaces) if isinstance(space, spaces.Dict) else {"": space}
 
 
 def _statistics(normaliser: VecNormalize | None, key: str) -> Any:

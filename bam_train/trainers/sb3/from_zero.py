@@ -18,7 +18,7 @@ def from_zero(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
 
 
 class FromZero(gym.Wrapper[Any, Any, Any, Any]):
-    """Gives observations less their space's ``start``, and takes actions less theirs; leaves of a Dict too."""
+    """Gives observations less their space's ``start``, and takes actions less its ``start``; leaves of a Dict too."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
@@ -33,7 +33,7 @@ class FromZero(gym.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Take an action that is counted from 0."""
         observation, *rest = self.env.step(plus_start(self.env.action_space, action))
-        return less_start(self.env.observation_space, observation), *rest  # type: ignore[return-value]
+        return less_start(self.env.observation_space, observation), *rest
 
 
 def plus_start(space: spaces.Space[Any], value: Any) -> Any:
@@ -60,7 +60,12 @@ def _from_zero(space: spaces.Space[Any]) -> spaces.Space[Any]:
     if isinstance(space, spaces.Dict):
         return spaces.Dict({key: _from_zero(leaf) for key, leaf in space.spaces.items()})
     if isinstance(space, spaces.Discrete):
-        return spaces.Discrete(int(space.n), dtype=space.dtype)
+        return spaces.Discrete(int(space.n), dtype=_integer(space))
     if isinstance(space, spaces.MultiDiscrete):
-        return spaces.MultiDiscrete(space.nvec, dtype=space.dtype)
+        return spaces.MultiDiscrete(space.nvec, dtype=_integer(space))
     return space
+
+
+def _integer(space: Any) -> type[np.integer[Any]]:
+    dtype: type[np.integer[Any]] = np.dtype(space.dtype).type
+    return dtype

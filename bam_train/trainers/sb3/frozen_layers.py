@@ -25,19 +25,24 @@ class Layer(nn.Module):  # type: ignore[misc]
 # Observation
 
 
+def leaves(space: spaces.Space[Any]) -> dict[str, Any]:
+    """The spaces in a Dict by key; any other space just by ``""``."""
+    return dict(space.spaces) if isinstance(space, spaces.Dict) else {"": space}
+
+
 class _Numbers(Layer):
-    """A Box or MultiBinary: normalise in float64 as VecNormalize does, channels first, pixels to [0, 1], float32."""
+    """A Box or MultiBinary: channels first, normalise in float64 as VecNormalize does, pixels to [0, 1], float32."""
 
     def __init__(self, statistics: Any, channels_last: bool, pixels: bool) -> None:
         super().__init__()
         self.statistics, self.channels_last, self.pixels = statistics, channels_last, pixels
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
+        if self.channels_last:
+            x = x.permute(0, 3, 1, 2)
         if self.statistics is not None:
             mean, deviation, limit = self.statistics
             x = ((_to(x, torch.float64) - mean) / deviation).clamp(-limit, limit)
-        if self.channels_last:
-            x = x.permute(0, 3, 1, 2)
         x = _to(x, torch.float32)
         return x / 255.0 if self.pixels else x
 
@@ -242,7 +247,7 @@ def head(space: spaces.Space[Any], policy: BasePolicy) -> nn.Module:
 
 
 def _has_tanh(policy: BasePolicy) -> bool:
-    """Whether a tanh follows the last layer that `_network` returns; TD3 and DDPG have theirs among the layers."""
+    """Whether a tanh follows the last layer that `network` returns; TD3 and DDPG have theirs among the layers."""
     if isinstance(policy, ActorCriticPolicy):
         distribution = policy.action_dist
         return isinstance(distribution, StateDependentNoiseDistribution) and distribution.bijector is not None

@@ -11,10 +11,13 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecNormalize, VecTransposeImage, unwrap_vec_wrapper
 from torch import nn
 
 from bam_train.checkpoint import safetensors_file
+from bam_train.trainers.sb3.freeze import FrozenModule
+from bam_train.trainers.sb3.from_zero import less_start, plus_start
+from bam_train.trainers.sb3.frozen_layers import leaves
 
 _BUDGET = 200_000  # bytes of observations; images are random and do not pack
 _FAR = 1e6  # a bound beyond this says nothing about the values that occur
@@ -24,10 +27,9 @@ def golden(
     model: BaseAlgorithm,
     normaliser: VecNormalize | None,
     observation_space: spaces.Space[Any],
+    action_space: spaces.Space[Any],
     n: int = 256,
     seed: int = 0,
-    *,
-    action_space: spaces.Space[Any] | None = None,
 ) -> bytes:
     """Draw observations and record ``model.predict(..., deterministic=True)``.
 
@@ -35,14 +37,13 @@ def golden(
         model: The trained model; left as it was, and no random number of torch, NumPy or SB3 is drawn.
         normaliser: What its observations were normalised with, if anything.
         observation_space: The environment's own.
+        action_space: The environment's own; its ``start`` is added to what SB3 counts from 0.
         n: Rows; fewer if they are large. Of a recurrent policy: steps of one episode.
         seed: Of the observations.
-        action_space: The environment's own; the model's if it is the same.
 
     Returns:
         A safetensors file with ``observation`` (or ``observation.<key>``), (n, ...), and ``action``, (n, ...).
     """
-    action_space = model.action_space if action_space is None else action_space
     recurrent = hasattr(model.policy, "lstm_actor")
     n = min(n, max(4, _BUDGET // _size(observation_space)))
     rng = np.random.default_rng(seed)
@@ -62,7 +63,7 @@ def draw(
 
     Normalised numbers are drawn about their running mean, so that few of them end at the normaliser's limits.
     """
-    return {key: _draw(leaf, n, rng, _moments(normaliser, key)) for key, leaf in _leaves(space).items()}
+    return {key: _draw(leaf, n, rng, _moments(normaliser, key)) for key, leaf in leaves(space).items()}
 
 
 def trainer_actions(
@@ -73,20 +74,20 @@ def trainer_actions(
     observations: dict[str, np.ndarray],
 ) -> np.ndarray:
     """Return the trainer's own actions for raw observations, in the environment's action space."""
-    leaves = _leaves(observation_space)
-    seen: Any = {key: _from_zero(leaves[key], value) for key, value in observations.items()}
-    if not isinstance(observation_space, spaces.Dict):
-        seen = seen[""]
+    seen = less_start(
+        observation_space, observations if isinstance(observation_space, spaces.Dict) else observations[""]
+    )
     if normaliser is not None:
-        seen = normaliser.normalize_obs(seen)
+        transpose = unwrap_vec_wrapper(normaliser, VecTransposeImage)
+        seen = normaliser.normalize_obs(seen if transpose is None else transpose.transpose_observations(seen))
     with _evaluating(model.policy):
         if hasattr(model.policy, "lstm_actor"):
             actions = _episode(model, seen)
         else:
             actions = model.predict(seen, deterministic=True)[0]
-    if isinstance(action_space, (spaces.Discrete, spaces.MultiDiscrete)):
-        return np.asarray(actions + action_space.start).astype(action_space.dtype)
-    return actions.astype(np.int8) if isinstance(action_space, spaces.MultiBinary) else actions
+    if isinstance(action_space, spaces.MultiBinary):
+        return actions.astype(np.int8)
+    return np.asarray(plus_start(action_space, actions))
 
 
 def _episode(model: BaseAlgorithm, observations: Any) -> np.ndarray:
@@ -113,8 +114,6 @@ def _clearest(
     n: int,
 ) -> np.ndarray:
     """Return the n rows whose choice is clearest: where two choices tie, rounding decides, and that proves nothing."""
-    from bam_train.trainers.sb3.freeze import FrozenModule
-
     module = FrozenModule(model, normaliser, observation_space, action_space)
     with torch.no_grad():
         margin = module.head.margin(module.scores(*map(torch.as_tensor, observations.values()))).numpy()
@@ -132,17 +131,9 @@ def _evaluating(policy: nn.Module) -> Iterator[None]:
             module.training = training
 
 
-def _leaves(space: Any) -> dict[str, Any]:
-    return dict(space.spaces) if isinstance(space, spaces.Dict) else {"": space}
-
-
 def _size(space: spaces.Space[Any]) -> int:
     """Return the bytes of one observation."""
-    return sum(math.prod(leaf.shape) * np.dtype(leaf.dtype).itemsize for leaf in _leaves(space).values()) or 1
-
-
-def _from_zero(space: spaces.Space[Any], values: np.ndarray) -> np.ndarray:
-    return values - space.start if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)) else values
+    return sum(math.prod(leaf.shape) * np.dtype(leaf.dtype).itemsize for leaf in leaves(space).values()) or 1
 
 
 def _moments(normaliser: VecNormalize | None, key: str) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import io
 import warnings
 import zipfile
@@ -11,26 +12,40 @@ from typing import Any
 
 import torch
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
 
 from bam_train.environments import control_period
 from bam_train.errors import SettingsError
 from bam_train.settings import TrainSettings
 from bam_train.trainers.sb3 import hyperparameters
 from bam_train.trainers.sb3.algorithms import ALGORITHMS
-from bam_train.trainers.sb3.vec_env import FromZero, RowsVecEnv
+from bam_train.trainers.sb3.from_zero import FromZero
+from bam_train.trainers.sb3.frozen_layers import leaves
+from bam_train.trainers.sb3.vec_env import RowsVecEnv
 
 
 def make_model(settings: TrainSettings, venv: VecEnv) -> Any:
     """The algorithm's model; its constructor seeds everything and initialises the weights."""
-    env: VecEnv = venv
-    if settings.normalize:
-        arguments = settings.normalize if isinstance(settings.normalize, dict) else {}
-        env = VecNormalize(venv, **arguments)
+    env = _normalised(venv, settings.normalize) if settings.normalize else venv
     arguments = hyperparameters.build(settings.hyperparameters, venv.action_space)
     policy = arguments.pop("policy")
     device = _device(settings.device, policy)
     return ALGORITHMS[settings.algo].load()(policy, env, seed=settings.seed, device=device, verbose=0, **arguments)
+
+
+def _normalised(venv: VecEnv, given: bool | dict[str, Any]) -> VecNormalize:
+    """The normaliser over `venv`, and below it what brings an image's channels to the front, if one stays an image.
+
+    Above it, where stable-baselines3 would put that, the replay buffer is given the images of below: channels last.
+    """
+    arguments = given if isinstance(given, dict) else {}
+    venv.observation_space = copy.deepcopy(venv.observation_space)  # VecNormalize writes into a Dict
+    env = VecNormalize(venv, **arguments)
+    seen = leaves(env.observation_space).values()
+    if any(is_image_space(leaf) and not is_image_space_channels_first(leaf) for leaf in seen):
+        return VecNormalize(VecTransposeImage(venv), **arguments)
+    return env
 
 
 def _device(name: str, policy: str) -> str:

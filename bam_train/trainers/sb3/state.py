@@ -52,8 +52,10 @@ def load_weights(model: Any, tree: Mapping[str, Any]) -> None:
 
 
 def all_finite(model: Any) -> bool:
-    """Whether every parameter of the policy is a finite number."""
-    return all(bool(torch.isfinite(parameter).all()) for parameter in model.policy.parameters())
+    """Whether every parameter of the policy is a finite number, and the standard deviation of its actions too."""
+    log_std = getattr(model.policy, "log_std", None)
+    numbers = [*model.policy.parameters(), *([] if log_std is None else [log_std.exp()])]
+    return all(bool(torch.isfinite(one).all()) for one in numbers)
 
 
 def refused_distribution(error: Exception) -> bool:

@@ -105,18 +105,22 @@ class SB3Trainer:
         if steps <= self.steps:
             return
         self._on_progress, self._total, self._reported = on_progress, steps, self.steps
-        try:
+        with contextlib.suppress(_Stop), self._finite_distributions():
             # reset_num_timesteps=False: the total is what is left, and a restored episode goes on.
             with np.errstate(over="ignore", invalid="ignore"):  # NaN is looked for, and said once
                 self.model.learn(steps - self.steps, log_interval=self._log_interval(), reset_num_timesteps=False)
             self._between()
-        except _Stop:
-            return
-        except (ValueError, RuntimeError) as error:  # torch refuses a distribution of NaN in the middle of an update
+
+    @contextlib.contextmanager
+    def _finite_distributions(self) -> Iterator[None]:
+        """Torch refuses a distribution of NaN, in the middle of an update too: as our own error."""
+        try:
+            yield
+        except (ValueError, RuntimeError) as error:
             if all_finite(self.model) and not refused_distribution(error):
                 raise
             raise TrainingFailed(
-                f"the policy's weights are NaN or infinite after step {self.steps}; {_FINITE}"
+                f"the policy's weights or actions are NaN or infinite after step {self.steps}; {_FINITE}"
             ) from error
 
     def _log_interval(self) -> int:
@@ -167,11 +171,11 @@ class SB3Trainer:
         """Write a checkpoint that can be resumed and deployed."""
         self._require_finite_weights()
         spaces = self._spaces()
-        with undisturbed(self.model):
+        with undisturbed(self.model), self._finite_distributions():
             members = {
                 **sb3_members(self.model),
                 "bam/policy.onnx": freeze(self.model, self._normaliser, *spaces),
-                "bam/golden.safetensors": golden(self.model, self._normaliser, spaces[0], action_space=spaces[1]),
+                "bam/golden.safetensors": golden(self.model, self._normaliser, *spaces),
             }
         members |= resume.members(self.model, self.venv, self._normaliser, self._waiting, notes)
         return write_checkpoint(path, self._manifest(scores), members)
@@ -197,10 +201,10 @@ class SB3Trainer:
         }
 
     def _spaces(self) -> tuple[Any, Any]:
-        """The environment's own, before normalisation and image transposition."""
-        if isinstance(self.venv, RowsVecEnv):
-            return self.venv.observation_space, self.venv.action_space
+        """The environment's own, before normalisation, image transposition and counting from 0."""
         env = one_env(self.venv)
+        if isinstance(self.venv, RowsVecEnv):
+            return env.single_observation_space, env.single_action_space
         return env.observation_space, env.action_space
 
     def freeze(self) -> FrozenPolicy:

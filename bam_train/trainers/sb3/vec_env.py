@@ -6,7 +6,6 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -16,6 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from bam_train.environments import is_batched, make_env, make_rows
 from bam_train.errors import SettingsError
+from bam_train.trainers.sb3.from_zero import from_zero
 
 Observations = Any
 """An array (n, …), or a mapping of them."""
@@ -30,51 +30,6 @@ def make_training_env(env_id: str, env_kwargs: Mapping[str, Any], num_envs: int)
     if is_batched(env_id):
         return RowsVecEnv(make_rows(env_id, env_kwargs, num_envs))
     return DummyVecEnv([lambda: Monitor(from_zero(make_env(env_id, env_kwargs))) for _ in range(num_envs)])
-
-
-def from_zero(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
-    """`env` with every choice counted from 0, as stable-baselines3 counts; `env` itself where it does so already."""
-    wrapped = FromZero(env)
-    same = wrapped.observation_space == env.observation_space and wrapped.action_space == env.action_space
-    return env if same else wrapped
-
-
-class FromZero(gym.Wrapper[Any, Any, Any, Any]):
-    """Takes the ``start`` off Discrete and MultiDiscrete observations, and adds it to actions."""
-
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        super().__init__(env)
-        self.observation_space = _zero_based(env.observation_space)
-        self.action_space = _zero_based(env.action_space)
-
-    def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
-        """As the environment, counted from 0."""
-        observation, info = self.env.reset(**arguments)
-        return _shift(observation, self.env.observation_space, -1), info
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """As the environment, counted from 0."""
-        observation, *rest = self.env.step(_shift(action, self.env.action_space, 1))
-        return _shift(observation, self.env.observation_space, -1), *rest
-
-
-def _zero_based(space: spaces.Space[Any]) -> spaces.Space[Any]:
-    if isinstance(space, spaces.Dict):
-        return spaces.Dict({key: _zero_based(leaf) for key, leaf in space.spaces.items()})
-    if isinstance(space, spaces.Discrete) and space.start:
-        return spaces.Discrete(space.n)
-    if isinstance(space, spaces.MultiDiscrete) and np.any(space.start):
-        return spaces.MultiDiscrete(space.nvec, dtype=space.dtype)  # type: ignore[arg-type]
-    return space
-
-
-def _shift(value: Any, space: spaces.Space[Any], sign: int) -> Any:
-    """`value` with the start of every choice in `space` added (1) or taken off (-1)."""
-    if isinstance(space, spaces.Dict):
-        return {key: _shift(value[key], leaf, sign) for key, leaf in space.spaces.items()}
-    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
-        return value + sign * space.start
-    return value
 
 
 class RowsVecEnv(VecEnv):  # type: ignore[misc]

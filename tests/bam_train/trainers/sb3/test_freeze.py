@@ -340,14 +340,17 @@ def test_freezing_draws_no_random_number_and_leaves_the_model_as_it_was():
         modes = [module.training for module in model.policy.modules()]
         weights = {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
         before = torch.get_rng_state(), np.random.get_state()[1].copy(), random.getstate()
-        first = freeze(model, normaliser, VECTOR, action_space), golden(model, normaliser, VECTOR)
+        first = freeze(model, normaliser, VECTOR, action_space), golden(model, normaliser, VECTOR, action_space)
         assert torch.equal(torch.get_rng_state(), before[0])
         np.testing.assert_array_equal(np.random.get_state()[1], before[1])
         assert random.getstate() == before[2]
         assert [module.training for module in model.policy.modules()] == modes
         assert all(torch.equal(tensor, weights[name]) for name, tensor in model.policy.state_dict().items())
         assert all(tensor.requires_grad for tensor in model.policy.parameters() if tensor.is_leaf)
-        assert first == (freeze(model, normaliser, VECTOR, action_space), golden(model, normaliser, VECTOR))
+        assert first == (
+            freeze(model, normaliser, VECTOR, action_space),
+            golden(model, normaliser, VECTOR, action_space),
+        )
 
 
 def test_the_graph_says_what_it_takes_and_nothing_of_this_machine():
@@ -422,7 +425,7 @@ def test_golden_actions_are_the_trainers(
     algorithm: type[BaseAlgorithm], observation_space: Any, action_space: Any, rows: int, tmp_path: Path
 ):
     model, normaliser = make(algorithm, observation_space, action_space)
-    arrays = safetensors_file.parse(golden(model, normaliser, observation_space))
+    arrays = safetensors_file.parse(golden(model, normaliser, observation_space, action_space))
     action = arrays.pop("action")
     assert action.shape == (rows, *action_space.shape)
     drawn = {name.removeprefix("observation").removeprefix("."): array for name, array in arrays.items()}
@@ -434,7 +437,9 @@ def test_golden_actions_are_the_trainers(
 def test_golden_choices_are_clear_ones():
     model, _ = make(DQN, VECTOR, spaces.Discrete(3))
     module = FrozenModule(model, None, VECTOR, spaces.Discrete(3))
-    observation = torch.as_tensor(safetensors_file.parse(golden(model, None, VECTOR))["observation"])
+    observation = torch.as_tensor(
+        safetensors_file.parse(golden(model, None, VECTOR, model.action_space))["observation"]
+    )
     best = module.scores(observation).topk(2)[0]
     assert (best[:, 0] - best[:, 1]).min() > 0.01
 
@@ -459,7 +464,7 @@ def save(path: Path, model: Any, normaliser: Any, observation_space: Any, action
     }
     frozen = {
         "bam/policy.onnx": freeze(model, normaliser, observation_space, action_space),
-        "bam/golden.safetensors": golden(model, normaliser, observation_space),
+        "bam/golden.safetensors": golden(model, normaliser, observation_space, action_space),
     }
     return write_checkpoint(path, fields, {**frozen, **members}).path
 

@@ -127,6 +127,7 @@ def test_one_seed_one_result_and_another_seed_another(walk):
     ("algo", "hyperparameters", "message"),
     [
         ("ppo", {**FIRST, "learning_rate": 1e30}, "NaN or infinite"),
+        ("ppo", {**FIRST, "learning_rate": 1e12}, "NaN or infinite"),
         ("a2c", {"learning_rate": 1e30}, "NaN or infinite|is nan|is -?inf"),
         ("sac", {"learning_rate": 1e30, "learning_starts": 10}, "_loss is (nan|inf)"),
     ],
@@ -146,6 +147,23 @@ def test_weights_that_are_not_finite_are_never_saved(walk, tmp_path):
     for act in (lambda: trainer.save(tmp_path / "a.zip", {}, {}), trainer.freeze):
         with pytest.raises(TrainingFailed, match=r"^the policy's weights are NaN or infinite at step 0; "):
             act()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_standard_deviation_that_overflows_is_never_saved(walk, tmp_path):
+    trainer = SB3Trainer.create(completed(walk, hyperparameters=FIRST))
+    trainer.model.policy.log_std.data[:] = 1000.0
+    with pytest.raises(TrainingFailed, match=r"NaN or infinite at step 0; "):
+        trainer.save(tmp_path / "a.zip", {}, {})
+
+
+def test_actions_that_overflow_are_never_saved(walk, tmp_path):
+    """Every weight is finite, their products are not."""
+    trainer = SB3Trainer.create(completed(walk, hyperparameters=FIRST))
+    for parameter in trainer.model.policy.action_net.parameters():
+        parameter.data[:] = 3e38
+    with pytest.raises(TrainingFailed, match=r"^the policy's weights or actions are NaN or infinite after step 0; "):
+        trainer.save(tmp_path / "a.zip", {}, {})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -195,34 +213,55 @@ def test_tensorboard_files(walk, tmp_path):
     assert b"train/value_loss" in events
 
 
-def test_images_and_dictionaries(tmp_path):
-    class Seen(gym.Env):
-        metadata = {"render_modes": []}  # noqa: RUF012
-        observation_space = gym.spaces.Dict(
-            {"image": gym.spaces.Box(0, 255, (36, 36, 3), np.uint8), "x": gym.spaces.Box(-1, 1, (2,), np.float32)}
-        )
-        action_space = gym.spaces.MultiDiscrete([2, 3])
+class Seen(gym.Env):
+    """Random images, channels last, and numbers."""
 
-        def reset(self, *, seed=None, options=None):
-            super().reset(seed=seed)
-            return self.look(), {}
+    metadata = {"render_modes": []}  # noqa: RUF012
 
-        def look(self):
-            image = self.np_random.integers(0, 256, (36, 36, 3), dtype=np.uint8)
-            return {"image": image, "x": self.np_random.uniform(-1, 1, 2).astype(np.float32)}
+    def __init__(self, continuous=False):
+        image, x = gym.spaces.Box(0, 255, (36, 36, 3), np.uint8), gym.spaces.Box(-1, 1, (2,), np.float32)
+        self.observation_space = gym.spaces.Dict({"image": image, "x": x})
+        self.action_space = gym.spaces.Box(-1, 1, (1,)) if continuous else gym.spaces.MultiDiscrete([2, 3])
 
-        def step(self, action):
-            return self.look(), 1.0, bool(self.np_random.random() < 0.1), False, {}
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.look(), {}
 
+    def look(self):
+        image = self.np_random.integers(0, 256, (36, 36, 3), dtype=np.uint8)
+        return {"image": image, "x": self.np_random.uniform(-1, 1, 2).astype(np.float32)}
+
+    def step(self, action):
+        return self.look(), 1.0, bool(self.np_random.random() < 0.1), False, {}
+
+
+@pytest.fixture
+def seen():
     gym.register("test/Seen-v0", entry_point=Seen)
-    try:
-        trainer = SB3Trainer.create(
-            completed("test/Seen-v0", hyperparameters={"n_steps": 8, "batch_size": 8, "n_epochs": 1})
-        )
-        trainer.train(16, lambda progress: True)
-        trainer.save(tmp_path / "a.zip", {}, {})
-        SB3Trainer.load(Checkpoint.open(tmp_path / "a.zip")).train(32, lambda progress: True)
-        env = gym.make("test/Seen-v0")
-        assert env.action_space.contains(FrozenPolicy.load(tmp_path / "a.zip").act(env.reset(seed=1)[0]))
-    finally:
-        del gym.registry["test/Seen-v0"]
+    yield "test/Seen-v0"
+    del gym.registry["test/Seen-v0"]
+
+
+SAC = {"learning_starts": 8, "batch_size": 4, "buffer_size": 100, "policy_kwargs": {"net_arch": [8]}}
+
+
+@pytest.mark.parametrize(
+    ("algo", "given"),
+    [
+        ("ppo", {"hyperparameters": {"n_steps": 8, "batch_size": 8, "n_epochs": 1}}),
+        ("sac", {"hyperparameters": SAC}),
+        ("sac", {"hyperparameters": SAC, "normalize": {"norm_obs_keys": ["x"]}}),
+        ("sac", {"hyperparameters": SAC, "normalize": {"norm_obs": False}}),
+        ("sac", {"hyperparameters": SAC, "normalize": True}),
+    ],
+)
+def test_images_and_dictionaries(seen, tmp_path, algo, given):
+    kwargs = {"continuous": algo == "sac"}
+    trainer = SB3Trainer.create(completed(seen, algo, env_kwargs=kwargs, **given))
+    trainer.train(16, lambda progress: True)
+    trainer.save(tmp_path / "a.zip", {}, {})
+    checkpoint = Checkpoint.open(tmp_path / "a.zip")
+    assert checkpoint.manifest.observation_space["spaces"]["image"]["dtype"] == "uint8"
+    SB3Trainer.load(checkpoint).train(32, lambda progress: True)
+    env = gym.make(seen, **kwargs)
+    assert env.action_space.contains(FrozenPolicy.load(tmp_path / "a.zip").act(env.reset(seed=1)[0]))
