@@ -1,4 +1,4 @@
-"""What the whole suite needs: signals heard, also where the shell that started it ignores them (as a background job's)."""
+"""What the whole suite needs: signals are heard, also where the shell that started it ignores them."""
 
 import signal
 
