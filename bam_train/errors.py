@@ -11,6 +11,13 @@
     ├── FormatError                bytes that do not follow their file format (safetensors, ONNX)
     ├── PolicyError                a frozen policy that cannot run, or an observation that does not fit it
     ├── SettingsError              a setting or option that does not exist or does not fit
+    ├── LoopError                  the interaction loop
+    │   ├── UnknownVariable        a variable that nobody wrote
+    │   ├── TimeNotWritten         a time at which it is not written, or that has left the window
+    │   ├── ValueMismatch          another shape, dtype, device or kind of array than before
+    │   ├── WorkspaceError         anything else that a workspace refuses, such as variables of different lengths
+    │   ├── WiringError            an agent reads what no agent writes
+    │   └── AgentInUse             an agent is called by two threads at once
     ├── TrainingFailed             training cannot go on (a NaN loss); the last good checkpoint is kept
     └── OutputError                no space, no permission, or a file that is in the way
 
@@ -19,6 +26,8 @@ Third-party errors are mapped to these at the border, with the cause kept by ``f
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
 from pathlib import Path
 
 
@@ -72,6 +81,46 @@ class PolicyError(BamTrainError, ValueError):
 
 class SettingsError(BamTrainError, ValueError):
     """A setting or option that does not exist or does not fit."""
+
+
+class LoopError(BamTrainError):
+    """The interaction loop cannot do what it was asked to."""
+
+
+class UnknownVariable(LoopError, LookupError):  # noqa: N818 - reads as what happened
+    """A variable that nobody wrote; the text has the closest match.
+
+    Attributes:
+        name: As it was asked for.
+    """
+
+    def __init__(self, name: str, known: Iterable[str]) -> None:
+        self.name = name
+        names = sorted(known)
+        close = difflib.get_close_matches(name, names, n=1)
+        question = f", did you mean {close[0]!r}?" if close else "."
+        has = f" It has {', '.join(map(repr, names))}." if names else " It is empty."
+        super().__init__(f"{name!r} is not in the workspace{question}{has}")
+
+
+class TimeNotWritten(LoopError, LookupError):  # noqa: N818
+    """A time at which a variable is not written, or that has left the window."""
+
+
+class ValueMismatch(LoopError, ValueError):  # noqa: N818
+    """Another shape, dtype, device or kind of array than the variable has."""
+
+
+class WorkspaceError(LoopError, ValueError):
+    """Something else that a workspace refuses."""
+
+
+class WiringError(LoopError):
+    """An agent reads what no agent writes."""
+
+
+class AgentInUse(LoopError):  # noqa: N818
+    """An agent is called by two threads at once."""
 
 
 class TrainingFailed(BamTrainError):  # noqa: N818

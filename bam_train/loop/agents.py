@@ -1,0 +1,204 @@
+"""Agents that are made of others, and a few small ones: `Agents`, `KWAgentWrapper`, `CopyTAgent`, `PrintAgent`, ...
+
+Differences from BBRL: `KWAgentWrapper` goes round anything that can be called, `Agents` too; `CopyTAgent` detaches
+without t as well; `PrintAgent` without names prints what there is each time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+
+from bam_train.errors import LoopError
+from bam_train.loop.agent import Agent, agent_name, is_module
+from bam_train.loop.workspace import Workspace
+
+
+class Agents(Agent):
+    """Runs its members in order, with the same keywords.
+
+    Args:
+        agents: The members.
+        name: What `get_by_name` finds.
+
+    Raises:
+        LoopError: One of them is no agent.
+
+    Attributes:
+        agents: The members: an ``nn.ModuleList`` once torch is imported, else a list.
+    """
+
+    def __init__(self, *agents: Agent, name: str | None = None) -> None:
+        super().__init__(name=name)
+        for k, agent in enumerate(agents):
+            if not isinstance(agent, Agent):
+                raise LoopError(f"Agents: expected agents, found {type(agent).__name__} at place {k}.")
+        self.agents: Any = _module_list(agents) if is_module(self) else list(agents)
+
+    def __call__(self, workspace: Workspace, **kwargs: Any) -> None:
+        """Run every member on `workspace`."""
+        for agent in self._members():
+            agent(workspace, **kwargs)
+
+    def forward(self, **kwargs: Any) -> None:
+        """Not used: a container has no step of its own.
+
+        Raises:
+            NotImplementedError: Always.
+        """
+        raise NotImplementedError("Agents has no forward; call it with a workspace.")
+
+    def seed(self, seed: int) -> None:
+        """Seed every member."""
+        for agent in self._members():
+            agent.seed(seed)
+
+    def close(self) -> None:
+        """Close every member, those that move something real first; the first failure is raised at the end."""
+        errors = []
+        for agent in sorted(self._members(), key=lambda member: not member.live):
+            try:
+                agent.close()
+            except Exception as error:  # the others have to be closed all the same
+                errors.append(error)
+        if errors:
+            raise errors[0]
+
+    def get_by_name(self, n: str) -> list[Agent]:
+        """The agents of that name in the tree: members first, then the container."""
+        found = [one for agent in self._members() for one in agent.get_by_name(n)]
+        return found + super().get_by_name(n)
+
+    def __getitem__(self, k: Any) -> Any:
+        return self.agents[k]
+
+    def __len__(self) -> int:
+        return len(self.agents)
+
+    def __iter__(self) -> Iterator[Agent]:
+        return iter(self._members())
+
+    def _members(self) -> Iterable[Agent]:
+        # Past nn.Module's __getattr__ and ModuleList's own, which cost as much as a small agent.
+        modules = self.__dict__.get("_modules")
+        members: Iterable[Agent] = self.__dict__["agents"] if modules is None else modules["agents"]._modules.values()
+        return members
+
+
+class KWAgentWrapper(Agent):
+    """Runs an agent with more keywords.
+
+    Args:
+        agent: What to run.
+        kwargs: Keywords added to those of the call.
+    """
+
+    def __init__(self, agent: Agent, **kwargs: Any) -> None:
+        super().__init__()
+        self.wrapped = agent
+        self.kwargs = kwargs
+
+    def forward(self, **kwargs: Any) -> None:
+        """Run the agent on the same workspace."""
+        self.wrapped(self.workspace, **kwargs, **self.kwargs)
+
+    def seed(self, seed: int) -> Any:
+        """Seed the agent."""
+        return self.wrapped.seed(seed)
+
+    def close(self) -> None:
+        """Close the agent."""
+        self.wrapped.close()
+
+
+class CopyTAgent(Agent):
+    """Copies a variable: at time t, or all of it when the call has no t.
+
+    Args:
+        input_name: From.
+        output_name: To.
+        detach: Cut the copy off the graph.
+        name: What `get_by_name` finds.
+    """
+
+    def __init__(self, input_name: str, output_name: str, detach: bool = False, name: str | None = None) -> None:
+        super().__init__(name=name)
+        self.input_name, self.output_name, self.detach = input_name, output_name, detach
+        self.reads, self.writes = (input_name,), (output_name,)
+
+    def forward(self, t: int | None = None, **kwargs: Any) -> None:
+        """Copy the time t, or everything."""
+        value = self.get(self.input_name if t is None else (self.input_name, t))
+        if self.detach and hasattr(value, "detach"):
+            value = value.detach()
+        self.set(self.output_name if t is None else (self.output_name, t), value)
+
+
+class PrintAgent(Agent):
+    """Prints variables at time t.
+
+    Args:
+        names: Which; all that there are by default.
+        name: What `get_by_name` finds.
+    """
+
+    writes = ()
+
+    def __init__(self, *names: str, name: str | None = None) -> None:
+        super().__init__(name=name)
+        self.names = names
+        self.reads = names
+
+    def reset(self) -> None:
+        """Print all variables from now on."""
+        self.names = self.reads = ()
+
+    def forward(self, t: int, **kwargs: Any) -> None:
+        """Print ``name  =  value`` for each."""
+        for name in self.names or tuple(self.workspace.keys()):
+            print(name, " = ", self.get((name, t)))  # noqa: T201 - its purpose
+
+
+class EpisodesDone(Agent):
+    """Writes whether an episode has ended at t or before: a running OR, begun again at t = 0.
+
+    Args:
+        in_var: The flag that is true at an end (B,).
+        out_var: The flag that stays true (B,), bool.
+    """
+
+    def __init__(self, in_var: str = "env/done", out_var: str = "env/done") -> None:
+        super().__init__()
+        self.in_var, self.out_var = in_var, out_var
+        self.reads, self.writes = (in_var,), (out_var,)
+        self.state: Any = None
+
+    def forward(self, t: int, **kwargs: Any) -> None:
+        """Read the flag at t and write the running one."""
+        done = self.get((self.in_var, t))
+        done = done.astype(bool) if isinstance(done, np.ndarray) else done.bool()
+        self.state = done if t == 0 or self.state is None else self.state | done
+        self.set((self.out_var, t), self.state)
+
+
+def leaves(agent: Agent) -> list[Agent]:
+    """The agents that do the work, in the order in which they run."""
+    if isinstance(agent, Agents):
+        return [leaf for member in agent for leaf in leaves(member)]
+    inner = getattr(agent, "agent", None) or getattr(agent, "wrapped", None)
+    return leaves(inner) if isinstance(inner, Agent) and agent.writes is None else [agent]
+
+
+def describe(agent: Agent) -> str:
+    """Such as ``Agents(RobotAgent, PolicyAgent)``."""
+    if isinstance(agent, Agents):
+        return f"Agents({', '.join(describe(member) for member in agent)})"
+    return agent_name(agent)
+
+
+def _module_list(agents: Iterable[Agent]) -> Any:
+    from torch import nn
+
+    return nn.ModuleList(agents)  # type: ignore[arg-type]

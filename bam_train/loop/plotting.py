@@ -1,0 +1,168 @@
+"""A workspace as a picture (matplotlib) and as a table (pandas); both are imported on use."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bam_envs.errors import MissingExtra
+from bam_train.errors import WorkspaceError
+
+if TYPE_CHECKING:
+    from bam_train.loop.workspace import Workspace
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from pandas import DataFrame, Series
+
+MAX_LINES = 10
+"""Lines in one picture; matplotlib has as many colours."""
+MAX_VALUE_AXES = 2
+"""A value with more axes than this is an image."""
+
+
+def plot(workspace: Workspace, *names: str, batch: int | Sequence[int] | None = None) -> Figure:
+    """Draws variables over time: one picture below the other, one line for each batch column and component.
+
+    Numbers with a fraction are drawn as lines, bool and integers as steps. At most 10 lines are drawn in a picture,
+    whose title then says of how many. The figure does not belong to pyplot; a notebook shows it where it is the last
+    value of a cell, and ``figure.savefig("run.png")`` writes it.
+
+    Args:
+        workspace: With at least one variable.
+        *names: The variables, in this order; without names all, but for images.
+        batch: The batch column or columns to draw; None draws all.
+
+    Returns:
+        A :class:`matplotlib.figure.Figure`.
+
+    Raises:
+        UnknownVariable: A name is not in the workspace.
+        WorkspaceError: There is nothing to draw, a variable holds images, or it does not have these batch columns.
+        MissingExtra: matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingExtra("matplotlib", "notebook", "Workspace.plot()") from error
+    arrays = _arrays(workspace, names, "plot()")
+    figure = Figure(figsize=(8, 0.6 + 1.9 * len(arrays)), layout="constrained")
+    figure._repr_png_ = partial(_png, figure)
+    rows = figure.subplots(len(arrays), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, (name, array) in zip(rows, arrays.items(), strict=True):
+        times = workspace.first_time + np.arange(len(array))
+        _draw(axes, times, name, array, _columns(name, array.shape[1], batch))
+    rows[-1].set_xlabel("t")
+    return figure
+
+
+def to_dataframe(workspace: Workspace, *names: str) -> DataFrame:
+    """The variables as a table with one row for each time and batch column, indexed by ``("time", "batch")``.
+
+    A scalar variable is one column of its name, a vector ``name[0]``, ``name[1]``, …, a matrix ``name[0,0]``, ….
+    Where a variable is shorter than another, numbers with a fraction are NaN; bool and integers are NA, in pandas'
+    nullable types.
+
+    Args:
+        workspace: With at least one variable.
+        *names: The variables, in this order; without names all, but for images.
+
+    Raises:
+        UnknownVariable: A name is not in the workspace.
+        WorkspaceError: There is nothing to put into the table, or a variable holds images.
+        MissingExtra: pandas is not installed.
+    """
+    try:
+        import pandas
+    except ImportError as error:
+        raise MissingExtra("pandas", "notebook", "Workspace.to_dataframe()") from error
+    arrays = _arrays(workspace, names, "to_dataframe()")
+    first = workspace.first_time
+    length, width = (max(array.shape[axis] for array in arrays.values()) for axis in (0, 1))
+    rows = pandas.MultiIndex.from_product([range(first, first + length), range(width)], names=["time", "batch"])
+    columns = {}
+    for name, array in arrays.items():
+        own = pandas.MultiIndex.from_product([range(first, first + len(array)), range(array.shape[1])])
+        flat = array.reshape(own.size, -1)
+        for label, values in zip(_labels(array.shape[2:]), flat.T, strict=True):
+            columns[name + label] = _column(values, own, rows)
+    return pandas.DataFrame(columns, index=rows)
+
+
+def _column(values: np.ndarray, own: Any, rows: Any) -> Series:
+    import pandas
+
+    if own.equals(rows):
+        return pandas.Series(values, index=rows)
+    exact = values if values.dtype.kind == "f" else pandas.array(values)  # such as Int64 and boolean, which know NA
+    return pandas.Series(exact, index=own).reindex(rows)
+
+
+def _arrays(workspace: Workspace, names: tuple[str, ...], purpose: str) -> dict[str, np.ndarray]:
+    """The named variables, (T, B, ...) each, without images; all where no name is given."""
+    arrays = {name: _to_numpy(workspace.get_full(name)) for name in names or workspace.keys()}
+    images = [name for name, array in arrays.items() if array.ndim > 2 + MAX_VALUE_AXES]
+    if names and images:
+        shape = arrays[images[0]].shape[2:]
+        raise WorkspaceError(
+            f"{images[0]!r}: expected numbers, vectors or matrices, found images of shape {shape}; "
+            f"leave it out of {purpose}."
+        )
+    if len(images) == len(arrays):
+        raise WorkspaceError(
+            f"{purpose} has nothing to show: the workspace {'has only images' if images else 'is empty'}."
+        )
+    return {name: array for name, array in arrays.items() if name not in images}
+
+
+def _to_numpy(value: Any) -> np.ndarray:
+    if isinstance(value, np.ndarray):
+        return value
+    value = value.detach().cpu()
+    return np.asarray((value.float() if str(value.dtype) == "torch.bfloat16" else value).numpy())
+
+
+def _columns(name: str, width: int, batch: int | Sequence[int] | None) -> list[int]:
+    if batch is None:
+        return list(range(width))
+    chosen = [int(column) for column in np.atleast_1d(np.asarray(batch))]
+    for column in chosen:
+        if not 0 <= column < width:
+            raise WorkspaceError(f"{name!r} has no batch column {column}; it has columns 0 to {width - 1}.")
+    return chosen
+
+
+def _labels(shape: tuple[int, ...]) -> Iterator[str]:
+    """``""`` for a scalar; ``[0]``, ``[1]``, … for a vector; ``[0,0]``, … for a matrix, in C order."""
+    for index in np.ndindex(shape):
+        yield f"[{','.join(map(str, index))}]" if index else ""
+
+
+def _draw(axes: Axes, times: np.ndarray, name: str, array: np.ndarray, columns: list[int]) -> None:
+    labels = list(_labels(array.shape[2:]))
+    values = array.reshape(*array.shape[:2], len(labels))
+    lines = [(column, component) for column in columns for component in range(len(labels))]
+    style = "default" if array.dtype.kind == "f" else "steps-post"
+    for column, component in lines[:MAX_LINES]:
+        label = f"{column}{labels[component]}" if array.shape[1] > 1 else labels[component]
+        marker = "." if len(times) == 1 else ""  # a line through one point cannot be seen
+        axes.plot(times, values[:, column, component], drawstyle=style, marker=marker, label=label, linewidth=1)
+    if array.dtype == bool:
+        axes.set_yticks([0, 1], ["False", "True"])
+    axes.set_ylabel(name)
+    if len(lines) > 1:
+        axes.legend(
+            title="batch" if array.shape[1] > 1 else None, fontsize="small", loc="center left", bbox_to_anchor=(1, 0.5)
+        )
+    if len(lines) > MAX_LINES:
+        axes.set_title(f"{name}: the first {MAX_LINES} of {len(lines)} lines; choose with batch=", fontsize="small")
+
+
+def _png(figure: Figure) -> bytes:
+    """What a notebook shows that never imported pyplot."""
+    file = io.BytesIO()
+    figure.savefig(file, format="png")
+    return file.getvalue()

@@ -1,0 +1,120 @@
+"""What a TemporalAgent shows while it runs: steps, steps per second, time left; below a microsecond a step."""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.text import Text
+
+REDRAW_SECONDS = 0.1
+Advance = Callable[[int], None]
+
+
+class StepsPerSecond(ProgressColumn):
+    """``5,200 steps/s``, over the last seconds while it runs and over the whole run at its end."""
+
+    def render(self, task: Task) -> Text:
+        """The speed of one task, empty until it is known."""
+        speed = task.finished_speed or task.speed
+        return Text("" if speed is None else f"{speed:,.0f} steps/s" if speed >= 10 else f"{speed:.2g} steps/s")
+
+
+@contextmanager
+def progress_display(
+    progress: bool | Progress, n_steps: int | None, t: int = 0, description: str = "steps"
+) -> Iterator[Advance]:
+    """Shows how far a loop has come; gives a function to be called with the number of steps just done.
+
+    Args:
+        progress: A :class:`rich.progress.Progress` of the caller's, which gets one more task, or True for a display
+            of its own on stderr, which is drawn on a terminal and in a notebook only.
+        n_steps: How many steps there will be at most; None where only a stop variable ends the loop.
+        t: The time of the first step.
+        description: What is written in front of the bar.
+
+    A loop that ends early is shown as finished; one that an exception leaves stays where it was.
+    """
+    text = f"{description} from t={t}" if t else description
+    if isinstance(progress, Progress):
+        with _task(progress, n_steps, text, redraw=None) as advance:
+            yield advance
+    elif progress:
+        with _own_display(n_steps, text) as advance:
+            yield advance
+    else:
+        yield _nothing
+
+
+def _nothing(steps: int) -> None:
+    """Nobody is looking."""
+
+
+@contextmanager
+def _own_display(n_steps: int | None, text: str) -> Iterator[Advance]:
+    console = Console(stderr=True)
+    display = Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        StepsPerSecond(),
+        TimeRemainingColumn(elapsed_when_finished=True),
+        console=console,
+        auto_refresh=False,  # no thread: the loop itself redraws
+    )
+    if console.is_jupyter:
+        with _task(display, n_steps, text, _notebook_line(display)) as advance:
+            yield advance
+    elif console.is_terminal:
+        with display, _task(display, n_steps, text, display.refresh) as advance:
+            yield advance
+    else:
+        yield _nothing
+
+
+@contextmanager
+def _task(
+    progress: Progress, n_steps: int | None, text: str, redraw: Callable[[], None] | None = None
+) -> Iterator[Advance]:
+    """One task of a display, told how far it is every REDRAW_SECONDS; without `redraw` the display draws itself."""
+    task = progress.add_task(text, total=n_steps)
+    clock = time.perf_counter
+    done, due = 0, clock() + REDRAW_SECONDS
+
+    def show(total: int | None = None) -> None:
+        progress.update(task, completed=done, total=total)  # a total of None leaves it as it is
+        if redraw is not None:
+            redraw()
+
+    def advance(steps: int = 1) -> None:
+        nonlocal done, due
+        done += steps
+        if clock() >= due:
+            show()
+            due = clock() + REDRAW_SECONDS
+
+    try:
+        yield advance
+    except BaseException:
+        progress.stop_task(task)
+        show()
+        raise
+    progress.stop_task(task)
+    show(total=done)
+
+
+def _notebook_line(display: Progress) -> Callable[[], None]:
+    """One line of a notebook's output that is written over; rich's own way needs ipywidgets."""
+    from IPython.display import display as show_in_notebook
+
+    def line() -> dict[str, str]:
+        console = Console(file=io.StringIO(), width=100, force_jupyter=False)
+        console.print(display.get_renderable())
+        return {"text/plain": console.file.getvalue().rstrip()}  # type: ignore[attr-defined]
+
+    handle = show_in_notebook(line(), raw=True, display_id=True)
+    return lambda: handle.update(line(), raw=True)

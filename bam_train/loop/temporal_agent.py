@@ -1,0 +1,141 @@
+"""The loop: one agent, run at one time after the other.
+
+Differences from BBRL's `TemporalAgent`: what agents read is checked before the first of them runs; an exception says at
+which time and closes every agent's environment and robot; a progress display.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import nullcontext
+from typing import TYPE_CHECKING, Any
+
+from bam_train.errors import LoopError
+from bam_train.loop.agent import Agent
+from bam_train.loop.agents import describe
+from bam_train.loop.wiring import check_built, check_called
+from bam_train.loop.workspace import Workspace
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+
+class TemporalAgent(Agent):
+    """Runs an agent at times t, t + 1, ....
+
+    Args:
+        agent: What to run; often an `Agents` whose first member is the environment.
+        name: What `get_by_name` finds.
+        progress: True for a progress display on standard error, or a ``rich.progress.Progress`` to add a task to.
+
+    Raises:
+        LoopError: `agent` is no agent.
+        WiringError: The agent moves a robot, and something in it reads what nobody writes.
+    """
+
+    def __init__(self, agent: Agent, name: str | None = None, *, progress: bool | Progress = False) -> None:
+        super().__init__(name=name)
+        if not isinstance(agent, Agent):
+            raise LoopError(f"TemporalAgent: expected an agent, found {type(agent).__name__}.")
+        check_built(agent)
+        self.agent = agent
+        self.progress = progress
+
+    def __call__(
+        self,
+        workspace: Workspace,
+        t: int = 0,
+        n_steps: int | None = None,
+        stop_variable: str | None = None,
+        **kwargs: Any,
+    ) -> None:
+        """Run the agent from time t on.
+
+        When an exception leaves it, every agent's `close` is called; earlier times stay readable.
+
+        Args:
+            workspace: What it reads and writes.
+            t: The first time.
+            n_steps: How many times, at least one; None for until the stop variable says.
+            stop_variable: Stop after a time at which it is true for the whole batch.
+            kwargs: Given to every agent.
+
+        Raises:
+            LoopError: Neither `n_steps` nor `stop_variable`, or no workspace.
+            WiringError: An agent reads what nobody writes, or nobody writes the stop variable.
+            UnknownVariable: Nobody has written the stop variable at the first time.
+        """
+        if n_steps is None and stop_variable is None:
+            raise LoopError("TemporalAgent: when should it stop? Give n_steps, stop_variable or both.")
+        if workspace is None:
+            raise LoopError("TemporalAgent needs a workspace, found None.")
+        check_called(self.agent, workspace.keys(), stop_variable)
+        time = [t]
+        try:
+            with self._advance(n_steps, t) as advance:
+                self._run(workspace, time, n_steps, stop_variable, advance, kwargs)
+        except BaseException as error:
+            self._close_after(error, time[0])
+            raise
+
+    def _run(
+        self,
+        workspace: Workspace,
+        time: list[int],
+        n_steps: int | None,
+        stop_variable: str | None,
+        advance: Callable[[int], None] | None,
+        kwargs: dict[str, Any],
+    ) -> None:
+        """The loop itself; ``time[0]`` is where it is."""
+        agent = self.agent
+        t = time[0]
+        end = None if n_steps is None else t + max(1, n_steps)
+        while True:
+            agent(workspace, t=t, **kwargs)
+            if advance is not None:
+                advance(1)
+            if stop_variable is not None and workspace.get(stop_variable, t).all():
+                return
+            t += 1
+            if t == end:
+                return
+            time[0] = t
+
+    def _advance(self, n_steps: int | None, t: int) -> Any:
+        if self.progress is False:
+            return nullcontext(None)
+        from bam_train.loop.progress import progress_display
+
+        return progress_display(self.progress, n_steps, t, self.name or "steps")
+
+    def _close_after(self, error: BaseException, t: int) -> None:
+        """Close all agents, and note in the error where it came from."""
+        notes = [f"In {describe(self.agent)} at t={t}."]
+        try:
+            self.agent.close()
+        except Exception as failure:  # the first error is the one to be seen
+            notes.append(f"Closing failed too: {type(failure).__name__}: {failure}")
+        if hasattr(error, "add_note"):  # Python 3.11
+            for note in notes:
+                error.add_note(note)
+
+    def forward(self, **kwargs: Any) -> None:
+        """Not used.
+
+        Raises:
+            NotImplementedError: Always.
+        """
+        raise NotImplementedError("TemporalAgent has no forward; call it with a workspace.")
+
+    def close(self) -> None:
+        """Close the agent."""
+        self.agent.close()
+
+    def seed(self, seed: int) -> Any:
+        """Seed the agent."""
+        return self.agent.seed(seed)
+
+    def get_by_name(self, n: str) -> list[Agent]:
+        """The agents of that name in the tree: members first, then the container."""
+        return self.agent.get_by_name(n) + super().get_by_name(n)

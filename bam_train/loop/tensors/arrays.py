@@ -1,0 +1,272 @@
+"""Storage of one tensor variable of a workspace, as BBRL's: a list of one tensor a time, or one tensor of all times.
+
+A variable that `set` writes is a list: every value stays the very object that was given, with its graph, so that what
+was written at t and read at t + 1 can still be differentiated through. One that `set_full` writes is that tensor.
+
+Unlike BBRL's, a full read of a list is kept until the next write through the workspace, so that reading again is free.
+It is made anew when somebody has changed it in place, or when gradients are switched on in between; a stored value that
+is changed in place after a full read does not show in the next one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+
+from bam_train.errors import WorkspaceError
+from bam_train.loop.arrays import UNLIMITED, batch_of, kind_mismatch, mismatch, no_batch, not_written, require_full
+
+
+class _FullRead(NamedTuple):
+    """A concatenation of a list, and what it was like when it was made."""
+
+    tensor: torch.Tensor
+    version: int
+    requires_grad: bool
+    grad_enabled: bool
+
+    def is_current(self) -> bool:
+        """Whether a new concatenation would be the same."""
+        tensor = self.tensor
+        return (
+            tensor._version == self.version
+            and tensor.requires_grad == self.requires_grad
+            and (torch.is_grad_enabled() == self.grad_enabled or (self.grad_enabled and not self.requires_grad))
+            and not torch.is_inference_mode_enabled()
+        )
+
+
+class TensorVariable:
+    """One variable, T x B x ...; B x ... at one time.
+
+    Args:
+        name: For error messages.
+        first: The first time kept; only a windowed workspace starts later than 0.
+        limit: Times that are kept at most.
+        make_room: Called with a time that does not fit; afterwards `first` is later.
+    """
+
+    KIND = "a torch.Tensor"
+
+    def __init__(
+        self,
+        name: str,
+        first: int = 0,
+        limit: int = UNLIMITED,
+        make_room: Callable[[int], None] | None = None,
+    ) -> None:
+        self.name, self.first, self._limit, self._make_room = name, first, limit, make_room
+        self._values: list[torch.Tensor] | None = []
+        self._whole: torch.Tensor | None = None  # the variable itself when `_values` is None
+        self._read: _FullRead | None = None
+        self._shape: torch.Size | None = None  # of one time; None before the first write
+        self._dtype: torch.dtype | None = None
+        self._device: torch.device | None = None
+
+    # -- what it is ------------------------------------------------------------------------------------------------
+
+    @property
+    def size(self) -> torch.Size:
+        """Shape of one time of a list, of the whole of one tensor."""
+        if self._whole is not None:
+            return self._whole.shape
+        return torch.Size(()) if self._shape is None else self._shape
+
+    @property
+    def dtype(self) -> torch.dtype | None:
+        """The dtype of its values; None before the first."""
+        return self._dtype
+
+    @property
+    def device(self) -> torch.device | None:
+        """The device of its values; None before the first."""
+        return self._device
+
+    @property
+    def stop(self) -> int:
+        """One after the last time written."""
+        return self.time_size()
+
+    def time_size(self) -> int:
+        """One after the last time written."""
+        return self.first + (len(self._values) if self._values is not None else len(self._tensor))
+
+    def batch_size(self) -> int:
+        """B."""
+        return batch_of(self.name, self._shape)
+
+    @property
+    def _tensor(self) -> torch.Tensor:
+        if self._whole is None:
+            raise WorkspaceError(f"{self.name!r} is empty.")
+        return self._whole
+
+    # -- one time --------------------------------------------------------------------------------------------------
+
+    def set(self, t: int, value: torch.Tensor) -> None:
+        """Keep `value` (B x ...) at time t, the object itself; missing earlier times become zeros.
+
+        Raises:
+            ValueMismatch: Another shape, dtype, device or kind than before.
+            TimeNotWritten: A negative or lost time.
+        """
+        try:
+            fits = value.shape == self._shape and value.dtype is self._dtype and value.device == self._device
+        except AttributeError:
+            fits = False
+        if not fits:
+            self._check(value, f"t={t}")
+        values = self._values
+        if values is None:
+            values = self._to_list()
+        self._read = None
+        index = t - self.first if t >= 0 else len(values) + t
+        if index == len(values) < self._limit:
+            values.append(value)
+        elif index >= len(values):
+            self._append(t, index, value)
+        elif index >= 0:
+            values[index] = value
+        else:
+            raise not_written(self.name, t, self.first, self.stop)
+
+    def get(self, t: int) -> torch.Tensor:
+        """Time t, B x ...; -1 is the last. The object that was set, or a view of the whole.
+
+        Raises:
+            TimeNotWritten: Nobody wrote it.
+        """
+        values = self._values
+        if values is None:
+            values = self._tensor  # type: ignore[assignment] - is indexed alike
+        index = t - self.first if t >= 0 else len(values) + t
+        if 0 <= index < len(values):
+            return values[index]
+        raise not_written(self.name, t, self.first, self.stop)
+
+    # -- all times -------------------------------------------------------------------------------------------------
+
+    def set_full(self, value: torch.Tensor) -> None:
+        """Keep T x B x ..., the object itself. Over a list it overwrites the first T and leaves the rest."""
+        if self._values:
+            require_full(self.name, value, torch.Tensor, self.KIND)
+            for k, row in enumerate(value):
+                self.set(self.first + k, row)
+            return
+        require_full(self.name, value, torch.Tensor, self.KIND)
+        self._values, self._whole, self._read = None, value, None
+        self._shape, self._dtype, self._device = value.shape[1:], value.dtype, value.device
+
+    def full(self) -> torch.Tensor:
+        """All times kept, T x B x ...; of a list, the same tensor until the next write."""
+        if self._values is None:
+            return self._tensor
+        if self._read is None or not self._read.is_current():
+            tensor = _joined(self._values)
+            if tensor.is_inference():  # has no version, and cannot be used outside
+                return tensor
+            self._read = _FullRead(tensor, tensor._version, tensor.requires_grad, torch.is_grad_enabled())
+        return self._read.tensor
+
+    def truncated(self, begin: int, end: int) -> torch.Tensor:
+        """Times [begin, end), cut off at the end; a view of one tensor, a copy of a list."""
+        begin, end = max(0, begin - self.first), max(0, end - self.first)
+        if self._values is None:
+            return self._tensor[begin:end]
+        rows = self._values[begin:end]
+        return _joined(rows) if rows else torch.zeros((0, *self.size), dtype=self._dtype, device=self._device)
+
+    def drop(self, first: int) -> None:
+        """Forget the times before `first`."""
+        values = self._to_list() if self._values is None else self._values
+        del values[: first - self.first]
+        self.first, self._read = first, None
+
+    def copy_time(self, begin: int, to: int, count: int) -> None:
+        """Copy times [begin, begin + count) onto [to, to + count): objects of a list, memory of one tensor."""
+        if self._values is None:
+            whole = self._tensor
+            self.get(begin), self.get(begin + count - 1), self.get(to), self.get(to + count - 1)
+            whole[to : to + count] = whole[begin : begin + count].clone()
+            return
+        for k in range(count):
+            self.set(to + k, self.get(begin + k))
+
+    def detach(self) -> None:
+        """Cut every value off its graph."""
+        self._read = None
+        if self._values is None:
+            self._whole = self._tensor.detach()
+        else:
+            self._values = [value.detach() for value in self._values]
+
+    # -- growing ---------------------------------------------------------------------------------------------------
+
+    def _append(self, t: int, index: int, value: torch.Tensor) -> None:
+        """Keep a value later than the next time, or one that needs room first."""
+        values = self._values
+        if values is None:
+            raise WorkspaceError(f"{self.name!r} has no list.")
+        if index >= self._limit:
+            self._make_room(t)  # type: ignore[misc] - there is one where there is a limit
+            index = t - self.first
+        values.extend(torch.zeros_like(value, requires_grad=False) for _ in range(index - len(values)))
+        values.append(value)
+
+    def _to_list(self) -> list[torch.Tensor]:
+        """Turn one tensor into a list of views of it."""
+        values = list(self._tensor.unbind(0)) if len(self._tensor) else []
+        self._values, self._whole = values, None
+        return values
+
+    def _check(self, value: Any, where: str) -> None:
+        """Take the first value's shape, dtype and device, or say what differs from them."""
+        if not isinstance(value, torch.Tensor):
+            raise kind_mismatch(self.name, where, self.KIND, value)
+        if self._shape is None:
+            if value.ndim == 0:
+                raise no_batch(self.name, where)
+            self._shape, self._dtype, self._device = value.shape, value.dtype, value.device
+        pairs = (
+            ("shape", self._shape, value.shape),
+            ("dtype", self._dtype, value.dtype),
+            ("device", self._device, value.device),
+        )
+        for what, ours, theirs in pairs:
+            if ours != theirs:
+                raise mismatch(self.name, where, what, ours, theirs)
+
+    # -- operations on full tensors --------------------------------------------------------------------------------
+
+    @staticmethod
+    def stack(arrays: Sequence[torch.Tensor]) -> torch.Tensor:
+        """Tensors of one shape along a new first axis."""
+        return torch.stack(list(arrays))
+
+    @staticmethod
+    def concatenate(arrays: Sequence[torch.Tensor], axis: int) -> torch.Tensor:
+        """Tensors one after the other along `axis`."""
+        return torch.cat(list(arrays), dim=axis)
+
+    @staticmethod
+    def index(index: Any, like: torch.Tensor) -> torch.Tensor:
+        """`index` (integers or booleans) as a tensor that indexes `like`."""
+        return torch.as_tensor(index, device=like.device)
+
+    @staticmethod
+    def copied(array: torch.Tensor) -> torch.Tensor:
+        """A copy that shares no memory and keeps the graph."""
+        return array.clone()
+
+    @staticmethod
+    def on_device(array: torch.Tensor, device: Any) -> torch.Tensor:
+        """The tensor on `device`; itself if it is there."""
+        return array.to(device)
+
+
+def _joined(values: Sequence[torch.Tensor]) -> torch.Tensor:
+    """T tensors B x ... as one T x B x ...; `cat` and a view, several times as quick as `stack` for many small ones."""
+    shape = values[0].shape
+    return torch.cat(list(values)).view(len(values), *shape)
