@@ -18,22 +18,20 @@ from __future__ import annotations
 import copy
 import sys
 import time
-from threading import get_ident
 from typing import IO, TYPE_CHECKING, Any
 
 from bam_train.errors import AgentInUse, LoopError
 from bam_train.loop.workspace import Workspace
 
 if TYPE_CHECKING:
-    from typing_extensions import Self
-
     # Instances have nn.Module's members once torch is imported.
     from torch.nn import Module as _Base
+    from typing_extensions import Self
 else:
     _Base = object
 
 
-class Agent(_Base):
+class Agent(_Base):  # type: ignore[misc]
     """Override ``forward(self, t, **kwargs)``; in it, use `get` and `set`.
 
     Args:
@@ -74,24 +72,25 @@ class Agent(_Base):
         """Run `forward` with these keywords on `workspace`.
 
         Raises:
-            AgentInUse: Another thread is in it.
+            AgentInUse: It is running already: agents are not shared by threads, and do not call themselves.
             LoopError: `workspace` is None.
         """
-        # Straight into the instance's dictionary: nn.Module's __setattr__ costs 1.4 µs, this 0.05 µs.
+        if workspace is None:
+            raise LoopError(f"{agent_name(self)} needs a workspace, found None.")
+        # Straight into the instance's dictionary: nn.Module's __setattr__ costs 1.4 µs, this 0.05 µs. No other thread
+        # can come in between in `setdefault`, and every call has a dictionary of keywords of its own.
         own = self.__dict__
-        me = get_ident()
-        if own.setdefault("_thread", me) != me:
-            raise AgentInUse(f"{agent_name(self)} is running in another thread; give each thread its own: agent.clone().")
-        outer = own.get("workspace")
+        if own.setdefault("_call", kwargs) is not kwargs:
+            raise AgentInUse(
+                f"{agent_name(self)} is running already, in another thread or around this call; "
+                f"give each its own: agent.clone()."
+            )
         own["workspace"] = workspace
         try:
-            if workspace is None:
-                raise LoopError(f"{agent_name(self)} needs a workspace, found None.")
             self.forward(**kwargs)
         finally:
-            own["workspace"] = outer
-            if outer is None:
-                del own["_thread"]
+            own["workspace"] = None
+            del own["_call"]
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         """What the agent does at time t; to be overridden."""
@@ -112,23 +111,22 @@ class Agent(_Base):
 
     def get(self, index: str | tuple[str, int]) -> Any:
         """All times of a variable, T x B x ..., or with (name, t) its value at t, B x ...."""
-        if self._trace is not None:
-            self._write_trace("get", index)
+        workspace = self.workspace
+        if workspace is None:
+            workspace = self._workspace()
         if isinstance(index, str):
-            return self._workspace().get_full(index)
-        try:
-            return self.workspace.get(index[0], index[1])
-        except AttributeError:
-            return self._workspace().get(index[0], index[1])
+            return workspace.get_full(index)
+        return workspace.get(index[0], index[1])
 
     def set(self, index: str | tuple[str, int], value: Any) -> None:
         """Write all times of a variable, T x B x ..., or with (name, t) its value at t, B x ...."""
-        if self._trace is not None:
-            self._write_trace("set", index, value)
+        workspace = self.workspace
+        if workspace is None:
+            workspace = self._workspace()
         if isinstance(index, str):
-            self._workspace().set_full(index, value)
+            workspace.set_full(index, value)
         else:
-            (self.workspace or self._workspace()).set(index[0], index[1], value)
+            workspace.set(index[0], index[1], value)
 
     def get_time_truncated(self, name: str, from_time: int, to_time: int) -> Any:
         """Times [from_time, to_time) of a variable."""
@@ -173,7 +171,7 @@ class Agent(_Base):
         return copy.deepcopy(self)
 
     def __getstate__(self) -> dict[str, Any]:
-        left_out = ("_thread", "_trace")
+        left_out = ("_call", "_trace", "get", "set")
         return {**{key: value for key, value in self.__dict__.items() if key not in left_out}, "workspace": None}
 
     # -- files -----------------------------------------------------------------------------------------------------
@@ -193,18 +191,26 @@ class Agent(_Base):
     def set_trace_file(self, filename: Any) -> None:
         """Write a line to this file for every `get` and `set`, until `close_trace_file`."""
         self.close_trace_file()
-        self._trace = open(filename, "w", encoding="utf-8", buffering=1)  # noqa: SIM115 - stays open
+        file = open(filename, "w", encoding="utf-8", buffering=1)  # noqa: SIM115 - stays open
+
+        def get(index: Any) -> Any:
+            value = type(self).get(self, index)
+            file.write(f"{time.time():.6f} {agent_name(self)} get {index}\n")
+            return value
+
+        def set_(index: Any, value: Any) -> None:
+            type(self).set(self, index, value)
+            file.write(f"{time.time():.6f} {agent_name(self)} set {index} {tuple(value.shape)} {value.dtype}\n")
+
+        # In the instance's dictionary they hide the class's own, which need not ask whether there is a trace.
+        self.__dict__.update(_trace=file, get=get, set=set_)
 
     def close_trace_file(self) -> None:
         """Stop tracing."""
         if self._trace is not None:
             self._trace.close()
-            self._trace = None
-
-    def _write_trace(self, verb: str, index: Any, value: Any = None) -> None:
-        what = "" if value is None else f" = {tuple(value.shape)}/{value.dtype}"
-        if self._trace is not None:
-            self._trace.write(f"{time.time():.6f} {agent_name(self)} {verb} {index}{what}\n")
+            for name in ("_trace", "get", "set"):
+                del self.__dict__[name]
 
     def _workspace(self) -> Workspace:
         if self.workspace is None:

@@ -7,6 +7,7 @@ without t as well; `PrintAgent` without names prints what there is each time.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -56,15 +57,10 @@ class Agents(Agent):
             agent.seed(seed)
 
     def close(self) -> None:
-        """Close every member, those that move something real first; the first failure is raised at the end."""
-        errors = []
-        for agent in sorted(self._members(), key=lambda member: not member.live):
-            try:
-                agent.close()
-            except Exception as error:  # the others have to be closed all the same
-                errors.append(error)
-        if errors:
-            raise errors[0]
+        """Close every member, those that move something real first; a failure is raised at the end."""
+        with ExitStack() as stack:  # closes what is left when one fails, last one first
+            for agent in sorted(self._members(), key=lambda member: member.live):
+                stack.callback(agent.close)
 
     def get_by_name(self, n: str) -> list[Agent]:
         """The agents of that name in the tree: members first, then the container."""
@@ -183,6 +179,13 @@ class EpisodesDone(Agent):
         self.set((self.out_var, t), self.state)
 
 
+def members(agent: Agent) -> list[Agent]:
+    """What to call instead of `agent`: the members of an `Agents`, and of those in it."""
+    if type(agent).__call__ is not Agents.__call__:
+        return [agent]
+    return [one for member in agent for one in members(member)]
+
+
 def leaves(agent: Agent) -> list[Agent]:
     """The agents that do the work, in the order in which they run."""
     if isinstance(agent, Agents):
@@ -201,4 +204,4 @@ def describe(agent: Agent) -> str:
 def _module_list(agents: Iterable[Agent]) -> Any:
     from torch import nn
 
-    return nn.ModuleList(agents)  # type: ignore[arg-type]
+    return nn.ModuleList(agents)

@@ -64,7 +64,7 @@ class NumpyVariable:
         name: str,
         first: int = 0,
         limit: int = UNLIMITED,
-        make_room: Callable[[int], None] | None = None,
+        make_room: Callable[[int], None] = lambda t: None,
     ) -> None:
         self.name, self.first, self._limit, self._make_room = name, first, limit, make_room
         self._buffer: NDArray[Any] = np.empty((0, 0))
@@ -177,7 +177,7 @@ class NumpyVariable:
     def _append(self, t: int, index: int) -> int:
         """Make room for a time that is not there yet; its index in the buffer."""
         if index >= self._limit:
-            self._make_room(t)  # type: ignore[misc] - there is one where there is a limit
+            self._make_room(t)
             index = t - self.first
         if index >= len(self._buffer):
             rows = min(max(2 * len(self._buffer), index + 1, _FIRST_ROWS), max(self._limit, index + 1))
@@ -205,12 +205,14 @@ class NumpyVariable:
     @staticmethod
     def stack(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
         """Arrays of one shape along a new first axis."""
-        return np.stack(arrays)
+        stacked: NDArray[Any] = np.stack(arrays)
+        return stacked
 
     @staticmethod
     def concatenate(arrays: Sequence[NDArray[Any]], axis: int) -> NDArray[Any]:
         """Arrays one after the other along `axis`."""
-        return np.concatenate(arrays, axis=axis)
+        joined: NDArray[Any] = np.concatenate(arrays, axis=axis)
+        return joined
 
     @staticmethod
     def index(index: Any, like: Any) -> NDArray[Any]:
@@ -250,6 +252,7 @@ def no_batch(name: str, where: str) -> ValueMismatch:
 
 
 def kind_mismatch(name: str, where: str, expected: str, found: Any) -> ValueMismatch:
+    """The error for a value that is no array of this kind."""
     return ValueMismatch(f"{name!r} at {where}: expected {expected}, found {_article(kind_name(found))}.")
 
 
@@ -258,7 +261,9 @@ def require_full(name: str, value: Any, kind: type, kind_text: str) -> None:
     if not isinstance(value, kind):
         raise kind_mismatch(name, "all times", kind_text, value)
     if value.ndim == 0:  # type: ignore[attr-defined]
-        raise ValueMismatch(f"{name!r} at all times: expected time and batch first (T x B x ...), found a single number.")
+        raise ValueMismatch(
+            f"{name!r} at all times: expected time and batch first (T x B x ...), found a single number."
+        )
 
 
 def batch_of(name: str, shape: tuple[int, ...] | None) -> int:
@@ -274,5 +279,3 @@ def batch_of(name: str, shape: tuple[int, ...] | None) -> int:
 
 def _article(noun: str) -> str:
     return f"an {noun}" if noun[0] in "aeiou" else f"a {noun}"
-
-

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from bam_train.errors import LoopError
 from bam_train.loop.agent import Agent
-from bam_train.loop.agents import describe
+from bam_train.loop.agents import describe, members
 from bam_train.loop.wiring import check_built, check_called
 from bam_train.loop.workspace import Workspace
 
@@ -88,11 +88,13 @@ class TemporalAgent(Agent):
         kwargs: dict[str, Any],
     ) -> None:
         """The loop itself; ``time[0]`` is where it is."""
-        agent = self.agent
+        # Bound methods, and the members of an `Agents` one by one: half the cost of calling the objects.
+        calls = [agent.__call__ for agent in members(self.agent)]
         t = time[0]
         end = None if n_steps is None else t + max(1, n_steps)
         while True:
-            agent(workspace, t=t, **kwargs)
+            for call in calls:
+                call(workspace, t=t, **kwargs)
             if advance is not None:
                 advance(1)
             if stop_variable is not None and workspace.get(stop_variable, t).all():

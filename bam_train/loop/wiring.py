@@ -54,11 +54,16 @@ def _check(chain: list[Agent], held: frozenset[str], stop_variable: str | None) 
                 raise WiringError(f"{agent_name(one)} reads {name!r}, which nobody writes{_close(name, everything)}.")
         for name in one.reads or ():
             if name not in before:
-                late = "which only an agent after it writes; put it later" if name in everything else "which nobody writes"
-                raise WiringError(f"{agent_name(one)} reads {name!r}, {late}{_close(name, before)}.")
+                raise WiringError(f"{agent_name(one)} reads {name!r}, {_why(name, everything, before)}.")
         before.update(one.writes or ())
     if stop_variable is not None and stop_variable not in everything:
         raise WiringError(f"stop_variable {stop_variable!r} is written by nobody{_close(stop_variable, everything)}.")
+
+
+def _why(name: str, everything: frozenset[str], before: set[str]) -> str:
+    if name in everything:
+        return "which only an agent after it writes; put it behind that one"
+    return f"which nobody writes{_close(name, before)}"
 
 
 def _close(name: str, known: Iterable[str]) -> str:

@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bam_train.errors import UnknownVariable, ValueMismatch, WorkspaceError
-from bam_train.loop.arrays import UNLIMITED, NumpyVariable, kind_mismatch, require_window
+from bam_train.errors import UnknownVariable, WorkspaceError
+from bam_train.loop.arrays import UNLIMITED, NumpyVariable, kind_mismatch, no_batch, require_window
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -352,7 +352,8 @@ class Workspace:
         """A copy in memory that processes share, repeated over the batch; for remote agents."""
         from bam_train.loop.tensors.shared import shared_workspace
 
-        return shared_workspace(self, n_repeat, time_size)
+        workspace: Workspace = shared_workspace(self, n_repeat, time_size)
+        return workspace
 
     # -- pictures --------------------------------------------------------------------------------------------------
 
@@ -400,9 +401,7 @@ class Workspace:
 
             storage = TensorVariable
         elif isinstance(value, np.generic):
-            raise ValueMismatch(
-                f"{name!r} at {where}: expected a batch axis first (B x ...), found a single number; give it shape (1,)."
-            )
+            raise no_batch(name, where)
         else:
             raise kind_mismatch(name, where, "a torch.Tensor or a numpy.ndarray", value)
         return storage(name, self.first_time, self._limit, self._make_room)

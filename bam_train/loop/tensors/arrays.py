@@ -55,7 +55,7 @@ class TensorVariable:
         name: str,
         first: int = 0,
         limit: int = UNLIMITED,
-        make_room: Callable[[int], None] | None = None,
+        make_room: Callable[[int], None] = lambda t: None,
     ) -> None:
         self.name, self.first, self._limit, self._make_room = name, first, limit, make_room
         self._values: list[torch.Tensor] | None = []
@@ -64,6 +64,7 @@ class TensorVariable:
         self._shape: torch.Size | None = None  # of one time; None before the first write
         self._dtype: torch.dtype | None = None
         self._device: torch.device | None = None
+        self._is_cpu = False
 
     # -- what it is ------------------------------------------------------------------------------------------------
 
@@ -113,7 +114,11 @@ class TensorVariable:
             TimeNotWritten: A negative or lost time.
         """
         try:
-            fits = value.shape == self._shape and value.dtype is self._dtype and value.device == self._device
+            fits = (
+                value.shape == self._shape
+                and value.dtype is self._dtype
+                and (value.is_cpu if self._is_cpu else value.device == self._device)  # `is_cpu` is quicker
+            )
         except AttributeError:
             fits = False
         if not fits:
@@ -138,12 +143,11 @@ class TensorVariable:
         Raises:
             TimeNotWritten: Nobody wrote it.
         """
-        values = self._values
-        if values is None:
-            values = self._tensor  # type: ignore[assignment] - is indexed alike
+        values: Any = self._tensor if self._values is None else self._values  # indexed alike
         index = t - self.first if t >= 0 else len(values) + t
         if 0 <= index < len(values):
-            return values[index]
+            value: torch.Tensor = values[index]
+            return value
         raise not_written(self.name, t, self.first, self.stop)
 
     # -- all times -------------------------------------------------------------------------------------------------
@@ -157,7 +161,7 @@ class TensorVariable:
             return
         require_full(self.name, value, torch.Tensor, self.KIND)
         self._values, self._whole, self._read = None, value, None
-        self._shape, self._dtype, self._device = value.shape[1:], value.dtype, value.device
+        self._be_like(value.shape[1:], value)
 
     def full(self) -> torch.Tensor:
         """All times kept, T x B x ...; of a list, the same tensor until the next write."""
@@ -210,7 +214,7 @@ class TensorVariable:
         if values is None:
             raise WorkspaceError(f"{self.name!r} has no list.")
         if index >= self._limit:
-            self._make_room(t)  # type: ignore[misc] - there is one where there is a limit
+            self._make_room(t)
             index = t - self.first
         values.extend(torch.zeros_like(value, requires_grad=False) for _ in range(index - len(values)))
         values.append(value)
@@ -221,6 +225,9 @@ class TensorVariable:
         self._values, self._whole = values, None
         return values
 
+    def _be_like(self, shape: torch.Size, value: torch.Tensor) -> None:
+        self._shape, self._dtype, self._device, self._is_cpu = shape, value.dtype, value.device, value.is_cpu
+
     def _check(self, value: Any, where: str) -> None:
         """Take the first value's shape, dtype and device, or say what differs from them."""
         if not isinstance(value, torch.Tensor):
@@ -228,7 +235,7 @@ class TensorVariable:
         if self._shape is None:
             if value.ndim == 0:
                 raise no_batch(self.name, where)
-            self._shape, self._dtype, self._device = value.shape, value.dtype, value.device
+            self._be_like(value.shape, value)
         pairs = (
             ("shape", self._shape, value.shape),
             ("dtype", self._dtype, value.dtype),

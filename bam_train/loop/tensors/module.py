@@ -21,13 +21,14 @@ def become_module(agent: Any) -> None:
         if isinstance(value, (nn.Module, nn.Parameter)):
             raise AttributeError(f"{type(agent).__name__}: cannot assign {name!r} before super().__init__()")
     if not isinstance(agent, nn.Module):
-        agent.__class__ = module_form(type(agent))
+        kind: Any = type(agent)
+        agent.__class__ = module_form(kind)
     nn.Module.__init__(agent)
 
 
 @cache
-def module_form(kind: type) -> type:
-    """The subclass of `kind` and `nn.Module`; one for each class, with the same name."""
+def module_form(kind: Any) -> Any:
+    """The subclass of the class `kind` and of `nn.Module`; one for each class, with the same name."""
     members: dict[str, Any] = {name: getattr(kind, name) for name in ("__module__", "__qualname__", "__doc__")}
     if kind.__reduce__ is object.__reduce__ and kind.__reduce_ex__ is object.__reduce_ex__:
         members |= {"__reduce_ex__": _reduce, "_plain_class": kind}
@@ -39,6 +40,6 @@ def _reduce(agent: Any, protocol: Any) -> tuple[Any, ...]:
     return _rebuild, (agent._plain_class,), agent.__getstate__()
 
 
-def _rebuild(kind: type) -> Any:
+def _rebuild(kind: Any) -> Any:
     form = kind if issubclass(kind, nn.Module) else module_form(kind)
     return form.__new__(form)
