@@ -22,8 +22,9 @@ if TYPE_CHECKING:
 
     from bam_train.checkpoint import Checkpoint
     from bam_train.deploy.journal import Journal
-    from bam_train.deploy.loop import Watcher
-    from bam_train.policy import FrozenPolicy
+    from bam_train.deploy.agents import Watcher
+    from bam_train.deploy.loop import Deployment
+    from bam_train.deploy.pacer import Pacer
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,8 @@ def deploy_checkpoint(config: DeployConfig) -> int:
     startup.mark("python and arguments")
     _require_sane(config)
     from bam_train.checkpoint import Checkpoint
-    from bam_train.deploy.loop import connect
+    from bam_train.deploy.loop import Deployment
+    from bam_train.deploy.pacer import Pacer
     from bam_train.environments import make_env, require_fit
     from bam_train.policy import FrozenPolicy
 
@@ -66,33 +68,32 @@ def deploy_checkpoint(config: DeployConfig) -> int:
     env = make_env(manifest.env, manifest.env_kwargs, render_mode="human" if config.render else None)
     try:
         require_fit(checkpoint, env)
-        period = period_of(config, checkpoint, env)
-        connect(env)
+        pacer = Pacer(period_of(config, checkpoint, env))
+        journal = Journal(config.episodes, startup)
+        deployment = Deployment(env, policy, pacer, journal)
+        deployment.connect()
     except BaseException:
         env.close()  # type: ignore[no-untyped-call]
         raise
     startup.mark("environment")
-    return _run(config, checkpoint, env, policy, period, Journal(config.episodes, startup))
+    return _run(config, checkpoint, env, deployment, pacer, journal)
 
 
 def _run(
     config: DeployConfig,
     checkpoint: Checkpoint,
     env: gym.Env[Any, Any],
-    policy: FrozenPolicy,
-    period: float | None,
+    deployment: Deployment,
+    pacer: Pacer,
     journal: Journal,
 ) -> int:
-    from bam_train.deploy.loop import deploy
-    from bam_train.deploy.pacer import Pacer
     from bam_train.deploy.report import DeployReport
     from bam_train.deploy.signals import stop_signals
 
-    pacer = Pacer(period)
     with stop_signals():  # a second Ctrl-C must not lose the report
         with _display(f"{checkpoint.path} on {checkpoint.manifest.env}", env, journal) as watcher:
             journal.startup.mark("display")
-            ending = deploy(env, policy, pacer, journal, watcher, seed=config.seed)
+            ending = deployment.run(watcher, seed=config.seed)
         if ending.status:
             say(f"bam-deploy: {ending.reason}")
         report = DeployReport(checkpoint, config.seed, ending, journal, pacer)

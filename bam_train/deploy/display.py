@@ -41,7 +41,7 @@ class PlainDisplay:
 
     def ended(self, record: EpisodeRecord, pacer: Pacer) -> None:
         """Write how the episode went."""
-        self._write(episode_line(len(self._journal.records), self._journal.wanted, record))
+        self._write(episode_line(self._journal.begun, self._journal.wanted, record))
 
 
 class LiveDisplay:
@@ -81,7 +81,7 @@ class LiveDisplay:
 
     def ended(self, record: EpisodeRecord, pacer: Pacer) -> None:
         """Write how the episode went above the panel."""
-        self._live.console.print(episode_line(len(self._journal.records), self._journal.wanted, record))
+        self._live.console.print(episode_line(self._journal.begun, self._journal.wanted, record))
 
     def _panel(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> RenderableType:
         from rich.console import Group
@@ -95,7 +95,7 @@ class LiveDisplay:
 
     def rows(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> Iterator[tuple[str, str]]:
         """What the panel says, line by line: a name and a text; few enough for a screen of 24 lines."""
-        number, successes = len(self._journal.records), self._journal.successes
+        number, successes = self._journal.begun, self._journal.successes
         yield (
             "episode",
             f"{number} of {self._journal.wanted}" + ("" if successes is None else f", {successes} succeeded"),

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -69,6 +70,10 @@ class Startup:
         return sum(self.stages.values())
 
 
+KEPT = 1000
+"""Episodes whose records are kept; older ones are only counted, so that memory stays flat."""
+
+
 @dataclass
 class Journal:
     """The episodes of one deployment, and what its start cost."""
@@ -76,20 +81,52 @@ class Journal:
     wanted: int
     """Episodes asked for."""
     startup: Startup = field(default_factory=Startup)
-    records: list[EpisodeRecord] = field(default_factory=list)
+    records: deque[EpisodeRecord] = field(default_factory=deque)
+    """The last `KEPT` episodes."""
+    _older: _Count = field(default_factory=lambda: _Count())
 
     def begin(self, seed: int) -> EpisodeRecord:
         """A new episode, appended and returned."""
+        if len(self.records) == KEPT:
+            self._older.add(self.records.popleft())
         self.records.append(EpisodeRecord(seed))
         return self.records[-1]
 
     @property
-    def complete(self) -> list[EpisodeRecord]:
+    def begun(self) -> int:
+        """Episodes begun."""
+        return self._older.episodes + len(self.records)
+
+    @property
+    def completed(self) -> int:
         """Episodes that the environment ended."""
-        return [record for record in self.records if record.complete]
+        return self._count().completed
 
     @property
     def successes(self) -> int | None:
         """How many complete episodes succeeded; None if the environment does not say, 0 before the first."""
-        known = [record.success for record in self.complete if record.success is not None]
-        return sum(known) if known or not self.complete else None
+        count = self._count()
+        return count.succeeded if count.known or not count.completed else None
+
+    def _count(self) -> _Count:
+        count = replace(self._older)
+        for record in self.records:
+            count.add(record)
+        return count
+
+
+@dataclass
+class _Count:
+    """How many of some episodes were what."""
+
+    episodes: int = 0
+    completed: int = 0
+    known: int = 0
+    succeeded: int = 0
+
+    def add(self, record: EpisodeRecord) -> None:
+        self.episodes += 1
+        if record.complete:
+            self.completed += 1
+            self.known += record.success is not None
+            self.succeeded += bool(record.success)

@@ -27,7 +27,7 @@ class DeployReport:
         journal, manifest = self.journal, self.checkpoint.manifest
         return {
             "stop_reason": self.ending.reason,
-            "episodes": len(journal.complete),
+            "episodes": journal.completed,
             "successes": journal.successes,
             "ticks": self.pacer.ticks,
             "rate_hz": None if self.pacer.rate is None else round(self.pacer.rate, 3),
@@ -54,7 +54,7 @@ class DeployReport:
 def episodes_text(journal: Journal) -> str:
     """Such as ``5 of 5 episodes, 4 successes``."""
     successes = journal.successes
-    text = f"{len(journal.complete)} of {journal.wanted} episodes"
+    text = f"{journal.completed} of {journal.wanted} episodes"
     return text if successes is None else f"{text}, {successes} success{'' if successes == 1 else 'es'}"
 
 

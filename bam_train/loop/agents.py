@@ -78,9 +78,9 @@ class Agents(Agent):
 
     def _members(self) -> Iterable[Agent]:
         # Past nn.Module's __getattr__ and ModuleList's own, which cost as much as a small agent.
-        modules = self.__dict__.get("_modules")
-        members: Iterable[Agent] = self.__dict__["agents"] if modules is None else modules["agents"]._modules.values()
-        return members
+        own = self.__dict__
+        listed: Iterable[Agent] | None = own.get("agents")  # a module list is elsewhere
+        return own["_modules"]["agents"]._modules.values() if listed is None else listed
 
 
 class KWAgentWrapper(Agent):
@@ -204,4 +204,9 @@ def describe(agent: Agent) -> str:
 def _module_list(agents: Iterable[Agent]) -> Any:
     from torch import nn
 
+    from bam_train.loop.tensors.module import become_module
+
+    for agent in agents:
+        if not is_module(agent):  # made before torch was imported
+            become_module(agent)
     return nn.ModuleList(agents)

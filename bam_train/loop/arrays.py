@@ -1,7 +1,7 @@
 """Storage of one NumPy variable of a workspace: one buffer that grows, time first.
 
-Values are copied in. What is read is a view of the buffer: copy it before you change it or keep it beyond the next
-write.
+Values are copied in. What is read is a view of the buffer: it changes only where the same time is written again; copy it
+before you change it.
 """
 
 from __future__ import annotations
@@ -161,8 +161,9 @@ class NumpyVariable:
     def drop(self, first: int) -> None:
         """Forget the times before `first`."""
         left = max(0, self.stop - first)
-        self._buffer[:left] = self._buffer[self._count - left : self._count]
-        self.first, self._count = first, left
+        buffer = np.empty_like(self._buffer)  # a new one, so that what somebody has read does not change
+        buffer[:left] = self._buffer[self._count - left : self._count]
+        self._buffer, self.first, self._count = buffer, first, left
 
     def copy_time(self, begin: int, to: int, count: int) -> None:
         """Copy times [begin, begin + count) onto [to, to + count)."""

@@ -3,9 +3,8 @@
 A variable that `set` writes is a list: every value stays the very object that was given, with its graph, so that what
 was written at t and read at t + 1 can still be differentiated through. One that `set_full` writes is that tensor.
 
-Unlike BBRL's, a full read of a list is kept until the next write through the workspace, so that reading again is free.
-It is made anew when somebody has changed it in place, or when gradients are switched on in between; a stored value that
-is changed in place after a full read does not show in the next one.
+Unlike BBRL's, the joined form of a list is kept until the next write through the workspace, so that a second full read
+costs a copy only. A stored value that is changed in place after a full read does not show in the next one.
 """
 
 from __future__ import annotations
@@ -19,23 +18,16 @@ from bam_train.errors import WorkspaceError
 from bam_train.loop.arrays import UNLIMITED, batch_of, kind_mismatch, mismatch, no_batch, not_written, require_full
 
 
-class _FullRead(NamedTuple):
-    """A concatenation of a list, and what it was like when it was made."""
+class _Joined(NamedTuple):
+    """A concatenation of a list, which nobody else holds."""
 
     tensor: torch.Tensor
-    version: int
-    requires_grad: bool
     grad_enabled: bool
+    """Whether gradients were on when it was made."""
 
     def is_current(self) -> bool:
-        """Whether a new concatenation would be the same."""
-        tensor = self.tensor
-        return (
-            tensor._version == self.version
-            and tensor.requires_grad == self.requires_grad
-            and (torch.is_grad_enabled() == self.grad_enabled or (self.grad_enabled and not self.requires_grad))
-            and not torch.is_inference_mode_enabled()
-        )
+        """Whether a new concatenation would have the same graph."""
+        return torch.is_grad_enabled() == self.grad_enabled or (self.grad_enabled and not self.tensor.requires_grad)
 
 
 class TensorVariable:
@@ -60,7 +52,7 @@ class TensorVariable:
         self.name, self.first, self._limit, self._make_room = name, first, limit, make_room
         self._values: list[torch.Tensor] | None = []
         self._whole: torch.Tensor | None = None  # the variable itself when `_values` is None
-        self._read: _FullRead | None = None
+        self._read: _Joined | None = None
         self._shape: torch.Size | None = None  # of one time; None before the first write
         self._dtype: torch.dtype | None = None
         self._device: torch.device | None = None
@@ -164,15 +156,15 @@ class TensorVariable:
         self._be_like(value.shape[1:], value)
 
     def full(self) -> torch.Tensor:
-        """All times kept, T x B x ...; of a list, the same tensor until the next write."""
+        """All times kept, T x B x ...; of a list a new tensor, quick until the next write."""
         if self._values is None:
             return self._tensor
         if self._read is None or not self._read.is_current():
             tensor = _joined(self._values)
-            if tensor.is_inference():  # has no version, and cannot be used outside
+            if tensor.is_inference():  # cannot be used outside, where the next reader may be
                 return tensor
-            self._read = _FullRead(tensor, tensor._version, tensor.requires_grad, torch.is_grad_enabled())
-        return self._read.tensor
+            self._read = _Joined(tensor, torch.is_grad_enabled())
+        return self._read.tensor.clone()
 
     def truncated(self, begin: int, end: int) -> torch.Tensor:
         """Times [begin, end), cut off at the end; a view of one tensor, a copy of a list."""

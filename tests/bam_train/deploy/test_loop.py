@@ -10,7 +10,7 @@ from bam_envs.robot_env import RobotEnv
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.tasks.pick import PickTask
 from bam_train.deploy.journal import Journal, Startup
-from bam_train.deploy.loop import Ending, connect, deploy, fault_text
+from bam_train.deploy.loop import Deployment, Ending, fault_text
 from bam_train.deploy.pacer import Pacer
 
 
@@ -69,7 +69,7 @@ class Driven(gym.Wrapper):
 def run(env, policy=None, episodes=3, seed=7, watcher=None):
     journal = Journal(episodes)
     pacer = Pacer(None)
-    ending = deploy(env, policy or Right(), pacer, journal, watcher or Silent(), seed=seed)
+    ending = Deployment(env, policy or Right(), pacer, journal).run(watcher or Silent(), seed=seed)
     return ending, journal, pacer
 
 
@@ -120,7 +120,7 @@ def test_a_fault_halts_and_is_named(corridor, error, reason):
     assert env.robot.calls == ["halt", "close"]
     assert [record.end for record in journal.records] == ["stopped"]
     assert journal.records[0].length == 1
-    assert journal.complete == []
+    assert journal.completed == 0
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -177,7 +177,7 @@ def test_a_failing_close_is_a_fault(corridor):
 
     ending, journal, _ = run(Stuck(gym.make(corridor)))
     assert ending == Ending("fault: closing failed: OSError: stuck", 1)
-    assert len(journal.complete) == 3
+    assert journal.completed == 3
 
 
 def test_an_action_that_is_not_finite_never_reaches_the_robot(corridor):
@@ -218,7 +218,6 @@ def test_the_same_loop_drives_any_robot():
     """A `RobotEnv` over a robot without physics: every action becomes one command, and the robot is halted."""
     robot = FakeRobot()
     env = gym.wrappers.TimeLimit(RobotEnv(robot, PickTask(1)), 7)
-    connect(env)
     ending, journal, pacer = run(env, Right(np.array([1, 0, 0, 0, 1], np.float32)), episodes=2)
     assert ending == Ending("episodes done", 0)
     assert [(record.length, record.end) for record in journal.records] == [(7, "truncated")] * 2

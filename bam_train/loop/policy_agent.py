@@ -1,0 +1,101 @@
+"""A policy that is no agent itself, such as a frozen one, at work in the loop, on NumPy arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_train.errors import PolicyError
+from bam_train.loop.agent import Agent
+
+
+class PolicyAgent(Agent):
+    """Reads the observation at t and writes the action.
+
+    The policy's recurrent state is forgotten where an episode begins (``env/timestep`` is 0). Once every row's episode
+    has ended nothing is written: nobody would use it.
+
+    Args:
+        policy: Has ``reset(rows=None)`` and ``act_batch(observations)``, or ``act(observation)`` with `single`.
+        observation_names: The variables that make up its observation; of a Dict ``env/env_obs/<key>`` each.
+        single: The batch is one row, and the policy's `act` takes it without a batch axis.
+        output_string: The variable of the action.
+        input_prefix: What the environment's variables begin with.
+        name: What `get_by_name` finds.
+    """
+
+    def __init__(
+        self,
+        policy: Any,
+        observation_names: Sequence[str] = ("env/env_obs",),
+        *,
+        single: bool = False,
+        output_string: str = "action",
+        input_prefix: str = "env/",
+        name: str | None = None,
+    ) -> None:
+        super().__init__(name=name)
+        self.policy, self.single, self.output = policy, single, output_string
+        self.names = tuple(observation_names)
+        self._timestep, self._done = f"{input_prefix}timestep", f"{input_prefix}done"
+        root = f"{input_prefix}env_obs/"
+        self._keys = [name.removeprefix(root) for name in self.names] if self.names[0].startswith(root) else None
+        self.reads, self.writes = (*self.names, self._timestep, self._done), (output_string,)
+
+    def forward(self, t: int, seed: int | Sequence[int] | None = None, **kwargs: Any) -> None:
+        """Act on the observation at t.
+
+        Args:
+            t: The time.
+            seed: Of the episode, or of each row's, for an error's text.
+            kwargs: Not used.
+
+        Raises:
+            PolicyError: An action that is not finite.
+        """
+        if self.get((self._done, t)).all():
+            return
+        self._begin(t)
+        action = self._act(t)
+        require_finite(action, f"at step {t} of {_episode(seed)}")
+        self.set((self.output, t), action[None] if self.single else action)
+
+    def _begin(self, t: int) -> None:
+        """Forget the rows whose episode begins at t."""
+        steps = self.get((self._timestep, t))
+        if not steps.all():
+            rows = np.flatnonzero(steps == 0)
+            if len(rows) == len(steps):
+                self.policy.reset()
+            else:
+                self.policy.reset(rows)
+
+    def _act(self, t: int) -> NDArray[Any]:
+        values = [self.get((name, t)) for name in self.names]
+        if self.single:
+            values = [value[0] for value in values]
+        observation = values[0] if self._keys is None else dict(zip(self._keys, values, strict=True))
+        return np.asarray(self.policy.act(observation) if self.single else self.policy.act_batch(observation))
+
+
+def _episode(seed: int | Sequence[int] | None) -> str:
+    if seed is None:
+        return "the episode"
+    return f"the episode with seed {seed}" if isinstance(seed, int) else f"the episodes from seed {seed[0]} on"
+
+
+def require_finite(action: Any, when: str) -> None:
+    """Refuse an action that is not finite, naming the first such number.
+
+    Raises:
+        PolicyError: One of the numbers is NaN or infinite.
+    """
+    numbers = np.asarray(action)
+    if numbers.dtype.kind == "f" and not np.isfinite(numbers).all():
+        index = tuple(int(i) for i in np.argwhere(~np.isfinite(numbers))[0])
+        raise PolicyError(
+            f"action{list(index)} is {numbers[index]} {when}; expected finite numbers: the policy is broken"
+        )

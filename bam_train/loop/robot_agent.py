@@ -1,0 +1,140 @@
+"""One environment without automatic resets, usually a robot's, on NumPy arrays: what evaluation and deployment run on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_train.errors import LoopError
+from bam_train.loop.agent import Agent
+
+FLAGS = ("terminated", "truncated", "done")
+SUCCESS = "info/is_success"
+"""Whether the task is done, where the environment's info says ``is_success``."""
+SAYS_SUCCESS = "info/_is_success"
+"""Whether it says so; Gymnasium's name for such a mask."""
+
+
+class RobotAgent(Agent):
+    """At t = 0 resets the environment, later steps it with the action of t - 1.
+
+    It writes at every t, with a batch of one: ``env/env_obs`` (or ``env/env_obs/<key>`` of a Dict) with the space's
+    dtype, ``env/reward`` and ``env/cumulated_reward`` (float64; 0 at a reset), ``env/timestep`` (int64; steps since the
+    reset), ``env/terminated``, ``env/truncated`` and ``env/done`` (bool), and ``env/info/is_success`` with its mask
+    ``env/info/_is_success`` (bool). Run it until ``env/done``; a call at t = 0 begins the next episode.
+
+    An environment with a robot is live: a chain with it is checked when it is built, before the robot is connected.
+
+    Args:
+        env: The environment; closed by `close`.
+        input_string: The variable that has the action.
+        output_string: What its variables' names begin with.
+        name: What `get_by_name` finds.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        input_string: str = "action",
+        output_string: str = "env/",
+        name: str | None = None,
+    ) -> None:
+        super().__init__(name=name)
+        self.env, self.input, self.output = env, input_string, output_string
+        self.live = robot_of(env) is not None
+        self.observation_names = tuple(names_of(env.observation_space, f"{output_string}env_obs"))
+        rest = ("reward", "cumulated_reward", "timestep", *FLAGS, SUCCESS, SAYS_SUCCESS)
+        self.reads, self.reads_previous = (), (input_string,)
+        self.writes = (*self.observation_names, *(output_string + name for name in rest))
+        self._total, self._steps = 0.0, 0
+        self._running = self._closed = False
+
+    def connect(self) -> None:
+        """Open the link to the robot, if there is one, without moving it: what is missing shows before the loop."""
+        self._closed = False
+        robot = robot_of(self.env)
+        if robot is not None:
+            robot.connect()
+
+    def halt(self) -> None:
+        """Stop the robot moving, if there is one; may be called from any thread."""
+        robot = robot_of(self.env)
+        if robot is not None:
+            robot.halt()
+
+    def close(self) -> None:
+        """Halt the robot, then close the environment; a second call does nothing."""
+        self._running = False
+        if self._closed:
+            return
+        try:
+            self.halt()
+        finally:
+            self.env.close()  # type: ignore[no-untyped-call]
+        self._closed = True
+
+    def forward(self, t: int, seed: int | None = None, **kwargs: Any) -> None:
+        """Reset with `seed` at t = 0, else step.
+
+        Raises:
+            LoopError: t > 0 and no episode is running.
+        """
+        if t == 0:
+            self._closed = False
+            observation, info = self.env.reset(seed=seed)
+            self._total, self._steps, self._running = 0.0, 0, True
+            self._write(t, observation, 0.0, (False, False), info)
+            return
+        if not self._running:
+            raise LoopError(
+                f"No episode is running in {self.env.spec.id if self.env.spec else self.env}; begin at t=0."
+            )
+        action = self.get((self.input, t - 1))[0]
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._total += float(reward)
+        self._steps += 1
+        self._running = not (terminated or truncated)
+        self._write(t, observation, float(reward), (bool(terminated), bool(truncated)), info)
+
+    def _write(self, t: int, observation: Any, reward: float, ends: tuple[bool, bool], info: Mapping[str, Any]) -> None:
+        values = {
+            "reward": np.array([reward]),
+            "cumulated_reward": np.array([self._total]),
+            "timestep": np.array([self._steps]),
+            "terminated": np.array([ends[0]]),
+            "truncated": np.array([ends[1]]),
+            "done": np.array([ends[0] or ends[1]]),
+            SUCCESS: np.array([bool(info.get("is_success", False))]),
+            SAYS_SUCCESS: np.array(["is_success" in info]),
+        }
+        for name, value in flat(observation, f"{self.output}env_obs"):
+            self.set((name, t), np.asarray(value)[None])
+        for name, value in values.items():
+            self.set((self.output + name, t), value)
+
+
+def robot_of(env: gym.Env[Any, Any]) -> Any:
+    """The robot of a `RobotEnv`, or None."""
+    return getattr(env.unwrapped, "robot", None)
+
+
+def names_of(space: gym.Space[Any], name: str) -> Iterator[str]:
+    """Names of the variables that observations of `space` become."""
+    if isinstance(space, gym.spaces.Dict):
+        for key, part in space.spaces.items():
+            yield from names_of(part, f"{name}/{key}")
+    else:
+        yield name
+
+
+def flat(observation: Any, name: str) -> Iterator[tuple[str, NDArray[Any]]]:
+    """The arrays of an observation, with the names of their variables."""
+    if isinstance(observation, Mapping):
+        for key, part in observation.items():
+            yield from flat(part, f"{name}/{key}")
+    else:
+        yield name, observation
