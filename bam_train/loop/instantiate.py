@@ -26,10 +26,10 @@ def get_class(arguments: Any) -> Any:
     path = _entries(arguments).get("classname")
     if not isinstance(path, str):
         found = "none" if path is None else repr(path)
-        raise SettingsError(f'classname: expected a text such as "package.module.Class", found {found}.')
+        raise SettingsError(f'classname: expected a path such as "package.module.Class", found {found}.')
     module_path, _, name = path.rpartition(".")
-    if not module_path or not name:
-        raise SettingsError(f'classname: expected "package.module.Class", found {path!r}, which has no module.')
+    if not all(part.isidentifier() for part in path.split(".")) or not module_path:
+        raise SettingsError(f'classname: expected a path such as "package.module.Class", found {path!r}.')
     module = _module(path, module_path)
     try:
         return getattr(module, name)

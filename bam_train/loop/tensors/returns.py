@@ -4,8 +4,8 @@ T is time, B the batch. ``reward[t + 1]`` and ``critic[t + 1]`` follow from ``ac
 holds the reward of the action before it.
 
 Differences from BBRL's `bbrl.utils.functional`: shapes that differ are refused, where BBRL's broadcasts (N and N x 1
-give N x N without a word); `gae` takes time proportional to log T instead of T on wide tensors, has no rows from no
-rows, and works in the critic's dtype throughout.
+give N x N without a word); `gae` takes log2(T) operations on whole tensors instead of T on rows, gives no rows from no
+rows, and keeps float64.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ def gae(
         delta[t]     = reward[t] + discount_factor * must_bootstrap[t] * next_critic[t] - critic[t]
         advantage[t] = delta[t] + discount_factor * gae_coef * must_bootstrap[t] * advantage[t + 1]
 
-    The sum ends where `must_bootstrap` is False and at the last row. The first axis is time: give T x B. A flat batch of
-    N transitions (`get_transitions` of one environment) is right as well; of several environments it is not, because
+    The sum ends where `must_bootstrap` is False and at the last row. The first axis is time: give T x B. A flat batch
+    of N transitions (`get_transitions` of one environment) is right as well; of several environments it is not, because
     neighbours in such a batch belong to different environments (except with ``gae_coef=0``).
 
     Args:
@@ -50,7 +50,7 @@ def gae(
     """
     shape = reward.shape
     _require_shapes("gae", shape, next_critic=next_critic, must_bootstrap=must_bootstrap, critic=critic)
-    bootstrap = must_bootstrap.to(critic.dtype)
+    bootstrap = must_bootstrap.to(torch.promote_types(reward.dtype, critic.dtype))
     delta = reward + discount_factor * next_critic.detach() * bootstrap - critic
     if gae_coef == 0.0:
         return delta
@@ -153,10 +153,11 @@ def cumulated_reward(reward: torch.Tensor, done: torch.Tensor) -> float:
     unfinished = (~ended.any(0)).nonzero().flatten().tolist()
     if unfinished:
         raise WorkspaceError(
-            f"cumulated_reward: expected a done in every column, found none in {unfinished[:5]}; run until all are done."
+            f"cumulated_reward: expected a done in every column, found none in {unfinished[:5]}; "
+            f"run until all are done."
         )
     before = ended.int().cumsum(0) - ended.int() == 0
-    return float(torch.where(before, reward, 0).sum(0).float().mean())
+    return float(torch.where(before, reward, 0).mul(1.0).sum(0).mean())
 
 
 def _of_action(q: torch.Tensor, action: torch.Tensor) -> torch.Tensor:

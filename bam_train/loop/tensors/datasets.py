@@ -1,0 +1,149 @@
+"""Agents that write batches of a dataset at time 0.
+
+Differences from BBRL's agents of the same names: `ShuffledDatasetAgent` works, seeded and unseeded; a batch with fewer
+values than there are names is an error; a batch may be a mapping or one tensor; a finished `DataLoaderAgent` stays
+finished however often it is called; neither draws from torch's random numbers when it is made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from bam_train.errors import WorkspaceError
+from bam_train.loop.agent import Agent
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+_NAMES = ("x", "y")
+
+
+class _DatasetAgent(Agent):
+    """Writes batches, on the device where the agent is (`to`)."""
+
+    reads = ()
+
+    def __init__(self, output_names: Sequence[str]) -> None:
+        super().__init__()
+        self.output_names = tuple(output_names)
+        self.writes = self.output_names
+        self.ghost_params = torch.nn.Parameter(torch.empty(0))
+
+    def _write(self, batch: Any) -> None:
+        """Write the values of one batch at time 0, by name, in order."""
+        for name, value in zip(self.output_names, _values(batch, self.output_names), strict=False):
+            self.set((name, 0), torch.as_tensor(value).to(self.ghost_params.device))
+
+
+class DataLoaderAgent(_DatasetAgent):
+    """Writes the next batch of a data loader at each call; after the last one nothing, and `finished` is True.
+
+    ::
+
+        agent(workspace)
+        while not agent.finished():
+            ...
+            agent(workspace)
+
+    Args:
+        dataloader: A ``torch.utils.data.DataLoader``, or anything else that can be iterated over again and again.
+        output_names: Variables for the values of a batch, B x ... each; further values are left out.
+    """
+
+    def __init__(self, dataloader: Any, output_names: Sequence[str] = _NAMES) -> None:
+        super().__init__(output_names)
+        self.dataloader = dataloader
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin again with the first batch."""
+        self.iter = iter(self.dataloader)
+        self._finished = False
+
+    def finished(self) -> bool:
+        """Whether the last call found no batch, and wrote nothing."""
+        return self._finished
+
+    def forward(self, **kwargs: Any) -> None:
+        """Write the next batch at time 0.
+
+        Raises:
+            WorkspaceError: The batch has fewer values than there are names.
+        """
+        if self._finished:
+            return
+        try:
+            batch = next(self.iter)
+        except StopIteration:
+            self._finished = True
+        else:
+            self._write(batch)
+
+
+class ShuffledDatasetAgent(_DatasetAgent):
+    """Writes items of a dataset at each call, drawn uniformly with replacement, for ever.
+
+    Args:
+        dataset: A ``torch.utils.data.Dataset`` with a length, whose items are tuples of tensors or numbers.
+        batch_size: Items of each batch.
+        output_names: Variables for the values of an item, batch_size x ... each; further values are left out.
+    """
+
+    def __init__(self, dataset: Any, batch_size: int, output_names: Sequence[str] = _NAMES) -> None:
+        super().__init__(output_names)
+        self.dataset = dataset
+        self.batch_size = batch_size
+        self._rng: np.random.Generator | None = None
+
+    def seed(self, seed: int | None = None) -> Self:
+        """Draw from a generator of its own from now on; the agent itself is returned.
+
+        Without a seed at all it draws from torch's global generator.
+
+        Args:
+            seed: The same one gives the same batches; None gives others every time.
+
+        Raises:
+            WorkspaceError: A negative seed, or no int.
+        """
+        if seed is not None and (not isinstance(seed, int) or seed < 0):
+            raise WorkspaceError(f"seed: expected an int of at least 0, or None, found {seed!r}.")
+        self._rng = np.random.default_rng(seed)
+        return self
+
+    def forward(self, **kwargs: Any) -> None:
+        """Write a batch at time 0.
+
+        Raises:
+            WorkspaceError: The dataset is empty, or its items have fewer values than there are names.
+        """
+        items = [_values(self.dataset[k], self.output_names) for k in self._drawn()]
+        self._write([torch.stack([torch.as_tensor(value) for value in column]) for column in zip(*items, strict=True)])
+
+    def _drawn(self) -> list[int]:
+        """Which items."""
+        size = len(self.dataset)
+        if not size:
+            raise WorkspaceError("The dataset is empty: there is nothing to draw from.")
+        if self._rng is None:
+            return [int(k) for k in torch.randint(size, (self.batch_size,))]
+        return [int(k) for k in self._rng.integers(size, size=self.batch_size)]
+
+
+def _values(batch: Any, names: Sequence[str]) -> list[Any]:
+    """The values that `names` stand for, of a tuple, a mapping or one tensor."""
+    if isinstance(batch, Mapping):
+        missing = [name for name in names if name not in batch]
+        if missing:
+            raise WorkspaceError(f"The dataset has no {missing[0]!r}; its items have {', '.join(map(repr, batch))}.")
+        return [batch[name] for name in names]
+    values = [batch] if isinstance(batch, (torch.Tensor, np.ndarray)) else list(batch)
+    if len(values) < len(names):
+        raise WorkspaceError(
+            f"output_names: expected as many as the dataset has values ({len(values)}), found {names}."
+        )
+    return values[: len(names)]

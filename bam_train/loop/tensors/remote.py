@@ -1,0 +1,215 @@
+"""Agents in other processes, which write into one shared workspace.
+
+Differences from BBRL, whose processes die as they start while the parent waits for ever:
+
+- They work, with every start method. "spawn" is the default, because torch's threads and CUDA do not survive a fork; in
+  a notebook, or with agents that cannot be pickled, give ``start_method="fork"``.
+- A failure there is a `RemoteAgentError` here. The processes are closed then; the next call starts new ones.
+- Weights are in shared memory: ``load_state_dict`` on what `get_by_name` finds is seen in the process at once.
+- `seed` seeds the process's global generators as well, so that the noise of two processes differs; it works after the
+  start, too. Nobody needs to seed: process k has seed k, or, of a lone `RemoteAgent`, its generators one from torch's.
+- `NRemoteAgent.create` leaves the agent it is given as it was. With no processes, what it returns is not seeded.
+- `close` can be called at any time; processes also end with the agent's last reference and with the parent.
+- A process is a daemon: the agent in it cannot start processes of its own.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from bam_train.errors import LoopError, WorkspaceError
+from bam_train.loop.agent import Agent, agent_name
+from bam_train.loop.tensors.process_agent import ProcessAgent
+from bam_train.loop.tensors.shared import SharedWorkspace, _SplitSharedWorkspace
+from bam_train.loop.tensors.worker import RemoteAgentError, wait_for_any
+from bam_train.loop.workspace import Workspace
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+__all__ = ["NRemoteAgent", "RemoteAgent", "RemoteAgentError"]
+
+
+class RemoteAgent(ProcessAgent):
+    """Runs an agent in another process, on a shared workspace, without gradients.
+
+    Args:
+        agent: What to run there; its weights move into shared memory.
+        name: What `get_by_name` finds.
+        verbose: Kept as an attribute.
+        start_method: "spawn", "forkserver" or "fork".
+    """
+
+    def __init__(
+        self, agent: Agent, name: str | None = None, verbose: bool = False, *, start_method: str = "spawn"
+    ) -> None:
+        super().__init__(agent, name, verbose, start_method=start_method)
+        self._sent: Workspace | None = None
+
+    def __call__(self, workspace: Workspace, **kwargs: Any) -> None:
+        """Run the agent on `workspace` with these keywords, and wait for it.
+
+        Raises:
+            WorkspaceError: The workspace is not shared.
+            RemoteAgentError: The agent failed, or its process ended.
+            LoopError: It is running already.
+        """
+        self._asynchronous_call(workspace, **kwargs)
+        if self._worker is not None:
+            self._worker.wait()
+
+    def _asynchronous_call(self, workspace: Workspace, **kwargs: Any) -> None:
+        """The call without waiting; `is_running` says when it has ended."""
+        if not getattr(workspace, "is_shared", False):
+            raise WorkspaceError(
+                f"{agent_name(self)} needs a shared workspace; NRemoteAgent.create makes one, or "
+                f"bam_train.loop.tensors.shared.shared_workspace(workspace)."
+            )
+        before = self._worker
+        worker = self._running_worker()
+        known = worker is before and workspace is self._sent
+        worker.send("run", None if known else workspace, kwargs)
+        self._sent = workspace
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_sent": None}
+
+
+class NRemoteAgent(Agent):
+    """Runs copies of an agent in several processes, each on its own batch columns; see `create`.
+
+    Args:
+        agents: One for each process.
+        batch_dims: First column of each, and one after its last.
+
+    Attributes:
+        agents: One for each process.
+        batch_dims: First column of each, and one after its last.
+    """
+
+    def __init__(self, agents: Sequence[RemoteAgent], batch_dims: Sequence[tuple[int, int]]) -> None:
+        super().__init__()
+        self.agents = list(agents)
+        self.batch_dims = list(batch_dims)
+        self._split: tuple[Workspace, list[SharedWorkspace]] | None = None
+
+    @staticmethod
+    def create(
+        agent: Agent,
+        num_processes: int = 0,
+        time_size: int | None = None,
+        *,
+        start_method: str = "spawn",
+        **extra_kwargs: Any,
+    ) -> tuple[Agent, SharedWorkspace]:
+        """Make an agent of `num_processes` processes, and the shared workspace to call it with.
+
+        A copy of `agent` runs here once, with seed 0 and `extra_kwargs`, to see what it writes. Process k writes the
+        batch columns k * B to (k + 1) * B - 1, where B is the batch size of `agent`, and has seed k until
+        ``seed(s)`` gives it s + k. Seed what is returned, not `agent`.
+
+        Args:
+            agent: What to run; it is copied.
+            num_processes: Processes; 0 returns a copy of `agent` that runs here, to find errors with.
+            time_size: Times of the workspace; None for as many as the run here wrote.
+            start_method: "spawn", "forkserver" or "fork".
+            extra_kwargs: Keywords of the run here, such as ``t=0, n_steps=10``.
+
+        Raises:
+            WorkspaceError: The agent writes nothing, or variables of different batch sizes; or a negative number.
+        """
+        if num_processes < 0:
+            raise WorkspaceError(f"num_processes: expected at least 0, found {num_processes}.")
+        workspace, trial = Workspace(), copy.deepcopy(agent)
+        trial.seed(0)
+        trial(workspace, **extra_kwargs)
+        trial.close()
+        size = workspace.batch_size() or 0
+        shared = workspace._convert_to_shared_workspace(max(1, num_processes), time_size)
+        copies = [copy.deepcopy(agent) for _ in range(max(1, num_processes))]
+        if num_processes == 0:
+            return copies[0], shared  # type: ignore[return-value]
+        remotes = [RemoteAgent(one, start_method=start_method) for one in copies]
+        columns = [(k * size, (k + 1) * size) for k in range(num_processes)]
+        return NRemoteAgent(remotes, columns).seed(0), shared  # type: ignore[return-value]
+
+    def __call__(self, workspace: Workspace, **kwargs: Any) -> None:
+        """Run all copies at once, each on its columns of `workspace`, and wait for them.
+
+        Raises:
+            WorkspaceError: The workspace is not shared, or not as wide as all copies together.
+            RemoteAgentError: A copy failed, or its process ended. All are closed then.
+            LoopError: It is running already.
+        """
+        self._asynchronous_call(workspace, **kwargs)
+        try:
+            while running := [agent for agent in self.agents if agent.is_running()]:
+                wait_for_any([agent._worker for agent in running if agent._worker is not None])
+        except BaseException:
+            self.close()
+            raise
+
+    def _asynchronous_call(self, workspace: Workspace, **kwargs: Any) -> None:
+        """The call without waiting; `is_running` says when it has ended."""
+        if self.is_running():
+            raise LoopError(f"{agent_name(self)} is still running; wait until is_running() is False.")
+        for agent, columns in zip(self.agents, self._columns(workspace), strict=True):
+            agent._asynchronous_call(columns, **kwargs)
+
+    def forward(self, **kwargs: Any) -> None:
+        """Not used.
+
+        Raises:
+            NotImplementedError: Always.
+        """
+        raise NotImplementedError("NRemoteAgent has no forward; call it.")
+
+    def is_running(self) -> bool:
+        """Whether a call that did not wait is still under way in a process.
+
+        Raises:
+            RemoteAgentError: A copy failed. All are closed then.
+        """
+        try:
+            return bool([agent for agent in self.agents if agent.is_running()])  # looks at all: one may have failed
+        except RemoteAgentError:
+            self.close()
+            raise
+
+    def get_by_name(self, n: str) -> list[Agent]:
+        """The agents of that name: this one, then those in each process, whose weights are shared."""
+        return super().get_by_name(n) + [one for agent in self.agents for one in agent.get_by_name(n)]
+
+    def seed(self, seed: int, inc: int = 1) -> Self:
+        """Seed copy k with seed + k * inc; itself is returned."""
+        for k, agent in enumerate(self.agents):
+            agent.seed(seed + k * inc)
+        return self
+
+    def train(self, mode: bool = True) -> Self:
+        """Set the mode in all processes; `eval` is ``train(False)``."""
+        super().train(mode)
+        for agent in self.agents:
+            agent.train(mode)
+        return self
+
+    def close(self) -> None:
+        """End all processes; at any time, as often as one likes. The next call starts new ones."""
+        for agent in self.agents:
+            agent.close()
+
+    def _columns(self, workspace: Workspace) -> list[SharedWorkspace]:
+        """Each copy's part of a workspace; the same objects as long as the workspace is."""
+        if not isinstance(workspace, SharedWorkspace):
+            raise WorkspaceError(f"{agent_name(self)} needs the shared workspace that NRemoteAgent.create made for it.")
+        if self._split is None or self._split[0] is not workspace:
+            width = self.batch_dims[-1][1]
+            if workspace.batch_size() != width:
+                raise WorkspaceError(f"Expected a shared workspace of {width} columns, found {workspace.batch_size()}.")
+            self._split = (workspace, [_SplitSharedWorkspace(workspace, columns) for columns in self.batch_dims])
+        return self._split[1]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_split": None}

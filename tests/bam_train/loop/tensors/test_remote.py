@@ -1,0 +1,426 @@
+import copy
+import gc
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from remote_agents import Trouble, Walker
+
+from bam_train.errors import LoopError, WorkspaceError
+from bam_train.loop import Agents, SeedableAgent, TemporalAgent, Workspace
+from bam_train.loop.tensors.remote import NRemoteAgent, RemoteAgent, RemoteAgentError
+from bam_train.loop.tensors.shared import shared_workspace
+
+pytestmark = [
+    pytest.mark.usefixtures("no_process_left"),
+    pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning"),
+]
+
+STEPS = {"t": 0, "n_steps": 3}
+
+
+def loop(agent):
+    return TemporalAgent(Agents(agent))
+
+
+def here(agent, seed, **kwargs):
+    """The same run in this process."""
+    agent, workspace = copy.deepcopy(agent), Workspace()
+    with torch.random.fork_rng(), torch.no_grad():
+        torch.manual_seed(seed)
+        agent.seed(seed)
+        agent(workspace, **kwargs)
+    return workspace
+
+
+def same(shared, *expected):
+    for name in ("x", "grad"):
+        assert torch.equal(shared[name], torch.cat([workspace[name] for workspace in expected], 1))
+
+
+@pytest.fixture
+def started():
+    """Makes a remote agent and its workspace; closes it at the end."""
+    agents = []
+
+    def start(agent=None, **kwargs):
+        agent = loop(Walker()) if agent is None else agent
+        workspace = Workspace()
+        agents.append(RemoteAgent(copy.deepcopy(agent), **{"start_method": "fork", **kwargs}))
+        agent(workspace, **STEPS)
+        return agents[-1], shared_workspace(workspace, time_size=3)
+
+    yield start
+    for agent in agents:
+        agent.close()
+
+
+@pytest.fixture
+def created():
+    agents = []
+
+    def create(agent, processes=2, **kwargs):
+        made, workspace = NRemoteAgent.create(agent, processes, **{"start_method": "fork", **STEPS, **kwargs})
+        agents.append(made)
+        return made, workspace
+
+    yield create
+    for agent in agents:
+        agent.close()
+
+
+# -- results -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["spawn", "fork"])
+def test_processes_give_the_results_of_this_one(created, method):
+    agent = loop(Walker())
+    remote, workspace = created(agent, start_method=method)
+    remote.seed(5)
+    remote(workspace, **STEPS, scale=2.0)
+    same(workspace, here(agent, 5, **STEPS, scale=2.0), here(agent, 6, **STEPS, scale=2.0))
+    assert not workspace["grad"].any()
+    assert len(multiprocessing.active_children()) == 2
+
+
+def test_a_process_goes_on_where_it_was(started):
+    remote, workspace = started()
+    agent = remote.clone()
+    remote.seed(3)
+    remote(workspace, **STEPS)
+    remote(workspace, t=0, n_steps=1)
+    other = shared_workspace(workspace)
+    remote(other, t=1, n_steps=1)
+    assert workspace["x"][:, 0, 1].tolist() == [4, 2, 3]
+    assert other["x"][:, 0, 1].tolist() == [4, 5, 3]
+    assert agent.agent.agent[0].calls == 0
+
+
+def test_unseeded_processes_differ(created):
+    remote, workspace = created(Walker(), t=0)
+    remote(workspace, t=0)
+    assert workspace["x"][0, :, 0].tolist() == [0, 0, 1, 1]
+    assert workspace["x"][0, 0, 4] != workspace["x"][0, 2, 4]
+
+
+def test_an_unseeded_remote_agent_follows_torchs_seed(started):
+    noise = []
+    for _ in range(2):
+        remote, workspace = started()
+        torch.manual_seed(4)
+        remote(workspace, **STEPS)
+        noise.append(workspace["x"][:, :, 4].clone())
+        assert workspace["x"][0, 0, 0] == -1
+    assert torch.equal(*noise)
+
+
+def test_seeds_after_the_start(created):
+    agent = loop(Walker())
+    remote, workspace = created(agent)
+    remote(workspace, **STEPS)
+    remote.seed(10, inc=5)
+    remote(workspace, t=0, n_steps=1)
+    assert workspace["x"][0, :, 0].tolist() == [10, 10, 15, 15]
+    with torch.random.fork_rng():
+        torch.manual_seed(15)
+        assert torch.equal(workspace["x"][0, 2:, 4:5], torch.rand(2, 1))
+
+
+def test_modes(created):
+    remote, workspace = created(Walker(), t=0)
+    modes = []
+    for change in (lambda: None, remote.eval, remote.train):
+        change()
+        remote(workspace, t=0)
+        modes.append((remote.training, workspace["x"][0, 0, 2].item(), workspace["x"][0, 2, 2].item()))
+    assert modes == [(True, 1, 1), (False, 0, 0), (True, 1, 1)]
+
+
+def test_weights_are_shared(created):
+    remote, workspace = created(Agents(Walker(name="policy")), t=0)
+    remote(workspace, t=0)
+    assert workspace["x"][0, :, 5].tolist() == [0, 0, 0, 0]
+    state = {"weight": torch.tensor([2.5])}
+    for policy in remote.get_by_name("policy"):
+        policy.load_state_dict(state)
+    remote(workspace, t=0)
+    assert workspace["x"][0, :, 5].tolist() == [2.5] * 4
+
+
+def test_one_call_at_a_time(started):
+    remote, workspace = started(loop(Trouble()))
+    remote._asynchronous_call(workspace, **STEPS, at=0, what="hang")
+    with pytest.raises(LoopError, match=r"^RemoteAgent is still running; wait until is_running\(\) is False\.$"):
+        remote(workspace, **STEPS)
+    assert remote.is_running()
+    remote.close()
+    assert not remote.is_running()
+
+
+def test_several_without_waiting(created):
+    remote, workspace = created(loop(Walker()))
+    assert not remote.is_running()
+    remote._asynchronous_call(workspace, **STEPS)
+    while remote.is_running():
+        pass
+    assert workspace["x"][:, 3, 1].tolist() == [1, 2, 3]
+
+
+# -- create ------------------------------------------------------------------------------------------------------------
+
+
+def test_without_processes_it_is_a_copy(created):
+    agent = Walker()
+    made, workspace = created(agent, 0, t=0, time_size=4)
+    assert type(made) is type(agent)
+    assert (made is agent, made.calls, agent.calls, agent.own_seed) == (False, 0, 0, -1)
+    assert (workspace.is_shared, workspace.time_size(), workspace.batch_size()) == (True, 4, 2)
+    made(workspace, t=3)
+    assert workspace["x"][:, 0, 1].tolist() == [0, 0, 0, 1]
+    assert multiprocessing.active_children() == []
+
+
+def test_a_workspace_of_another_length(created):
+    remote, workspace = created(loop(Walker()), time_size=5, n_steps=1)
+    assert (workspace.time_size(), workspace.batch_size()) == (5, 4)
+    remote(workspace, t=0, n_steps=5)
+    assert workspace["x"][:, 0, 1].tolist() == [1, 2, 3, 4, 5]
+
+
+def test_an_agent_that_is_seeded_already():
+    class Seeded(SeedableAgent, Walker):
+        pass
+
+    with pytest.raises(LoopError, match=r"^Seeded is seeded with 3 already and cannot be seeded with 0;"):
+        NRemoteAgent.create(Seeded(seed=3), 1, t=0)
+
+
+def test_create_refuses_what_it_cannot_share():
+    with pytest.raises(WorkspaceError, match=r"^The workspace is empty: there is nothing to share"):
+        NRemoteAgent.create(Agents(), 1)
+    with pytest.raises(WorkspaceError, match=r"^num_processes: expected at least 0, found -1\.$"):
+        NRemoteAgent.create(Walker(), -1, t=0)
+
+
+def test_workspaces_that_do_not_fit(created, started):
+    remote, _ = created(Walker(), t=0)
+    narrow = Workspace()
+    Walker()(narrow, t=0)
+    with pytest.raises(
+        WorkspaceError, match=r"^NRemoteAgent needs the shared workspace that NRemoteAgent\.create made"
+    ):
+        remote(narrow, t=0)
+    with pytest.raises(WorkspaceError, match=r"^Expected a shared workspace of 4 columns, found 2\.$"):
+        remote(shared_workspace(narrow), t=0)
+    with pytest.raises(
+        WorkspaceError, match=r"^RemoteAgent 'far' needs a shared workspace; NRemoteAgent\.create makes"
+    ):
+        started(name="far")[0](narrow, t=0)
+    assert multiprocessing.active_children() == []
+
+
+def test_names_and_forward(created):
+    remote, _ = created(Walker(name="walker"), t=0)
+    remote.agents[0].set_name("first")
+    remote.set_name("all")
+    assert remote.get_by_name("all") == [remote]
+    assert remote.get_by_name("first") == [remote.agents[0]]
+    assert remote.get_by_name("walker") == [agent.agent for agent in remote.agents]
+    for agent in (remote, remote.agents[0]):
+        with pytest.raises(NotImplementedError, match="has no forward; call it"):
+            agent.forward()
+
+
+# -- failures ----------------------------------------------------------------------------------------------------------
+
+
+def test_what_an_agent_raises_is_raised_here(created):
+    remote, workspace = created(loop(Trouble()))
+    with pytest.raises(RemoteAgentError) as caught:
+        remote(workspace, **STEPS, at=1)
+    assert str(caught.value) == "TemporalAgent failed in its process: ValueError: no such joint"
+    assert 'raise ValueError("no such joint")' in caught.value.traceback
+    assert caught.value.traceback in str(caught.value.__cause__)
+    assert caught.value.exit_code is None
+    assert multiprocessing.active_children() == []
+    remote(workspace, **STEPS)  # new processes
+    assert workspace["x"][:, 0, 1].tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("what", "message", "code"),
+    [
+        ("die", "The process of TemporalAgent was ended by SIGKILL.", -signal.SIGKILL),
+        ("leave", "The process of TemporalAgent ended with exit code 7.", 7),
+    ],
+)
+def test_a_process_that_ends(started, what, message, code):
+    remote, workspace = started(loop(Trouble()))
+    with pytest.raises(RemoteAgentError) as caught:
+        remote(workspace, **STEPS, at=2, what=what)
+    assert (str(caught.value), caught.value.exit_code) == (message, code)
+    assert multiprocessing.active_children() == []
+    remote(workspace, **STEPS)
+    assert workspace["x"][:, 0, 1].tolist() == [1, 2, 3]
+
+
+def test_one_that_dies_ends_the_others(created):
+    class Half(Trouble):
+        """The one with seed 1 dies, the other would run for ever."""
+
+        def die(self):
+            if self.own_seed == 1:
+                super().die()
+            signal.pause()
+
+    remote, workspace = created(loop(Half()))
+    with pytest.raises(RemoteAgentError, match=r"^The process of TemporalAgent was ended by SIGKILL\.$"):
+        remote(workspace, **STEPS, at=0, what="die")
+    assert multiprocessing.active_children() == []
+
+
+def test_one_that_died_while_idle(started):
+    remote, workspace = started()
+    remote(workspace, **STEPS)
+    (process,) = multiprocessing.active_children()
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    with pytest.raises(RemoteAgentError, match=r"^The process of TemporalAgent was ended by SIGKILL\.$"):
+        remote(workspace, **STEPS)
+    remote(workspace, **STEPS)
+
+
+def test_a_seed_that_is_refused(started):
+    class Seeded(SeedableAgent, Walker):
+        pass
+
+    remote, workspace = started(Agents(Seeded()))
+    remote.seed(1)
+    remote(workspace, t=0)
+    with pytest.raises(RemoteAgentError, match=r"^Agents failed in its process: LoopError: Seeded is seeded with 1"):
+        remote.seed(2)
+
+
+def test_arguments_that_cannot_be_sent(started):
+    remote, workspace = started()
+    with pytest.raises(RemoteAgentError, match=r"^TemporalAgent: cannot be sent to another process: .*lambda"):
+        remote(workspace, **STEPS, scale=lambda: None)
+    remote(workspace, **STEPS)
+    assert workspace["x"][:, 0, 1].tolist() == [1, 2, 3]
+
+
+def test_agents_that_cannot_be_sent(started):
+    class Local(Walker):
+        pass
+
+    remote, workspace = started(Local(), start_method="spawn")
+    with pytest.raises(RemoteAgentError, match=r"""^Local: cannot be sent .* or start_method="fork"\.$"""):
+        remote(workspace, t=0)
+    assert multiprocessing.active_children() == []
+
+
+def test_an_interrupt_ends_a_busy_process(started, monkeypatch):
+    remote, workspace = started(loop(Trouble()))
+    remote._asynchronous_call(workspace, **STEPS, at=0, what="hang")
+    monkeypatch.setattr(remote._worker._connection, "poll", _interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        remote._worker.wait()
+    assert multiprocessing.active_children() == []
+
+
+def _interrupted(timeout):
+    raise KeyboardInterrupt
+
+
+# -- the end -----------------------------------------------------------------------------------------------------------
+
+
+def test_close_as_often_as_one_likes(started):
+    remote, workspace = started()
+    remote.close()
+    remote(workspace, **STEPS)
+    assert len(multiprocessing.active_children()) == 1
+    remote.close()
+    remote.close()
+    assert multiprocessing.active_children() == []
+    remote(workspace, **STEPS)
+    assert workspace["x"][:, 0, 1].tolist() == [1, 2, 3]
+
+
+def test_the_agent_is_closed_in_its_process(started, tmp_path):
+    class Closing(Walker):
+        def close(self):
+            (tmp_path / "closed").write_text(str(os.getpid()))
+
+    remote, workspace = started(Closing())
+    remote(workspace, t=0)
+    remote.close()
+    assert int((tmp_path / "closed").read_text()) != os.getpid()
+
+
+def test_the_last_reference_ends_the_process():
+    agent = Walker()
+    workspace = Workspace()
+    agent(workspace, t=0)
+    remote = RemoteAgent(agent, start_method="fork")
+    remote(shared_workspace(workspace), t=0)
+    copied = copy.deepcopy(remote)
+    del remote
+    gc.collect()
+    assert multiprocessing.active_children() == []
+    copied.close()
+
+
+SCRIPT = """
+import os, signal
+from remote_agents import Trouble
+from bam_train.loop import NRemoteAgent
+
+if __name__ == "__main__":
+    idle, workspace = NRemoteAgent.create(Trouble(), 1, start_method="fork", t=0)
+    idle(workspace, t=0)
+    busy, workspace = NRemoteAgent.create(Trouble(), 1, start_method="fork", t=0)
+    busy._asynchronous_call(workspace, t=0, at=0, what="hang")
+    print(busy.is_running(), flush=True)
+    if {killed}:
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.parametrize(("killed", "code"), [(True, -signal.SIGKILL), (False, 0)])
+def test_processes_end_with_their_parent(killed, code):
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    # Waits until the last process has closed its end of the pipe.
+    run = subprocess.run(
+        [sys.executable, "-W", "ignore::DeprecationWarning", "-c", SCRIPT.format(killed=killed)],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert (run.returncode, run.stdout, run.stderr) == (code, "True\n", "")
+
+
+def test_a_script_without_main_guard(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from remote_agents import Walker\n"
+        "from bam_train.loop import NRemoteAgent\n"
+        "agent, workspace = NRemoteAgent.create(Walker(), 1, t=0)\n"
+        "agent(workspace, t=0)\n"
+    )
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    run = subprocess.run(
+        [sys.executable, str(script)],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert run.returncode == 1
+    assert "ended with exit code 1 before it was ready; a script that starts processes needs `if __name__" in run.stderr

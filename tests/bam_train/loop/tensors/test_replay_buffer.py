@@ -1,0 +1,196 @@
+import pytest
+import torch
+
+from bam_train.errors import UnknownVariable, ValueMismatch, WorkspaceError
+from bam_train.loop import Workspace
+from bam_train.loop.tensors.replay_buffer import ReplayBuffer
+
+
+def rows(first, count):
+    """A workspace 2 x count: at time 0 first, first + 1, ...; at time 1 those plus 100."""
+    numbers = torch.arange(first, first + count).float()
+    workspace = Workspace()
+    workspace.set_full("x", torch.stack([numbers, numbers + 100]))
+    workspace.set_full("done", torch.stack([numbers > 1, numbers > 0]))
+    return workspace
+
+
+def full(**variables):
+    workspace = Workspace()
+    for name, value in variables.items():
+        workspace.set_full(name, value)
+    return workspace
+
+
+def column(buffer):
+    return buffer.variables["x"][:, 0].tolist()
+
+
+def test_rows_are_kept_row_first():
+    buffer = ReplayBuffer(4)
+    buffer.put(rows(0, 3))
+    assert {name: tuple(value.shape) for name, value in buffer.variables.items()} == {"x": (4, 2), "done": (4, 2)}
+    assert buffer.variables["done"].dtype == torch.bool
+    assert buffer.variables["x"].tolist() == [[0, 100], [1, 101], [2, 102], [0, 0]]
+    assert (buffer.size(), buffer.position, buffer.is_full) == (3, 3, False)
+
+
+def test_the_oldest_rows_make_room():
+    buffer = ReplayBuffer(5)
+    states = []
+    for first, count in [(0, 2), (2, 2), (4, 1), (5, 3), (8, 5)]:
+        buffer.put(rows(first, count))
+        states.append((column(buffer), buffer.position, buffer.is_full, buffer.size()))
+    assert states == [
+        ([0, 1, 0, 0, 0], 2, False, 2),
+        ([0, 1, 2, 3, 0], 4, False, 4),
+        ([0, 1, 2, 3, 4], 0, True, 5),
+        ([5, 6, 7, 3, 4], 3, True, 5),
+        ([10, 11, 12, 8, 9], 3, True, 5),
+    ]
+
+
+@pytest.mark.parametrize("count", [5, 6, 7, 10, 11, 23])
+def test_of_too_many_rows_the_newest_are_kept(count):
+    buffer, one_by_one = ReplayBuffer(5), ReplayBuffer(5)
+    buffer.put(rows(50, 3))
+    buffer.put(rows(0, count))
+    for first, number in [(50, 3)] + [(k, 1) for k in range(count)]:
+        one_by_one.put(rows(first, number))
+    assert sorted(column(buffer)) == list(range(count - 5, count))
+    assert column(buffer) == column(one_by_one)
+    assert buffer.position == one_by_one.position
+    assert buffer.is_full
+
+
+def test_no_rows_fix_the_shapes_only():
+    buffer = ReplayBuffer(5)
+    buffer.put(rows(0, 0))
+    assert (buffer.size(), buffer.is_full, buffer.variables["x"].shape) == (0, False, (5, 2))
+
+
+def test_a_batch_is_drawn_from_torchs_global_generator():
+    buffer = ReplayBuffer(8)
+    buffer.put(rows(0, 6))
+    torch.manual_seed(3)
+    expected = torch.randint(6, (4,))
+    torch.manual_seed(3)
+    drawn = buffer.get_shuffled(4)
+    assert drawn["x"].tolist() == [expected.tolist(), (expected + 100).tolist()]
+    assert drawn["done"].tolist() == [(expected > 1).tolist(), (expected > 0).tolist()]
+    assert (drawn.time_size(), drawn.batch_size()) == (2, 4)
+
+
+def test_a_batch_is_a_copy():
+    buffer = ReplayBuffer(2)
+    buffer.put(rows(0, 2))
+    buffer.get_shuffled(3)["x"].zero_()
+    assert column(buffer) == [0, 1]
+
+
+def test_values_are_copied_and_detached():
+    buffer = ReplayBuffer(2)
+    value = torch.ones(2, 1, requires_grad=True)
+    doubled = value * 2
+    buffer.put(full(x=doubled))
+    doubled.detach().zero_()
+    assert buffer.variables["x"][0].tolist() == [2, 2]
+    assert not buffer.variables["x"].requires_grad
+
+
+def test_variables_written_time_by_time_and_whole_rollouts():
+    workspace = Workspace()
+    for t in range(4):
+        workspace.set("obs", t, torch.full((3, 2), float(t)))
+    buffer = ReplayBuffer(3)
+    buffer.put(workspace)
+    assert buffer.variables["obs"].shape == (3, 4, 2)
+    assert buffer.variables["obs"][1, :, 0].tolist() == [0, 1, 2, 3]
+
+
+def test_numpy_workspaces():
+    import numpy as np
+
+    buffer = ReplayBuffer(3)
+    buffer.put(full(x=np.array([[1.0, 2.0], [3.0, 4.0]])))
+    assert buffer.variables["x"].tolist() == [[1, 3], [2, 4], [0, 0]]
+
+
+def test_variables_of_different_times():
+    buffer = ReplayBuffer(3)
+    buffer.put(full(obs=torch.zeros(2, 2), advantage=torch.ones(1, 2)))
+    assert buffer.variables["advantage"].shape == (3, 1)
+
+
+def test_to_moves_rows_and_later_puts():
+    buffer = ReplayBuffer(3)
+    buffer.put(rows(0, 2))
+    assert buffer.to("meta") is buffer
+    assert buffer.variables["x"].device.type == "meta"
+    assert buffer.device == torch.device("meta")
+    assert ReplayBuffer(3).to("meta").variables == {}
+
+
+def state(buffer):
+    return {name: value.tolist() for name, value in buffer.variables.items()}, buffer.position, buffer.is_full
+
+
+@pytest.mark.parametrize(
+    ("workspace", "error", "message"),
+    [
+        (
+            full(x=torch.zeros(3, 1), done=torch.zeros(3, 1) > 0),
+            ValueMismatch,
+            "'x' in the replay buffer: expected time size 2, found 3.",
+        ),
+        (
+            full(x=torch.zeros(2, 1), done=torch.zeros(2, 1, 1) > 0),
+            ValueMismatch,
+            "'done' in the replay buffer: expected shape (), found (1,).",
+        ),
+        (
+            full(x=torch.zeros(2, 1), done=torch.zeros(2, 1)),
+            ValueMismatch,
+            "'done' in the replay buffer: expected dtype torch.bool, found torch.float32.",
+        ),
+        (full(x=torch.zeros(2, 1)), UnknownVariable, "'done' is not in the workspace. It has 'x'."),
+        (
+            full(x=torch.zeros(2, 1), done=torch.zeros(2, 1) > 0, new=torch.zeros(2, 1)),
+            WorkspaceError,
+            "'new' is not in the replay buffer, which has 'done', 'x' since the first put.",
+        ),
+        (
+            full(x=torch.zeros(2, 1), done=torch.zeros(2, 2) > 0),
+            WorkspaceError,
+            "Expected one batch size for all variables, found 'x' 1, 'done' 2.",
+        ),
+        (Workspace(), WorkspaceError, "The workspace is empty: there is nothing to put into the replay buffer."),
+    ],
+)
+def test_a_put_that_does_not_fit_changes_nothing(workspace, error, message):
+    buffer = ReplayBuffer(3)
+    buffer.put(rows(0, 2))
+    before = state(buffer)
+    with pytest.raises(error) as caught:
+        buffer.put(workspace)
+    assert str(caught.value) == message
+    assert state(buffer) == before
+
+
+def test_a_first_put_that_does_not_fit_changes_nothing():
+    buffer = ReplayBuffer(3)
+    with pytest.raises(WorkspaceError):
+        buffer.put(full(x=torch.zeros(2, 1), y=torch.zeros(2, 2)))
+    assert buffer.variables == {}
+
+
+def test_an_empty_buffer_says_so():
+    with pytest.raises(
+        WorkspaceError, match=r"^The replay buffer is empty: put transitions into it before drawing from"
+    ):
+        ReplayBuffer(3).get_shuffled(1)
+
+
+def test_a_buffer_has_room_for_a_row():
+    with pytest.raises(WorkspaceError, match=r"^max_size: expected at least 1 row, found 0\.$"):
+        ReplayBuffer(0)

@@ -1,0 +1,138 @@
+import pytest
+import torch
+
+from bam_train.errors import ValueMismatch, WorkspaceError
+from bam_train.loop.tensors.returns import (
+    cumulated_reward,
+    doubleqlearning_temporal_difference,
+    gae,
+    temporal_difference,
+)
+
+T, B, GAMMA, LAMBDA = 37, 3, 0.9, 0.8
+
+
+@pytest.fixture
+def steps():
+    generator = torch.Generator().manual_seed(0)
+    reward, next_critic, critic = torch.rand(3, T, B, generator=generator)
+    return reward, next_critic, torch.rand(T, B, generator=generator) > 0.2, critic
+
+
+def by_hand(reward, next_critic, must_bootstrap, critic, gamma=GAMMA, lam=LAMBDA):
+    """The definition, one row at a time from the end."""
+    delta = reward + gamma * next_critic.detach() * must_bootstrap - critic
+    rows = [delta[-1]]
+    for t in range(len(delta) - 2, -1, -1):
+        rows.append(delta[t] + gamma * lam * must_bootstrap[t] * rows[-1])
+    return torch.stack(rows[::-1])
+
+
+def test_gae_in_numbers():
+    reward, critic = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([10.0, 20.0, 30.0])
+    next_critic, bootstrap = torch.tensor([20.0, 30.0, 40.0]), torch.tensor([True, False, True])
+    # delta: 1 + 0.5 * 20 - 10, 2 - 20, 3 + 0.5 * 40 - 30; the second ends an episode
+    assert gae(reward, next_critic, bootstrap, critic, 0.5, 0.5).tolist() == [1 - 0.25 * 18, -18, -7]
+
+
+@pytest.mark.parametrize("length", [1, 2, 3, 4, 5, 8, 31, T])
+def test_gae_is_the_recursion(steps, length):
+    wide = [value[:length] for value in steps]
+    torch.testing.assert_close(gae(*wide, GAMMA, LAMBDA), by_hand(*wide))
+    flat = [value[:length, 0] for value in steps]
+    torch.testing.assert_close(gae(*flat, GAMMA, LAMBDA), by_hand(*flat))
+
+
+def test_columns_are_independent(steps):
+    columns = [gae(*(value[:, k] for value in steps), GAMMA, LAMBDA) for k in range(B)]
+    torch.testing.assert_close(gae(*steps, GAMMA, LAMBDA), torch.stack(columns, 1))
+
+
+def test_the_gradient_goes_through_the_critic_only(steps):
+    grads = []
+    for function in (lambda *values: gae(*values, GAMMA, LAMBDA), by_hand):
+        reward, next_critic, bootstrap, critic = steps
+        next_critic, critic = next_critic.clone().requires_grad_(), critic.clone().requires_grad_()
+        function(reward, next_critic, bootstrap, critic).square().sum().backward()
+        assert next_critic.grad is None
+        grads.append(critic.grad)
+    torch.testing.assert_close(*grads)
+
+
+def test_lambda_0_and_1(steps):
+    reward, next_critic, bootstrap, critic = steps
+    delta = reward + GAMMA * next_critic * bootstrap - critic
+    assert torch.equal(gae(*steps, GAMMA, 0.0), delta)
+    alive = torch.ones(3, dtype=torch.bool)
+    advantage = gae(torch.ones(3), torch.zeros(3), alive, torch.zeros(3), 0.5, 1.0)
+    assert advantage.tolist() == [1.75, 1.5, 1.0]
+
+
+def test_gae_keeps_the_dtype_and_takes_flags_as_numbers(steps):
+    reward, next_critic, bootstrap, critic = (value.double() for value in steps)
+    expected = by_hand(reward, next_critic, bootstrap, critic)
+    found = gae(reward, next_critic, bootstrap, critic, GAMMA, LAMBDA)
+    torch.testing.assert_close(gae(reward, next_critic, bootstrap.bool(), critic, GAMMA, LAMBDA), found)
+    torch.testing.assert_close(found, expected, rtol=1e-14, atol=1e-14)
+    assert gae(reward.float(), next_critic, bootstrap, critic, GAMMA, LAMBDA).dtype == torch.float64
+    assert (
+        gae(reward, *(value.float() for value in (next_critic, bootstrap, critic)), GAMMA, 0.5).dtype == torch.float64
+    )
+
+
+def test_gae_of_no_rows():
+    assert gae(*(torch.zeros(0, 2) for _ in range(4)), GAMMA, LAMBDA).shape == (0, 2)
+
+
+def test_gae_refuses_what_would_broadcast():
+    values = torch.zeros(3), torch.zeros(3), torch.zeros(3), torch.zeros(3, 1)
+    with pytest.raises(ValueMismatch, match=r"^gae: expected critic \(3,\), found \(3, 1\)\.$"):
+        gae(*values, GAMMA, LAMBDA)
+
+
+def test_temporal_difference_in_numbers():
+    critic = torch.tensor([[10.0, 1.0], [20.0, 2.0], [30.0, 3.0]], requires_grad=True)
+    reward = torch.tensor([[9.0, 9.0], [1.0, 2.0], [3.0, 4.0]])
+    bootstrap = torch.tensor([[True, False], [False, True]])
+    td = temporal_difference(critic, reward, bootstrap, 0.5)
+    assert td.tolist() == [[1 + 10 - 10, 2 - 1], [3 - 20, 4 + 1.5 - 2], [0, 0]]
+    td.sum().backward()
+    assert critic.grad.tolist() == [[-1, -1], [-1, -1], [0, 0]]
+
+
+def test_temporal_difference_wants_one_flag_for_each_transition():
+    message = r"^temporal_difference: expected must_bootstrap \(1, 1\), found \(2, 1\)\.$"
+    with pytest.raises(ValueMismatch, match=message):
+        temporal_difference(torch.zeros(2, 1), torch.zeros(2, 1), torch.zeros(2, 1), 0.5)
+
+
+def test_double_q_learning_in_numbers():
+    q = torch.tensor([[[1.0, 2.0]], [[4.0, 3.0]]], requires_grad=True)
+    q_target = torch.tensor([[[50.0, 60.0]], [[70.0, 80.0]]])
+    action, reward = torch.tensor([[1], [0]]), torch.tensor([[9.0], [5.0]])
+    td = doubleqlearning_temporal_difference(q, action, q_target, reward, torch.tensor([[True]]), 0.5)
+    assert td.tolist() == [[5 + 35 - 2], [0]]
+    td.sum().backward()
+    assert q.grad.tolist() == [[[0, -1]], [[0, 0]]]
+    ended = doubleqlearning_temporal_difference(q, action, q_target, reward, torch.tensor([[False]]), 0.5)
+    assert ended.tolist() == [[5 - 2], [0]]
+
+
+def test_double_q_learning_names_what_does_not_fit():
+    q = torch.zeros(2, 1, 3)
+    message = r"^doubleqlearning_temporal_difference: expected action \(2, 1\), found \(2,\)\.$"
+    with pytest.raises(ValueMismatch, match=message):
+        doubleqlearning_temporal_difference(q, torch.zeros(2), q, torch.zeros(2, 1), torch.zeros(1, 1), 0.5)
+
+
+def test_cumulated_reward_ends_with_the_first_done():
+    reward = torch.tensor([[1.0, 1.0], [2.0, 10.0], [4.0, float("nan")]])
+    done = torch.tensor([[0, 0], [0, 1], [1, 1]])
+    assert cumulated_reward(reward, done) == (7 + 11) / 2
+    assert cumulated_reward(reward.nan_to_num().int(), done) == 9.0
+
+
+def test_cumulated_reward_of_what_has_not_ended():
+    message = r"^cumulated_reward: expected a done in every column, found none in \[1\]; run until all are done\.$"
+    with pytest.raises(WorkspaceError, match=message):
+        cumulated_reward(torch.zeros(2, 2), torch.tensor([[False, False], [True, False]]))
