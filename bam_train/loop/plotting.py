@@ -13,10 +13,11 @@ from bam_envs.errors import MissingExtra
 from bam_train.errors import WorkspaceError
 
 if TYPE_CHECKING:
-    from bam_train.loop.workspace import Workspace
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from pandas import DataFrame, Series
+
+    from bam_train.loop.workspace import Workspace
 
 MAX_LINES = 10
 """Lines in one picture; matplotlib has as many colours."""
@@ -50,7 +51,7 @@ def plot(workspace: Workspace, *names: str, batch: int | Sequence[int] | None = 
         raise MissingExtra("matplotlib", "notebook", "Workspace.plot()") from error
     arrays = _arrays(workspace, names, "plot()")
     figure = Figure(figsize=(8, 0.6 + 1.9 * len(arrays)), layout="constrained")
-    figure._repr_png_ = partial(_png, figure)
+    figure._repr_png_ = partial(_png, figure)  # type: ignore[attr-defined]
     rows = figure.subplots(len(arrays), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (name, array) in zip(rows, arrays.items(), strict=True):
         times = workspace.first_time + np.arange(len(array))
@@ -158,7 +159,8 @@ def _draw(axes: Axes, times: np.ndarray, name: str, array: np.ndarray, columns: 
             title="batch" if array.shape[1] > 1 else None, fontsize="small", loc="center left", bbox_to_anchor=(1, 0.5)
         )
     if len(lines) > MAX_LINES:
-        axes.set_title(f"{name}: the first {MAX_LINES} of {len(lines)} lines; choose with batch=", fontsize="small")
+        choose = "; choose with batch=" if len(columns) > 1 else ""
+        axes.set_title(f"{name}: the first {MAX_LINES} of {len(lines)} lines{choose}", fontsize="small")
 
 
 def _png(figure: Figure) -> bytes:

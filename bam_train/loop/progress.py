@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import io
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
@@ -65,6 +68,7 @@ def _own_display(n_steps: int | None, text: str) -> Iterator[Advance]:
         TimeRemainingColumn(elapsed_when_finished=True),
         console=console,
         auto_refresh=False,  # no thread: the loop itself redraws
+        redirect_stdout=sys.stdout.isatty(),  # what is printed goes above the bar; into a file it goes as always
     )
     if console.is_jupyter:
         with _task(display, n_steps, text, _notebook_line(display)) as advance:
@@ -97,6 +101,8 @@ def _task(
             show()
             due = clock() + REDRAW_SECONDS
 
+    if redraw is not None:
+        redraw()
     try:
         yield advance
     except BaseException:
@@ -109,12 +115,18 @@ def _task(
 
 def _notebook_line(display: Progress) -> Callable[[], None]:
     """One line of a notebook's output that is written over; rich's own way needs ipywidgets."""
-    from IPython.display import display as show_in_notebook
+    show_in_notebook = importlib.import_module("IPython.display").display
+    handle: Any = None
 
-    def line() -> dict[str, str]:
-        console = Console(file=io.StringIO(), width=100, force_jupyter=False)
+    def redraw() -> None:
+        nonlocal handle
+        text = io.StringIO()
+        console = Console(file=text, width=100, force_terminal=False, force_jupyter=False, color_system=None)
         console.print(display.get_renderable())
-        return {"text/plain": console.file.getvalue().rstrip()}  # type: ignore[attr-defined]
+        line = {"text/plain": text.getvalue().rstrip()}
+        if handle is None:
+            handle = show_in_notebook(line, raw=True, display_id=True)
+        else:
+            handle.update(line, raw=True)
 
-    handle = show_in_notebook(line(), raw=True, display_id=True)
-    return lambda: handle.update(line(), raw=True)
+    return redraw

@@ -1,0 +1,116 @@
+"""Agents that take a time, a seed, a file; algorithms inherit from all of them at once."""
+
+import pickle
+
+import pytest
+
+from bam_train.errors import LoopError, OutputError
+from bam_train.loop import (
+    Agent,
+    SeedableAgent,
+    SeedableAgentLast,
+    SeedableAgentMean,
+    SeedableAgentSum,
+    SerializableAgent,
+    TimeAgent,
+    Workspace,
+    load,
+)
+
+
+class Actor(TimeAgent, SeedableAgent, SerializableAgent):
+    """As algorithms write it."""
+
+    def __init__(self, gain, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.gain = gain
+
+    def forward(self, t, **kwargs):
+        self.seen = t
+
+
+class Unpicklable(SerializableAgent):
+    def __init__(self):
+        super().__init__()
+        self.function = lambda: None
+
+
+class Lean(Unpicklable):
+    def serialize(self):
+        return Actor(3)
+
+
+def test_all_conventions_at_once():
+    actor = Actor(2, name="actor", seed=5)
+    assert (actor.gain, actor.name, actor._seed) == (2, "actor", 5)
+    assert [isinstance(actor, kind) for kind in (Agent, TimeAgent, SeedableAgent, SerializableAgent)] == [True] * 4
+    actor(Workspace(), t=4)
+    assert actor.seen == 4
+
+
+def test_a_time_agent_has_to_have_a_forward():
+    with pytest.raises(NotImplementedError):
+        TimeAgent()(Workspace(), t=0)
+
+
+def test_one_seed_only():
+    agent = SeedableAgent()
+    assert agent._seed is None
+    assert agent.seed(3) is agent
+    assert agent._seed == 3
+    with pytest.raises(LoopError) as error:
+        agent.seed(4)
+    assert str(error.value) == (
+        "SeedableAgent is seeded with 3 already and cannot be seeded with 4; "
+        "SeedableAgentLast, SeedableAgentSum and SeedableAgentMean take several seeds."
+    )
+    assert agent._seed == 3
+
+
+def test_a_seed_of_the_constructor_is_the_one():
+    with pytest.raises(LoopError):
+        SeedableAgent(seed=0).seed(1)
+
+
+@pytest.mark.parametrize(("kind", "expected"), [(SeedableAgentLast, 5), (SeedableAgentSum, 11), (SeedableAgentMean, 3)])
+def test_several_seeds(kind, expected):
+    agent = kind(name="a")
+    for seed in (2, 4, 5):
+        agent.seed(seed)
+    assert agent._seed == expected
+    assert agent.name == "a"
+
+
+def test_saving_and_loading(tmp_path):
+    Actor(7, name="actor").save(tmp_path / "actor.pickle")
+    with open(tmp_path / "actor.pickle", "rb") as file:
+        assert pickle.load(file).gain == 7
+    actor = load(tmp_path / "actor.pickle")
+    assert isinstance(actor, Actor)
+    assert (actor.gain, actor.name) == (7, "actor")
+    assert load(str(tmp_path / "actor.pickle")).gain == 7
+
+
+def test_what_is_saved_can_be_chosen(tmp_path):
+    Lean().save(tmp_path / "lean.pickle")
+    assert load(tmp_path / "lean.pickle").gain == 3
+
+
+def test_what_cannot_be_saved_leaves_no_file(tmp_path):
+    with pytest.raises(LoopError) as error:
+        Unpicklable().save(tmp_path / "agent.pickle")
+    assert str(error.value).startswith("Unpicklable cannot be saved: ")
+    assert str(error.value).endswith("; override serialize().")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_files_that_are_not_there_or_no_pickles(tmp_path):
+    with pytest.raises(LoopError) as missing:
+        load(tmp_path / "none.pickle")
+    assert str(missing.value).startswith(f"{tmp_path}/none.pickle: no agent can be loaded: ")
+    (tmp_path / "text.pickle").write_text("hello")
+    with pytest.raises(LoopError):
+        load(tmp_path / "text.pickle")
+    with pytest.raises(OutputError) as folder:
+        Actor(1).save(tmp_path / "nowhere" / "actor.pickle")
+    assert str(folder.value) == f"{tmp_path}/nowhere/actor.pickle: cannot be written: No such file or directory"

@@ -1,0 +1,204 @@
+"""Reading and writing: one time, all times, what a workspace says about itself."""
+
+from collections import OrderedDict
+
+import pytest
+
+from bam_train.loop import Workspace
+
+
+def counted(kind, *names, times=3):
+    """Variables of two columns: 10 * t + column, the second variable 100 more, and so on."""
+    ws = Workspace()
+    for k, name in enumerate(names):
+        for t in range(times):
+            ws.set(name, t, kind([100.0 * k + 10 * t, 100.0 * k + 10 * t + 1]))
+    return ws
+
+
+def test_set_and_get_one_time(kind):
+    ws = Workspace()
+    assert ws.set("x", 0, kind([1.0, 2.0])) is None
+    ws.set("x", 1, kind([3.0, 4.0]))
+    kind.check(ws.get("x", 0), [1.0, 2.0])
+    kind.check(ws.get("x", 1), [3.0, 4.0])
+
+
+def test_all_times(kind):
+    ws = counted(kind, "x")
+    kind.check(ws.get_full("x"), [[0.0, 1.0], [10.0, 11.0], [20.0, 21.0]])
+    kind.check(ws["x"], [[0.0, 1.0], [10.0, 11.0], [20.0, 21.0]])
+
+
+def test_several_names_at_once(kind):
+    ws = counted(kind, "x", "y", times=1)
+    y, x = ws["y", "x"]
+    kind.check(y, [[100.0, 101.0]])
+    kind.check(x, [[0.0, 1.0]])
+    (again,) = ws[["y"]]
+    kind.check(again, [[100.0, 101.0]])
+
+
+def test_minus_one_is_the_last_time(kind):
+    ws = counted(kind, "x")
+    kind.check(ws.get("x", -1), [20.0, 21.0])
+    ws.set("x", -1, kind([7.0, 8.0]))
+    kind.check(ws["x"], [[0.0, 1.0], [10.0, 11.0], [7.0, 8.0]])
+
+
+@pytest.mark.parametrize(("dtype", "zero", "one"), [("float32", 0.0, 1.0), ("int64", 0, 1), ("bool", False, True)])
+def test_missing_earlier_times_are_zeros(kind, dtype, zero, one):
+    ws = Workspace()
+    ws.set("x", 2, kind([[one, one]], dtype))
+    kind.check(ws["x"], [[[zero, zero]], [[zero, zero]], [[one, one]]], dtype)
+    ws.set("x", 4, kind([[one, zero]], dtype))
+    kind.check(ws["x"][2:], [[[one, one]], [[zero, zero]], [[one, zero]]], dtype)
+
+
+def test_any_order_and_overwriting(kind):
+    ws = Workspace()
+    for t in (3, 1, 2, 0):
+        ws.set("x", t, kind([float(t)]))
+    ws.set("x", 1, kind([9.0]))
+    kind.check(ws["x"], [[0.0], [9.0], [2.0], [3.0]])
+
+
+def test_reading_again_after_every_write(kind):
+    ws = Workspace()
+    for t in range(40):
+        ws.set("x", t, kind([t], "int64"))
+        kind.check(ws["x"], [[k] for k in range(t + 1)], "int64")
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float64", "int32", "uint8", "bool"])
+def test_the_first_write_fixes_the_dtype(kind, dtype):
+    ws = Workspace()
+    ws.set("x", 0, kind([[1, 0]], dtype))
+    ws.set("x", 1, kind([[0, 1]], dtype))
+    kind.check(ws["x"], [[[1, 0]], [[0, 1]]], dtype)
+
+
+def test_images(kind):
+    ws = Workspace()
+    ws.set("x", 0, kind.zeros(2, 4, 5, 3, dtype="uint8"))
+    ws.set("x", 1, kind.zeros(2, 4, 5, 3, dtype="uint8"))
+    assert tuple(ws["x"].shape) == (2, 2, 4, 5, 3)
+    assert (ws.time_size(), ws.batch_size()) == (2, 2)
+
+
+def test_a_batch_of_nobody(kind):
+    ws = Workspace()
+    ws.set("x", 0, kind.zeros(0, 3))
+    assert tuple(ws["x"].shape) == (1, 0, 3)
+    assert (ws.time_size(), ws.batch_size()) == (1, 0)
+
+
+def test_set_full(kind):
+    ws = Workspace()
+    ws.set_full("x", kind.column(1.0, 2.0, 3.0))
+    kind.check(ws["x"], [[1.0], [2.0], [3.0]])
+    kind.check(ws.get("x", 1), [2.0])
+    kind.check(ws.get("x", -1), [3.0])
+
+
+def test_set_full_replaces_a_full_variable(kind):
+    ws = Workspace()
+    ws.set_full("x", kind.column(1.0, 2.0, 3.0))
+    ws.set_full("x", kind.column(4.0, 5.0))
+    kind.check(ws["x"], [[4.0], [5.0]])
+    assert ws.time_size() == 2
+
+
+def test_set_full_over_single_times_leaves_a_longer_tail(kind):
+    ws = counted(kind, "x")
+    ws.set_full("x", kind([[7.0, 7.0], [8.0, 8.0]]))
+    kind.check(ws["x"], [[7.0, 7.0], [8.0, 8.0], [20.0, 21.0]])
+    ws.set_full("x", kind([[1.0, 1.0]] * 4))
+    kind.check(ws["x"], [[1.0, 1.0]] * 4)
+
+
+def test_set_after_set_full(kind):
+    ws = Workspace()
+    ws.set_full("x", kind.column(1.0, 2.0))
+    ws.set("x", 0, kind([5.0]))
+    ws.set("x", 3, kind([6.0]))
+    kind.check(ws["x"], [[5.0], [2.0], [0.0], [6.0]])
+
+
+def test_names_keep_the_order_of_their_first_write(kind):
+    ws = counted(kind, "b", "a", "c")
+    ws.set("a", 0, kind([0.0, 0.0]))
+    assert list(ws.keys()) == ["b", "a", "c"]
+    assert list(ws.variables) == ["b", "a", "c"]
+    assert "a" in ws.variables
+    assert "d" not in ws.variables
+    assert {name: variable.time_size() for name, variable in ws.variables.items()} == OrderedDict(b=3, a=3, c=3)
+
+
+def test_sizes(kind):
+    ws = Workspace()
+    assert ws.time_size() is None
+    assert ws.batch_size() is None
+    ws.set_full("x", kind.zeros(4, 2, 3))
+    assert (ws.time_size(), ws.batch_size()) == (4, 2)
+    variable = ws.variables["x"]
+    assert tuple(variable.size) == (4, 2, 3)
+    assert (variable.time_size(), variable.batch_size()) == (4, 2)
+    assert variable.dtype == kind.zeros(1).dtype
+    assert str(variable.device) == "cpu"
+
+
+def test_forgetting_one_variable_and_all(kind):
+    ws = counted(kind, "x", "y", "z")
+    ws.clear("x")
+    assert list(ws.keys()) == ["y", "z"]
+    ws.remove_variable("y")
+    assert list(ws.keys()) == ["z"]
+    ws.clear()
+    assert list(ws.keys()) == []
+    assert ws.time_size() is None
+    ws.set("x", 0, kind([[1]], "int64"))
+    kind.check(ws["x"], [[[1]]], "int64")
+
+
+def test_a_copy_shares_nothing(kind):
+    ws = counted(kind, "x", times=2)
+    ws.set_full("y", kind.column(1.0, 2.0, 3.0))
+    copy = Workspace(ws)
+    ws.set("x", 0, kind([5.0, 5.0]))
+    ws["y"][0] = 9.0
+    copy.set("x", 1, kind([6.0, 6.0]))
+    kind.check(copy["x"], [[0.0, 1.0], [6.0, 6.0]])
+    kind.check(copy["y"], [[1.0], [2.0], [3.0]])
+    kind.check(ws["x"], [[5.0, 5.0], [10.0, 11.0]])
+
+
+def test_contiguous(kind):
+    ws = counted(kind, "x", "y", times=2)
+    ws.set_full("y", kind([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]))
+    whole = ws.contiguous()
+    assert whole is not ws
+    assert list(whole.keys()) == ["x", "y"]
+    kind.check(whole["x"], [[0.0, 1.0], [10.0, 11.0]])
+    kind.check(whole["y"], [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
+    whole.set_full("x", kind.column(1.0))
+    kind.check(ws["x"], [[0.0, 1.0], [10.0, 11.0]])
+
+
+def test_as_text(kind):
+    ws = counted(kind, "env/obs", "action")
+    text = "Workspace:\n\tenv/obs: time_size = 3, batch_size = 2\n\taction: time_size = 3, batch_size = 2"
+    assert str(ws) == text
+    assert str(Workspace()) == "Workspace:"
+
+
+def test_variables_of_different_lengths_can_be_read(kind):
+    ws = counted(kind, "x")
+    ws.set("advantage", 0, kind([1.0, 2.0]))
+    kind.check(ws["advantage"], [[1.0, 2.0]])
+    assert str(ws).splitlines()[-1] == "\tadvantage: time_size = 1, batch_size = 2"
+    kind.check(ws.select_batch(kind([1], "int64"))["advantage"], [[2.0]])
+
+
+def test_is_not_shared(kind):
+    assert counted(kind, "x").is_shared is False

@@ -1,0 +1,183 @@
+"""A full read is kept until the next write; nobody may notice, but for the time that it takes."""
+
+import pytest
+import torch
+
+from bam_train.loop import Workspace
+
+
+@pytest.fixture
+def weight():
+    return torch.tensor([2.0, 3.0], requires_grad=True)
+
+
+@pytest.fixture
+def ws(weight):
+    workspace = Workspace()
+    for t in range(3):
+        workspace.set("x", t, t * weight)
+        workspace.set("plain", t, torch.tensor([1.0 * t, 10.0 * t]))
+    return workspace
+
+
+VALUES = [[0.0, 0.0], [1.0, 10.0], [2.0, 20.0]]
+
+
+def gradient(weight, loss):
+    weight.grad = None
+    loss.backward(retain_graph=True)
+    return weight.grad.tolist()
+
+
+def test_read_under_no_grad_then_with_gradients(ws, weight):
+    with torch.no_grad():
+        assert not ws["x"].requires_grad
+    assert ws["x"].requires_grad
+    assert gradient(weight, ws["x"].sum()) == [3.0, 3.0]
+
+
+def test_read_with_gradients_then_under_no_grad(ws, weight):
+    assert ws["x"].requires_grad
+    with torch.no_grad():
+        assert not ws["x"].requires_grad
+        assert not (2 * ws["x"]).requires_grad
+    assert gradient(weight, ws["x"].sum()) == [3.0, 3.0]
+
+
+def test_read_in_inference_mode_then_outside(ws, weight):
+    with torch.inference_mode():
+        assert ws["plain"].is_inference()
+        assert not ws["x"].requires_grad
+    assert not ws["plain"].is_inference()
+    assert gradient(weight, (ws["plain"] * weight).sum()) == [3.0, 30.0]
+    assert gradient(weight, ws["x"].sum()) == [3.0, 3.0]
+
+
+def test_read_outside_then_in_inference_mode(ws):
+    assert ws["plain"].tolist() == VALUES
+    with torch.inference_mode():
+        assert ws["plain"].tolist() == VALUES
+        assert (ws["plain"] * 2).is_inference()
+    assert not ws["plain"].is_inference()
+
+
+def test_values_written_in_inference_mode():
+    ws = Workspace()
+    with torch.inference_mode():
+        for t in range(2):
+            ws.set("x", t, torch.tensor([1.0 * t]))
+        assert ws["x"].tolist() == [[0.0], [1.0]]
+    assert ws["x"].tolist() == [[0.0], [1.0]]
+    assert (ws["x"] + 1).tolist() == [[1.0], [2.0]]
+    assert ws["x"].tolist() == [[0.0], [1.0]]
+
+
+def test_after_zero_grad(ws):
+    assert ws["x"].requires_grad
+    ws.zero_grad()
+    assert not ws["x"].requires_grad
+
+
+def test_two_losses_of_the_same_variable(ws, weight):
+    assert gradient(weight, ws["x"].sum()) == [3.0, 3.0]
+    assert gradient(weight, (2 * ws["x"]).sum()) == [6.0, 6.0]
+
+
+def test_backward_twice_without_retaining_through_leaves():
+    ws, leaves = Workspace(), [torch.ones(2, requires_grad=True) for _ in range(2)]
+    for t, leaf in enumerate(leaves):
+        ws.set("x", t, leaf)
+    for _ in range(2):
+        (ws["x"] ** 2).sum().backward()
+    assert [leaf.grad.tolist() for leaf in leaves] == [[4.0, 4.0], [4.0, 4.0]]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda tensor: tensor.mul_(2),
+        lambda tensor: tensor.__setitem__(0, 7.0),
+        lambda tensor: tensor[1].zero_(),
+        lambda tensor: tensor.detach().zero_(),
+        lambda tensor: tensor.data.zero_(),
+        lambda tensor: tensor.numpy().fill(5.0),
+        lambda tensor: tensor.unsqueeze_(0),
+        lambda tensor: tensor.t_(),
+        lambda tensor: tensor.resize_(1, 1),
+        lambda tensor: setattr(tensor, "data", torch.zeros(3, 2)),
+        lambda tensor: tensor.requires_grad_(),
+        lambda tensor: tensor.requires_grad_().sum().backward(),
+    ],
+    ids=["mul_", "item", "row", "detach", "data", "numpy", "unsqueeze_", "t_", "resize_", "data=", "leaf", "backward"],
+)
+def test_what_is_done_to_a_full_read_does_not_show_in_the_next(ws, change):
+    for _ in range(2):
+        change(ws["plain"])
+        again = ws["plain"]
+        assert again.tolist() == VALUES
+        assert not again.requires_grad
+        assert again.grad is None
+    assert [ws.get("plain", t).tolist() for t in range(3)] == VALUES
+
+
+def test_a_change_in_place_under_no_grad(ws, weight):
+    with torch.no_grad():
+        ws["x"].zero_()
+    assert ws["x"].tolist() == [[0.0, 0.0], [2.0, 3.0], [4.0, 6.0]]
+    assert gradient(weight, ws["x"].sum()) == [3.0, 3.0]
+
+
+def test_a_hook_belongs_to_one_read(ws, weight):
+    seen = []
+    ws["x"].register_hook(seen.append)
+    assert gradient(weight, ws["x"].sum()) == [3.0, 3.0]
+    assert seen == []
+
+
+def test_retained_gradients_belong_to_one_read(ws, weight):
+    first = ws["x"]
+    first.retain_grad()
+    gradient(weight, first.sum())
+    assert ws["x"] is not first
+    gradient(weight, (2 * ws["x"]).sum())
+    assert first.grad.tolist() == [[1.0, 1.0]] * 3
+
+
+def test_two_reads_do_not_share_memory(ws):
+    first, second = ws["plain"], ws["plain"]
+    first += 1
+    assert second.tolist() == VALUES
+
+
+def test_a_stored_value_that_is_changed_in_place_shows(ws):
+    assert ws["plain"].tolist() == VALUES
+    ws.get("plain", 1).add_(1)
+    assert ws["plain"].tolist() == [[0.0, 0.0], [2.0, 11.0], [2.0, 20.0]]
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda ws: ws.set("plain", 1, torch.tensor([5.0, 5.0])),
+        lambda ws: ws.set("plain", -1, torch.tensor([5.0, 5.0])),
+        lambda ws: ws.set_full("plain", torch.tensor([[5.0, 5.0]])),
+        lambda ws: ws.copy_time(2, 0, 1),
+        lambda ws: ws.copy_n_last_steps(1),
+        lambda ws: (ws.clear("plain"), ws.set("plain", 0, torch.tensor([5.0, 5.0]))),
+    ],
+)
+def test_every_kind_of_write_shows(ws, write):
+    before = ws["plain"]
+    write(ws)
+    after = ws["plain"].tolist()
+    assert after == [ws.get("plain", t).tolist() for t in range(len(after))]
+    assert after != VALUES
+    assert before.tolist() == VALUES
+
+
+def test_a_full_variable_is_the_tensor_itself():
+    ws, value = Workspace(), torch.zeros(2, 1)
+    ws.set_full("x", value)
+    assert ws["x"] is value
+    ws["x"][0] = 1.0
+    assert ws.get("x", 0).tolist() == [1.0]

@@ -1,0 +1,147 @@
+"""Tensors keep their graph through everything that a workspace does with them."""
+
+import pytest
+import torch
+
+from bam_train.loop import Agent, TemporalAgent, Workspace
+
+
+@pytest.fixture
+def weight():
+    return torch.tensor([2.0, 3.0], requires_grad=True)
+
+
+@pytest.fixture
+def ws(weight):
+    """x[t] = t * weight: the sum over three times has the gradient 0 + 1 + 2 = 3."""
+    workspace = Workspace()
+    for t in range(3):
+        workspace.set("x", t, t * weight)
+        workspace.set("env/done", t, torch.tensor([False, t == 0]))
+    return workspace
+
+
+def gradient(weight, loss):
+    weight.grad = None
+    loss.backward(retain_graph=True)
+    return weight.grad.tolist()
+
+
+def test_a_value_is_the_object_that_was_set(weight):
+    ws, value = Workspace(), 2 * weight
+    ws.set("x", 0, value)
+    assert ws.get("x", 0) is value
+    ws.set_full("y", value[None])
+    assert ws["y"].data_ptr() == value.data_ptr()
+
+
+def test_one_time(ws, weight):
+    assert gradient(weight, ws.get("x", 2).sum()) == [2.0, 2.0]
+
+
+def test_a_full_read(ws, weight):
+    assert gradient(weight, ws["x"].sum()) == [3.0, 3.0]
+
+
+def test_reading_all_and_going_on_writing(ws, weight):
+    early = ws["x"].sum()
+    ws.set("x", 3, 3 * weight)
+    late = ws["x"].sum()
+    ws.set("x", 3, 5 * weight)
+    assert gradient(weight, early) == [3.0, 3.0]
+    assert late.item() == 6 * 5.0
+    assert gradient(weight, ws["x"].sum()) == [8.0, 8.0]
+
+
+def test_what_t_wrote_is_differentiated_through_at_the_next_t(weight):
+    ws = Workspace()
+    ws.set("h", 0, torch.ones(2))
+    for t in range(1, 4):
+        ws.set("h", t, ws.get("h", t - 1) * weight)
+    assert ws["h"][-1].tolist() == [8.0, 27.0]
+    assert gradient(weight, ws["h"][-1].sum()) == [12.0, 27.0]
+
+
+def test_values_with_and_without_gradient_in_one_variable(weight):
+    ws = Workspace()
+    ws.set("x", 0, torch.zeros(2))
+    ws.set("x", 1, 4 * weight)
+    ws.set("x", 3, weight.detach())
+    assert ws["x"].requires_grad
+    assert ws["x"].tolist() == [[0.0, 0.0], [8.0, 12.0], [0.0, 0.0], [2.0, 3.0]]
+    assert gradient(weight, ws["x"].sum()) == [4.0, 4.0]
+
+
+def test_set_full_and_its_views(weight):
+    ws = Workspace()
+    ws.set_full("x", torch.stack([weight, 2 * weight]))
+    assert gradient(weight, ws.get("x", 1).sum()) == [2.0, 2.0]
+    ws.set_full("x", torch.stack([weight, 3 * weight]))
+    ws.set("x", 2, 5 * weight)
+    assert gradient(weight, ws["x"].sum()) == [9.0, 9.0]
+
+
+@pytest.mark.parametrize(
+    ("operation", "expected"),
+    [
+        (lambda ws: ws.subtime(1, 3), [3.0, 3.0]),
+        (lambda ws: ws.get_time_truncated_workspace(2, 3), [2.0, 2.0]),
+        (lambda ws: ws.contiguous(), [3.0, 3.0]),
+        (lambda ws: ws.select_batch(torch.tensor([1, 1])), [0.0, 6.0]),
+        (lambda ws: ws.select_batch(torch.tensor([True, False])), [3.0, 0.0]),
+        (lambda ws: ws.select_subtime(torch.tensor([0, 1]), 2), [1.0, 3.0]),
+        (lambda ws: ws.get_transitions(no_final_state=True), [4.0, 4.0]),
+        (lambda ws: ws.get_transitions(), [4.0, 3.0]),
+        (lambda ws: ws.cat_batch([ws, ws]), [6.0, 6.0]),
+        (lambda ws: ws.sample_subworkspace(1, 2, 3), [3.0, 3.0]),
+    ],
+)
+def test_pieces_keep_the_graph(ws, weight, operation, expected):
+    assert gradient(weight, operation(ws)["x"].sum()) == expected
+
+
+def test_get_time_truncated_keeps_the_graph(ws, weight):
+    assert gradient(weight, ws.get_time_truncated("x", 1, 2).sum()) == [1.0, 1.0]
+
+
+def test_copy_time_keeps_the_graph(ws, weight):
+    ws.copy_time(2, 0, 1)
+    assert gradient(weight, ws["x"].sum()) == [5.0, 5.0]
+    ws.copy_n_last_steps(2)  # 1, 2, 2
+    assert gradient(weight, ws["x"].sum()) == [5.0, 5.0]
+
+
+def test_zero_grad_detaches_and_keeps_the_values(ws, weight):
+    ws.set_full("y", torch.stack([weight, weight]))
+    before = ws["x"]
+    ws.zero_grad()
+    assert not ws["x"].requires_grad
+    assert not ws.get("x", 1).requires_grad
+    assert not ws["y"].requires_grad
+    assert ws["x"].tolist() == [[0.0, 0.0], [2.0, 3.0], [4.0, 6.0]]
+    assert gradient(weight, before.sum()) == [3.0, 3.0]
+
+
+def test_epochs_with_zero_grad_between(weight):
+    """What a user of deep Q-learning does: collect with gradients, learn, detach, go on from the last time."""
+
+    class Policy(Agent):
+        def forward(self, t, **kwargs):
+            last = self.get(("q", t - 1)) if t > 0 else torch.ones(2)
+            self.set(("q", t), last * weight)
+
+    ws, agent = Workspace(), TemporalAgent(Policy())
+    agent(ws, t=0, n_steps=2)
+    assert gradient(weight, ws["q"][-1].sum()) == [4.0, 6.0]
+    ws.zero_grad()
+    ws.copy_n_last_steps(1)
+    agent(ws, t=1, n_steps=1)
+    assert ws["q"].tolist() == [[4.0, 9.0], [8.0, 27.0]]
+    assert gradient(weight, ws["q"].sum()) == [4.0, 9.0]
+
+
+def test_a_copy_is_cloned_with_its_graph_or_without_but_shares_nothing(ws):
+    copy = Workspace(ws)
+    with torch.no_grad():
+        copy.get("x", 1).zero_()
+    assert ws.get("x", 1).tolist() == [2.0, 3.0]

@@ -1,0 +1,110 @@
+"""What only NumPy values do: they are copied in, and no torch is needed for anything."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from bam_train.loop import Workspace
+
+PROGRAM = """
+import sys
+import numpy as np
+from bam_train.loop import Agent, Agents, CopyTAgent, EpisodesDone, TemporalAgent, Workspace
+
+class Count(Agent):
+    def forward(self, t, **kwargs):
+        self.set(("x", t), np.array([float(t), 2.0 * t]))
+        self.set(("done", t), np.array([t >= 2, t >= 3]))
+
+agent = TemporalAgent(Agents(Count(name="count"), CopyTAgent("x", "y"), EpisodesDone("done", "over")))
+ws = Workspace()
+agent(ws, t=0, stop_variable="over")
+assert ws["y"].tolist() == [[0.0, 0.0], [1.0, 2.0], [2.0, 4.0], [3.0, 6.0]]
+assert ws.get_transitions(filter_key="done")["x"].shape == (2, 5)
+assert ws.select_batch(np.array([1]))["x"].tolist() == [[0.0], [2.0], [4.0], [6.0]]
+ws.zero_grad()
+ws.copy_n_last_steps(1)
+assert ws.subtime(0, 2)["x"].tolist() == [[3.0, 6.0], [1.0, 2.0]]
+assert ws.select_batch_n(4).batch_size() == 4
+assert ws.sample_subworkspace(2, 1, 2).batch_size() == 2
+assert agent.get_by_name("count")[0].name == "count"
+assert agent.clone().agent is not agent.agent
+heavy = {"torch", "pandas", "matplotlib", "rich", "gymnasium"} & set(sys.modules)
+print(sorted(heavy))
+"""
+
+
+def run(program):
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_importing_the_loop_imports_nothing_heavy():
+    names = '{"torch", "pandas", "matplotlib", "rich", "gymnasium", "mujoco"}'
+    assert run(f"import sys, bam_train.loop; print(sorted({names} & set(sys.modules)))") == "[]"
+
+
+def test_numpy_agents_run_without_torch():
+    assert run(PROGRAM) == "[]"
+
+
+def test_every_public_name_is_there_and_listed():
+    program = "import bam_train.loop as loop; print([n for n in loop.__all__ if not hasattr(loop, n)], len(dir(loop)))"
+    assert run(program).startswith("[] ")
+
+
+def test_an_unknown_name_of_the_package():
+    import bam_train.loop
+
+    with pytest.raises(AttributeError) as error:
+        bam_train.loop.Workspac  # noqa: B018
+    assert "Workspac" in str(error.value)
+
+
+def test_values_are_copied_in():
+    ws, value, whole = Workspace(), np.array([1.0, 2.0]), np.array([[1.0], [2.0]])
+    ws.set("x", 0, value)
+    ws.set_full("y", whole)
+    value[:], whole[:] = 9.0, 9.0
+    assert ws.get("x", 0).tolist() == [1.0, 2.0]
+    assert ws["y"].tolist() == [[1.0], [2.0]]
+
+
+def test_a_buffer_of_the_caller_may_be_used_again_at_every_step():
+    ws, value = Workspace(), np.zeros(2)
+    for t in range(50):
+        value[:] = t
+        ws.set("x", t, value)
+    assert ws["x"].tolist() == [[float(t)] * 2 for t in range(50)]
+
+
+def test_what_was_read_before_keeps_its_values_when_the_variable_grows():
+    ws = Workspace()
+    ws.set("x", 0, np.array([1.0]))
+    first = ws["x"]
+    for t in range(1, 100):
+        ws.set("x", t, np.array([float(t)]))
+    assert first.tolist() == [[1.0]]
+
+
+@pytest.mark.parametrize("value", [np.array([1, 2])[::-1], np.arange(4).reshape(2, 2).T, np.broadcast_to([3], (2,))])
+def test_any_strides(value):
+    ws = Workspace()
+    ws.set("x", 0, value)
+    assert ws["x"].tolist() == [value.tolist()]
+
+
+def test_tensors_and_arrays_in_one_workspace():
+    torch = pytest.importorskip("torch")
+    ws = Workspace()
+    ws.set("x", 0, np.array([1.0]))
+    ws.set("y", 0, torch.tensor([2.0]))
+    assert isinstance(ws["x"], np.ndarray)
+    assert isinstance(ws["y"], torch.Tensor)
+    assert (ws.time_size(), ws.batch_size()) == (1, 1)
+    copy = Workspace(ws).contiguous().subtime(0, 1).select_batch([0])
+    assert isinstance(copy["x"], np.ndarray)
+    assert isinstance(copy["y"], torch.Tensor)

@@ -1,0 +1,185 @@
+"""Pieces of a workspace: times, batch columns, windows, several workspaces side by side."""
+
+import numpy as np
+import pytest
+import torch
+
+from bam_train.loop import Workspace
+
+
+@pytest.fixture
+def ws(kind):
+    """x: single times, 4 x 3, 10 * t + column; y: one array of the same values, negative."""
+    workspace = Workspace()
+    for t in range(4):
+        workspace.set("x", t, kind([10.0 * t, 10.0 * t + 1, 10.0 * t + 2]))
+    workspace.set_full("y", kind([[-10.0 * t - column for column in range(3)] for t in range(4)]))
+    return workspace
+
+
+def test_copy_time(ws, kind):
+    ws.copy_time(2, 0, 2)
+    kind.check(ws["x"], [[20.0, 21.0, 22.0], [30.0, 31.0, 32.0], [20.0, 21.0, 22.0], [30.0, 31.0, 32.0]])
+    kind.check(ws["y"], [[-20.0, -21.0, -22.0], [-30.0, -31.0, -32.0], [-20.0, -21.0, -22.0], [-30.0, -31.0, -32.0]])
+
+
+def test_copy_time_of_some_variables(ws, kind):
+    ws.copy_time(3, 0, 1, var_names=["y"])
+    kind.check(ws.get("x", 0), [0.0, 1.0, 2.0])
+    kind.check(ws.get("y", 0), [-30.0, -31.0, -32.0])
+
+
+def test_copy_time_beyond_the_end_of_single_times(kind):
+    ws = Workspace()
+    for t in range(2):
+        ws.set("x", t, kind([float(t)]))
+    ws.copy_time(0, 2, 2)
+    kind.check(ws["x"], [[0.0], [1.0], [0.0], [1.0]])
+
+
+def test_copy_n_last_steps_keeps_the_length(ws, kind):
+    assert ws.copy_n_last_steps(1) is None
+    kind.check(ws["x"], [[30.0, 31.0, 32.0], [10.0, 11.0, 12.0], [20.0, 21.0, 22.0], [30.0, 31.0, 32.0]])
+    kind.check(ws.get("y", 0), [-30.0, -31.0, -32.0])
+    assert ws.time_size() == 4
+
+
+def test_copy_two_last_steps(ws, kind):
+    ws.copy_n_last_steps(2)
+    kind.check(ws["x"], [[20.0, 21.0, 22.0], [30.0, 31.0, 32.0], [20.0, 21.0, 22.0], [30.0, 31.0, 32.0]])
+
+
+def test_copy_n_last_steps_of_some_variables_copies_these_only(ws, kind):
+    ws.set("other", 0, kind([5.0, 5.0, 5.0]))
+    ws.copy_n_last_steps(1, var_names=["x"])
+    kind.check(ws.get("x", 0), [30.0, 31.0, 32.0])
+    kind.check(ws.get("y", 0), [0.0, -1.0, -2.0])
+    kind.check(ws.get("other", 0), [5.0, 5.0, 5.0])
+
+
+def test_subtime(ws, kind):
+    piece = ws.subtime(1, 3)
+    kind.check(piece["x"], [[10.0, 11.0, 12.0], [20.0, 21.0, 22.0]])
+    kind.check(piece["y"], [[-10.0, -11.0, -12.0], [-20.0, -21.0, -22.0]])
+    assert (piece.time_size(), piece.batch_size()) == (2, 3)
+
+
+@pytest.mark.parametrize(("begin", "end", "times"), [(2, 99, [2, 3]), (-2, 4, [2, 3]), (0, -1, [0, 1, 2])])
+def test_subtime_follows_the_rules_of_slices(ws, begin, end, times):
+    for name, sign in (("x", 1), ("y", -1)):
+        assert ws.subtime(begin, end)[name][:, 1].tolist() == [sign * (10.0 * t + 1) for t in times]
+
+
+def test_changing_a_subtime_of_single_times_leaves_the_original(ws, kind):
+    piece = ws.subtime(0, 2)
+    piece.set("x", 0, kind([7.0, 7.0, 7.0]))
+    kind.check(ws.get("x", 0), [0.0, 1.0, 2.0])
+
+
+def test_get_time_truncated(ws, kind):
+    kind.check(ws.get_time_truncated("x", 1, 3), [[10.0, 11.0, 12.0], [20.0, 21.0, 22.0]])
+    kind.check(ws.get_time_truncated("x", 3, 9), [[30.0, 31.0, 32.0]])
+    kind.check(ws.get_time_truncated("y", 3, 9), [[-30.0, -31.0, -32.0]])
+
+
+def test_get_time_truncated_workspace_of_different_lengths(ws, kind):
+    ws.set("z", 0, kind([1.0, 2.0, 3.0]))
+    piece = ws.get_time_truncated_workspace(0, 2)
+    kind.check(piece["x"], [[0.0, 1.0, 2.0], [10.0, 11.0, 12.0]])
+    kind.check(piece["z"], [[1.0, 2.0, 3.0]])
+
+
+def test_select_batch_keeps_order_and_repeats(ws, kind):
+    chosen = ws.select_batch(kind([2, 0, 2], "int64"))
+    kind.check(chosen.get("x", 1), [12.0, 10.0, 12.0])
+    kind.check(chosen.get("y", 1), [-12.0, -10.0, -12.0])
+    assert (chosen.time_size(), chosen.batch_size()) == (4, 3)
+
+
+def test_select_batch_by_a_mask(ws, kind):
+    chosen = ws.select_batch(kind([False, True, True], "bool"))
+    kind.check(chosen.get("x", 2), [21.0, 22.0])
+    kind.check(chosen.get("y", 2), [-21.0, -22.0])
+
+
+def test_selected_columns_are_copies(ws, kind):
+    chosen = ws.select_batch(kind([0, 1, 2], "int64"))
+    chosen.set("x", 0, kind([7.0, 7.0, 7.0]))
+    chosen["y"][0] = 7.0
+    kind.check(ws.get("x", 0), [0.0, 1.0, 2.0])
+    kind.check(ws.get("y", 0), [0.0, -1.0, -2.0])
+
+
+def test_select_batch_n_draws_with_replacement(ws):
+    torch.manual_seed(0)
+    np.random.seed(0)
+    chosen = ws.select_batch_n(200)
+    assert (chosen.time_size(), chosen.batch_size()) == (4, 200)
+    x, y = chosen["x"], chosen["y"]
+    assert set(x[1].tolist()) == {10.0, 11.0, 12.0}
+    assert (x == -y).all()
+    assert ((x[1:] - x[:-1]) == 10.0).all()
+
+
+def test_select_subtime(ws, kind):
+    piece = ws.select_subtime(kind([0, 2, 1], "int64"), 2)
+    kind.check(piece["x"], [[0.0, 21.0, 12.0], [10.0, 31.0, 22.0]])
+    kind.check(piece["y"], [[0.0, -21.0, -12.0], [-10.0, -31.0, -22.0]])
+
+
+def test_select_subtime_of_vectors(kind):
+    ws = Workspace()
+    ws.set_full("x", kind([[[t, column] for column in range(2)] for t in range(3)], "int64"))
+    piece = ws.select_subtime(kind([1, 0], "int64"), 2)
+    kind.check(piece["x"], [[[1, 0], [0, 1]], [[2, 0], [1, 1]]], "int64")
+
+
+@pytest.mark.parametrize("n_times", [1, 3])
+def test_sample_subworkspace(ws, n_times):
+    piece = ws.sample_subworkspace(n_times, 2, 3)
+    assert (piece.time_size(), piece.batch_size()) == (3, 2 * n_times)
+    x = piece["x"]
+    assert ((x[1:] - x[:-1]) == 10.0).all()
+    for k in range(n_times):
+        columns = x[0, 2 * k : 2 * k + 2].tolist()
+        assert len(set(columns)) == 2  # without replacement
+        assert {value % 10 for value in columns} <= {0.0, 1.0, 2.0}
+        assert {value // 10 for value in columns} <= {0.0, 1.0}
+
+
+def test_sample_subworkspace_of_everything(ws):
+    piece = ws.sample_subworkspace(1, 3, 4)
+    assert (piece.time_size(), piece.batch_size()) == (4, 3)
+    assert sorted(piece["x"][0].tolist()) == [0.0, 1.0, 2.0]
+
+
+@pytest.mark.parametrize("through", [Workspace, Workspace()])
+def test_cat_batch(ws, kind, through):
+    both = through.cat_batch([ws, ws.select_batch(kind([1], "int64"))])
+    kind.check(both.get("x", 1), [10.0, 11.0, 12.0, 11.0])
+    kind.check(both.get("y", 3), [-30.0, -31.0, -32.0, -31.0])
+    assert (both.time_size(), both.batch_size()) == (4, 4)
+
+
+def test_zero_grad_changes_no_value(ws, kind):
+    ws.zero_grad()
+    kind.check(ws.get("x", 3), [30.0, 31.0, 32.0])
+    kind.check(ws.get("y", 3), [-30.0, -31.0, -32.0])
+
+
+def test_to_a_device(ws, kind):
+    moved = ws.to("cpu")
+    assert moved is not ws
+    kind.check(moved.get("x", 3), [30.0, 31.0, 32.0])
+    kind.check(moved.get("y", 3), [-30.0, -31.0, -32.0])
+    moved.set("x", 4, kind([0.0, 0.0, 0.0]))
+    assert ws.time_size() == 4
+
+
+def test_to_another_device():
+    ws = Workspace()
+    ws.set("x", 0, torch.tensor([1.0]))
+    ws.set_full("y", torch.tensor([[1.0]]))
+    moved = ws.to(torch.device("meta"))
+    assert [str(moved[name].device) for name in ("x", "y")] == ["meta", "meta"]
+    assert [str(ws[name].device) for name in ("x", "y")] == ["cpu", "cpu"]
