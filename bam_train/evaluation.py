@@ -1,8 +1,8 @@
-"""Seeded evaluation of a policy: success, return and length over a fixed list of episodes.
+"""Seeded evaluation of a policy: success, return and length over a fixed list of episodes; and films of some.
 
-Episode k starts from ``reset(seed=seed + k)`` however many rows run side by side. Rows are run in waves: every row
-plays one episode, and what a row does after its first end is not counted (it keeps stepping only because others are
-not done).
+Episode k starts from ``reset(seed=seed + k)`` however many rows run side by side. Rows are run in waves, each a run of
+one `TemporalAgent` (environment, policy) until all rows have ended: every row plays one episode, and what a row does
+after its end is not counted (it keeps stepping only because others are not done).
 """
 
 from __future__ import annotations
@@ -13,12 +13,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
+import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
-from numpy.typing import NDArray
 
 from bam_train.environments import is_batched, make_rows
-from bam_train.errors import PolicyError, SettingsError
+from bam_train.errors import SettingsError
+from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, VecGymAgent, Workspace
+from bam_train.loop.film_agent import FilmAgent
+from bam_train.loop.gym.observations import names
+from bam_train.video import Frame
 
 FIRST_SEED = 1_000_000
 """Where evaluation's seeds start unless told: far from the small seeds that training runs start their episodes from."""
@@ -173,51 +177,57 @@ def play_wave(env: VectorEnv[Any, Any, Any], policy: BatchPolicy, seed: int, cou
 
     The surplus rows of a last, smaller wave run too (a vector environment steps all rows) and are ignored.
     """
-    seeds: Any = [seed + i for i in range(env.num_envs)]  # lists are taken, though Gymnasium's hint says int only
-    observations, _ = env.reset(seed=seeds)
-    policy.reset()
-    totals, lengths = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=np.int64)
-    success: list[bool | None] = [None] * env.num_envs
-    running = np.arange(env.num_envs) < count
-    while running.any():
-        actions = policy.act_batch(observations)
-        require_finite(actions, f"after {int(lengths.max())} steps of the episodes from seed {seed} on")
-        observations, rewards, terminated, truncated, infos = env.step(actions)
-        totals[running] += rewards[running]
-        lengths += running
-        ended = np.flatnonzero(terminated | truncated)
-        for row in ended[running[ended]]:
-            success[row] = final_success(infos, int(row))
-        if len(ended):
-            policy.reset(ended)
-        running[ended] = False
-    return [Episode(seed + i, float(totals[i]), int(lengths[i]), success[i]) for i in range(count)]
+    rows = VecGymAgent(lambda: env, auto_reset=False, arrays="numpy", info_keys=("is_success",))
+    acting = PolicyAgent(policy, [f"env/{name}" for name in names(env.single_observation_space)])
+    workspace = Workspace(window=2)
+    seeds = [seed + i for i in range(env.num_envs)]
+    loop = TemporalAgent(Agents(rows, _Wave(count), acting))
+    loop(workspace, t=0, stop_variable="wave/done", seed=seeds)
+    last = {name: workspace.get(name, -1) for name in workspace}
+    return [_episode(last, seed, row) for row in range(count)]
 
 
-def final_success(infos: Mapping[str, Any], row: int) -> bool | None:
-    """`is_success` at the end of `row`'s episode; None where the environment does not say.
+def film_episodes(env: gym.Env[Any, Any], policy: Any, add: Callable[[Frame], Any], *, episodes: int, seed: int) -> int:
+    """Film a policy, the first picture of every episode included; episode k gets ``seed + k``.
 
-    With automatic resets in the same step, the end's info is in ``infos["final_info"]``, and
-    ``infos["is_success"]`` may be the next episode's.
+    Args:
+        env: Made with ``render_mode="rgb_array"``.
+        policy: Has ``reset()`` and ``act(observation)``: a `FrozenPolicy`.
+        add: Takes a picture, such as what `bam_train.video.open_video` gives.
+        episodes: How many.
+        seed: Seed of the first.
+
+    Returns:
+        How many pictures.
     """
-    final = infos.get("final_info", {})
-    if "is_success" not in final or not final.get("_is_success", np.ones(row + 1, dtype=bool))[row]:
-        return None
-    return bool(final["is_success"][row])
+    robot, film = RobotAgent(env), FilmAgent(env, add)
+    loop = TemporalAgent(Agents(robot, film, PolicyAgent(policy, robot.observation_names, single=True)))
+    for k in range(episodes):
+        loop(Workspace(window=2), t=0, stop_variable="env/done", seed=seed + k)
+    return film.count
 
 
-def require_finite(action: NDArray[Any], when: str) -> None:
-    """Refuse an action that is not finite, naming the first such number.
+class _Wave(Agent):
+    """Writes ``wave/done`` (B,): the rows that have ended, and those that do not count."""
 
-    Raises:
-        PolicyError: One of the numbers is NaN or infinite.
-    """
-    numbers = np.asarray(action)
-    if numbers.dtype.kind == "f" and not np.isfinite(numbers).all():
-        index = tuple(int(i) for i in np.argwhere(~np.isfinite(numbers))[0])
-        raise PolicyError(
-            f"action{list(index)} is {numbers[index]} {when}; expected finite numbers: the policy is broken"
-        )
+    reads = ("env/done",)
+    writes = ("wave/done",)
+
+    def __init__(self, count: int) -> None:
+        super().__init__()
+        self._count = count
+
+    def forward(self, t: int, **kwargs: Any) -> None:
+        done = self.get(("env/done", t)).copy()
+        done[self._count :] = True
+        self.set(("wave/done", t), done)
+
+
+def _episode(last: Mapping[str, Any], seed: int, row: int) -> Episode:
+    """The episode of `row`, from the variables at its end, which repeat until all have ended."""
+    says = "env/info/is_success" in last and last["env/info/_is_success"][row]
+    success = bool(last["env/info/is_success"][row]) if says else None
+    return Episode(seed + row, float(last["env/cumulated_reward"][row]), int(last["env/timestep"][row]), success)
 
 
 def _finite(value: float) -> float | None:

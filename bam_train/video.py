@@ -5,10 +5,10 @@ from __future__ import annotations
 import importlib
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -19,16 +19,6 @@ from bam_train.errors import OutputError, SettingsError
 
 Frame = NDArray[np.uint8]
 """One picture. Shape: (height, width, 3)."""
-
-
-class Policy(Protocol):
-    """What decides: a `FrozenPolicy`."""
-
-    def reset(self, rows: Any = None) -> None:
-        """Forget the recurrent state."""
-
-    def act(self, observation: Any) -> Any:
-        """The action for one observation."""
 
 
 def require_video_path(path: Path) -> Path:
@@ -51,26 +41,6 @@ def require_video_path(path: Path) -> Path:
     return path
 
 
-def frames(env: gym.Env[Any, Any], policy: Policy, episodes: int, seed: int) -> Iterator[Frame]:
-    """Every picture of `episodes` episodes, the first of each included; episode k gets ``seed + k``.
-
-    Args:
-        env: Made with ``render_mode="rgb_array"``.
-        policy: What decides.
-        episodes: How many.
-        seed: Seed of the first.
-    """
-    for k in range(episodes):
-        observation, _ = env.reset(seed=seed + k)
-        policy.reset()
-        ended = False
-        yield picture(env)
-        while not ended:
-            observation, _, terminated, truncated, _ = env.step(policy.act(observation))
-            ended = bool(terminated or truncated)
-            yield picture(env)
-
-
 def picture(env: gym.Env[Any, Any]) -> Frame:
     """What `env` shows now.
 
@@ -87,45 +57,61 @@ def picture(env: gym.Env[Any, Any]) -> Frame:
     return image.astype(np.uint8, copy=False)
 
 
-def write_video(path: Path, pictures: Iterable[Frame], rate: float) -> int:
-    """Write a film, whole or not at all; the number of its pictures.
+@contextmanager
+def open_video(path: Path, rate: float) -> Iterator[Callable[[Frame], None]]:
+    """A film to add pictures to, all of one size; it is there at the end, whole, or not at all after an exception.
 
     Args:
         path: Ends in ``.gif`` or ``.mp4``.
-        pictures: At least one, all of one size.
         rate: Pictures a second.
 
     Raises:
+        SettingsError: No picture was added.
         OutputError: No space or no permission.
     """
-    with _replacing(path) as temporary:
-        return _WRITERS[path.suffix.lower()](temporary, iter(pictures), rate)
+    count = 0
+
+    def add(frame: Frame) -> None:
+        nonlocal count
+        write(frame)
+        count += 1
+
+    with _replacing(path) as temporary, _WRITERS[path.suffix.lower()](temporary, rate) as write:
+        yield add
+        if count == 0:
+            raise SettingsError(f"{path}: a film needs at least one picture")
 
 
-def _write_gif(path: Path, pictures: Iterator[Frame], rate: float) -> int:
+@contextmanager
+def _gif(path: Path, rate: float) -> Iterator[Callable[[Frame], None]]:
     """One palette, from the first picture, for the whole film: what stands still does not flicker and costs nothing."""
     from PIL import Image
 
-    first = Image.fromarray(next(pictures)).quantize(colors=256, dither=Image.Dither.NONE)
-    rest = [Image.fromarray(one).quantize(palette=first, dither=Image.Dither.NONE) for one in pictures]
+    pictures: list[Image.Image] = []
+
+    def add(frame: Frame) -> None:
+        image = Image.fromarray(frame)
+        plain = {"dither": Image.Dither.NONE}
+        pictures.append(
+            image.quantize(palette=pictures[0], **plain) if pictures else image.quantize(colors=256, **plain)
+        )
+
+    yield add
     # GIF counts in hundredths of a second, and players slow down what is faster than 2 of them.
     duration = 10 * max(2, round(100 / rate))
+    first, rest = pictures[0], pictures[1:]
     first.save(path, format="GIF", save_all=True, append_images=rest, duration=duration, loop=0, optimize=False)
-    return 1 + len(rest)
 
 
-def _write_mp4(path: Path, pictures: Iterator[Frame], rate: float) -> int:
+@contextmanager
+def _mp4(path: Path, rate: float) -> Iterator[Callable[[Frame], None]]:
     import imageio.v2 as imageio
 
-    count = 0
     with imageio.get_writer(path, format="FFMPEG", fps=rate, codec="libx264", macro_block_size=2) as writer:
-        for one in pictures:
-            writer.append_data(one)  # type: ignore[attr-defined]
-            count += 1
-    return count
+        yield writer.append_data  # type: ignore[attr-defined]
 
 
-_WRITERS: dict[str, Callable[[Path, Iterator[Frame], float], int]] = {".gif": _write_gif, ".mp4": _write_mp4}
+_WRITERS = {".gif": _gif, ".mp4": _mp4}
 
 
 def _require_writer(suffix: str) -> None:

@@ -11,8 +11,9 @@ from bam_envs.errors import BamEnvsError
 from bam_train.checkpoint import Checkpoint
 from bam_train.environments import make_env
 from bam_train.errors import BamTrainError
+from bam_train.evaluation import film_episodes
 from bam_train.policy import FrozenPolicy
-from bam_train.video import frames
+from bam_train.video import Frame
 
 LIMIT = 2_000_000
 """Largest picture that the README may have [bytes]."""
@@ -27,11 +28,14 @@ def film(checkpoint: Path, episodes: int, seed: int) -> tuple[list[Image.Image],
     env = make_env(manifest.env, manifest.env_kwargs, render_mode="rgb_array")
     pictures: list[Image.Image] = []
     durations: list[int] = []
+
+    def add(frame: Frame) -> None:
+        pictures.append(Image.fromarray(frame))
+
     try:
         for k in range(episodes):
-            shown = [Image.fromarray(picture) for picture in frames(env, policy, 1, seed + k)]
-            pictures += shown
-            durations += [round(1000 * (manifest.period or 0.05))] * (len(shown) - 1) + [PAUSE]
+            count = film_episodes(env, policy, add, episodes=1, seed=seed + k)
+            durations += [round(1000 * (manifest.period or 0.05))] * (count - 1) + [PAUSE]
     finally:
         env.close()  # type: ignore[no-untyped-call]
     return pictures, durations

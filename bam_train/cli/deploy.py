@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     import gymnasium as gym
 
     from bam_train.checkpoint import Checkpoint
-    from bam_train.deploy.journal import Journal
     from bam_train.deploy.agents import Watcher
+    from bam_train.deploy.journal import Journal
     from bam_train.deploy.loop import Deployment
     from bam_train.deploy.pacer import Pacer
 

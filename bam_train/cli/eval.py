@@ -184,13 +184,15 @@ def _require_picture(subject: Subject) -> None:
 
 def _film(config: EvalConfig, subject: Subject, path: Path) -> None:
     from bam_train.environments import control_period, make_env
-    from bam_train.video import frames, write_video
+    from bam_train.evaluation import film_episodes
+    from bam_train.video import open_video
 
     env = make_env(subject.env, subject.env_kwargs, render_mode="rgb_array")
     period = control_period(env) or 1 / 30
     episodes = min(config.video_episodes, config.episodes)
     try:
-        count = write_video(path, frames(env, subject.policy, episodes, config.seed), 1 / period)
+        with open_video(path, 1 / period) as add:
+            count = film_episodes(env, subject.policy, add, episodes=episodes, seed=config.seed)
     finally:
         env.close()  # type: ignore[no-untyped-call]
     say(f"bam-eval: {path}: {episodes} episode{'' if episodes == 1 else 's'}, {count} pictures")

@@ -39,8 +39,8 @@ class Ending:
 class Deployment:
     """A frozen policy and a robot in one loop.
 
-    Memory stays flat however long it runs: the workspace keeps the last `window` ticks at least, and gives older ones to
-    `sink` as they leave.
+    Memory stays flat however long it runs: the workspace keeps the last `window` ticks at least, and gives older ones
+    to `sink` as they leave.
 
     Args:
         env: The environment, already proved to fit the policy.

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-
 KEPT = 65536
 """Ticks whose lateness is kept, so that memory stays flat: 55 minutes at 20 Hz."""
 

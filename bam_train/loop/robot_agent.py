@@ -1,4 +1,4 @@
-"""One environment without automatic resets, usually a robot's, on NumPy arrays: what evaluation and deployment run on."""
+"""One environment without automatic resets, usually a robot's, on NumPy arrays: what a deployment runs on."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bam_train.errors import LoopError
 from bam_train.loop.agent import Agent
+from bam_train.loop.gym.observations import NAME, names
 
 FLAGS = ("terminated", "truncated", "done")
 SUCCESS = "info/is_success"
@@ -46,7 +47,7 @@ class RobotAgent(Agent):
         super().__init__(name=name)
         self.env, self.input, self.output = env, input_string, output_string
         self.live = robot_of(env) is not None
-        self.observation_names = tuple(names_of(env.observation_space, f"{output_string}env_obs"))
+        self.observation_names = tuple(output_string + name for name in names(env.observation_space))
         rest = ("reward", "cumulated_reward", "timestep", *FLAGS, SUCCESS, SAYS_SUCCESS)
         self.reads, self.reads_previous = (), (input_string,)
         self.writes = (*self.observation_names, *(output_string + name for name in rest))
@@ -111,7 +112,7 @@ class RobotAgent(Agent):
             SUCCESS: np.array([bool(info.get("is_success", False))]),
             SAYS_SUCCESS: np.array(["is_success" in info]),
         }
-        for name, value in flat(observation, f"{self.output}env_obs"):
+        for name, value in flat(observation, self.output + NAME):
             self.set((name, t), np.asarray(value)[None])
         for name, value in values.items():
             self.set((self.output + name, t), value)
@@ -120,15 +121,6 @@ class RobotAgent(Agent):
 def robot_of(env: gym.Env[Any, Any]) -> Any:
     """The robot of a `RobotEnv`, or None."""
     return getattr(env.unwrapped, "robot", None)
-
-
-def names_of(space: gym.Space[Any], name: str) -> Iterator[str]:
-    """Names of the variables that observations of `space` become."""
-    if isinstance(space, gym.spaces.Dict):
-        for key, part in space.spaces.items():
-            yield from names_of(part, f"{name}/{key}")
-    else:
-        yield name
 
 
 def flat(observation: Any, name: str) -> Iterator[tuple[str, NDArray[Any]]]:

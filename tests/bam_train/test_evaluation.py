@@ -10,9 +10,7 @@ from bam_train.evaluation import (
     Episode,
     default_rows,
     evaluate,
-    final_success,
     play_wave,
-    require_finite,
     summarise,
     wilson_interval,
 )
@@ -86,15 +84,15 @@ def test_json_is_plain(corridor):
     assert values["episodes"] == 2
 
 
-def test_recurrent_state_is_forgotten_row_by_row(corridor, starting_cell):
+def test_recurrent_state_is_forgotten_at_the_start_of_every_wave(corridor, starting_cell):
     policy = Always(1)
     rows = make_rows(corridor, None, 2)
     seed = next(seed for seed in range(100) if starting_cell(seed) == 3 and starting_cell(seed + 1) == 2)
-    episodes = play_wave(rows, policy, seed, 2)
+    waves = [play_wave(rows, policy, seed, 2) for _ in range(2)]
     rows.close()
-    assert [episode.length for episode in episodes] == [1, 2]
-    assert policy.forgotten[:2] == [None, [0]]
-    assert 1 in policy.forgotten[2]
+    assert [[episode.length for episode in wave] for wave in waves] == [[1, 2], [1, 2]]
+    assert policy.forgotten == [None, None]
+    assert len(policy.batches) == 4
 
 
 def test_given_rows_are_used_again_and_left_open(corridor):
@@ -144,13 +142,8 @@ def test_an_action_that_is_not_finite_is_refused():
     with pytest.raises(PolicyError) as caught:
         evaluate(Broken(), "Pendulum-v1", episodes=2, seed=4)
     assert str(caught.value) == (
-        "action[0, 0] is nan after 0 steps of the episodes from seed 4 on; "
-        "expected finite numbers: the policy is broken"
+        "action[0, 0] is nan at step 0 of the episodes from seed 4 on; expected finite numbers: the policy is broken"
     )
-
-
-def test_integer_actions_are_finite():
-    require_finite(np.array([1, 2]), "now")
 
 
 def test_returns_that_are_not_finite_are_none():
@@ -158,16 +151,6 @@ def test_returns_that_are_not_finite_are_none():
     assert (report.return_mean, report.return_std, report.return_min, report.return_max) == (None, None, None, None)
     assert (report.length_mean, report.length_std) == (2.0, 1.0)
     json.dumps(report.to_json(), allow_nan=False)
-
-
-def test_success_of_a_row_is_read_from_its_own_end():
-    infos = {
-        "is_success": np.array([False, False]),
-        "final_info": {"is_success": np.array([True, False]), "_is_success": np.array([True, False])},
-    }
-    assert final_success(infos, 0) is True
-    assert final_success(infos, 1) is None
-    assert final_success({}, 0) is None
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,8 @@ from PIL import Image
 
 from bam_envs.errors import MissingExtra
 from bam_train.errors import OutputError, SettingsError
-from bam_train.video import frames, require_video_path, write_video
+from bam_train.evaluation import film_episodes
+from bam_train.video import open_video, require_video_path
 
 
 class Right:
@@ -21,8 +22,10 @@ class Right:
 
 def test_every_picture_of_every_episode(corridor, starting_cell):
     env = gym.make(corridor, render_mode="rgb_array")
-    pictures = list(frames(env, Right(), episodes=2, seed=7))
+    pictures = []
+    count = film_episodes(env, Right(), pictures.append, episodes=2, seed=7)
     env.close()
+    assert count == len(pictures)
     cells = [cell for seed in (7, 8) for cell in range(starting_cell(seed), 5)]
     assert [int(picture[0, :, 0].argmax()) // 8 for picture in pictures] == cells
 
@@ -30,7 +33,8 @@ def test_every_picture_of_every_episode(corridor, starting_cell):
 def test_gif(corridor, tmp_path):
     env = gym.make(corridor, render_mode="rgb_array")
     path = tmp_path / "film.gif"
-    count = write_video(path, frames(env, Right(), episodes=2, seed=7), rate=20)
+    with open_video(path, rate=20) as add:
+        count = film_episodes(env, Right(), add, episodes=2, seed=7)
     env.close()
     with Image.open(path) as film:
         assert film.n_frames == count
@@ -47,7 +51,9 @@ def test_mp4(tmp_path):
     imageio = pytest.importorskip("imageio.v2")
     pytest.importorskip("imageio_ffmpeg")
     path = tmp_path / "film.mp4"
-    assert write_video(path, [np.full((48, 64, 3), 20 * i, np.uint8) for i in range(10)], rate=20) == 10
+    with open_video(path, rate=20) as add:
+        for i in range(10):
+            add(np.full((48, 64, 3), 20 * i, np.uint8))
     with imageio.get_reader(path) as reader:
         assert reader.get_meta_data()["fps"] == 20
         assert reader.get_meta_data()["size"] == (64, 48)
@@ -56,11 +62,20 @@ def test_mp4(tmp_path):
 
 def test_nothing_is_left_of_a_film_that_failed(tmp_path):
     def broken():
-        yield np.zeros((8, 8, 3), np.uint8)
-        raise ValueError("no more")
+        with open_video(tmp_path / "film.gif", rate=20) as add:
+            add(np.zeros((8, 8, 3), np.uint8))
+            raise ValueError("no more")
 
     with pytest.raises(ValueError, match="no more"):
-        write_video(tmp_path / "film.gif", broken(), rate=20)
+        broken()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_film_needs_a_picture(tmp_path):
+    path = tmp_path / "film.gif"
+    with pytest.raises(SettingsError) as caught, open_video(path, rate=20):
+        pass
+    assert str(caught.value) == f"{path}: a film needs at least one picture"
     assert list(tmp_path.iterdir()) == []
 
 
@@ -95,5 +110,5 @@ def test_a_missing_writer_is_named(tmp_path, monkeypatch):
 def test_an_environment_without_pictures():
     env = gym.make("CartPole-v1")
     with pytest.warns(UserWarning, match="render method without specifying"), pytest.raises(SettingsError) as caught:
-        next(frames(env, Right(), episodes=1, seed=0))
+        film_episodes(env, Right(), [].append, episodes=1, seed=0)
     assert str(caught.value) == "CartPole-v1: render() gives no picture; a film cannot be made of it"
