@@ -59,7 +59,7 @@ class ReplayBuffer:
             ValueMismatch: Another T, shape or dtype than the first `put`.
             WorkspaceError: A variable that the buffer does not have, columns that differ in number, or no variable.
         """
-        rows = {name: self._rows(workspace.get_full(name)) for name in workspace.keys()}  # noqa: SIM118
+        rows = {name: self._rows(name, workspace.get_full(name)) for name in workspace.keys()}  # noqa: SIM118
         count = _count(rows)
         if self.variables:
             self._require_alike(rows)
@@ -68,7 +68,7 @@ class ReplayBuffer:
         start = self.position + max(0, count - self.max_size)
         kept = min(count, self.max_size)
         for name, value in rows.items():
-            self._write(self.variables[name], value[count - kept :], start % self.max_size)
+            self._write(self.variables[name], value if kept == count else value[-kept:], start % self.max_size)
         self.is_full = self.is_full or self.position + count >= self.max_size
         self.position = (self.position + count) % self.max_size
 
@@ -99,9 +99,16 @@ class ReplayBuffer:
         self.variables = {name: value.to(self.device) for name, value in self.variables.items()}
         return self
 
-    def _rows(self, value: Any) -> torch.Tensor:
+    def _rows(self, name: str, value: Any) -> torch.Tensor:
         """T x N x ... as N x T x ..., without graph, on the buffer's device."""
-        return torch.as_tensor(value).detach().to(self.device).transpose(0, 1)
+        value = torch.as_tensor(value)
+        if value.ndim < 2:
+            raise ValueMismatch(
+                f"{name!r} in the replay buffer: expected T x N x ..., found shape {tuple(value.shape)}."
+            )
+        if value.requires_grad or value.device != self.device:
+            value = value.detach().to(self.device)
+        return value.transpose(0, 1)
 
     def _empty(self, rows: torch.Tensor) -> torch.Tensor:
         """Room for `max_size` rows like these."""
@@ -109,9 +116,12 @@ class ReplayBuffer:
 
     def _write(self, kept: torch.Tensor, rows: torch.Tensor, start: int) -> None:
         """Write at most `max_size` rows from `start` on, going round at the end."""
-        before_end = min(len(rows), self.max_size - start)
-        kept[start : start + before_end] = rows[:before_end]
-        kept[: len(rows) - before_end] = rows[before_end:]
+        before_end = self.max_size - start
+        if len(rows) <= before_end:
+            kept[start : start + len(rows)] = rows
+        else:
+            kept[start:] = rows[:before_end]
+            kept[: len(rows) - before_end] = rows[before_end:]
 
     def _require_alike(self, rows: dict[str, torch.Tensor]) -> None:
         """Refuse rows that do not fit those in the buffer."""
@@ -127,6 +137,8 @@ class ReplayBuffer:
 
 def _require_like(name: str, kept: torch.Tensor, rows: torch.Tensor) -> None:
     """Refuse another T, shape or dtype than the buffer's."""
+    if rows.shape[1:] == kept.shape[1:] and rows.dtype is kept.dtype:
+        return
     pairs = (
         ("time size", kept.shape[1], rows.shape[1]),
         ("shape", tuple(kept.shape[2:]), tuple(rows.shape[2:])),

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from bam_train.errors import LoopError
 from bam_train.loop.workspace import Workspace
 
 _LOOK_AGAIN = 1.0  # seconds between two looks at whether the parent is alive
@@ -58,7 +59,7 @@ class _Server:
 
     def start(self, payload: Any, seed: int | None, noise: int) -> None:
         """Take the agent, and seed it."""
-        self.agent = pickle.loads(payload) if isinstance(payload, bytes) else payload
+        self.agent = _unpickled(payload) if isinstance(payload, bytes) else payload
         self._seed_generators(noise)
         if seed is not None:
             self.agent.seed(seed)
@@ -101,6 +102,15 @@ class _Server:
         torch.manual_seed(seed)
         np.random.seed(seed % 2**32)
         random.seed(seed)
+
+
+def _unpickled(payload: bytes) -> Any:
+    try:
+        return pickle.loads(payload)
+    except (AttributeError, ImportError) as error:  # its class is not where this process can import it
+        raise LoopError(
+            f'{error}; define what the agent is made of in a module that can be imported, or give start_method="fork"'
+        ) from error
 
 
 def _end_with_parent(parent: int) -> None:

@@ -4,8 +4,8 @@ Its variables and its length are fixed. Values are copied in, without their grap
 which changes when another process writes.
 
 Differences from BBRL: a split workspace has all members of a workspace; `set_full` writes into the shared memory, where
-BBRL's puts a private tensor in its place; writing beyond the end, another shape or another dtype is an error that names
-the variable; NumPy variables can be shared, too.
+BBRL's puts a private tensor in its place; times that overlap can be copied; writing beyond the end, another shape or
+another dtype is an error that names the variable; NumPy variables can be shared, too.
 """
 
 from __future__ import annotations

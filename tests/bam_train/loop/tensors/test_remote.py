@@ -5,14 +5,16 @@ import os
 import signal
 import subprocess
 import sys
+import types
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from remote_agents import Trouble, Walker
 
 from bam_train.errors import LoopError, WorkspaceError
-from bam_train.loop import Agents, SeedableAgent, TemporalAgent, Workspace
+from bam_train.loop import Agent, Agents, SeedableAgent, TemporalAgent, Workspace
 from bam_train.loop.tensors.remote import NRemoteAgent, RemoteAgent, RemoteAgentError
 from bam_train.loop.tensors.shared import shared_workspace
 
@@ -160,6 +162,25 @@ def test_one_call_at_a_time(started):
     assert remote.is_running()
     remote.close()
     assert not remote.is_running()
+
+
+def test_in_a_loop_of_this_process(created):
+    remote, workspace = created(Walker(), t=0, time_size=3)
+    TemporalAgent(Agents(remote))(workspace, t=0, n_steps=3, scale=4.0)
+    assert workspace["x"][:, 2, 1].tolist() == [1, 2, 3]
+    assert workspace["x"][:, 2, 3].tolist() == [4, 4, 4]
+
+
+def test_numpy_variables(created):
+    class Numbers(Agent):
+        def forward(self, t, **kwargs):
+            self.set(("x", t), np.array([t, os.getpid()]))
+
+    remote, workspace = created(TemporalAgent(Numbers()))
+    remote(workspace, **STEPS)
+    assert isinstance(workspace["x"], np.ndarray)
+    assert workspace["x"][:, [0, 2]].tolist() == [[0, 0], [1, 1], [2, 2]]
+    assert len({os.getpid(), *workspace["x"][0, [1, 3]].tolist()}) == 3
 
 
 def test_several_without_waiting(created):
@@ -321,6 +342,20 @@ def test_agents_that_cannot_be_sent(started):
     remote, workspace = started(Local(), start_method="spawn")
     with pytest.raises(RemoteAgentError, match=r"""^Local: cannot be sent .* or start_method="fork"\.$"""):
         remote(workspace, t=0)
+    assert multiprocessing.active_children() == []
+
+
+def test_agents_of_modules_that_only_this_process_has(started, monkeypatch):
+    notebook = types.ModuleType("notebook")
+    exec("from remote_agents import Walker\nclass Own(Walker):\n    pass", notebook.__dict__)
+    monkeypatch.setitem(sys.modules, "notebook", notebook)
+    remote, workspace = started(Agents(notebook.Own()), start_method="spawn")
+    with pytest.raises(RemoteAgentError) as caught:
+        remote(workspace, t=0)
+    assert str(caught.value) == (
+        "Agents failed in its process: LoopError: No module named 'notebook'; define what the agent is made of in a "
+        'module that can be imported, or give start_method="fork"'
+    )
     assert multiprocessing.active_children() == []
 
 

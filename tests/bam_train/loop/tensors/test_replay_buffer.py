@@ -164,6 +164,11 @@ def state(buffer):
             WorkspaceError,
             "Expected one batch size for all variables, found 'x' 1, 'done' 2.",
         ),
+        (
+            full(x=torch.zeros(2), done=torch.zeros(2, 2) > 0),
+            ValueMismatch,
+            "'x' in the replay buffer: expected T x N x ..., found shape (2,).",
+        ),
         (Workspace(), WorkspaceError, "The workspace is empty: there is nothing to put into the replay buffer."),
     ],
 )
