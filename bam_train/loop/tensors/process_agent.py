@@ -76,6 +76,11 @@ class ProcessAgent(Agent):
             self.close()
             raise
 
+    def ask_to_end(self) -> None:
+        """Begin to end an idle process, so that several end at the same time; only `close` may follow."""
+        if self._worker is not None:
+            self._worker.ask_to_end()
+
     def close(self) -> None:
         """End the process; at any time, as often as one likes. The next call starts a new one."""
         if self._worker is not None:

@@ -10,7 +10,7 @@ Differences from BBRL, whose processes die as they start while the parent waits 
   start, too. Nobody needs to seed: process k has seed k, or, of a lone `RemoteAgent`, its generators one from torch's.
 - `NRemoteAgent.create` leaves the agent it is given as it was. With no processes, what it returns is not seeded.
 - `close` can be called at any time; processes also end with the agent's last reference and with the parent.
-- A process is a daemon: the agent in it cannot start processes of its own.
+- A process is a daemon: the agent in it cannot start processes of its own. It has one torch thread.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 from bam_train.errors import LoopError, WorkspaceError
 from bam_train.loop.agent import Agent, agent_name
 from bam_train.loop.tensors.process_agent import ProcessAgent
-from bam_train.loop.tensors.shared import SharedWorkspace, _SplitSharedWorkspace
+from bam_train.loop.tensors.shared import SharedWorkspace, _SplitSharedWorkspace, shared_workspace
 from bam_train.loop.tensors.worker import RemoteAgentError, wait_for_any
 from bam_train.loop.workspace import Workspace
 
@@ -124,16 +124,18 @@ class NRemoteAgent(Agent):
             raise WorkspaceError(f"num_processes: expected at least 0, found {num_processes}.")
         workspace, trial = Workspace(), copy.deepcopy(agent)
         trial.seed(0)
-        trial(workspace, **extra_kwargs)
-        trial.close()
+        try:
+            trial(workspace, **extra_kwargs)
+        finally:
+            trial.close()
         size = workspace.batch_size() or 0
-        shared = workspace._convert_to_shared_workspace(max(1, num_processes), time_size)
+        shared = shared_workspace(workspace, max(1, num_processes), time_size)
         copies = [copy.deepcopy(agent) for _ in range(max(1, num_processes))]
         if num_processes == 0:
-            return copies[0], shared  # type: ignore[return-value]
+            return copies[0], shared
         remotes = [RemoteAgent(one, start_method=start_method) for one in copies]
         columns = [(k * size, (k + 1) * size) for k in range(num_processes)]
-        return NRemoteAgent(remotes, columns).seed(0), shared  # type: ignore[return-value]
+        return NRemoteAgent(remotes, columns).seed(0), shared
 
     def __call__(self, workspace: Workspace, **kwargs: Any) -> None:
         """Run all copies at once, each on its columns of `workspace`, and wait for them.
@@ -155,8 +157,13 @@ class NRemoteAgent(Agent):
         """The call without waiting; `is_running` says when it has ended."""
         if self.is_running():
             raise LoopError(f"{agent_name(self)} is still running; wait until is_running() is False.")
-        for agent, columns in zip(self.agents, self._columns(workspace), strict=True):
-            agent._asynchronous_call(columns, **kwargs)
+        parts = self._columns(workspace)
+        try:
+            for agent, columns in zip(self.agents, parts, strict=True):
+                agent._asynchronous_call(columns, **kwargs)
+        except BaseException:
+            self.close()
+            raise
 
     def forward(self, **kwargs: Any) -> None:
         """Not used.
@@ -197,6 +204,8 @@ class NRemoteAgent(Agent):
 
     def close(self) -> None:
         """End all processes; at any time, as often as one likes. The next call starts new ones."""
+        for agent in self.agents:
+            agent.ask_to_end()
         for agent in self.agents:
             agent.close()
 

@@ -68,7 +68,7 @@ class Worker:
         self.name = agent_name(agent)
         self._owner = os.getpid()
         self._pending = 0
-        self._started = False
+        self._started = self._asked = False
         self._result: Any = None
         self.closed = False
         if isinstance(agent, torch.nn.Module):
@@ -124,21 +124,30 @@ class Worker:
         """The result of the last command that had one."""
         return self._result
 
+    def ask_to_end(self) -> None:
+        """Ask an idle process to close its agent and end, without waiting; only `close` may follow."""
+        if not (self._pending or self._asked or self.closed) and self._is_mine():
+            self._asked = True
+            with suppress(OSError):
+                self._connection.send_bytes(self._pickled(("exit",)))
+
     def close(self) -> None:
         """End the process, at once if it is busy; from any state, as often as one likes."""
-        if self.closed or self._owner != os.getpid():  # a forked process has copies of its siblings' ends
+        if self.closed or not self._is_mine():
             return
-        self.closed = True
-        with suppress(OSError):
-            if not self._pending:
-                self._connection.send_bytes(self._pickled(("exit",)))
-                self._process.join(PATIENCE)
+        self.ask_to_end()
+        if not self._pending:
+            self._process.join(PATIENCE)
         for end in (self._process.terminate, self._process.kill):
             if self._process.is_alive():
                 end()
                 self._process.join(PATIENCE)
-        self._pending = 0
+        self.closed, self._pending = True, 0
         self._connection.close()
+
+    def _is_mine(self) -> bool:
+        """Whether this process started it: a forked one has copies of its siblings' ends."""
+        return self._owner == os.getpid()
 
     def _take_if_ready(self, seconds: float) -> bool:
         """Take one answer if it comes in time; closes the process on whatever goes wrong, Ctrl-C too."""
@@ -166,16 +175,16 @@ class Worker:
         """The error for a process that is no more."""
         self._process.join(PATIENCE)
         code = self._process.exitcode
-        how = f"was ended by {signal.Signals(-code).name}" if code and code < 0 else f"ended with exit code {code}"
-        remedy = (
-            ""
-            if self._started
-            else (
-                ' before it was ready; a script that starts processes needs `if __name__ == "__main__":` '
-                'around what it does, or start_method="fork"'
+        if code and code < 0:
+            how = f"was ended by {signal.Signals(-code).name}"
+        elif self._started:
+            how = f"ended with exit code {code}"
+        else:
+            how = (
+                f"ended with exit code {code} before it was ready; a script that starts processes needs "
+                f'`if __name__ == "__main__":` around what it does, or start_method="fork"'
             )
-        )
-        return RemoteAgentError(f"The process of {self.name} {how}{remedy}.", exit_code=code)
+        return RemoteAgentError(f"The process of {self.name} {how}.", exit_code=code)
 
     def _pickled(self, what: Any) -> bytes:
         try:

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import types
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from remote_agents import Trouble, Walker
 
 from bam_train.errors import LoopError, WorkspaceError
 from bam_train.loop import Agent, Agents, SeedableAgent, TemporalAgent, Workspace
+from bam_train.loop.gym import ParallelGymAgent, make_env
 from bam_train.loop.tensors.remote import NRemoteAgent, RemoteAgent, RemoteAgentError
 from bam_train.loop.tensors.shared import shared_workspace
 
@@ -88,6 +90,31 @@ def test_processes_give_the_results_of_this_one(created, method):
     same(workspace, here(agent, 5, **STEPS, scale=2.0), here(agent, 6, **STEPS, scale=2.0))
     assert not workspace["grad"].any()
     assert len(multiprocessing.active_children()) == 2
+
+
+class Policy(Agent):
+    """Samples the actions of CartPole."""
+
+    def __init__(self):
+        super().__init__(name="policy")
+        self.model = torch.nn.Linear(4, 2)
+
+    def forward(self, t, **kwargs):
+        logits = self.model(self.get(("env/env_obs", t)))
+        self.set(("action", t), torch.distributions.Categorical(logits=logits).sample())
+
+
+def test_environments_in_processes(created):
+    environment = ParallelGymAgent(partial(make_env, "CartPole-v1", autoreset=True), 2)
+    agent = TemporalAgent(Agents(environment, Policy()))
+    remote, workspace = created(agent, n_steps=30)
+    remote.seed(3, inc=4)
+    remote(workspace, t=0, n_steps=30)
+    assert workspace["env/done"].any()
+    for k, expected in enumerate(here(agent, seed, t=0, n_steps=30) for seed in (3, 7)):
+        assert list(workspace.keys()) == list(expected.keys())
+        for name in expected.keys():  # noqa: SIM118
+            assert torch.equal(workspace[name][:, 2 * k : 2 * k + 2], expected[name])
 
 
 def test_a_process_goes_on_where_it_was(started):
