@@ -184,6 +184,21 @@ def test_abstract_agents():
         Planned()
 
 
+def test_classes_that_count_their_subclasses_count_each_once():
+    class Counted(Agent):
+        found = []  # noqa: RUF012
+
+        def __init_subclass__(cls, *, key, **kwargs):
+            super().__init_subclass__(**kwargs)
+            Counted.found.append((cls.__name__, key))
+
+    class One(Counted, key="one"):
+        pass
+
+    assert isinstance(One(), nn.Module)
+    assert Counted.found == [("One", "one")]
+
+
 def test_an_agent_that_names_nn_module_itself():
     ws, agent = Workspace(), Both(name="both")
     agent(ws, t=0)

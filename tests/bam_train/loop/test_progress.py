@@ -229,6 +229,13 @@ def test_a_temporal_agent_that_fails_stops_its_task():
     assert task.stop_time is not None
 
 
+def test_a_copy_of_a_temporal_agent_can_be_made():
+    display = Undrawn()
+    copy = TemporalAgent(Nothing(), progress=display).clone()
+    copy(Workspace(), n_steps=2)
+    assert TemporalAgent(Nothing(), progress=True).clone().progress is True
+
+
 def test_without_a_display_rich_is_not_needed(monkeypatch):
     monkeypatch.delitem(sys.modules, "bam_train.loop.progress")
     monkeypatch.setitem(sys.modules, "rich.progress", None)

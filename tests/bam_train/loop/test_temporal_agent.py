@@ -74,6 +74,14 @@ def test_no_steps_runs_once(kind):
     assert clock.times == [0]
 
 
+@pytest.mark.parametrize(("n_steps", "runs"), [(2.5, 3), (3.0, 3), (-4, 1)])
+def test_odd_numbers_of_steps_end_as_well(kind, n_steps, runs):
+    """As from ``total / n_envs``."""
+    clock = Clock(kind, fails_at=9)
+    TemporalAgent(clock)(Workspace(), n_steps=n_steps)
+    assert len(clock.times) == runs
+
+
 @pytest.mark.parametrize("dtype", ["bool", "int64", "float32", "uint8"])
 def test_any_number_but_zero_stops(kind, dtype):
     clock = Clock(kind, dtype=dtype)

@@ -197,6 +197,15 @@ def test_the_first_time_without_a_window(kind):
     assert len(ws["x"]) == 1000
 
 
+def test_a_value_that_an_agent_keeps_does_not_change_as_time_goes_on(kind):
+    """Such as a hidden state or the observation before, kept as an attribute."""
+    ws, kept = Workspace(window=2), []
+    for t in range(200):
+        ws.set("x", t, kind([t], "int64"))
+        kept.append(ws.get("x", t))
+    assert [value.item() for value in kept] == list(range(200))
+
+
 def test_gradients_in_a_window():
     torch = pytest.importorskip("torch")
     weight = torch.tensor([1.0], requires_grad=True)

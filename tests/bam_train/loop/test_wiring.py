@@ -92,6 +92,24 @@ def test_wrappers_are_looked_into():
     assert inner.calls == 0
 
 
+class Exploring(Agent):
+    """Runs another agent and writes something of its own, without saying so."""
+
+    def __init__(self, agent):
+        super().__init__()
+        self.agent = agent
+
+    def forward(self, t, **kwargs):
+        self.agent(self.workspace, t=t)
+        self.set(("noise", t), np.array([0.5]))
+
+
+def test_a_users_wrapper_may_write_more_than_what_is_in_it():
+    policy, reader = Step(("obs",), ("action",)), Step(("noise",), ())
+    TemporalAgent(Agents(Env(), Exploring(policy), reader))(Workspace(), n_steps=2)
+    assert (policy.calls, reader.calls) == (2, 2)
+
+
 def test_a_chain_with_a_robot_is_checked_when_it_is_built():
     with pytest.raises(WiringError, match="'osb'"):
         TemporalAgent(Agents(Robot(), Step(("osb",), ("action",))))

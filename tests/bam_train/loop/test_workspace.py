@@ -1,5 +1,7 @@
 """Reading and writing: one time, all times, what a workspace says about itself."""
 
+import copy
+import pickle
 from collections import OrderedDict
 
 import pytest
@@ -198,6 +200,27 @@ def test_variables_of_different_lengths_can_be_read(kind):
     kind.check(ws["advantage"], [[1.0, 2.0]])
     assert str(ws).splitlines()[-1] == "\tadvantage: time_size = 1, batch_size = 2"
     kind.check(ws.select_batch(kind([1], "int64"))["advantage"], [[2.0]])
+
+
+@pytest.mark.parametrize("again", [copy.deepcopy, lambda ws: pickle.loads(pickle.dumps(ws))])
+def test_pickled_and_copied(kind, again):
+    ws = counted(kind, "x", times=2)
+    ws.set_full("y", kind([[1.0, 2.0], [3.0, 4.0]]))
+    other = again(ws)
+    ws.set("x", 0, kind([9.0, 9.0]))
+    kind.check(other["x"], [[0.0, 1.0], [10.0, 11.0]])
+    other.set("x", 2, kind([5.0, 5.0]))
+    kind.check(other["x"][2], [5.0, 5.0])
+    kind.check(other["y"], [[1.0, 2.0], [3.0, 4.0]])
+    assert ws.time_size() == 2
+
+
+def test_values_one_number_each(kind):
+    """T numbers without a batch can be written whole, such as the advantages of a flat batch."""
+    ws = Workspace()
+    ws.set_full("x", kind([1.0, 2.0, 3.0]))
+    kind.check(ws["x"], [1.0, 2.0, 3.0])
+    assert ws.time_size() == 3
 
 
 def test_is_not_shared(kind):

@@ -143,6 +143,21 @@ def test_retained_gradients_belong_to_one_read(ws, weight):
     assert first.grad.tolist() == [[1.0, 1.0]] * 3
 
 
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+def test_a_full_read_lies_in_order_in_memory(dtype):
+    """So that it can be viewed with another shape: images often come as views of height x width x channels."""
+    ws = Workspace()
+    pictures = torch.arange(2 * 4 * 5 * 3).reshape(2, 4, 5, 3).to(dtype)
+    for t in range(3):
+        ws.set("x", t, pictures.permute(0, 3, 1, 2))
+        ws.set("transposed", t, pictures[0, 0].T)
+    for name in ("x", "transposed"):
+        assert ws[name].is_contiguous()
+        assert ws.get_time_truncated(name, 0, 2).is_contiguous()
+        assert ws.subtime(0, 2)[name].is_contiguous()
+    assert ws["x"].view(6, -1)[0, :5].tolist() == [0, 3, 6, 9, 12]
+
+
 def test_two_reads_do_not_share_memory(ws):
     first, second = ws["plain"], ws["plain"]
     first += 1

@@ -81,6 +81,17 @@ def test_set_full_and_its_views(weight):
     assert gradient(weight, ws["x"].sum()) == [9.0, 9.0]
 
 
+def test_a_stored_value_may_be_changed_in_place(weight):
+    ws = Workspace()
+    ws.set_full("x", torch.ones(3, 2))
+    ws.set("x", 0, torch.zeros(2))
+    ws.set("y", 0, torch.ones(2))
+    for name in ("x", "y"):
+        ws.get(name, -1).mul_(weight)
+        assert ws[name][-1].tolist() == [2.0, 3.0]
+        assert gradient(weight, ws[name].sum()) == [1.0, 1.0]
+
+
 @pytest.mark.parametrize(
     ("operation", "expected"),
     [

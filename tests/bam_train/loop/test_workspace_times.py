@@ -57,6 +57,13 @@ def test_copy_n_last_steps_of_some_variables_copies_these_only(ws, kind):
     kind.check(ws.get("other", 0), [5.0, 5.0, 5.0])
 
 
+def test_copying_no_steps_does_nothing(ws, kind):
+    ws.copy_n_last_steps(0)
+    ws.copy_time(0, 1, 0)
+    kind.check(ws.get("x", 0), [0.0, 1.0, 2.0])
+    kind.check(ws.get("y", 0), [0.0, -1.0, -2.0])
+
+
 def test_subtime(ws, kind):
     piece = ws.subtime(1, 3)
     kind.check(piece["x"], [[10.0, 11.0, 12.0], [20.0, 21.0, 22.0]])
