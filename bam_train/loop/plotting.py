@@ -120,10 +120,11 @@ def _arrays(workspace: Workspace, names: tuple[str, ...], purpose: str) -> dict[
 
 
 def _to_numpy(value: Any) -> np.ndarray:
-    if isinstance(value, np.ndarray):
-        return value
-    value = value.detach().cpu()
-    return np.asarray((value.float() if str(value.dtype) == "torch.bfloat16" else value).numpy())
+    """T x B x ...; what has no batch gets one column."""
+    if not isinstance(value, np.ndarray):
+        value = value.detach().cpu()
+        value = (value.float() if str(value.dtype) == "torch.bfloat16" else value).numpy()
+    return np.asarray(value if value.ndim > 1 else value[:, None])
 
 
 def _columns(name: str, width: int, batch: int | Sequence[int] | None) -> list[int]:

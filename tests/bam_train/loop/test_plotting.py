@@ -137,6 +137,13 @@ def test_gradients_and_small_floats():
     assert to_dataframe(ws).iloc[0].tolist() == [1.5, 2.5]
 
 
+def test_values_without_a_batch(kind):
+    ws = Workspace()
+    ws.set_full("x", kind([1.0, 2.0]))
+    assert lines(plot(ws).axes[0]) == {"_child0": [[0, 1], [1, 2]]}
+    assert to_dataframe(ws)["x"].tolist() == [1.0, 2.0]
+
+
 def test_values_that_are_not_numbers_leave_gaps(kind):
     ws = Workspace()
     ws.set_full("x", kind.column(1.0, math.nan, math.inf))

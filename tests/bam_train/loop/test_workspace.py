@@ -48,6 +48,23 @@ def test_minus_one_is_the_last_time(kind):
     kind.check(ws["x"], [[0.0, 1.0], [10.0, 11.0], [7.0, 8.0]])
 
 
+def test_what_was_read_does_not_change_with_later_writes(kind):
+    ws = counted(kind, "x", times=2)
+    whole, piece = ws["x"], ws.get_time_truncated("x", 0, 2)
+    ws.set("x", 0, kind([7.0, 7.0]))
+    ws.copy_n_last_steps(1)
+    for before in (whole, piece):
+        kind.check(before, [[0.0, 1.0], [10.0, 11.0]])
+
+
+def test_changing_what_was_read_does_not_change_single_times(kind):
+    ws = counted(kind, "x", times=2)
+    whole = ws["x"]
+    whole += 1
+    kind.check(ws["x"], [[0.0, 1.0], [10.0, 11.0]])
+    kind.check(ws.get("x", 0), [0.0, 1.0])
+
+
 @pytest.mark.parametrize(("dtype", "zero", "one"), [("float32", 0.0, 1.0), ("int64", 0, 1), ("bool", False, True)])
 def test_missing_earlier_times_are_zeros(kind, dtype, zero, one):
     ws = Workspace()
