@@ -154,11 +154,13 @@ def _draw(axes: Axes, times: np.ndarray, name: str, array: np.ndarray, columns: 
         axes.plot(times, values[:, column, component], drawstyle=style, marker=marker, label=label, linewidth=1)
     if array.dtype == bool:
         axes.set_yticks([0, 1], ["False", "True"])
+    elif style != "default":
+        axes.locator_params(axis="y", integer=True)
     axes.set_ylabel(name)
     if len(lines) > 1:
-        axes.legend(
-            title="batch" if array.shape[1] > 1 else None, fontsize="small", loc="center left", bbox_to_anchor=(1, 0.5)
-        )
+        title = "batch" if array.shape[1] > 1 else None
+        beside = {"loc": "center left", "bbox_to_anchor": (1, 0.5), "ncols": 1 if len(lines) <= 5 else 2}
+        axes.legend(title=title, fontsize="small", title_fontsize="small", **beside)
     if len(lines) > MAX_LINES:
         choose = "; choose with batch=" if len(columns) > 1 else ""
         axes.set_title(f"{name}: the first {MAX_LINES} of {len(lines)} lines{choose}", fontsize="small")

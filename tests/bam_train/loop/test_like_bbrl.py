@@ -80,7 +80,7 @@ def apply(workspace, values, operation):
     elif verb == "truncate":
         workspace = workspace.get_time_truncated_workspace(*given_)
     elif verb == "select":
-        workspace = workspace.select_batch(torch.tensor(given_[0]))
+        workspace = workspace.select_batch(torch.tensor(given_[0])).contiguous()  # ours is already
     elif verb == "select_subtime":
         workspace = workspace.select_subtime(torch.tensor(given_[0]), given_[1])
     elif verb == "contiguous":
@@ -88,7 +88,7 @@ def apply(workspace, values, operation):
     elif verb == "copy":
         workspace = type(workspace)(workspace)
     elif verb == "cat":
-        workspace = workspace.cat_batch([workspace, workspace]).select_batch(torch.tensor([1, 3, 5]))
+        workspace = workspace.cat_batch([workspace, workspace]).select_batch(torch.tensor([1, 3, 5])).contiguous()
     return workspace, None
 
 

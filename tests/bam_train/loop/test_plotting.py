@@ -89,6 +89,13 @@ def test_flags_and_whole_numbers_are_steps(ws):
     assert lines(done) == {"0": [[0, 0], [1, 0], [2, 1]], "1": [[0, 0], [1, 0], [2, 0]]}
 
 
+def test_whole_numbers_have_whole_ticks(kind):
+    ws = Workspace()
+    ws.set_full("x", kind.column(0, 1, 2, dtype="int64"))
+    (axes,) = plot(ws).axes
+    assert {tick % 1 for tick in axes.get_yticks()} == {0.0}
+
+
 def test_too_many_lines_are_capped_and_it_says_so(kind):
     ws = Workspace()
     ws.set_full("x", kind.zeros(2, 64))
