@@ -1,0 +1,210 @@
+"""What the agents of Gymnasium environments have in common: names of variables, spaces, seeds, writing."""
+
+from __future__ import annotations
+
+import warnings
+from abc import ABC
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import Space, spaces
+
+from bam_train.errors import LoopError, SettingsError
+from bam_train.loop.agent import agent_name
+from bam_train.loop.conventions import SeedableAgent, SerializableAgent, TimeAgent
+from bam_train.loop.gym.infos import InfoRecorder
+from bam_train.loop.gym.observations import names
+
+_ARRAYS = ("torch", "numpy")
+
+
+class GymAgent(TimeAgent, SeedableAgent, SerializableAgent, ABC):
+    """Base of `ParallelGymAgent` and `VecGymAgent`.
+
+    Args:
+        args: For classes that are inherited beside this one.
+        input_string: The variable with the action; or, where actions are dicts, the first part of their names.
+        output_string: Put before the names of all variables that it writes.
+        reward_at_t: Write the reward and the cumulated reward of action[t] at t, not at t + 1. The reward at the
+            newest time is 0 until the next step overwrites it.
+        include_last_state: Whether the row at which an episode ends has its last observation; without it that row has
+            the first observation of the next episode. Without auto-reset it is always True.
+        arrays: ``"torch"``: tensors, float32 and int64. ``"numpy"``: arrays, observations of the space's dtype,
+            rewards float64; torch is not needed.
+        info_keys: Entries k of the environments' infos to write too: ``info/k`` beside the mask ``info/_k``.
+        kwargs: ``seed``, ``name``, ``verbose``.
+
+    Attributes:
+        ghost_params: An empty parameter; its device is where observations are put. None with NumPy.
+        default_seed: The seed of an agent that was given none when it first runs.
+
+    Raises:
+        SettingsError: `arrays` is neither of the two.
+    """
+
+    default_seed = 42
+    envs: Any
+    num_envs: int
+
+    def __init__(
+        self,
+        *args: Any,
+        input_string: str = "action",
+        output_string: str = "env/",
+        reward_at_t: bool = False,
+        include_last_state: bool = True,
+        arrays: str = "torch",
+        info_keys: Sequence[str] = (),
+        **kwargs: Any,
+    ) -> None:
+        if arrays not in _ARRAYS:
+            raise SettingsError(f'arrays: expected "torch" or "numpy", found {arrays!r}.')
+        if isinstance(info_keys, str):
+            raise SettingsError(f"info_keys: expected several names, found {info_keys!r}; write ({info_keys!r},).")
+        if arrays == "torch":
+            import torch  # before Agent.__init__, which then makes this a module
+        super().__init__(*args, **kwargs)
+        self.input, self.output = input_string, output_string
+        self.reward_at_t, self.include_last_state = reward_at_t, include_last_state
+        self.arrays, self.info_keys = arrays, tuple(info_keys)
+        self.ghost_params = torch.nn.Parameter(torch.Tensor()) if arrays == "torch" else None
+        self.observation_space: Space[Any] | None = None
+        self.action_space: Space[Any] | None = None
+        self._nb_reset = 1
+        self._floats = np.float32 if arrays == "torch" else np.float64
+        self._to_array: Callable[[Any], Any] = torch.from_numpy if arrays == "torch" else _same
+        self._infos: InfoRecorder | None = None
+
+    # -- running ---------------------------------------------------------------------------------------------------
+
+    def forward(self, t: int, *args: Any, **kwargs: Any) -> None:
+        """Take the default seed if there is none, and count the resets; subclasses do the rest."""
+        if self._seed is None and kwargs.get("seed") is None:
+            self.seed(self.default_seed)
+        if t == 0:
+            self._nb_reset += 1
+
+    def set_obs(self, observations: Mapping[str, Any], t: int) -> None:
+        """Write tensors or arrays (B x ...) at t, moved to the device of `ghost_params`.
+
+        Args:
+            observations: By name without the output prefix.
+            t: The time.
+        """
+        if self.ghost_params is not None and not self.ghost_params.is_cpu:
+            observations = {key: value.to(self.ghost_params.device) for key, value in observations.items()}
+        write = self.workspace.set if self._trace is None else self._traced_set
+        if self.reward_at_t:
+            observations = self._rewards_at_t(observations, t, write)
+        prefix = self.output
+        for key, value in observations.items():
+            write(prefix + key, t, value)
+
+    def _rewards_at_t(self, observations: Mapping[str, Any], t: int, write: Any) -> dict[str, Any]:
+        """Write the rewards of action[t - 1] at t - 1; what is left to write at t."""
+        left = dict(observations)
+        for key in ("reward", "cumulated_reward"):
+            if key in left:
+                if t > 0:
+                    write(self.output + key, t - 1, left[key])
+                left[key] = left[key] * 0 if key == "reward" else left[key] + 0  # new: no two times share memory
+        return left
+
+    def _traced_set(self, name: str, t: int, value: Any) -> None:
+        self.set((name, t), value)
+
+    def _written(self) -> tuple[str, ...]:
+        """The names of all variables that it writes."""
+        flags = ("terminated", "truncated", "done", "reward", "cumulated_reward", "timestep")
+        infos = [name for key in self.info_keys for name in (f"info/{key}", f"info/_{key}")]
+        return tuple(self.output + name for name in (*names(self.get_observation_space()), *flags, *infos))
+
+    def _row_seeds(self, seed: Any) -> int | list[int | None]:
+        """What the environments are reset with at t = 0: one seed to count from, or one for each.
+
+        Args:
+            seed: What the call was given: None for the agent's own rule.
+
+        Raises:
+            SettingsError: Neither a whole number nor as many as there are environments.
+        """
+        if seed is None:
+            # Row k gets num_envs * (number of the reset, from 2) * seed + k + 1, as BBRL's ParallelGymAgent does.
+            return self.num_envs * self._nb_reset * int(self._seed or 0) + 1
+        if isinstance(seed, (int, np.integer)):
+            return int(seed)
+        try:
+            seeds = [None if one is None else int(one) for one in seed]
+        except (TypeError, ValueError):
+            raise SettingsError(f"seed: expected a whole number or a list of them, found {seed!r}.") from None
+        if len(seeds) != self.num_envs:
+            raise SettingsError(f"seed: expected a number or {self.num_envs} of them, found {len(seeds)}.")
+        return seeds
+
+    def _not_open(self) -> LoopError:
+        return LoopError(f"{agent_name(self)} has no episode running; its environments are (re)started at t=0.")
+
+    # -- spaces ----------------------------------------------------------------------------------------------------
+
+    def get_observation_space(self) -> Space[Any]:
+        """The observation space of one environment.
+
+        Raises:
+            LoopError: It has none yet.
+        """
+        if self.observation_space is None:
+            raise LoopError(f"{agent_name(self)} has no observation space.")
+        return self.observation_space
+
+    def get_action_space(self) -> Space[Any]:
+        """The action space of one environment.
+
+        Raises:
+            LoopError: It has none yet.
+        """
+        if self.action_space is None:
+            raise LoopError(f"{agent_name(self)} has no action space.")
+        return self.action_space
+
+    def get_obs_and_actions_sizes(self) -> tuple[Any, Any]:
+        """Sizes of observation and action: length, or number of choices; with a warning, the shape of more dimensions.
+
+        Raises:
+            LoopError: A space has no size, such as a dict.
+        """
+        return _size(self.get_observation_space()), _size(self.get_action_space())
+
+    def is_continuous_action(self) -> bool:
+        """Whether the action space is a Box."""
+        return isinstance(self.action_space, spaces.Box)
+
+    def is_discrete_action(self) -> bool:
+        """Whether the action space is Discrete."""
+        return isinstance(self.action_space, spaces.Discrete)
+
+    def is_continuous_state(self) -> bool:
+        """Whether the observation space is a Box."""
+        return isinstance(self.observation_space, spaces.Box)
+
+    def is_discrete_state(self) -> bool:
+        """Whether the observation space is Discrete."""
+        return isinstance(self.observation_space, spaces.Discrete)
+
+
+def _same(array: Any) -> Any:
+    return array
+
+
+def _size(space: Space[Any]) -> Any:
+    if not space.shape:
+        if not hasattr(space, "n"):
+            raise LoopError(f"{space} has no single size; ask its parts: get_observation_space(), get_action_space().")
+        return space.n
+    if len(space.shape) == 1:
+        return space.shape[0]
+    warnings.warn(
+        f"The space has shape {space.shape}, which is returned as it is; flatten observations to get one length.",
+        stacklevel=3,
+    )
+    return space.shape

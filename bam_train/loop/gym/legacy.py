@@ -1,0 +1,132 @@
+"""The gym agents of BBRL up to 0.3 (``bbrl.agents.gyma``), with their arguments and variables.
+
+Differences from bbrl 0.3: the environments are Gymnasium's, whose time limit is a flag of its own; ``truncated`` is
+what ``info["TimeLimit.truncated"]`` was: the time limit, unless the task ended in the same step. ``env/rendering`` is a
+uint8 tensor B x height x width x 3. An action must be there and fit at every t > 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium.wrappers import Autoreset
+
+from bam_train.errors import SettingsError
+from bam_train.loop.gym.env_rows import Rows, has_autoreset
+from bam_train.loop.gym.parallel import ParallelGymAgent
+from bam_train.loop.gym.peeling import Env
+
+
+class _LegacyGymAgent(ParallelGymAgent):
+    """What both have in common; `_autoreset` is all that differs.
+
+    Rows are those of `ParallelGymAgent`, in the variables env_obs, done, truncated, reward, timestep and
+    cumulated_reward. Environment k is seeded with ``seed + k`` when it is made; no reset seeds it again.
+
+    Args:
+        make_env_fn: Called `n_envs` times with `make_env_args`.
+        make_env_args: Its keywords.
+        n_envs: How many environments.
+        seed: Of the first environment; required.
+        action_string: The variable with the action.
+        output: Put before the names of all variables.
+        arrays: ``"torch"`` or ``"numpy"``, see `GymAgent`.
+
+    Raises:
+        SettingsError: There is no seed, or `n_envs` is not at least 1.
+    """
+
+    _autoreset: bool
+
+    def __init__(
+        self,
+        make_env_fn: Callable[..., Env],
+        make_env_args: Mapping[str, Any] | None = None,
+        n_envs: int | None = None,
+        seed: int | None = None,
+        action_string: str = "action",
+        output: str = "env/",
+        *,
+        arrays: str = "torch",
+    ) -> None:
+        if seed is None:
+            raise SettingsError(f"{type(self).__name__}: expected a seed, found None.")
+        if n_envs is None:
+            raise SettingsError(f"{type(self).__name__}: expected n_envs, the number of environments, found None.")
+        super().__init__(
+            make_env_fn,
+            n_envs,
+            make_env_args,
+            seed=seed,
+            input_string=action_string,
+            output_string=output,
+            arrays=arrays,
+        )
+
+    @property
+    def n_envs(self) -> int:
+        """How many environments."""
+        return self.num_envs
+
+    def seed(self, seed: int) -> None:
+        """Nothing, as in bbrl 0.3: the environments were seeded when they were made."""
+
+    def get_obs_and_actions_sizes(self) -> tuple[Any, Any]:
+        """Length of observation and action, or number of choices of the action; 1 for a Discrete observation."""
+        observation, action = super().get_obs_and_actions_sizes()
+        return (1 if self.is_discrete_state() else observation), action
+
+    def _open(self) -> None:
+        self._seeded = False
+        super()._open()
+        self._is_autoreset = self._autoreset
+
+    def _make(self) -> Env:
+        env = super()._make()
+        return Autoreset(env) if self._autoreset and not has_autoreset(env) else env
+
+    def _row_seeds(self, seed: Any) -> int | list[int | None]:
+        if seed is not None:
+            return super()._row_seeds(seed)
+        return [None if self._seeded else int(self._seed or 0) + k for k in range(self.num_envs)]
+
+    def forward(self, t: int = 0, save_render: bool = False, render: bool = False, **kwargs: Any) -> None:
+        """One step of every environment with the action of t - 1; at t = 0 all are reset.
+
+        Args:
+            t: The time.
+            save_render: Write the pictures of all environments to ``env/rendering``.
+            render: Have all environments rendered.
+            kwargs: ``seed``, see `ParallelGymAgent`.
+        """
+        super().forward(t, **kwargs)
+        if t == 0:
+            self._seeded = True
+        if save_render or render:
+            pictures: list[Any] = [env.render() for env in self.envs]
+            if save_render:
+                self.set_obs({"rendering": self._to_array(np.array(pictures))}, t)
+
+    def _frame(self, rows: Rows) -> dict[str, Any]:
+        frame = super()._frame(rows)
+        terminated = frame.pop("terminated")
+        frame["truncated"] = frame["truncated"] & ~terminated
+        last = {name: frame.pop(name) for name in ("done", "truncated", "reward", "timestep", "cumulated_reward")}
+        return {**frame, **last}
+
+    def _written(self) -> tuple[str, ...]:
+        return tuple(name for name in super()._written() if name != f"{self.output}terminated")
+
+
+class AutoResetGymAgent(_LegacyGymAgent):
+    """Environments that begin the next episode after one has ended, in the row after its last."""
+
+    _autoreset = True
+
+
+class NoAutoResetGymAgent(_LegacyGymAgent):
+    """Environments whose last frame is repeated, with reward 0, once an episode has ended."""
+
+    _autoreset = False

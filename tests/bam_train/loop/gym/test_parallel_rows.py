@@ -1,0 +1,219 @@
+"""What the rows of `ParallelGymAgent` hold: with and without auto-reset, last states, rewards at t."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.wrappers import Autoreset
+
+from bam_train.errors import LoopError, SettingsError
+from bam_train.loop import ParallelGymAgent, Workspace
+
+
+def test_variables_are_those_of_bbrl(toys):
+    agent = ParallelGymAgent(toys.Counting, 2)
+    workspace = Workspace()
+    agent(workspace, t=0)
+    found = {name: (workspace[name].dtype, tuple(workspace[name].shape)) for name in workspace.variables}
+    assert list(found.items()) == [
+        ("env/env_obs", (torch.float32, (1, 2, 2))),
+        ("env/terminated", (torch.bool, (1, 2))),
+        ("env/truncated", (torch.bool, (1, 2))),
+        ("env/done", (torch.bool, (1, 2))),
+        ("env/reward", (torch.float32, (1, 2))),
+        ("env/cumulated_reward", (torch.float32, (1, 2))),
+        ("env/timestep", (torch.int64, (1, 2))),
+    ]
+    assert agent.writes == tuple(found)
+    assert agent.reads is None
+
+
+def test_without_auto_reset_the_last_frame_is_repeated(toys):
+    agent = ParallelGymAgent(toys.Counting, 2, {"length": 3})
+    agent.envs[1].length = 4
+    ws = toys.run(agent, 6)
+    assert toys.column(ws, "env/env_obs", 0) == [[1, 0], [1, 1], [1, 2], [1, 3], [1, 3], [1, 3]]
+    assert toys.column(ws, "env/reward", 0) == [0, 11, 12, 13, 0, 0]
+    assert toys.column(ws, "env/reward", 1) == [0, 11, 12, 13, 14, 0]
+    assert toys.column(ws, "env/cumulated_reward", 0) == [0, 11, 23, 36, 36, 36]
+    assert toys.column(ws, "env/timestep", 0) == [0, 1, 2, 3, 3, 3]
+    assert toys.column(ws, "env/timestep", 1) == [0, 1, 2, 3, 4, 4]
+    for name in ("env/done", "env/terminated"):
+        assert toys.column(ws, name, 0) == [False, False, False, True, True, True]
+    assert not ws["env/truncated"].any()
+    assert agent.envs[0].actions == [1, 2, 3]
+    assert agent.include_last_state
+
+
+def test_a_new_call_at_0_resets_all(toys):
+    agent = ParallelGymAgent(toys.Counting, 1, include_last_state=False)
+    toys.run(agent, 6)
+    ws = toys.run(agent, 3)
+    assert toys.column(ws, "env/env_obs") == [[2, 0], [2, 1], [2, 2]]
+    assert toys.column(ws, "env/cumulated_reward") == [0, 21, 43]
+    assert toys.column(ws, "env/timestep") == [0, 1, 2]
+
+
+def test_auto_reset_with_the_last_state(toys):
+    agent = ParallelGymAgent(lambda: Autoreset(toys.Counting(length=2)), 1)
+    ws = toys.run(agent, 8)
+    assert toys.column(ws, "env/env_obs") == [[1, 0], [1, 1], [1, 2], [2, 0], [2, 1], [2, 2], [3, 0], [3, 1]]
+    assert toys.column(ws, "env/reward") == [0, 11, 12, 0, 21, 22, 0, 31]
+    assert toys.column(ws, "env/cumulated_reward") == [0, 11, 23, 0, 21, 43, 0, 31]
+    assert toys.column(ws, "env/timestep") == [0, 1, 2, 0, 1, 2, 0, 1]
+    assert toys.column(ws, "env/done") == [False, False, True, False, False, True, False, False]
+    assert agent.envs[0].unwrapped.actions == [1, 2, 4, 5, 7]
+    assert ws["env/cumulated_reward"][ws["env/done"]].tolist() == [23, 43]
+
+
+def test_the_pair_over_an_episode_end_is_no_transition(toys):
+    ws = toys.run(ParallelGymAgent(lambda: Autoreset(toys.Counting(length=2)), 1), 5)
+    steps = ws.get_transitions()
+    assert steps["env/env_obs"][:, :, 1].tolist() == [[0, 1, 0], [1, 2, 1]]
+    assert steps["action"][0].tolist() == [1, 2, 4]
+    assert steps["env/reward"][1].tolist() == [11, 12, 21]
+
+
+def test_auto_reset_without_the_last_state(toys):
+    agent = ParallelGymAgent(lambda: Autoreset(toys.Counting(length=2)), 1, include_last_state=False)
+    ws = toys.run(agent, 6)
+    assert toys.column(ws, "env/env_obs") == [[1, 0], [1, 1], [2, 0], [2, 1], [3, 0], [3, 1]]
+    assert toys.column(ws, "env/reward") == [0, 11, 12, 21, 22, 31]
+    assert toys.column(ws, "env/cumulated_reward") == [0, 11, 23, 21, 43, 31]
+    assert toys.column(ws, "env/done") == [False, False, True, False, True, False]
+    assert toys.column(ws, "env/timestep") == [0, 1, 2, 0, 1, 0]  # one short from the second episode on, as BBRL's
+    assert agent.envs[0].unwrapped.actions == [1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize("wrap", [lambda env: env, gym.wrappers.RecordEpisodeStatistics])
+def test_time_limits(toys, wrap):
+    """The same whether `Autoreset`, `TimeLimit` and `OrderEnforcing` are outermost or not."""
+
+    def make():
+        return wrap(Autoreset(gym.wrappers.TimeLimit(gym.wrappers.OrderEnforcing(toys.Counting(length=5)), 2)))
+
+    ws = toys.run(ParallelGymAgent(make, 2), 8)
+    for row in (0, 1):
+        assert toys.column(ws, "env/truncated", row) == [False, False, True, False, False, True, False, False]
+        assert toys.column(ws, "env/timestep", row) == [0, 1, 2, 0, 1, 2, 0, 1]
+    assert not ws["env/terminated"].any()
+
+
+def test_a_time_limit_of_its_own_for_each_environment(toys):
+    limits = iter([4, 2])
+    agent = ParallelGymAgent(lambda: gym.wrappers.TimeLimit(toys.Counting(length=3), next(limits)), 2)
+    ws = toys.run(agent, 5)
+    assert toys.column(ws, "env/truncated", 0) == [False] * 5
+    assert toys.column(ws, "env/terminated", 0) == [False, False, False, True, True]
+    assert toys.column(ws, "env/truncated", 1) == [False, False, True, True, True]
+
+
+def test_ends_at_the_time_limit_too(toys):
+    make = lambda: Autoreset(gym.wrappers.TimeLimit(toys.Counting(length=2), 2))  # noqa: E731
+    ws = toys.run(ParallelGymAgent(make, 1, include_last_state=False), 6)
+    assert toys.column(ws, "env/truncated") == [False, False, True, False, True, False]
+    assert toys.column(ws, "env/terminated") == [False, False, True, False, True, False]
+
+
+def test_reward_at_t(toys):
+    ws = toys.run(ParallelGymAgent(toys.Counting, 1, reward_at_t=True), 4)
+    assert toys.column(ws, "env/reward") == [11, 12, 13, 0]
+    assert toys.column(ws, "env/cumulated_reward") == [11, 23, 36, 36]
+    last, before = (ws.get("env/cumulated_reward", t) for t in (3, 2))
+    assert last.data_ptr() != before.data_ptr()
+
+
+def test_every_time_has_its_own_memory(toys):
+    ws = toys.run(ParallelGymAgent(toys.Counting, 2), 6)
+    for name in ws.variables:
+        pointers = [ws.get(name, t).data_ptr() for t in range(6)]
+        assert len(set(pointers)) == 6
+
+
+def test_numpy_arrays(toys):
+    agent = ParallelGymAgent(toys.Counting, 1, arrays="numpy", info_keys=("odd",))
+    ws = toys.run(agent, 3)
+    assert {name: ws[name].dtype.name for name in ws.variables} == {
+        "env/env_obs": "float64",
+        "env/terminated": "bool",
+        "env/truncated": "bool",
+        "env/done": "bool",
+        "env/reward": "float64",
+        "env/cumulated_reward": "float64",
+        "env/timestep": "int64",
+        "env/info/odd": "int64",
+        "env/info/_odd": "bool",
+        "action": "int64",
+    }
+    assert toys.column(ws, "env/reward") == [0, 11, 12]
+    assert agent.ghost_params is None
+
+
+def test_infos(toys):
+    agent = ParallelGymAgent(lambda: Autoreset(toys.Counting()), 1, info_keys=("is_success", "odd", "never"))
+    ws = toys.run(agent, 6)
+    assert toys.column(ws, "env/info/is_success") == [False, False, False, True, False, False]
+    assert toys.column(ws, "env/info/_is_success") == [True] * 6
+    assert toys.column(ws, "env/info/odd") == [0, 1, 0, 3, 0, 1]
+    assert toys.column(ws, "env/info/_odd") == [False, True, False, True, False, True]
+    assert "env/info/never" not in ws.variables
+    assert ws["env/info/odd"].dtype == torch.int64
+
+
+def test_closed_environments_are_made_anew_at_0(toys):
+    agent = ParallelGymAgent(toys.Counting, 2)
+    ws = toys.run(agent, 2)
+    first = agent.envs
+    agent.close()
+    agent.close()
+    assert [env.closed for env in first] == [True, True]
+    with pytest.raises(LoopError, match=r"^ParallelGymAgent has no episode running; its environments are .* at t=0\.$"):
+        agent(ws, t=2)
+    ws = toys.run(agent, 2)
+    assert toys.column(ws, "env/env_obs") == [[1, 0], [1, 1]]
+
+
+def test_all_are_closed_even_if_one_cannot_be(toys):
+    class Stuck(toys.Counting):
+        def close(self):
+            super().close()
+            raise OSError("stuck")
+
+    agent = ParallelGymAgent(Stuck, 2)
+    envs = agent.envs
+    with pytest.raises(OSError, match="stuck"):
+        agent.close()
+    assert [env.closed for env in envs] == [True, True]
+
+
+def test_a_clone_goes_on_by_itself(toys):
+    agent = ParallelGymAgent(lambda: Autoreset(toys.Counting(length=2)), 1)
+    ws = toys.run(agent, 2)
+    copy = agent.clone()
+    other = Workspace(ws)
+    toys.run(copy, 3, other, first=2)
+    toys.run(agent, 3, ws, first=2)
+    assert torch.equal(ws["env/env_obs"], other["env/env_obs"])
+
+
+def test_refused_arguments(toys):
+    for wrong in (0, -1, 2.0, True, None):
+        with pytest.raises(SettingsError, match=rf"^num_envs: expected a whole number of at least 1, found {wrong}\.$"):
+            ParallelGymAgent(toys.Counting, wrong)
+    with pytest.raises(SettingsError, match=r'^arrays: expected "torch" or "numpy", found \'jax\'\.$'):
+        ParallelGymAgent(toys.Counting, 1, arrays="jax")
+    with pytest.raises(SettingsError, match=r"^info_keys: expected several names, found 'odd'; write \('odd',\)\.$"):
+        ParallelGymAgent(toys.Counting, 1, info_keys="odd")
+
+
+def test_float32_rewards_are_summed_as_bbrl_sums_them(toys):
+    class Tenths(toys.Counting):
+        def step(self, action):
+            observation, _, *rest = super().step(action)
+            return observation, np.float32(0.1), *rest
+
+    ws = toys.run(ParallelGymAgent(Tenths, 1, {"length": 99}), 60)
+    expected = 0.0
+    for _ in range(59):
+        expected = expected + np.float32(0.1)
+    assert ws["env/cumulated_reward"][-1].item() == float(np.float32(expected))
