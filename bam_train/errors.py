@@ -97,7 +97,7 @@ class UnknownVariable(LoopError, LookupError):  # noqa: N818 - reads as what hap
     def __init__(self, name: str, known: Iterable[str]) -> None:
         self.name = name
         names = sorted(known)
-        close = difflib.get_close_matches(name, names, n=1)
+        close = difflib.get_close_matches(str(name), names, n=1)
         question = f", did you mean {close[0]!r}?" if close else "."
         has = f" It has {', '.join(map(repr, names))}." if names else " It is empty."
         super().__init__(f"{name!r} is not in the workspace{question}{has}")

@@ -18,6 +18,7 @@ from __future__ import annotations
 import copy
 import sys
 import time
+from collections.abc import Iterable
 from typing import IO, TYPE_CHECKING, Any
 
 from bam_train.errors import AgentInUse, LoopError
@@ -98,6 +99,22 @@ class Agent(_Base):  # type: ignore[misc]
 
     def close(self) -> None:
         """Stop what moves and release what is open; called when an exception leaves the loop. Nothing by default."""
+
+    def _parts(self) -> tuple[Agent, ...] | None:
+        """The agents that do its work; None if it does it itself."""
+        return None
+
+    def _declare(
+        self,
+        owner: type[Agent],
+        *,
+        reads: Iterable[str],
+        writes: Iterable[str],
+        reads_previous: Iterable[str] = (),
+    ) -> None:
+        """Say what ``owner.forward`` reads and writes; a subclass with a forward of its own may do otherwise."""
+        if type(self).forward is owner.forward:
+            self.reads, self.writes, self.reads_previous = tuple(reads), tuple(writes), tuple(reads_previous)
 
     def is_running(self) -> bool:
         """Whether it is still at work in another process."""

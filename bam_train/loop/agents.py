@@ -76,6 +76,9 @@ class Agents(Agent):
     def __iter__(self) -> Iterator[Agent]:
         return iter(self._members())
 
+    def _parts(self) -> tuple[Agent, ...]:
+        return tuple(self._members())
+
     def _members(self) -> Iterable[Agent]:
         # Past nn.Module's __getattr__ and ModuleList's own, which cost as much as a small agent.
         own = self.__dict__
@@ -108,6 +111,9 @@ class KWAgentWrapper(Agent):
         """Close the agent."""
         self.wrapped.close()
 
+    def _parts(self) -> tuple[Agent, ...]:
+        return (self.wrapped,)
+
 
 class CopyTAgent(Agent):
     """Copies a variable: at time t, or all of it when the call has no t.
@@ -122,7 +128,7 @@ class CopyTAgent(Agent):
     def __init__(self, input_name: str, output_name: str, detach: bool = False, name: str | None = None) -> None:
         super().__init__(name=name)
         self.input_name, self.output_name, self.detach = input_name, output_name, detach
-        self.reads, self.writes = (input_name,), (output_name,)
+        self._declare(CopyTAgent, reads=(input_name,), writes=(output_name,))
 
     def forward(self, t: int | None = None, **kwargs: Any) -> None:
         """Copy the time t, or everything."""
@@ -140,16 +146,15 @@ class PrintAgent(Agent):
         name: What `get_by_name` finds.
     """
 
-    writes = ()
-
     def __init__(self, *names: str, name: str | None = None) -> None:
         super().__init__(name=name)
         self.names = names
-        self.reads = names
+        self._declare(PrintAgent, reads=names, writes=())
 
     def reset(self) -> None:
         """Print all variables from now on."""
-        self.names = self.reads = ()
+        self.names = ()
+        self._declare(PrintAgent, reads=(), writes=())
 
     def forward(self, t: int, **kwargs: Any) -> None:
         """Print ``name  =  value`` for each."""
@@ -168,7 +173,7 @@ class EpisodesDone(Agent):
     def __init__(self, in_var: str = "env/done", out_var: str = "env/done") -> None:
         super().__init__()
         self.in_var, self.out_var = in_var, out_var
-        self.reads, self.writes = (in_var,), (out_var,)
+        self._declare(EpisodesDone, reads=(in_var,), writes=(out_var,))
         self.state: Any = None
 
     def forward(self, t: int, **kwargs: Any) -> None:
@@ -188,10 +193,8 @@ def members(agent: Agent) -> list[Agent]:
 
 def leaves(agent: Agent) -> list[Agent]:
     """The agents that do the work, in the order in which they run."""
-    if isinstance(agent, Agents):
-        return [leaf for member in agent for leaf in leaves(member)]
-    inner = getattr(agent, "agent", None) or getattr(agent, "wrapped", None)
-    return leaves(inner) if isinstance(inner, Agent) and agent.writes is None else [agent]
+    parts = agent._parts()
+    return [agent] if parts is None else [leaf for part in parts for leaf in leaves(part)]
 
 
 def describe(agent: Agent) -> str:

@@ -1,7 +1,7 @@
 """Storage of one NumPy variable of a workspace: one buffer that grows, time first.
 
-Values are copied in. What is read is a view of the buffer: it changes only where the same time is written again; copy it
-before you change it.
+Values are copied in. What is read of one time is a view of the buffer: it changes only where the same time is written
+again; copy it before you change it. What is read of several times is a copy.
 """
 
 from __future__ import annotations
@@ -151,12 +151,16 @@ class NumpyVariable:
         self._count, self._shape, self._sliced = len(value), value.shape[1:], False
 
     def full(self) -> NDArray[Any]:
-        """A view of all times kept, T x B x ..."""
+        """A copy of all times kept, T x B x ..."""
+        return self._buffer[: self._count].copy()
+
+    def view(self) -> NDArray[Any]:
+        """All times kept, T x B x ..., to be read at once and not to be changed."""
         return self._buffer[: self._count]
 
     def truncated(self, begin: int, end: int) -> NDArray[Any]:
-        """A view of times [begin, end), cut off at the end."""
-        return self._buffer[max(0, begin - self.first) : max(0, min(end - self.first, self._count))]
+        """A copy of times [begin, end), cut off at the end."""
+        return self.view()[max(0, begin - self.first) : max(0, end - self.first)].copy()
 
     def drop(self, first: int) -> None:
         """Forget the times before `first`."""
@@ -218,7 +222,10 @@ class NumpyVariable:
     @staticmethod
     def index(index: Any, like: Any) -> NDArray[Any]:
         """`index` (integers or booleans) as an array that indexes `like`."""
-        return np.asarray(index)
+        array = np.asarray(index)
+        return (
+            array.astype(np.int64) if array.dtype.kind == "f" and not array.size else array
+        )  # an empty list is floats
 
     @staticmethod
     def copied(array: NDArray[Any]) -> NDArray[Any]:

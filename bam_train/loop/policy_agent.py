@@ -43,7 +43,7 @@ class PolicyAgent(Agent):
         self._timestep, self._done = f"{input_prefix}timestep", f"{input_prefix}done"
         root = f"{input_prefix}env_obs/"
         self._keys = [name.removeprefix(root) for name in self.names] if self.names[0].startswith(root) else None
-        self.reads, self.writes = (*self.names, self._timestep, self._done), (output_string,)
+        self._declare(PolicyAgent, reads=(*self.names, self._timestep, self._done), writes=(output_string,))
 
     def forward(self, t: int, seed: int | Sequence[int] | None = None, **kwargs: Any) -> None:
         """Act on the observation at t.

@@ -49,8 +49,8 @@ class RobotAgent(Agent):
         self.live = robot_of(env) is not None
         self.observation_names = tuple(output_string + name for name in names(env.observation_space))
         rest = ("reward", "cumulated_reward", "timestep", *FLAGS, SUCCESS, SAYS_SUCCESS)
-        self.reads, self.reads_previous = (), (input_string,)
-        self.writes = (*self.observation_names, *(output_string + name for name in rest))
+        writes = (*self.observation_names, *(output_string + name for name in rest))
+        self._declare(RobotAgent, reads=(), reads_previous=(input_string,), writes=writes)
         self._total, self._steps = 0.0, 0
         self._running = self._closed = False
 

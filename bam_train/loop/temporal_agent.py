@@ -91,7 +91,7 @@ class TemporalAgent(Agent):
         # Bound methods, and the members of an `Agents` one by one: half the cost of calling the objects.
         calls = [agent.__call__ for agent in members(self.agent)]
         t = time[0]
-        end = None if n_steps is None else t + max(1, n_steps)
+        end = None if n_steps is None else t + n_steps
         while True:
             for call in calls:
                 call(workspace, t=t, **kwargs)
@@ -100,7 +100,7 @@ class TemporalAgent(Agent):
             if stop_variable is not None and workspace.get(stop_variable, t).all():
                 return
             t += 1
-            if t == end:
+            if end is not None and t >= end:
                 return
             time[0] = t
 
@@ -121,6 +121,13 @@ class TemporalAgent(Agent):
         if hasattr(error, "add_note"):  # Python 3.11
             for note in notes:
                 error.add_note(note)
+
+    def _parts(self) -> tuple[Agent, ...]:
+        return (self.agent,)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A display of the caller's stays with the original."""
+        return {**super().__getstate__(), "progress": self.progress is True}
 
     def forward(self, **kwargs: Any) -> None:
         """Not used.

@@ -11,7 +11,9 @@ It is BBRL's `Workspace`, with these differences:
 - `to`, `cat_batch` and `sample_subworkspace` with more than one window work; `copy_n_last_steps` copies only the
   variables that it was given.
 - `select_batch` gives variables of one tensor each, which are quicker to go on with.
-- With a window it forgets old times, after giving them to a sink: memory stays flat however long the loop runs.
+- `copy_n_last_steps` copies once, also where the copied times overlap (BBRL copies once for each variable).
+- With a window it forgets old times, after giving them to a sink: memory stays flat however long the loop runs. What is
+  made of it (`contiguous`, `select_batch`, `to`, a copy) holds the times kept, and begins at time 0 again.
 """
 
 from __future__ import annotations
@@ -22,8 +24,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bam_train.errors import UnknownVariable, WorkspaceError
-from bam_train.loop.arrays import UNLIMITED, NumpyVariable, kind_mismatch, no_batch, require_window
+from bam_train.errors import TimeNotWritten, UnknownVariable, WorkspaceError
+from bam_train.loop.arrays import UNLIMITED, NumpyVariable, kept, kind_mismatch, no_batch, require_window
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -82,12 +84,15 @@ class Workspace:
             TimeNotWritten: t has left the window, or is negative beyond the first.
         """
         variable = self.variables.get(name)
-        if variable is None:
-            variable = self._new(name, value, f"t={t}")
+        if variable is not None:
             variable.set(t, value)
-            self.variables[name] = variable
-        else:
-            variable.set(t, value)
+            return
+        self.variables[name] = self._new(name, value, f"t={t}")
+        try:
+            self.variables[name].set(t, value)
+        except BaseException:
+            del self.variables[name]
+            raise
 
     def get(self, name: str, t: int) -> Any:
         """The value at time t, B x ...; -1 is the last.
@@ -109,7 +114,12 @@ class Workspace:
 
         Raises:
             ValueMismatch: Not an array, or it differs from the times already written.
+            WorkspaceError: Earlier times have left the window.
         """
+        if self.first_time:
+            raise WorkspaceError(
+                f"{name!r}: all times cannot be written, those before {self.first_time} have left the window."
+            )
         variable = self.variables.get(name)
         fresh = self._new(name, value, "all times") if variable is None else variable
         fresh.set_full(value)
@@ -217,9 +227,11 @@ class Workspace:
 
         Raises:
             WorkspaceError: The variables have different lengths.
+            TimeNotWritten: It begins with a time that has left the window.
         """
-        self.time_size()
         begin, end, _ = slice(from_t, to_t).indices(self.time_size() or 0)
+        for name in self.variables if begin < end else ():
+            require_window(name, begin, end, self.first_time)
         return self._of({name: one.truncated(begin, max(begin, end)) for name, one in self.variables.items()})
 
     def get_time_truncated_workspace(self, from_time: int, to_time: int) -> Workspace:
@@ -235,12 +247,18 @@ class Workspace:
             WorkspaceError: The variables have different batch sizes.
         """
         self.batch_size()
-        full = {name: (one, one.full()) for name, one in self.variables.items()}
-        return self._of({name: array[:, one.index(batch_indexes, array)] for name, (one, array) in full.items()})
+        views = {name: (one, one.view()) for name, one in self.variables.items()}
+        return self._of({name: array[:, one.index(batch_indexes, array)] for name, (one, array) in views.items()})
 
     def select_batch_n(self, n: int) -> Workspace:
-        """A new workspace of n batch columns, drawn uniformly with replacement."""
-        size = self.batch_size() or 0
+        """A new workspace of n batch columns, drawn uniformly with replacement.
+
+        Raises:
+            WorkspaceError: There are none.
+        """
+        size = self.batch_size()
+        if not size:
+            raise WorkspaceError(f"select_batch_n: {n} columns are wanted, and there are none.")
         if self._has_tensors():
             import torch
 
@@ -253,11 +271,19 @@ class Workspace:
         Args:
             t: One time for each column. Shape: (B,), int.
             window_size: Times of the result.
+
+        Raises:
+            TimeNotWritten: A window goes beyond the times of a variable.
         """
         result = {}
         for name, one in self.variables.items():
-            array = one.full()
-            start = one.index(t, array)
+            array = one.view()
+            start = one.index(t, array) - self.first_time
+            if len(start) and not 0 <= int(start.min()) <= int(start.max()) <= len(array) - window_size:
+                raise TimeNotWritten(
+                    f"{name!r}: windows of {window_size} from t={int(start.min()) + self.first_time} to "
+                    f"{int(start.max()) + self.first_time} are wanted; {kept(one.first, one.stop)}."
+                )
             columns = one.index(range(one.batch_size()), array)
             result[name] = one.stack([array[start + k, columns] for k in range(window_size)])
         return self._of(result)
@@ -287,8 +313,11 @@ class Workspace:
         """A new workspace: these, side by side over the batch.
 
         Raises:
-            WorkspaceError: They have different lengths or variables.
+            WorkspaceError: There are none, or they have different lengths.
+            UnknownVariable: One lacks a variable that the first has.
         """
+        if not workspaces:
+            raise WorkspaceError("cat_batch: expected one workspace or more, found none.")
         first = workspaces[0]
         for other in workspaces[1:]:
             if other.time_size() != first.time_size():
@@ -439,7 +468,8 @@ class Workspace:
 
     def _pairs(self, name: str, inside: Any) -> Any:
         """Neighbouring times of one variable, 2 x N x ...; those where `inside` (T - 1, B) is true, or all."""
-        one, array = self.variables[name], self.get_full(name)
+        one = self.variables[name]
+        array = one.view()
         if inside is None:
             shape = (-1, *array.shape[2:]) if array.shape[0] > 1 else (0, *array.shape[2:])
             return one.stack([array[:-1].reshape(shape), array[1:].reshape(shape)])
@@ -477,7 +507,7 @@ class Workspace:
             return
         first = self.first_time
         piece = {
-            name: one.copied(one.truncated(first, min(stop, one.stop)))
+            name: one.copied(one.truncated(first, min(stop, one.stop)))  # of a tensor it would be a view
             for name, one in self.variables.items()
             if one.stop > first
         }

@@ -157,6 +157,10 @@ class TensorVariable:
 
     def full(self) -> torch.Tensor:
         """All times kept, T x B x ...; of a list a new tensor, quick until the next write."""
+        return self._tensor if self._values is None else self.view().clone()
+
+    def view(self) -> torch.Tensor:
+        """All times kept, T x B x ..., to be read at once and not to be changed."""
         if self._values is None:
             return self._tensor
         if self._read is None or not self._read.is_current():
@@ -164,7 +168,7 @@ class TensorVariable:
             if tensor.is_inference():  # cannot be used outside, where the next reader may be
                 return tensor
             self._read = _Joined(tensor, torch.is_grad_enabled())
-        return self._read.tensor.clone()
+        return self._read.tensor
 
     def truncated(self, begin: int, end: int) -> torch.Tensor:
         """Times [begin, end), cut off at the end; a view of one tensor, a copy of a list."""
@@ -182,6 +186,8 @@ class TensorVariable:
 
     def copy_time(self, begin: int, to: int, count: int) -> None:
         """Copy times [begin, begin + count) onto [to, to + count): objects of a list, memory of one tensor."""
+        if count == 0:
+            return
         if self._values is None:
             whole = self._tensor
             self.get(begin), self.get(begin + count - 1), self.get(to), self.get(to + count - 1)
@@ -213,7 +219,7 @@ class TensorVariable:
 
     def _to_list(self) -> list[torch.Tensor]:
         """Turn one tensor into a list of views of it."""
-        values = list(self._tensor.unbind(0)) if len(self._tensor) else []
+        values = [self._tensor[k] for k in range(len(self._tensor))]  # not unbind, whose views refuse in-place changes
         self._values, self._whole = values, None
         return values
 
@@ -252,7 +258,8 @@ class TensorVariable:
     @staticmethod
     def index(index: Any, like: torch.Tensor) -> torch.Tensor:
         """`index` (integers or booleans) as a tensor that indexes `like`."""
-        return torch.as_tensor(index, device=like.device)
+        tensor = torch.as_tensor(index, device=like.device)
+        return tensor.long() if tensor.is_floating_point() and not tensor.numel() else tensor  # an empty list is floats
 
     @staticmethod
     def copied(array: torch.Tensor) -> torch.Tensor:
@@ -268,4 +275,4 @@ class TensorVariable:
 def _joined(values: Sequence[torch.Tensor]) -> torch.Tensor:
     """T tensors B x ... as one T x B x ...; `cat` and a view, several times as quick as `stack` for many small ones."""
     shape = values[0].shape
-    return torch.cat(list(values)).view(len(values), *shape)
+    return torch.cat(list(values)).view(len(values), *shape).contiguous()  # `cat` keeps channels_last

@@ -26,13 +26,20 @@ def become_module(agent: Any) -> None:
     nn.Module.__init__(agent)
 
 
+class _Quiet:
+    """Keeps ``__init_subclass__`` of the agent's own class from being called for its module form."""
+
+    def __init_subclass__(cls) -> None:
+        """Nothing."""
+
+
 @cache
 def module_form(kind: Any) -> Any:
     """The subclass of the class `kind` and of `nn.Module`; one for each class, with the same name."""
     members: dict[str, Any] = {name: getattr(kind, name) for name in ("__module__", "__qualname__", "__doc__")}
     if kind.__reduce__ is object.__reduce__ and kind.__reduce_ex__ is object.__reduce_ex__:
         members |= {"__reduce_ex__": _reduce, "_plain_class": kind}
-    return type(kind.__name__, (kind, nn.Module), members)
+    return type(kind.__name__, (_Quiet, kind, nn.Module), members)
 
 
 def _reduce(agent: Any, protocol: Any) -> tuple[Any, ...]:

@@ -164,10 +164,16 @@ def test_two_reads_do_not_share_memory(ws):
     assert second.tolist() == VALUES
 
 
-def test_a_stored_value_that_is_changed_in_place_shows(ws):
-    assert ws["plain"].tolist() == VALUES
+def test_a_stored_value_that_is_changed_in_place_shows_until_all_are_read(ws):
+    """As the module says: the joined form is kept until the next write through the workspace."""
     ws.get("plain", 1).add_(1)
-    assert ws["plain"].tolist() == [[0.0, 0.0], [2.0, 11.0], [2.0, 20.0]]
+    changed = [[0.0, 0.0], [2.0, 11.0], [2.0, 20.0]]
+    assert ws["plain"].tolist() == changed
+    ws.get("plain", 1).add_(1)
+    assert ws.get("plain", 1).tolist() == [3.0, 12.0]
+    assert ws["plain"].tolist() == changed
+    ws.set("plain", 0, ws.get("plain", 0))
+    assert ws["plain"].tolist() == [[0.0, 0.0], [3.0, 12.0], [2.0, 20.0]]
 
 
 @pytest.mark.parametrize(
