@@ -109,8 +109,8 @@ except LookupError as error:
 # %% [markdown]
 # ## A real environment
 #
-# Gymnasium environments are agents too: `NoAutoResetGymAgent` runs every environment to its end and repeats its last frame,
-# `AutoResetGymAgent` begins a new episode instead. They have BBRL's old signature; `ParallelGymAgent`, below, is
+# Gymnasium environments are agents too: `NoAutoResetGymAgent` runs every environment to its end and repeats its last
+# frame, `AutoResetGymAgent` begins a new episode instead. They have BBRL's old signature; `ParallelGymAgent`, below, is
 # their successor. Our `ActionAgent` reads `obs`, and they write `env/env_obs`: an agent that copies goes in between.
 
 # %%
@@ -142,8 +142,8 @@ print(transitions.batch_size(), "transitions; none joins the end of an episode t
 # %% [markdown]
 # ## A neural ActionAgent
 #
-# An agent is an `nn.Module`, so a network is one attribute. It writes the probability of what it did as well: values keep
-# their graph in the workspace, and a loss computed from the workspace reaches the network.
+# An agent is an `nn.Module`, so a network is one attribute. It writes the probability of what it did as well: values
+# keep their graph in the workspace, and a loss computed from the workspace reaches the network.
 
 
 # %%
@@ -226,5 +226,5 @@ print(f"epoch {epoch}: {score:.1f} over 100 episodes: {'solved' if score >= 475 
 curve.plot("mean return")
 
 # %% [markdown]
-# CartPole-v1 counts as solved at a mean return of 475. From here: `scripts/ppo_pick.py` is PPO on a simulated robot, written
-# on the same loop; `bam-eval` and `bam-deploy` run frozen policies on it.
+# CartPole-v1 counts as solved at a mean return of 475. From here: `scripts/ppo_pick.py` is PPO on a simulated robot,
+# written on the same loop; `bam-eval` and `bam-deploy` run frozen policies on it.

@@ -152,7 +152,7 @@ class NumpyVariable:
 
     def full(self) -> NDArray[Any]:
         """A copy of all times kept, T x B x ..."""
-        return self._buffer[: self._count].copy()
+        return np.array(self.view())
 
     def view(self) -> NDArray[Any]:
         """All times kept, T x B x ..., to be read at once and not to be changed."""
@@ -160,7 +160,8 @@ class NumpyVariable:
 
     def truncated(self, begin: int, end: int) -> NDArray[Any]:
         """A copy of times [begin, end), cut off at the end."""
-        return self.view()[max(0, begin - self.first) : max(0, end - self.first)].copy()
+        piece = self.view()[max(0, begin - self.first) : max(0, end - self.first)]
+        return np.array(piece)
 
     def drop(self, first: int) -> None:
         """Forget the times before `first`."""
@@ -223,14 +224,14 @@ class NumpyVariable:
     def index(index: Any, like: Any) -> NDArray[Any]:
         """`index` (integers or booleans) as an array that indexes `like`."""
         array = np.asarray(index)
-        return (
-            array.astype(np.int64) if array.dtype.kind == "f" and not array.size else array
-        )  # an empty list is floats
+        if array.dtype.kind == "f" and not array.size:  # what an empty list becomes
+            return np.empty(0, dtype=np.int64)
+        return array
 
     @staticmethod
     def copied(array: NDArray[Any]) -> NDArray[Any]:
         """A copy that shares no memory."""
-        return array.copy()
+        return np.array(array)
 
     @staticmethod
     def on_device(array: NDArray[Any], device: Any) -> NDArray[Any]:

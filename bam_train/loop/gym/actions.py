@@ -110,7 +110,9 @@ class _Part:
         array = self._checked(value, t)
         if self._range is not None:
             self._check_range(array, np.minimum.reduce(array), np.maximum.reduce(array), t)
-        fits = self._dtype is not None and np.can_cast(array.dtype, self._dtype, "same_kind")
+        fits = array.dtype == self._dtype or (
+            self._dtype is not None and np.can_cast(array.dtype, self._dtype, "same_kind")
+        )
         cast: NDArray[Any] = array.astype(self._dtype if fits else array.dtype)
         return cast
 

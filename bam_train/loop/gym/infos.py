@@ -60,6 +60,9 @@ class InfoRecorder:
 
     def replaced(self, new: dict[str, Array], old: Mapping[str, Array], rows: Array) -> None:
         """In `new`, take these rows (n,) bool from `old`; where `old` has nothing, nothing was given."""
+        for name, array in old.items():
+            if name.startswith("info/") and name not in new:
+                new[name] = np.zeros_like(array)
         for name, array in new.items():
             array[rows] = old[name][rows] if name in old else 0
 

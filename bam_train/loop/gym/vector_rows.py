@@ -134,10 +134,16 @@ class VectorRows:
         rewards[begin], terminated[begin], truncated[begin] = 0, False, False
 
     def _take_final(self, frame: Frame, ended: Array, infos: Mapping[str, Any], recorded: Frame) -> None:
-        """Where rows ended: the last observation, if it is to be shown, and the last info."""
+        """Where rows ended: the last observation, if it is to be shown, and the last info.
+
+        Raises:
+            LoopError: The environment did not keep the last observation.
+        """
         if not ended.any():
             return
         if self._include_last:
+            if "final_obs" not in infos:
+                raise LoopError(f'{self._envs} is AutoresetMode.SAME_STEP but gave no infos["final_obs"] at an end.')
             final = infos["final_obs"]
             each = isinstance(final, np.ndarray) and final.dtype == object
             for entry in self._entries:
@@ -153,7 +159,7 @@ class VectorRows:
         """Reset these rows (n,) bool, and see that no other row was.
 
         Raises:
-            LoopError: They do not.
+            LoopError: Another was.
         """
         observations, infos = self._envs.reset(options={"reset_mask": rows.copy()})
         first = self._packed(observations)
@@ -180,7 +186,8 @@ class VectorRows:
             self._over, self._advance = done.copy(), ~done
             self._last = {name: array.copy() for name, array in frame.items()}  # what is given away may change
             return
-        self._begin = done.copy()
+        if self._turns:
+            self._begin = done.copy()
         if np.count_nonzero(done):
             self._cumulated[done] = 0
             self._timestep[done] = -1  # so that the reset is step 0

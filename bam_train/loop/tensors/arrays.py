@@ -259,7 +259,9 @@ class TensorVariable:
     def index(index: Any, like: torch.Tensor) -> torch.Tensor:
         """`index` (integers or booleans) as a tensor that indexes `like`."""
         tensor = torch.as_tensor(index, device=like.device)
-        return tensor.long() if tensor.is_floating_point() and not tensor.numel() else tensor  # an empty list is floats
+        if tensor.is_floating_point() and not tensor.numel():  # what an empty list becomes
+            return tensor.long()
+        return tensor
 
     @staticmethod
     def copied(array: torch.Tensor) -> torch.Tensor:

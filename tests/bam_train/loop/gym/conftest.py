@@ -42,7 +42,11 @@ class Counting(gym.Env):
         self.count += 1
         terminated, truncated = self.count == self.length, self.count == self.limit
         self.running = not (terminated or truncated)
-        info = {"is_success": terminated, "odd": self.count} if self.count % 2 else {"is_success": terminated}
+        info = {"is_success": terminated}
+        if self.count % 2:
+            info["odd"] = self.count
+        if terminated:
+            info["length"] = float(self.count)
         return self.observe(), 10 * self.episode + self.count, terminated, truncated, info
 
     def close(self):

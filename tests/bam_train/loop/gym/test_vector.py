@@ -66,7 +66,7 @@ def plain(toys):
 
 @pytest.mark.parametrize("mode", MODES)
 def test_rows_with_the_last_state(plain, mode):
-    keys = ("is_success", "odd")
+    keys = ("is_success", "odd", "length")
     found = plain.run(VecGymAgent(vector_of(plain, mode), info_keys=keys), 14)
     expected = plain.run(parallel_of(plain, info_keys=keys), 14)
     assert_same(without_episode(found), without_episode(expected))
@@ -74,7 +74,7 @@ def test_rows_with_the_last_state(plain, mode):
 
 @pytest.mark.parametrize("mode", RESETTING)
 def test_rows_without_the_last_state(toys, mode):
-    keys = ("is_success", "odd")
+    keys = ("is_success", "odd", "length")
     found = toys.run(VecGymAgent(vector_of(toys, mode), include_last_state=False, info_keys=keys), 14)
     expected = toys.run(parallel_of(toys, include_last_state=False, info_keys=keys), 14)
     assert_same({name: found[name] for name in found.variables}, {name: expected[name] for name in expected.variables})
@@ -82,7 +82,7 @@ def test_rows_without_the_last_state(toys, mode):
 
 @pytest.mark.parametrize("mode", MODES)
 def test_rows_without_auto_reset(toys, mode):
-    keys = ("is_success", "odd")
+    keys = ("is_success", "odd", "length")
     agent = VecGymAgent(vector_of(toys, mode), auto_reset=False, info_keys=keys)
     found = toys.run(agent, 7)
     expected = toys.run(parallel_of(toys, autoreset=False, info_keys=keys), 7)
@@ -358,6 +358,17 @@ def test_the_mode_is_that_of_its_own_environment(toys):
     )
     ws = toys.run(first, 40, act=lambda t: torch.ones(2, dtype=torch.int64))
     assert torch.equal(ws["env/timestep"][1:] == 0, ws["env/done"][:-1])
+
+
+def test_a_same_step_environment_without_last_observations(toys):
+    class Forgetful(SyncVectorEnv):
+        def step(self, actions):
+            *rest, _ = super().step(actions)
+            return *rest, {}
+
+    make = lambda: Forgetful([toys.Counting], autoreset_mode=AutoresetMode.SAME_STEP)  # noqa: E731
+    with pytest.raises(LoopError, match=r'is AutoresetMode\.SAME_STEP but gave no infos\["final_obs"\] at an end\.$'):
+        toys.run(VecGymAgent(make), 6)
 
 
 def test_actions_that_do_not_fit(toys):
