@@ -77,11 +77,13 @@ class Options(NamedTuple):
 
 
 def seconds(work: Work) -> float:
-    """CPU time of a call [s]; what others left behind is collected before."""
+    """CPU time of a call [s]; what others left behind is collected before, and what it returns is freed afterwards."""
     gc.collect()
     start = time.process_time()
-    work()
-    return time.process_time() - start
+    result = work()
+    taken = time.process_time() - start
+    del result
+    return taken
 
 
 def in_turns(works: Mapping[str, Work], rounds: int) -> dict[str, list[float]]:
@@ -288,11 +290,16 @@ def bench_pick(options: Options) -> Iterator[Figure]:
         def forward(self, t: int, **kwargs: Any) -> None:
             self.set(("action", t), self.values[t])
 
+    def run_on(agent: Any) -> Any:
+        workspace = library.Workspace()
+        agent(workspace, t=0, n_steps=PICK_STEPS + 1, seed=0)
+        return workspace
+
     def recorder(arrays: str) -> Work:
         last = [*actions, actions[0]]  # the action of the last time is not used
         values = [torch.from_numpy(action) for action in last] if arrays == "torch" else last
         agent = library.TemporalAgent(library.Agents(library.VecGymAgent(envs, arrays=arrays), Random(values)))
-        return lambda: agent(library.Workspace(), t=0, n_steps=PICK_STEPS + 1, seed=0)
+        return partial(run_on, agent)
 
     times = in_turns({"bare": run_bare, "torch": recorder("torch"), "numpy": recorder("numpy")}, options.rounds)
     rates = {name: rate(PICK_ROWS * PICK_STEPS)(median(one)) for name, one in times.items()}
