@@ -46,13 +46,13 @@ def test_what_fits_runs():
 
 def test_a_misspelt_variable():
     assert refused(Env(), Step(("osb",), ("action",), name="policy")) == (
-        "Step 'policy' reads 'osb', which nobody writes, did you mean 'obs'? written are 'done', 'obs'."
+        "Step 'policy' reads 'osb', which nobody writes, did you mean 'obs'? Written are 'done', 'obs'."
     )
 
 
 def test_a_misspelt_action():
     assert refused(Env(), Step(("obs",), ("actoin",))) == (
-        "Env reads 'action', which nobody writes, did you mean 'actoin'? written are 'actoin', 'done', 'obs'."
+        "Env reads 'action', which nobody writes, did you mean 'actoin'? Written are 'actoin', 'done', 'obs'."
     )
 
 
@@ -62,7 +62,7 @@ def test_the_wrong_order():
 
 
 def test_nothing_is_written():
-    assert refused(Step(("obs",), ())) == "Step reads 'obs', which nobody writes; nothing is written."
+    assert refused(Step(("obs",), ())) == "Step reads 'obs', which nobody writes. Nothing is written."
 
 
 def test_a_stop_variable_that_nobody_writes():

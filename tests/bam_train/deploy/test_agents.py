@@ -1,0 +1,151 @@
+import tracemalloc
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from bam_envs.errors import ResetNeeded
+from bam_envs.robot_env import RobotEnv
+from bam_envs.robots.fake import FakeRobot
+from bam_envs.tasks.pick import PickTask
+from bam_train.deploy.journal import KEPT, Journal
+from bam_train.deploy.loop import Deployment, Ending
+from bam_train.deploy.pacer import Pacer
+from bam_train.errors import WiringError
+from bam_train.loop import Agent
+
+
+class Right:
+    def reset(self, rows=None):
+        pass
+
+    def act(self, observation):
+        return 1
+
+
+class Silent:
+    def ticked(self, record, action, pacer):
+        pass
+
+    def ended(self, record, pacer):
+        pass
+
+
+class Endless(gym.Env):
+    """Counts; nothing ends."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,))
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        self.count = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.count += 1
+        return np.array([self.count], np.float32), 1.0, False, False, {}
+
+
+class Sees(Agent):
+    """Another agent of the chain: sees what was acted on."""
+
+    reads = ("action", "env/env_obs")
+    writes = ("seen",)
+
+    def __init__(self):
+        super().__init__()
+        self.seen = []
+
+    def forward(self, t, **kwargs):
+        if not self.get(("env/done", t))[0]:
+            self.seen.append(self.get(("env/env_obs", t)).tolist())
+        self.set(("seen", t), np.array([len(self.seen)]))
+
+
+def test_the_sink_gets_every_tick_once_episode_by_episode(corridor, starting_cell):
+    pieces = []
+    deployment = Deployment(
+        gym.make(corridor), Right(), Pacer(None), Journal(3), sink=lambda first, piece: pieces.append((first, piece))
+    )
+    assert deployment.run(Silent(), seed=7) == Ending("episodes done", 0)
+    assert [first for first, _ in pieces] == [0, 0, 0]
+    for (_, piece), seed in zip(pieces, (7, 8, 9), strict=True):
+        cells = list(range(starting_cell(seed), 5))
+        assert piece["env/env_obs"].ravel().tolist() == cells
+        assert piece["env/timestep"].ravel().tolist() == list(range(len(cells)))
+        assert piece["action"].ravel().tolist() == [1] * (len(cells) - 1)
+
+
+def test_the_sink_gets_the_ticks_of_an_episode_that_was_cut_short(corridor):
+    class Breaks(gym.Wrapper):
+        def step(self, action):
+            raise OSError("broken")
+
+    pieces = []
+    deployment = Deployment(
+        Breaks(gym.make(corridor)), Right(), Pacer(None), Journal(1), sink=lambda *piece: pieces.append(piece)
+    )
+    assert deployment.run(Silent(), seed=7) == Ending("fault: OSError: broken", 1)
+    assert [(first, piece["action"].tolist()) for first, piece in pieces] == [(0, [[1]])]
+
+
+def test_a_sink_that_fails_is_a_fault(corridor):
+    def sink(first, piece):
+        raise OSError(28, "No space left on device")
+
+    deployment = Deployment(gym.make(corridor), Right(), Pacer(None), Journal(2), sink=sink)
+    assert deployment.run(Silent(), seed=7) == Ending("fault: OSError: [Errno 28] No space left on device", 1)
+
+
+def test_agents_of_ones_own_join_the_chain(corridor, starting_cell):
+    sees = Sees()
+    deployment = Deployment(gym.make(corridor), Right(), Pacer(None), Journal(1), agents=[sees])
+    deployment.run(Silent(), seed=7)
+    assert sees.seen == [[[cell]] for cell in range(starting_cell(7), 4)]
+
+
+def test_an_agent_that_reads_what_nobody_writes_is_refused_before_the_robot_is_connected():
+    class Lost(Sees):
+        reads = ("camera",)
+
+    robot = FakeRobot()
+    env = gym.wrappers.TimeLimit(RobotEnv(robot, PickTask(1)), 7)
+    with pytest.raises(WiringError, match=r"^Lost reads 'camera', which nobody writes\. Written are 'action', "):
+        Deployment(env, Right(), Pacer(None), Journal(1), agents=[Lost()])
+    with pytest.raises(ResetNeeded, match="not connected"):
+        robot.step(np.zeros((1, 7)))
+
+
+@pytest.mark.parametrize("limit", [None, 4], ids=["one endless episode", "many short ones"])
+def test_memory_stays_flat(limit):
+    """A sink that keeps nothing; 3,000 ticks fill the window, 20,000 more add nothing."""
+    held = []
+
+    class Looks(Silent):
+        ticks = 0
+
+        def ticked(self, record, action, pacer):
+            self.ticks += 1
+            if self.ticks in (8_000, 28_000):
+                held.append(tracemalloc.get_traced_memory()[0])
+            if self.ticks == 28_000:
+                raise StopIteration
+
+    env = Endless() if limit is None else gym.wrappers.TimeLimit(Endless(), limit)
+    deployment = Deployment(env, Right(), Pacer(None), Journal(10**6), sink=lambda first, piece: None)
+    tracemalloc.start()
+    try:
+        deployment.run(Looks(), seed=0)
+    finally:
+        tracemalloc.stop()
+    assert held[1] - held[0] < 50_000
+
+
+def test_old_records_are_counted_and_forgotten():
+    journal = Journal(10**6)
+    for seed in range(KEPT + 10):
+        record = journal.begin(seed)
+        record.end, record.success = "terminated", seed % 2 == 0
+    assert (journal.begun, journal.completed, journal.successes) == (KEPT + 10, KEPT + 10, KEPT // 2 + 5)
+    assert len(journal.records) == KEPT
+    assert journal.records[0].seed == 10
