@@ -55,9 +55,9 @@ class ActionAgent(Agent):
 
 
 # %% [markdown]
-# The second one is the environment. At time `t` it reads the action of `t - 1` and writes what came of it: so `action[t]`
-# leads to `reward[t + 1]` and `obs[t + 1]`. At `t = 0` there is no action yet. Every value has a batch axis first, here
-# of one.
+# The second one is the environment. At time `t` it reads the action of `t - 1` and writes what came of it: so
+# `action[t]` leads to `reward[t + 1]` and `obs[t + 1]`. At `t = 0` there is no action yet. Every value has a batch axis
+# first, here of one.
 
 
 # %%

@@ -59,7 +59,7 @@ class Agent(_Base):  # type: ignore[misc]
     _trace: IO[str] | None = None
 
     def __init__(self, name: str | None = None, verbose: bool = False) -> None:
-        if "torch" in sys.modules:
+        if sys.modules.get("torch") is not None:
             from bam_train.loop.tensors.module import become_module
 
             become_module(self)
@@ -108,13 +108,14 @@ class Agent(_Base):  # type: ignore[misc]
         self,
         owner: type[Agent],
         *,
-        reads: Iterable[str],
+        reads: Iterable[str] | None,
         writes: Iterable[str],
         reads_previous: Iterable[str] = (),
     ) -> None:
         """Say what ``owner.forward`` reads and writes; a subclass with a forward of its own may do otherwise."""
         if type(self).forward is owner.forward:
-            self.reads, self.writes, self.reads_previous = tuple(reads), tuple(writes), tuple(reads_previous)
+            self.reads = None if reads is None else tuple(reads)
+            self.writes, self.reads_previous = tuple(writes), tuple(reads_previous)
 
     def is_running(self) -> bool:
         """Whether it is still at work in another process."""
@@ -131,19 +132,21 @@ class Agent(_Base):  # type: ignore[misc]
         workspace = self.workspace
         if workspace is None:
             workspace = self._workspace()
-        if isinstance(index, str):
-            return workspace.get_full(index)
-        return workspace.get(index[0], index[1])
+        if type(index) is tuple:  # quicker than isinstance
+            return workspace.get(index[0], index[1])
+        return workspace.get_full(index) if isinstance(index, str) else workspace.get(*index)
 
     def set(self, index: str | tuple[str, int], value: Any) -> None:
         """Write all times of a variable, T x B x ..., or with (name, t) its value at t, B x ...."""
         workspace = self.workspace
         if workspace is None:
             workspace = self._workspace()
-        if isinstance(index, str):
+        if type(index) is tuple:  # quicker than isinstance
+            workspace.set(index[0], index[1], value)
+        elif isinstance(index, str):
             workspace.set_full(index, value)
         else:
-            workspace.set(index[0], index[1], value)
+            workspace.set(*index, value)
 
     def get_time_truncated(self, name: str, from_time: int, to_time: int) -> Any:
         """Times [from_time, to_time) of a variable."""

@@ -21,6 +21,10 @@ _FIRST_ROWS = 16
 """Times that a new buffer has room for."""
 
 
+def no_window(t: int) -> None:
+    """Makes no room for time t: nothing is ever forgotten."""
+
+
 def kept(first: int, stop: int) -> str:
     """Which times a variable has, for an error's text."""
     if stop <= first:
@@ -64,7 +68,7 @@ class NumpyVariable:
         name: str,
         first: int = 0,
         limit: int = UNLIMITED,
-        make_room: Callable[[int], None] = lambda t: None,
+        make_room: Callable[[int], None] = no_window,
     ) -> None:
         self.name, self.first, self._limit, self._make_room = name, first, limit, make_room
         self._buffer: NDArray[Any] = np.empty((0, 0))

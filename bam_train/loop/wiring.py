@@ -51,23 +51,23 @@ def _check(chain: list[Agent], held: frozenset[str], stop_variable: str | None) 
     for one in chain:
         for name in one.reads_previous:
             if name not in everything:
-                raise WiringError(f"{agent_name(one)} reads {name!r}, which nobody writes{_close(name, everything)}.")
+                raise WiringError(f"{agent_name(one)} reads {name!r}, which nobody writes{_close(name, everything)}")
         for name in one.reads or ():
             if name not in before:
-                raise WiringError(f"{agent_name(one)} reads {name!r}, {_why(name, everything, before)}.")
+                raise WiringError(f"{agent_name(one)} reads {name!r}, {_why(name, everything, before)}")
         before.update(one.writes or ())
     if stop_variable is not None and stop_variable not in everything:
-        raise WiringError(f"stop_variable {stop_variable!r} is written by nobody{_close(stop_variable, everything)}.")
+        raise WiringError(f"stop_variable {stop_variable!r} is written by nobody{_close(stop_variable, everything)}")
 
 
 def _why(name: str, everything: frozenset[str], before: set[str]) -> str:
     if name in everything:
-        return "which only an agent after it writes; put it behind that one"
+        return "which only an agent after it writes; put it behind that one."
     return f"which nobody writes{_close(name, before)}"
 
 
 def _close(name: str, known: Iterable[str]) -> str:
     names = sorted(known)
     close = difflib.get_close_matches(name, names, n=1)
-    question = f", did you mean {close[0]!r}?" if close else ";"
-    return f"{question} written are {', '.join(map(repr, names))}" if names else f"{question} nothing is written"
+    question = f", did you mean {close[0]!r}?" if close else "."
+    return f"{question} Written are {', '.join(map(repr, names))}." if names else f"{question} Nothing is written."

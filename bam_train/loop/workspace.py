@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bam_train.errors import TimeNotWritten, UnknownVariable, WorkspaceError
-from bam_train.loop.arrays import UNLIMITED, NumpyVariable, kept, kind_mismatch, no_batch, require_window
+from bam_train.loop.arrays import UNLIMITED, NumpyVariable, kept, kind_mismatch, no_batch, no_window, require_window
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -83,16 +83,12 @@ class Workspace:
             ValueMismatch: Another shape, dtype, device or kind of array than the variable has.
             TimeNotWritten: t has left the window, or is negative beyond the first.
         """
-        variable = self.variables.get(name)
-        if variable is not None:
-            variable.set(t, value)
-            return
-        self.variables[name] = self._new(name, value, f"t={t}")
         try:
-            self.variables[name].set(t, value)
-        except BaseException:
-            del self.variables[name]
-            raise
+            variable = self.variables[name]
+        except KeyError:
+            self._set_first(name, t, value)
+        else:
+            variable.set(t, value)
 
     def get(self, name: str, t: int) -> Any:
         """The value at time t, B x ...; -1 is the last.
@@ -414,6 +410,15 @@ class Workspace:
 
     # -- inside ----------------------------------------------------------------------------------------------------
 
+    def _set_first(self, name: str, t: int, value: Any) -> None:
+        """Make a variable with its first value; without leaving anything behind if that fails."""
+        self.variables[name] = self._new(name, value, f"t={t}")
+        try:
+            self.variables[name].set(t, value)
+        except BaseException:
+            del self.variables[name]
+            raise
+
     def _variable(self, name: str) -> Variable:
         try:
             return self.variables[name]
@@ -425,7 +430,7 @@ class Workspace:
         storage: type[NumpyVariable] | type[TensorVariable]
         if isinstance(value, np.ndarray):
             storage = NumpyVariable
-        elif "torch" in sys.modules and isinstance(value, sys.modules["torch"].Tensor):
+        elif sys.modules.get("torch") is not None and isinstance(value, sys.modules["torch"].Tensor):
             from bam_train.loop.tensors.arrays import TensorVariable
 
             storage = TensorVariable
@@ -433,7 +438,9 @@ class Workspace:
             raise no_batch(name, where)
         else:
             raise kind_mismatch(name, where, "a torch.Tensor or a numpy.ndarray", value)
-        return storage(name, self.first_time, self._limit, self._make_room)
+        # Only with a window: in a cycle with its variables a workspace is freed late, by the garbage collector.
+        make_room = no_window if self.window is None else self._make_room
+        return storage(name, self.first_time, self._limit, make_room)
 
     def _of(self, arrays: Mapping[str, Any]) -> Workspace:
         """A new workspace of full arrays."""

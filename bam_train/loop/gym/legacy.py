@@ -64,6 +64,7 @@ class _LegacyGymAgent(ParallelGymAgent):
             output_string=output,
             arrays=arrays,
         )
+        self._declare(_LegacyGymAgent, reads=None, writes=self._written())
 
     @property
     def n_envs(self) -> int:

@@ -89,7 +89,7 @@ class ParallelGymAgent(GymAgent):
         if not self._is_autoreset:
             self.include_last_state = True
         self._actions = ActionReader(self.input, self.action_space, self.num_envs)
-        self.writes = self._written()
+        self._declare(ParallelGymAgent, reads=None, writes=self._written())
 
     def _make(self) -> Env:
         return self.make_env_fn(**self._make_env_args)

@@ -74,7 +74,7 @@ class VecGymAgent(GymAgent):
         self._actions = ActionReader(self.input, self.envs.single_action_space, self.num_envs)
         if self.info_keys:
             self._infos = InfoRecorder(self.info_keys, self.num_envs, self.arrays == "torch")
-        self.writes = self._written()
+        self._declare(VecGymAgent, reads=None, writes=self._written())
 
     def close(self) -> None:
         """Close the environment; it is made anew at the next t = 0."""

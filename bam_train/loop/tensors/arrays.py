@@ -15,7 +15,16 @@ from typing import Any, NamedTuple
 import torch
 
 from bam_train.errors import WorkspaceError
-from bam_train.loop.arrays import UNLIMITED, batch_of, kind_mismatch, mismatch, no_batch, not_written, require_full
+from bam_train.loop.arrays import (
+    UNLIMITED,
+    batch_of,
+    kind_mismatch,
+    mismatch,
+    no_batch,
+    no_window,
+    not_written,
+    require_full,
+)
 
 
 class _Joined(NamedTuple):
@@ -47,7 +56,7 @@ class TensorVariable:
         name: str,
         first: int = 0,
         limit: int = UNLIMITED,
-        make_room: Callable[[int], None] = lambda t: None,
+        make_room: Callable[[int], None] = no_window,
     ) -> None:
         self.name, self.first, self._limit, self._make_room = name, first, limit, make_room
         self._values: list[torch.Tensor] | None = []
@@ -115,14 +124,15 @@ class TensorVariable:
             fits = False
         if not fits:
             self._check(value, f"t={t}")
+        self._read = None
         values = self._values
         if values is None:
             values = self._to_list()
-        self._read = None
-        index = t - self.first if t >= 0 else len(values) + t
-        if index == len(values) < self._limit:
+        count = len(values)
+        index = t - self.first if t >= 0 else count + t
+        if index == count < self._limit:
             values.append(value)
-        elif index >= len(values):
+        elif index >= count:
             self._append(t, index, value)
         elif index >= 0:
             values[index] = value
