@@ -17,6 +17,7 @@
     │   ├── ValueMismatch          another shape, dtype, device or kind of array than before
     │   ├── WorkspaceError         anything else that a workspace refuses, such as variables of different lengths
     │   ├── WiringError            an agent reads what no agent writes
+    │   ├── RemoteAgentError       an agent in another process failed, or its process ended
     │   └── AgentInUse             an agent is called by two threads at once
     ├── TrainingFailed             training cannot go on (a NaN loss); the last good checkpoint is kept
     └── OutputError                no space, no permission, or a file that is in the way
@@ -117,6 +118,19 @@ class WorkspaceError(LoopError, ValueError):
 
 class WiringError(LoopError):
     """An agent reads what no agent writes."""
+
+
+class RemoteAgentError(LoopError):
+    """An agent in another process failed, or its process ended.
+
+    Attributes:
+        traceback: The traceback there; None if there is none.
+        exit_code: How the process ended, the negative number of a signal; None if it did not end.
+    """
+
+    def __init__(self, message: str, traceback: str | None = None, exit_code: int | None = None) -> None:
+        self.traceback, self.exit_code = traceback, exit_code
+        super().__init__(message)
 
 
 class AgentInUse(LoopError):  # noqa: N818

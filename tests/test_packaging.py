@@ -76,7 +76,7 @@ def test_the_base_install_is_small(metadata):
 
 
 def test_extras(metadata):
-    assert sorted(metadata.get_all("Provides-Extra")) == ["all", "dev", "sim", "train", "video"]
+    assert sorted(metadata.get_all("Provides-Extra")) == ["all", "dev", "notebook", "sim", "train", "video"]
 
 
 def test_licence_and_versions(metadata):

@@ -382,12 +382,12 @@ class Workspace:
 
     # -- pictures --------------------------------------------------------------------------------------------------
 
-    def plot(self, *names: str, batch: Sequence[int] | None = None) -> Figure:
+    def plot(self, *names: str, batch: int | Sequence[int] | None = None) -> Figure:
         """A matplotlib figure of these variables over time (all without a name), one axes each.
 
         Args:
             names: Variables.
-            batch: Columns to draw; all by default.
+            batch: The column or columns to draw; all by default.
 
         Raises:
             MissingExtra: matplotlib is not installed.

@@ -5,9 +5,9 @@ from __future__ import annotations
 import weakref
 from typing import TYPE_CHECKING, Any
 
-from bam_train.errors import LoopError
+from bam_train.errors import LoopError, RemoteAgentError
 from bam_train.loop.agent import Agent, agent_name
-from bam_train.loop.tensors.worker import RemoteAgentError, Worker
+from bam_train.loop.tensors.worker import Worker
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -19,11 +19,11 @@ import copy
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from bam_train.errors import LoopError, WorkspaceError
+from bam_train.errors import LoopError, RemoteAgentError, WorkspaceError
 from bam_train.loop.agent import Agent, agent_name
 from bam_train.loop.tensors.process_agent import ProcessAgent
 from bam_train.loop.tensors.shared import SharedWorkspace, _SplitSharedWorkspace, shared_workspace
-from bam_train.loop.tensors.worker import RemoteAgentError, wait_for_any
+from bam_train.loop.tensors.worker import wait_for_any
 from bam_train.loop.workspace import Workspace
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from typing import Any
 import torch
 import torch.multiprocessing  # teaches pickle to share tensors
 
-from bam_train.errors import LoopError
+from bam_train.errors import RemoteAgentError
 from bam_train.loop.agent import Agent, agent_name
 from bam_train.loop.tensors.serve import serve
 
@@ -30,19 +30,6 @@ PATIENCE = 5.0
 """Seconds that an idle process has to end by itself."""
 
 _LOOK_AGAIN = 1.0  # seconds between two looks at whether the other process is alive
-
-
-class RemoteAgentError(LoopError):
-    """An agent in another process failed, or its process ended.
-
-    Attributes:
-        traceback: The traceback there; None if there is none.
-        exit_code: How the process ended, the negative number of a signal; None if it did not end.
-    """
-
-    def __init__(self, message: str, traceback: str | None = None, exit_code: int | None = None) -> None:
-        self.traceback, self.exit_code = traceback, exit_code
-        super().__init__(message)
 
 
 class _ChildTraceback(Exception):  # noqa: N818 - the cause of a RemoteAgentError, as Python prints it
