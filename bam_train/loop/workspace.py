@@ -14,6 +14,8 @@ It is BBRL's `Workspace`, with these differences:
 - `copy_n_last_steps` copies once, also where the copied times overlap (BBRL copies once for each variable).
 - With a window it forgets old times, after giving them to a sink: memory stays flat however long the loop runs. What is
   made of it (`contiguous`, `select_batch`, `to`, a copy) holds the times kept, and begins at time 0 again.
+
+Longer than most files here: BBRL's users find every member in one class.
 """
 
 from __future__ import annotations

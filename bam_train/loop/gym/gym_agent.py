@@ -4,19 +4,30 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium import Space, spaces
 
-from bam_train.errors import LoopError, SettingsError
+from bam_train.errors import LoopError, SettingsError, ValueMismatch
 from bam_train.loop.agent import agent_name
 from bam_train.loop.conventions import SeedableAgent, SerializableAgent, TimeAgent
 from bam_train.loop.gym.infos import InfoRecorder
 from bam_train.loop.gym.observations import names
 
 _ARRAYS = ("torch", "numpy")
+_NUMBERS = {
+    "terminated": bool,
+    "truncated": bool,
+    "done": bool,
+    "reward": float,
+    "cumulated_reward": float,
+    "timestep": np.int64,
+}
+"""Variables of one number for each environment, in the order in which they are written."""
+_NOTHING = ("", None, None)
+_EMPTY: dict[str, Any] = {}
 
 
 class GymAgent(TimeAgent, SeedableAgent, SerializableAgent, ABC):
@@ -72,7 +83,9 @@ class GymAgent(TimeAgent, SeedableAgent, SerializableAgent, ABC):
         self.observation_space: Space[Any] | None = None
         self.action_space: Space[Any] | None = None
         self._nb_reset = 1
-        self._floats = np.float32 if arrays == "torch" else np.float64
+        floats = np.float32 if arrays == "torch" else np.float64
+        self._dtypes = {name: np.dtype(floats if kind is float else kind) for name, kind in _NUMBERS.items()}
+        self._deferring: dict[str, tuple[str, Any, Any]] = {}
         self._to_array: Callable[[Any], Any] = torch.from_numpy if arrays == "torch" else _same
         self._infos: InfoRecorder | None = None
 
@@ -92,14 +105,52 @@ class GymAgent(TimeAgent, SeedableAgent, SerializableAgent, ABC):
             observations: By name without the output prefix.
             t: The time.
         """
-        if self.ghost_params is not None and not self.ghost_params.is_cpu:
-            observations = {key: value.to(self.ghost_params.device) for key, value in observations.items()}
+        device = self._device()
+        if device is not None:
+            observations = {key: value.to(device) for key, value in observations.items()}
         write = self.workspace.set if self._trace is None else self._traced_set
         if self.reward_at_t:
             observations = self._rewards_at_t(observations, t, write)
         prefix = self.output
         for key, value in observations.items():
             write(prefix + key, t, value)
+
+    def set_numbers(self, numbers: Mapping[str, Any], t: int) -> None:
+        """Write one number for each environment (B,) at t, for several variables.
+
+        With tensors most are written as they are, and become tensors when somebody reads them.
+
+        Args:
+            numbers: By name without the output prefix; sequences that nobody changes any more.
+            t: The time.
+        """
+        rest = numbers
+        if self.arrays == "torch" and self._trace is None and not self.reward_at_t and self._device() is None:
+            rest = {key: values for key, values in numbers.items() if not self._defer(key, t, values)}
+        if rest:
+            self.set_obs({key: self._to_array(_numbers(key, values, self._dtypes)) for key, values in rest.items()}, t)
+            self._remember(rest)
+
+    def _defer(self, key: str, t: int, values: Any) -> bool:
+        """Write numbers without making a tensor, if the variable is the one that was written before."""
+        name, variable, shape = self._deferring.get(key, _NOTHING)
+        if self.workspace.variables.get(name) is not variable or variable is None or variable._shape is not shape:
+            return False
+        deferred: bool = variable.defer(t, values, self._dtypes[key])
+        return deferred
+
+    def _remember(self, keys: Iterable[str]) -> None:
+        """The variables that have just been written, so that the next times of them may be deferred."""
+        for key in keys:
+            variable = self.workspace.variables[self.output + key]
+            if hasattr(variable, "defer"):
+                self._deferring[key] = (self.output + key, variable, variable._shape)
+
+    def _device(self) -> Any:
+        """Where tensors have to go; None if they are there already."""
+        # Past nn.Module's __getattr__, which costs as much as storing a tensor.
+        ghost = self.__dict__.get("_parameters", _EMPTY).get("ghost_params")
+        return None if ghost is None or ghost.is_cpu else ghost.device
 
     def _rewards_at_t(self, observations: Mapping[str, Any], t: int, write: Any) -> dict[str, Any]:
         """Write the rewards of action[t - 1] at t - 1; what is left to write at t."""
@@ -144,6 +195,10 @@ class GymAgent(TimeAgent, SeedableAgent, SerializableAgent, ABC):
 
     def _not_open(self) -> LoopError:
         return LoopError(f"{agent_name(self)} has no episode running; its environments are (re)started at t=0.")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy writes into another workspace."""
+        return {**super().__getstate__(), "_deferring": {}}
 
     # -- spaces ----------------------------------------------------------------------------------------------------
 
@@ -190,6 +245,14 @@ class GymAgent(TimeAgent, SeedableAgent, SerializableAgent, ABC):
     def is_discrete_state(self) -> bool:
         """Whether the observation space is Discrete."""
         return isinstance(self.observation_space, spaces.Discrete)
+
+
+def _numbers(name: str, values: Any, dtypes: Mapping[str, np.dtype[Any]]) -> Any:
+    """One number from each environment as an array (B,)."""
+    array = np.array(values, dtypes[name])
+    if array.ndim != 1:
+        raise ValueMismatch(f"{name!r}: expected one number from each environment, found {values[0]!r}.")
+    return array
 
 
 def _same(array: Any) -> Any:

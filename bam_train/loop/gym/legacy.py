@@ -110,12 +110,11 @@ class _LegacyGymAgent(ParallelGymAgent):
             if save_render:
                 self.set_obs({"rendering": self._to_array(np.array(pictures))}, t)
 
-    def _frame(self, rows: Rows) -> dict[str, Any]:
-        frame = super()._frame(rows)
-        terminated = frame.pop("terminated")
-        frame["truncated"] = frame["truncated"] & ~terminated
-        last = {name: frame.pop(name) for name in ("done", "truncated", "reward", "timestep", "cumulated_reward")}
-        return {**frame, **last}
+    def _numbers(self, rows: Rows) -> dict[str, Any]:
+        numbers = super()._numbers(rows)
+        flags = zip(numbers["truncated"], numbers["terminated"], strict=True)
+        numbers["truncated"] = [truncated and not terminated for truncated, terminated in flags]
+        return {name: numbers[name] for name in ("done", "truncated", "reward", "timestep", "cumulated_reward")}
 
     def _written(self) -> tuple[str, ...]:
         return tuple(name for name in super()._written() if name != f"{self.output}terminated")

@@ -15,12 +15,11 @@ environments depend on the number of resets; rewards that are NumPy float32 are 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bam_train.errors import SettingsError, ValueMismatch
 from bam_train.loop.gym.actions import ActionReader
@@ -123,7 +122,11 @@ class ParallelGymAgent(GymAgent):
             raise self._not_open()
         else:
             rows = self._rows.step(self._actions.rows(self.workspace, t - 1))
-        self.set_obs(self._frame(rows), t)
+        to_array = self._to_array
+        self.set_obs({entry.name: to_array(pack(entry, rows.observations)) for entry in self._entries}, t)
+        self.set_numbers(self._numbers(rows), t)
+        if self._infos is not None:
+            self.set_obs({name: to_array(one) for name, one in self._infos.of_rows(rows.infos).items()}, t)
 
     def _reset(self, seed: Any) -> Rows:
         if not self.envs:
@@ -135,20 +138,24 @@ class ParallelGymAgent(GymAgent):
         self._entries = entries(rows.observations[0], self.observation_space, self.arrays == "torch")
         return rows
 
-    def _frame(self, rows: Rows) -> dict[str, Any]:
-        """All variables of one time as tensors or arrays."""
-        to_array, floats = self._to_array, self._floats
-        frame = {entry.name: to_array(pack(entry, rows.observations)) for entry in self._entries}
-        terminated, truncated = _flags(rows.terminated), _flags(rows.truncated)
-        frame["terminated"] = to_array(terminated)
-        frame["truncated"] = to_array(truncated)
-        frame["done"] = to_array(terminated | truncated)
-        frame["reward"] = to_array(_numbers("reward", rows.rewards, floats))
-        frame["cumulated_reward"] = to_array(np.array(rows.cumulated, floats))
-        frame["timestep"] = to_array(rows.timestep)
-        if self._infos is not None:
-            frame.update((name, to_array(one)) for name, one in self._infos.of_rows(rows.infos).items())
-        return frame
+    def _numbers(self, rows: Rows) -> dict[str, Any]:
+        """One number for each environment, in the order in which the variables are written first.
+
+        Raises:
+            ValueMismatch: A reward is no number.
+        """
+        terminated, truncated, rewards = rows.terminated, rows.truncated, rows.rewards
+        done = [a or b for a, b in zip(terminated, truncated, strict=True)] if any(truncated) else terminated
+        if type(rewards[0]) is not float and np.ndim(rewards) != 1:
+            raise ValueMismatch(f"'reward': expected one number from each environment, found {rewards[0]!r}.")
+        return {
+            "terminated": terminated,
+            "truncated": truncated,
+            "done": done,
+            "reward": rewards,
+            "cumulated_reward": rows.cumulated,
+            "timestep": rows.timestep,
+        }
 
     @staticmethod
     def _format_frame(frame: Any) -> dict[str, Any]:
@@ -157,14 +164,3 @@ class ParallelGymAgent(GymAgent):
 
         found = entries(frame, None, for_torch=True)
         return {entry.name: torch.from_numpy(pack(entry, [frame])) for entry in found}
-
-
-def _flags(values: Sequence[bool]) -> NDArray[np.bool_]:
-    return np.array(values, bool) if any(values) else np.zeros(len(values), bool)
-
-
-def _numbers(name: str, values: Any, dtype: Any) -> Any:
-    array = np.array(values, dtype)
-    if array.ndim != 1:
-        raise ValueMismatch(f"{name!r}: expected one number from each environment, found {values[0]!r}.")
-    return array

@@ -108,7 +108,16 @@ class VecGymAgent(GymAgent):
             raise self._not_open()
         else:
             frame = self._rows.step(self._actions.batch(self.workspace, t - 1))
+        self._write(frame, t)
+
+    def _write(self, frame: dict[str, Any], t: int) -> None:
+        """The variables in the order of `ParallelGymAgent`'s: observation, numbers, infos."""
+        numbers = {name: frame.pop(name) for name in self._dtypes}
+        infos = {name: frame.pop(name) for name in list(frame) if name.startswith("info/")}
         self.set_obs({name: self._to_array(array) for name, array in frame.items()}, t)
+        self.set_numbers(numbers, t)
+        if infos:
+            self.set_obs({name: self._to_array(array) for name, array in infos.items()}, t)
 
     def _reset(self, seed: Any) -> dict[str, Any]:
         if self.envs is None:

@@ -58,8 +58,8 @@ class VectorRows:
         auto_reset: Whether an ended episode is followed by a new one.
         include_last_state: See above.
         infos: Takes entries of the infos; None for none.
-        for_torch: Floats become float32 and integers int64; else observations have the space's dtype and other
-            floats are float64.
+        for_torch: Observations of floats become float32 and of integers int64; else they have the space's dtype.
+            Other floats are float64.
     """
 
     def __init__(
@@ -73,7 +73,6 @@ class VectorRows:
     ) -> None:
         self._envs, self._mode, self._auto_reset, self._include_last = envs, mode, auto_reset, include_last_state
         self._infos, self._for_torch = infos, for_torch
-        self._floats = np.float32 if for_torch else np.float64
         self._entries: list[Entry] = []
         n = envs.num_envs
         self._cumulated, self._timestep = np.zeros(n), np.zeros(n, dtype=np.int64)
@@ -203,8 +202,7 @@ class VectorRows:
 
     def _frame(self, frame: Frame, rewards: Array, terminated: Array, truncated: Array, recorded: Frame) -> Frame:
         frame["terminated"], frame["truncated"], frame["done"] = terminated, truncated, terminated | truncated
-        frame["reward"] = rewards.astype(self._floats)
-        frame["cumulated_reward"] = self._cumulated.astype(self._floats)
+        frame["reward"], frame["cumulated_reward"] = rewards, self._cumulated.copy()
         frame["timestep"] = self._timestep.copy()
         frame.update(recorded)
         return frame

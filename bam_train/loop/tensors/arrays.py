@@ -5,6 +5,12 @@ was written at t and read at t + 1 can still be differentiated through. One that
 
 Unlike BBRL's, the joined form of a list is kept until the next write through the workspace, so that a second full read
 costs a copy only. A stored value that is changed in place after a full read does not show in the next one.
+
+Numbers that few agents read before the rollout is over, such as rewards and flags, can be deferred: they are kept as
+NumPy arrays or lists, and become tensors when they are read, all at once by a full read. Making a tensor costs several
+times what keeping it does.
+
+Longer than most files here: a list, one tensor and deferred numbers are three forms of one variable.
 """
 
 from __future__ import annotations
@@ -12,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 
 from bam_train.errors import WorkspaceError
@@ -39,6 +46,10 @@ class _Joined(NamedTuple):
         return torch.is_grad_enabled() == self.grad_enabled or (self.grad_enabled and not self.tensor.requires_grad)
 
 
+_DEFERRED = (tuple, list, np.ndarray)
+"""What deferred numbers are kept as."""
+
+
 class TensorVariable:
     """One variable, T x B x ...; B x ... at one time.
 
@@ -59,7 +70,8 @@ class TensorVariable:
         make_room: Callable[[int], None] = no_window,
     ) -> None:
         self.name, self.first, self._limit, self._make_room = name, first, limit, make_room
-        self._values: list[torch.Tensor] | None = []
+        self._values: list[Any] | None = []  # tensors, and deferred numbers
+        self._deferred: Any = None  # the NumPy dtype of deferred numbers; None when there are none
         self._whole: torch.Tensor | None = None  # the variable itself when `_values` is None
         self._read: _Joined | None = None
         self._shape: torch.Size | None = None  # of one time; None before the first write
@@ -149,8 +161,28 @@ class TensorVariable:
         index = t - self.first if t >= 0 else len(values) + t
         if 0 <= index < len(values):
             value: torch.Tensor = values[index]
+            if self._deferred is not None and type(value) in _DEFERRED:
+                value = values[index] = torch.from_numpy(np.array(value, self._deferred))
             return value
         raise not_written(self.name, t, self.first, self.stop)
+
+    def defer(self, t: int, numbers: Any, dtype: Any) -> bool:
+        """Keep numbers (B,) that become a tensor when somebody reads them.
+
+        Args:
+            t: The time.
+            numbers: A sequence that nobody changes any more, of the variable's shape: that is not looked at.
+            dtype: The NumPy dtype that becomes the variable's.
+
+        Returns:
+            Whether they were kept: only as the next time of a list on the CPU.
+        """
+        values = self._values
+        if values is None or t - self.first != len(values) or len(values) >= self._limit or not self._is_cpu:
+            return False
+        values.append(numbers)
+        self._deferred, self._read = dtype, None
+        return True
 
     # -- all times -------------------------------------------------------------------------------------------------
 
@@ -174,7 +206,7 @@ class TensorVariable:
         if self._values is None:
             return self._tensor
         if self._read is None or not self._read.is_current():
-            tensor = _joined(self._values)
+            tensor = _joined(self._values) if self._deferred is None else self._joined_deferred(self._values)
             if tensor.is_inference():  # cannot be used outside, where the next reader may be
                 return tensor
             self._read = _Joined(tensor, torch.is_grad_enabled())
@@ -182,6 +214,7 @@ class TensorVariable:
 
     def truncated(self, begin: int, end: int) -> torch.Tensor:
         """Times [begin, end), cut off at the end; a view of one tensor, a copy of a list."""
+        self._settle()
         begin, end = max(0, begin - self.first), max(0, end - self.first)
         if self._values is None:
             return self._tensor[begin:end]
@@ -212,7 +245,25 @@ class TensorVariable:
         if self._values is None:
             self._whole = self._tensor.detach()
         else:
-            self._values = [value.detach() for value in self._values]
+            self._values = [value if type(value) in _DEFERRED else value.detach() for value in self._values]
+
+    # -- deferred numbers ------------------------------------------------------------------------------------------
+
+    def _settle(self) -> None:
+        """Make tensors of all deferred numbers, one for each time."""
+        if self._deferred is not None and self._values is not None:
+            for t in range(self.first, self.stop):
+                self.get(t)
+            self._deferred = None
+
+    def _joined_deferred(self, values: list[Any]) -> torch.Tensor:
+        """All times at once, T x B, some of which are deferred."""
+        try:
+            rows = [value if type(value) in _DEFERRED else value.numpy() for value in values]
+        except RuntimeError:  # one has a gradient
+            self._settle()
+            return _joined(values)
+        return torch.from_numpy(np.array(rows, self._deferred))
 
     # -- growing ---------------------------------------------------------------------------------------------------
 
