@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 import bam_envs  # noqa: F401 - registers the environments
 
 EXAMPLES = """examples:
-  python scripts/bench_loop.py                        every row, about four minutes
+  python scripts/bench_loop.py                        every row, about three minutes
   python scripts/bench_loop.py --quick                fewer rounds and ticks, half a minute
   python scripts/bench_loop.py --only cartpole vector some rows
 """
@@ -468,9 +468,19 @@ def main() -> int:
     for name, bench in BENCHES.items():
         if not arguments.only or name in arguments.only:
             print(f"measuring {name} ...", file=sys.stderr, flush=True)
-            figures.extend(bench(options))
+            figures.extend(figures_of(name, bench, options))
     report(figures)
     return 0
+
+
+def figures_of(name: str, bench: Callable[[Options], Iterator[Figure]], options: Options) -> list[Figure]:
+    """The lines of a bench; one that says so where torch is missing."""
+    try:
+        return list(bench(options))
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        return [Figure(name, "needs torch", "  pip install torch")]
 
 
 def report(figures: list[Figure]) -> None:

@@ -9,7 +9,14 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-NO_BBRL = 'raise ModuleNotFoundError("No module named \'bbrl\'", name="bbrl")\n'
+
+
+def missing(folder, *names):
+    """Packages that cannot be imported, as if they were not installed."""
+    for name in names:
+        error = f'ModuleNotFoundError("No module named {name!r}", name={name!r})'
+        (folder / f"{name}.py").write_text(f"raise {error}\n")
+    return folder
 
 
 def bench(*arguments, before=()):
@@ -43,10 +50,15 @@ def test_an_unknown_row():
 
 def test_without_bbrl_our_own_figure_is_there_and_how_to_compare_it(tmp_path):
     pytest.importorskip("torch")
-    (tmp_path / "bbrl.py").write_text(NO_BBRL)
-    (line,) = table(bench("--quick", "--only", "notebook", before=[tmp_path]))
+    (line,) = table(bench("--quick", "--only", "notebook", before=[missing(tmp_path, "bbrl")]))
     pattern = r"notebook's agents, 10,000 steps +\d+\.\d us/step +pip install bbrl==1\.0\.1 +>= 2x"
     assert re.fullmatch(pattern, line)
+
+
+def test_without_torch_it_says_what_is_missing(tmp_path):
+    (line,) = table(bench("--quick", "--only", "notebook", before=[missing(tmp_path, "torch")]))
+    assert line.split("  ", 1)[0] == "notebook"
+    assert line.endswith(" needs torch       pip install torch")
 
 
 def test_the_deployment_needs_neither_torch_nor_bbrl(tmp_path):
