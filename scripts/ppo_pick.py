@@ -1,23 +1,22 @@
 """PPO (Schulman et al. 2017, arXiv:1707.06347), all of it, on the interaction loop: learn to pick up a cube.
 
-Every quantity is a variable of one workspace, time x environment: the environments write env/env_obs, env/reward, ...,
-the actor sample and log_prob, the critic value, `learn` advantage. Another algorithm is another line where one of them
-is worked out, or one more agent in the chain; print(workspace) and workspace.plot("value", batch=[0]) show them.
+Every quantity is a variable of one workspace, time x environment, that an agent of the chain writes, or `learn`. Change
+the algorithm where it is worked out, or with one more agent; workspace.plot("value", batch=0) shows one over time.
 
 Examples:
   python scripts/ppo_pick.py                                 until 99 % of the episodes succeed
   python scripts/ppo_pick.py --seed 1 --until-success 0.995  another run, a better policy
-  python scripts/ppo_pick.py --steps 20000 --num-envs 16     a short one
 """
 
 import argparse
-import math
 import time
 
 import torch
 from torch import nn
 
+from bam_envs.errors import BamEnvsError
 from bam_train.environments import make_rows
+from bam_train.errors import BamTrainError
 from bam_train.evaluation import FIRST_SEED, evaluate
 from bam_train.loop import Agent, Agents, TemporalAgent, VecGymAgent, Workspace, gae
 
@@ -88,7 +87,7 @@ def learn(workspace: Workspace, actor: Actor, critic: Critic, optimiser: torch.o
     transitions, both = workspace.get_transitions().subtime(0, 1), Agents(actor, critic)  # of each pair the first
     size = transitions.batch_size() or 0
     for _ in range(EPOCHS):
-        for rows in torch.randperm(size).tensor_split(math.ceil(size / BATCH)):
+        for rows in torch.randperm(size).tensor_split(-(-size // BATCH)):
             batch = transitions.select_batch(rows)
             before, value, advantage = batch["log_prob", "value", "advantage"]
             both(batch, t=0, replay=True)
@@ -130,12 +129,11 @@ def train(seed: int, steps: int, until: float, num_envs: int, episodes: int) -> 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add = parser.add_argument
-    add("--seed", type=int, default=0, help="of weights, samples and environments (default 0)")
-    add("--steps", type=int, default=800_000, help="steps after which it ends (default 800000)")
-    add("--until-success", type=float, default=0.99, help="success rate at which it ends (default 0.99)")
-    add("--num-envs", type=int, default=64, help="robots simulated side by side (default 64)")
-    add("--episodes", type=int, default=200, help="episodes of an evaluation (default 200)")
+    parser.add_argument("--seed", type=int, default=0, help="of weights, samples and environments (default 0)")
+    parser.add_argument("--steps", type=int, default=800_000, help="steps to end after (default 800000)")
+    parser.add_argument("--until-success", type=float, default=0.99, help="success rate to end at (default 0.99)")
+    parser.add_argument("--num-envs", type=int, default=64, help="robots simulated side by side (default 64)")
+    parser.add_argument("--episodes", type=int, default=200, help="episodes of an evaluation (default 200)")
     seed, steps, until, num_envs, episodes = options = vars(parser.parse_args()).values()
     if seed < 0 or min(steps, num_envs, episodes) < 1 or not 0 < until <= 1:
         parser.error("--seed must be at least 0, --until-success above 0 and at most 1, the others at least 1")
@@ -143,6 +141,8 @@ def main() -> None:
         train(*options)
     except KeyboardInterrupt:
         parser.exit(130, "stopped by Ctrl-C\n")
+    except (BamEnvsError, BamTrainError) as error:
+        parser.exit(1, f"ppo_pick: {error}\n")
 
 
 if __name__ == "__main__":

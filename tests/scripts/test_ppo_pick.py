@@ -51,7 +51,7 @@ def test_it_is_short_and_needs_no_other_library():
 def test_help_shows_examples(run):
     status, out, err = run("--help")
     assert (status, err) == (0, "")
-    assert out.count("\n  python scripts/ppo_pick.py") == 3
+    assert out.count("\n  python scripts/ppo_pick.py") == 2
     for option in ("--seed", "--steps", "--until-success", "--num-envs", "--episodes"):
         assert f"\n  {option} " in out
 
@@ -129,3 +129,14 @@ def test_the_advantages_end_where_episodes_do(script, monkeypatch):
     first = torch.tensor([0.5 + g * 3 - 1 + decay * last, last, 0, 0])
     second = torch.tensor([1.0 - 2, 0, 2 + g * 8 - 6, 0])  # terminated: no value counts
     torch.testing.assert_close(workspace["advantage"], torch.stack([first, second], dim=1))
+
+
+def test_what_is_missing_is_one_line(run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    for name in [name for name in sys.modules if name.startswith("bam_envs.robots.simulated")]:
+        monkeypatch.delitem(sys.modules, name)
+    status, out, err = run()
+    assert (status, out) == (1, "")
+    assert err.startswith("ppo_pick: ")
+    assert 'pip install "bam-train[sim]"' in err
+    assert err.count("\n") == 1
