@@ -17,7 +17,7 @@ from bam_envs.errors import BamEnvsError
 from bam_train.deploy.agents import JournalAgent, PacerAgent, StartupAgent, Watcher
 from bam_train.deploy.journal import Journal
 from bam_train.deploy.pacer import Pacer
-from bam_train.deploy.signals import Stopped, stop_signals
+from bam_train.deploy.signals import Stopped, StopSwitch, stop_signals
 from bam_train.errors import BamTrainError
 from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, Workspace
 from bam_train.loop.workspace import Sink
@@ -68,7 +68,7 @@ class Deployment:
     ) -> None:
         self._robot, self._journal = RobotAgent(env), journal
         self._workspace = Workspace(window=window, sink=sink)
-        self._loop = TemporalAgent(
+        self._loop = _Loop(
             Agents(
                 self._robot,
                 JournalAgent(journal, pacer),
@@ -91,6 +91,7 @@ class Deployment:
             seed: Seed of the first episode.
         """
         with stop_signals() as switch:
+            self._loop.switch = switch
             try:
                 try:
                     switch.armed = True
@@ -123,6 +124,17 @@ class Deployment:
             if ending.status == 0:
                 return replace(ending, reason=f"fault: closing failed: {fault_text(error)}", status=1)
         return ending
+
+
+class _Loop(TemporalAgent):
+    """Once it has begun to close its agents, the robot's first of all, no signal interrupts it."""
+
+    switch: StopSwitch | None = None
+
+    def _close_after(self, error: BaseException, t: int) -> None:
+        if self.switch is not None:
+            self.switch.armed = False
+        super()._close_after(error, t)
 
 
 def fault_text(error: Exception) -> str:

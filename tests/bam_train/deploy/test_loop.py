@@ -148,6 +148,20 @@ def test_a_second_signal_does_not_stop_the_halt(corridor):
     assert halted == [True]
 
 
+def test_a_signal_while_a_fault_is_halted_changes_nothing(corridor):
+    env = Driven(gym.make(corridor, slow=True), raises(RobotFault("link lost")))
+    halted = []
+
+    def halt():
+        os.kill(os.getpid(), signal.SIGINT)
+        halted.append(True)
+
+    env.robot.halt = halt
+    ending, _, _ = run(env)
+    assert ending == Ending("fault: link lost", 1)
+    assert halted == [True]
+
+
 def test_a_third_signal_gives_up(corridor):
     env = Driven(gym.make(corridor, slow=True), lambda: os.kill(os.getpid(), signal.SIGINT))
 
