@@ -25,6 +25,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from importlib import metadata
 from statistics import median
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -500,7 +501,7 @@ def torch_text() -> str:
     """Which torch and bbrl were used, if any."""
     torch = sys.modules.get("torch")
     version = f"torch {torch.__version__}" if torch else "without torch"
-    return f"{version}, bbrl 1.0.1" if "bbrl" in sys.modules else version
+    return f"{version}, bbrl {metadata.version('bbrl')}" if "bbrl" in sys.modules else version
 
 
 if __name__ == "__main__":
