@@ -82,10 +82,7 @@ class Agent(_Base):  # type: ignore[misc]
         # can come in between in `setdefault`, and every call has a dictionary of keywords of its own.
         own = self.__dict__
         if own.setdefault("_call", kwargs) is not kwargs:
-            raise AgentInUse(
-                f"{agent_name(self)} is running already, in another thread or around this call; "
-                f"give each its own: agent.clone()."
-            )
+            raise in_use(self)
         own["workspace"] = workspace
         try:
             self.forward(**kwargs)
@@ -237,6 +234,14 @@ class Agent(_Base):  # type: ignore[misc]
             raise LoopError(f"{agent_name(self)} has no workspace outside a call; call it: agent(workspace, t=0).")
         workspace: Workspace = self.workspace
         return workspace
+
+
+def in_use(agent: Agent) -> AgentInUse:
+    """The error for an agent that is called while it runs."""
+    return AgentInUse(
+        f"{agent_name(agent)} is running already, in another thread or around this call; "
+        f"give each its own: agent.clone()."
+    )
 
 
 def agent_name(agent: Agent) -> str:

@@ -11,7 +11,7 @@ from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 from bam_train.errors import LoopError
-from bam_train.loop.agent import Agent
+from bam_train.loop.agent import Agent, in_use
 from bam_train.loop.agents import describe, members
 from bam_train.loop.wiring import check_built, check_called
 from bam_train.loop.workspace import Workspace
@@ -88,13 +88,28 @@ class TemporalAgent(Agent):
         kwargs: dict[str, Any],
     ) -> None:
         """The loop itself; ``time[0]`` is where it is."""
-        # Bound methods, and the members of an `Agents` one by one: half the cost of calling the objects.
-        calls = [agent.__call__ for agent in members(self.agent)]
+        # Of each member of an `Agents`: its dictionary, unless it is called in a way of its own, and its forward.
+        plain = Agent.__call__
+        calls = [
+            (one, one.__dict__ if type(one).__call__ is plain else None, one.forward) for one in members(self.agent)
+        ]
+        key = object()
         t = time[0]
         end = None if n_steps is None else t + n_steps
         while True:
-            for call in calls:
-                call(workspace, t=t, **kwargs)
+            for agent, own, forward in calls:
+                if own is None:
+                    agent(workspace, t=t, **kwargs)
+                    continue
+                # What Agent.__call__ does, without its frame and a second copy of the keywords: 0.25 µs less each.
+                if own.setdefault("_call", key) is not key:
+                    raise in_use(agent)
+                own["workspace"] = workspace
+                try:
+                    forward(t=t, **kwargs)
+                finally:
+                    own["workspace"] = None
+                    del own["_call"]
             if advance is not None:
                 advance(1)
             if stop_variable is not None and workspace.get(stop_variable, t).all():

@@ -26,7 +26,7 @@ _NUMBERS = {
     "timestep": np.int64,
 }
 """Variables of one number for each environment, in the order in which they are written."""
-_NOTHING = ("", None, None)
+_NOTHING: tuple[Any, ...] = ("", None, None, None)
 _EMPTY: dict[str, Any] = {}
 
 
@@ -85,7 +85,7 @@ class GymAgent(TimeAgent, SeedableAgent, SerializableAgent, ABC):
         self._nb_reset = 1
         floats = np.float32 if arrays == "torch" else np.float64
         self._dtypes = {name: np.dtype(floats if kind is float else kind) for name, kind in _NUMBERS.items()}
-        self._deferring: dict[str, tuple[str, Any, Any]] = {}
+        self._deferring: dict[str, tuple[Any, ...]] = {}
         self._to_array: Callable[[Any], Any] = torch.from_numpy if arrays == "torch" else _same
         self._infos: InfoRecorder | None = None
 
@@ -126,25 +126,27 @@ class GymAgent(TimeAgent, SeedableAgent, SerializableAgent, ABC):
         """
         rest = numbers
         if self.arrays == "torch" and self._trace is None and not self.reward_at_t and self._device() is None:
-            rest = {key: values for key, values in numbers.items() if not self._defer(key, t, values)}
+            rest = self._defer(numbers, t)
         if rest:
             self.set_obs({key: self._to_array(_numbers(key, values, self._dtypes)) for key, values in rest.items()}, t)
             self._remember(rest)
 
-    def _defer(self, key: str, t: int, values: Any) -> bool:
-        """Write numbers without making a tensor, if the variable is the one that was written before."""
-        name, variable, shape = self._deferring.get(key, _NOTHING)
-        if self.workspace.variables.get(name) is not variable or variable is None or variable._shape is not shape:
-            return False
-        deferred: bool = variable.defer(t, values, self._dtypes[key])
-        return deferred
+    def _defer(self, numbers: Mapping[str, Any], t: int) -> dict[str, Any]:
+        """Write numbers without making tensors, where the variable is the one that was written before; the others."""
+        held, known, rest = self.workspace.variables, self._deferring, {}
+        for key, values in numbers.items():
+            name, variable, shape, dtype = known.get(key, _NOTHING)
+            same = variable is not None and held.get(name) is variable and variable._shape is shape
+            if not same or not variable.defer(t, values, dtype):
+                rest[key] = values
+        return rest
 
     def _remember(self, keys: Iterable[str]) -> None:
         """The variables that have just been written, so that the next times of them may be deferred."""
         for key in keys:
             variable = self.workspace.variables[self.output + key]
             if hasattr(variable, "defer"):
-                self._deferring[key] = (self.output + key, variable, variable._shape)
+                self._deferring[key] = (self.output + key, variable, variable._shape, self._dtypes[key])
 
     def _device(self) -> Any:
         """Where tensors have to go; None if they are there already."""
