@@ -177,7 +177,7 @@ def play_wave(env: VectorEnv[Any, Any, Any], policy: BatchPolicy, seed: int, cou
 
     The surplus rows of a last, smaller wave run too (a vector environment steps all rows) and are ignored.
     """
-    rows = VecGymAgent(lambda: env, auto_reset=False, arrays="numpy", info_keys=("is_success",))
+    rows = _Rows(lambda: env, auto_reset=False, arrays="numpy", info_keys=("is_success",))
     acting = PolicyAgent(policy, [f"env/{name}" for name in names(env.single_observation_space)])
     workspace = Workspace(window=2)
     seeds = [seed + i for i in range(env.num_envs)]
@@ -205,6 +205,13 @@ def film_episodes(env: gym.Env[Any, Any], policy: Any, add: Callable[[Frame], An
     for k in range(episodes):
         loop(Workspace(window=2), t=0, stop_variable="env/done", seed=seed + k)
     return film.count
+
+
+class _Rows(VecGymAgent):
+    """An environment that is somebody else's: an exception does not close it."""
+
+    def close(self) -> None:
+        """Nothing."""
 
 
 class _Wave(Agent):

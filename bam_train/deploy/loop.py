@@ -7,7 +7,7 @@ Ctrl-C, SIGTERM, a fault) the robot is halted and closed before anything is repo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -50,6 +50,7 @@ class Deployment:
         agents: More agents, run behind the policy; they say what they read and write.
         window: Ticks that the workspace keeps at least.
         sink: ``sink(first_time, {variable: array (n, 1, ...)})`` gets every tick once, in order, episode by episode.
+            It is called between two ticks, so it has to be quick; a failure ends the deployment.
 
     Raises:
         WiringError: An agent reads what nobody writes; nothing has been connected.
@@ -67,7 +68,7 @@ class Deployment:
         sink: Sink | None = None,
     ) -> None:
         self._robot, self._journal = RobotAgent(env), journal
-        self._workspace = Workspace(window=window, sink=sink)
+        self._workspace = Workspace(window=window, sink=None if sink is None else _once_broken_silent(sink))
         self._loop = _Loop(
             Agents(
                 self._robot,
@@ -104,34 +105,51 @@ class Deployment:
             except Exception as error:  # whatever went wrong: the robot has to be halted and the report made
                 ending = Ending(f"fault: {fault_text(error)}", 1)
             except BaseException:
-                self._robot.halt()
+                if not self._loop.closing:
+                    self._robot.halt()
                 raise
-            return self._close(ending)
+            ending = _unless_it_fails(ending, "closing", self._robot.close)
+            return _unless_it_fails(ending, "recording", self._workspace.flush)  # of an episode cut short
 
     def _episodes(self, watcher: Watcher, seed: int) -> None:
-        try:
-            for k in range(self._journal.wanted):
-                self._loop(self._workspace, t=0, stop_variable="env/done", seed=seed + k, watcher=watcher)
-                self._workspace.flush()
-        finally:
-            self._workspace.flush()  # of an episode cut short
+        for k in range(self._journal.wanted):
+            self._loop(self._workspace, t=0, stop_variable="env/done", seed=seed + k, watcher=watcher)
+            self._robot.halt()  # a sink may take its time, and so may the next reset
+            self._workspace.flush()
 
-    def _close(self, ending: Ending) -> Ending:
-        """Halt and drop the link; a failure to is a fault too, unless there was one before."""
-        try:
-            self._robot.close()
-        except Exception as error:  # an environment's own business, and the report must come out all the same
-            if ending.status == 0:
-                return replace(ending, reason=f"fault: closing failed: {fault_text(error)}", status=1)
-        return ending
+
+def _unless_it_fails(ending: Ending, what: str, end: Callable[[], None]) -> Ending:
+    """Call `end`; that it fails is a fault too, unless there was one before."""
+    try:
+        end()
+    except Exception as error:  # somebody else's business, and the report must come out all the same
+        if ending.status == 0:
+            return replace(ending, reason=f"fault: {what} failed: {fault_text(error)}", status=1)
+    return ending
+
+
+def _once_broken_silent(sink: Sink) -> Sink:
+    """The sink, which is not called any more after it has failed."""
+    broken = False
+
+    def guarded(first_time: int, piece: dict[str, Any]) -> None:
+        nonlocal broken
+        if not broken:
+            broken = True  # while it runs: whatever leaves it
+            sink(first_time, piece)
+            broken = False
+
+    return guarded
 
 
 class _Loop(TemporalAgent):
     """Once it has begun to close its agents, the robot's first of all, no signal interrupts it."""
 
     switch: StopSwitch | None = None
+    closing: bool = False
 
     def _close_after(self, error: BaseException, t: int) -> None:
+        self.closing = True
         if self.switch is not None:
             self.switch.armed = False
         super()._close_after(error, t)

@@ -59,7 +59,7 @@ class Agents(Agent):
     def close(self) -> None:
         """Close every member, those that move something real first; a failure is raised at the end."""
         with ExitStack() as stack:  # closes what is left when one fails, last one first
-            for agent in sorted(self._members(), key=lambda member: member.live):
+            for agent in sorted(self._members(), key=is_live):
                 stack.callback(agent.close)
 
     def get_by_name(self, n: str) -> list[Agent]:
@@ -76,8 +76,11 @@ class Agents(Agent):
     def __iter__(self) -> Iterator[Agent]:
         return iter(self._members())
 
-    def _parts(self) -> tuple[Agent, ...]:
+    def _inner(self) -> tuple[Agent, ...]:
         return tuple(self._members())
+
+    def _parts(self) -> tuple[Agent, ...] | None:
+        return self._inner() if type(self).__call__ is Agents.__call__ else None
 
     def _members(self) -> Iterable[Agent]:
         # Past nn.Module's __getattr__ and ModuleList's own, which cost as much as a small agent.
@@ -111,8 +114,11 @@ class KWAgentWrapper(Agent):
         """Close the agent."""
         self.wrapped.close()
 
-    def _parts(self) -> tuple[Agent, ...]:
+    def _inner(self) -> tuple[Agent, ...]:
         return (self.wrapped,)
+
+    def _parts(self) -> tuple[Agent, ...] | None:
+        return self._inner() if type(self).forward is KWAgentWrapper.forward else None
 
 
 class CopyTAgent(Agent):
@@ -195,6 +201,11 @@ def leaves(agent: Agent) -> list[Agent]:
     """The agents that do the work, in the order in which they run."""
     parts = agent._parts()
     return [agent] if parts is None else [leaf for part in parts for leaf in leaves(part)]
+
+
+def is_live(agent: Agent) -> bool:
+    """Whether it, or an agent in it, moves something real."""
+    return agent.live or any(is_live(one) for one in agent._inner())
 
 
 def describe(agent: Agent) -> str:

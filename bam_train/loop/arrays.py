@@ -145,12 +145,11 @@ class NumpyVariable:
 
     def set_full(self, value: NDArray[Any]) -> None:
         """Copy T x B x ... in. Over single times it overwrites the first T and leaves the rest, as BBRL does."""
+        require_full(self.name, value, np.ndarray, self.KIND)
         if self._sliced and self._shape is not None:
             for k, row in enumerate(value):
-                self.set(self.first + k, row)
-            self._sliced = True
+                self.set(self.first + k, np.asarray(row))
             return
-        require_full(self.name, value, np.ndarray, self.KIND)
         self._buffer = np.array(value)
         self._count, self._shape, self._sliced = len(value), value.shape[1:], False
 

@@ -15,8 +15,8 @@ from bam_train.loop.agent import Agent
 class PolicyAgent(Agent):
     """Reads the observation at t and writes the action.
 
-    The policy's recurrent state is forgotten where an episode begins (``env/timestep`` is 0). Once every row's episode
-    has ended nothing is written: nobody would use it.
+    The policy's recurrent state is forgotten where an episode begins (``env/timestep`` is 0); so with environments that
+    leave out the last state (``include_last_state=False``) a recurrent policy forgets one step late.
 
     Args:
         policy: Has ``reset(rows=None)`` and ``act_batch(observations)``, or ``act(observation)`` with `single`.
@@ -56,11 +56,10 @@ class PolicyAgent(Agent):
         Raises:
             PolicyError: An action that is not finite.
         """
-        if self.get((self._done, t)).all():
-            return
         self._begin(t)
         action = self._act(t)
-        require_finite(action, f"at step {t} of {_episode(seed)}")
+        if not self.get((self._done, t)).all():  # once all have ended, nobody does what it says
+            require_finite(action, f"at step {t} of {_episode(seed)}")
         self.set((self.output, t), action[None] if self.single else action)
 
     def _begin(self, t: int) -> None:
@@ -76,7 +75,7 @@ class PolicyAgent(Agent):
     def _act(self, t: int) -> NDArray[Any]:
         values = [self.get((name, t)) for name in self.names]
         if self.single:
-            values = [value[0] for value in values]
+            values = [value[0].copy() for value in values]  # the policy may keep it
         observation = values[0] if self._keys is None else dict(zip(self._keys, values, strict=True))
         return np.asarray(self.policy.act(observation) if self.single else self.policy.act_batch(observation))
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from bam_train.errors import LoopError
 from bam_train.loop.agent import Agent
-from bam_train.loop.gym.observations import NAME, names
+from bam_train.loop.gym.observations import Entry, entries, names, pack
 
 FLAGS = ("terminated", "truncated", "done")
 SUCCESS = "info/is_success"
@@ -52,6 +51,7 @@ class RobotAgent(Agent):
         writes = (*self.observation_names, *(output_string + name for name in rest))
         self._declare(RobotAgent, reads=(), reads_previous=(input_string,), writes=writes)
         self._total, self._steps = 0.0, 0
+        self._entries: list[Entry] = []
         self._running = self._closed = False
 
     def connect(self) -> None:
@@ -74,8 +74,10 @@ class RobotAgent(Agent):
             return
         try:
             self.halt()
-        finally:
+        except Exception:
             self.env.close()  # type: ignore[no-untyped-call]
+            raise
+        self.env.close()  # type: ignore[no-untyped-call]
         self._closed = True
 
     def forward(self, t: int, seed: int | None = None, **kwargs: Any) -> None:
@@ -87,6 +89,7 @@ class RobotAgent(Agent):
         if t == 0:
             self._closed = False
             observation, info = self.env.reset(seed=seed)
+            self._entries = entries(observation, self.env.observation_space, for_torch=False)
             self._total, self._steps, self._running = 0.0, 0, True
             self._write(t, observation, 0.0, (False, False), info)
             return
@@ -94,7 +97,7 @@ class RobotAgent(Agent):
             raise LoopError(
                 f"No episode is running in {self.env.spec.id if self.env.spec else self.env}; begin at t=0."
             )
-        action = self.get((self.input, t - 1))[0]
+        action = self.get((self.input, t - 1))[0].copy()  # the environment may change it
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._total += float(reward)
         self._steps += 1
@@ -112,8 +115,8 @@ class RobotAgent(Agent):
             SUCCESS: np.array([bool(info.get("is_success", False))]),
             SAYS_SUCCESS: np.array(["is_success" in info]),
         }
-        for name, value in flat(observation, self.output + NAME):
-            self.set((name, t), np.asarray(value)[None])
+        for entry in self._entries:
+            self.set((self.output + entry.name, t), pack(entry, [observation]))
         for name, value in values.items():
             self.set((self.output + name, t), value)
 
@@ -121,12 +124,3 @@ class RobotAgent(Agent):
 def robot_of(env: gym.Env[Any, Any]) -> Any:
     """The robot of a `RobotEnv`, or None."""
     return getattr(env.unwrapped, "robot", None)
-
-
-def flat(observation: Any, name: str) -> Iterator[tuple[str, NDArray[Any]]]:
-    """The arrays of an observation, with the names of their variables."""
-    if isinstance(observation, Mapping):
-        for key, part in observation.items():
-            yield from flat(part, f"{name}/{key}")
-    else:
-        yield name, observation

@@ -10,9 +10,9 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
-from bam_train.errors import LoopError
+from bam_train.errors import LoopError, WiringError
 from bam_train.loop.agent import Agent, in_use
-from bam_train.loop.agents import describe, members
+from bam_train.loop.agents import describe, is_live, members
 from bam_train.loop.wiring import check_built, check_called
 from bam_train.loop.workspace import Workspace
 
@@ -61,6 +61,7 @@ class TemporalAgent(Agent):
             kwargs: Given to every agent.
 
         Raises:
+            AgentInUse: It is running already: loops are not shared by threads.
             LoopError: Neither `n_steps` nor `stop_variable`, or no workspace.
             WiringError: An agent reads what nobody writes, or nobody writes the stop variable.
             UnknownVariable: Nobody has written the stop variable at the first time.
@@ -69,13 +70,30 @@ class TemporalAgent(Agent):
             raise LoopError("TemporalAgent: when should it stop? Give n_steps, stop_variable or both.")
         if workspace is None:
             raise LoopError("TemporalAgent needs a workspace, found None.")
-        check_called(self.agent, workspace.keys(), stop_variable)
-        time = [t]
+        own, key, time = self.__dict__, object(), [t]
+        begun = False
         try:
+            if own.setdefault("_call", key) is not key:
+                raise in_use(self)
+            self._check(workspace, stop_variable)
+            begun = True
             with self._advance(n_steps, t) as advance:
                 self._run(workspace, time, n_steps, stop_variable, advance, kwargs)
         except BaseException as error:
-            self._close_after(error, time[0])
+            if begun:
+                self._close_after(error, time[0])
+            raise
+        finally:
+            if "_call" in own and own["_call"] is key:
+                del own["_call"]
+
+    def _check(self, workspace: Workspace, stop_variable: str | None) -> None:
+        """Check who reads what; a robot that is waiting for the next call is halted when something is wrong."""
+        try:
+            check_called(self.agent, workspace.keys(), stop_variable)
+        except WiringError:
+            if is_live(self.agent):
+                self.agent.close()
             raise
 
     def _run(
@@ -102,14 +120,15 @@ class TemporalAgent(Agent):
                     agent(workspace, t=t, **kwargs)
                     continue
                 # What Agent.__call__ does, without its frame and a second copy of the keywords: 0.25 µs less each.
-                if own.setdefault("_call", key) is not key:
-                    raise in_use(agent)
-                own["workspace"] = workspace
                 try:
+                    if own.setdefault("_call", key) is not key:
+                        raise in_use(agent)
+                    own["workspace"] = workspace
                     forward(t=t, **kwargs)
                 finally:
-                    own["workspace"] = None
-                    del own["_call"]
+                    if "_call" in own and own["_call"] is key:
+                        own["workspace"] = None
+                        del own["_call"]
             if advance is not None:
                 advance(1)
             if stop_variable is not None and workspace.get(stop_variable, t).all():
@@ -137,8 +156,11 @@ class TemporalAgent(Agent):
             for note in notes:
                 error.add_note(note)
 
-    def _parts(self) -> tuple[Agent, ...]:
+    def _inner(self) -> tuple[Agent, ...]:
         return (self.agent,)
+
+    def _parts(self) -> tuple[Agent, ...] | None:
+        return self._inner() if type(self).__call__ is TemporalAgent.__call__ else None
 
     def __getstate__(self) -> dict[str, Any]:
         """A display of the caller's stays with the original."""

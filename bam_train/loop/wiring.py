@@ -13,7 +13,7 @@ from collections.abc import Iterable
 
 from bam_train.errors import WiringError
 from bam_train.loop.agent import Agent, agent_name
-from bam_train.loop.agents import leaves
+from bam_train.loop.agents import is_live, leaves
 
 
 def check_built(agent: Agent) -> None:
@@ -22,16 +22,20 @@ def check_built(agent: Agent) -> None:
     Raises:
         WiringError: An agent does not say what it reads and writes, or reads what nobody writes.
     """
+    if is_live(agent):
+        _check(_declared(agent), frozenset(), None)
+
+
+def _declared(agent: Agent) -> list[Agent]:
+    """The agents of a chain, all of which say what they read and write."""
     chain = leaves(agent)
-    if not any(one.live for one in chain):
-        return
     for one in chain:
         if one.reads is None or one.writes is None:
             raise WiringError(
                 f"{agent_name(one)} is in a chain with a robot and does not say what it reads and writes; "
                 f'give its class reads = ("name", ...) and writes = ("name", ...).'
             )
-    _check(chain, frozenset(), None)
+    return chain
 
 
 def check_called(agent: Agent, held: Iterable[str], stop_variable: str | None) -> None:
@@ -40,7 +44,7 @@ def check_called(agent: Agent, held: Iterable[str], stop_variable: str | None) -
     Raises:
         WiringError: An agent reads what nobody writes, or nobody writes the stop variable.
     """
-    chain = leaves(agent)
+    chain = _declared(agent) if is_live(agent) else leaves(agent)
     if not any(one.writes is None for one in chain):
         _check(chain, frozenset(held), stop_variable)
 

@@ -21,6 +21,7 @@ Longer than most files here: BBRL's users find every member in one class.
 from __future__ import annotations
 
 import sys
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, KeysView, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -51,7 +52,8 @@ class Workspace:
         workspace: Begin as a copy of this one, sharing no memory.
         window: Keep at least the last so many times and forget older ones; None keeps all.
         sink: Gets what leaves the window, in order: ``sink(first_time, {name: array (n, B, ...)})``. A variable that
-            nobody wrote at these times is shorter or absent.
+            nobody wrote at these times is shorter or absent. It is called by the write that needs room: a loop with a
+            deadline waits for it.
 
     Attributes:
         variables: The variables by name, in the order of their first write.
@@ -69,6 +71,7 @@ class Workspace:
         self.variables: dict[str, Variable] = {}
         self.first_time = 0
         self.window, self._sink = window, sink
+        self._outbox: deque[tuple[int, dict[str, Any]]] = deque()  # what the sink has still to get
         self._limit = UNLIMITED if window is None else window + max(window, _LEAST_PIECE)
         if workspace is not None:
             for name, variable in workspace.variables.items():
@@ -372,8 +375,9 @@ class Workspace:
         """Give all that is left to the sink, forget it, and begin again at time 0."""
         stop = max((one.stop for one in self.variables.values()), default=0)
         if stop > self.first_time:
-            self._give(stop)
+            self._take_out(stop)
         self.clear()
+        self._deliver()
 
     def _convert_to_shared_workspace(self, n_repeat: int = 1, time_size: int | None = None) -> Workspace:
         """A copy in memory that processes share, repeated over the batch; for remote agents."""
@@ -505,22 +509,27 @@ class Workspace:
     def _make_room(self, t: int) -> None:
         """Forget so much that time t fits; what is forgotten goes to the sink."""
         first = t - (self.window or 0) + 1
-        self._give(first)
+        self._take_out(first)
         for one in self.variables.values():
             one.drop(first)
-        self.first_time = first
+        self._deliver()
 
-    def _give(self, stop: int) -> None:
-        """Give the times before `stop` to the sink."""
+    def _deliver(self) -> None:
+        """Give the sink what is waiting for it; each piece once, also if the sink fails."""
+        while self._outbox and self._sink is not None:
+            self._sink(*self._outbox.popleft())
+
+    def _take_out(self, stop: int) -> None:
+        """Keep the times before `stop` for the sink, and count them as forgotten."""
+        first, self.first_time = self.first_time, stop
         if self._sink is None:
             return
-        first = self.first_time
         piece = {
             name: one.copied(one.truncated(first, min(stop, one.stop)))  # of a tensor it would be a view
             for name, one in self.variables.items()
             if one.stop > first
         }
-        self._sink(first, piece)
+        self._outbox.append((first, piece))
 
 
 def _as_bool(array: Any) -> Any:

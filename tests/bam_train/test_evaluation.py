@@ -92,7 +92,7 @@ def test_recurrent_state_is_forgotten_at_the_start_of_every_wave(corridor, start
     rows.close()
     assert [[episode.length for episode in wave] for wave in waves] == [[1, 2], [1, 2]]
     assert policy.forgotten == [None, None]
-    assert len(policy.batches) == 4
+    assert len(policy.batches) == 6  # at the end of an episode too, for nobody
 
 
 def test_given_rows_are_used_again_and_left_open(corridor):
@@ -167,3 +167,15 @@ def test_same_seeds_same_numbers_on_gymnasium():
     assert one.success_rate is None
     assert 8 <= one.length_mean <= 11
     assert one.return_mean == one.length_mean
+
+
+def test_given_rows_are_left_open_after_an_exception():
+    class Broken(Always):
+        def act_batch(self, observations):
+            return np.full((len(observations), 1), np.nan, np.float32)
+
+    rows = make_rows("Pendulum-v1", None, 2)
+    with pytest.raises(PolicyError):
+        evaluate(Broken(), "Pendulum-v1", episodes=2, env=rows)
+    assert not rows.closed
+    rows.close()

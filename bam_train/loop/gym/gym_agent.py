@@ -169,9 +169,8 @@ class GymAgent(TimeAgent, SeedableAgent, SerializableAgent, ABC):
 
     def _written(self) -> tuple[str, ...]:
         """The names of all variables that it writes."""
-        flags = ("terminated", "truncated", "done", "reward", "cumulated_reward", "timestep")
         infos = [name for key in self.info_keys for name in (f"info/{key}", f"info/_{key}")]
-        return tuple(self.output + name for name in (*names(self.get_observation_space()), *flags, *infos))
+        return tuple(self.output + name for name in (*names(self.get_observation_space()), *_NUMBERS, *infos))
 
     def _row_seeds(self, seed: Any) -> int | list[int | None]:
         """What the environments are reset with at t = 0: one seed to count from, or one for each.

@@ -81,6 +81,7 @@ class ParallelGymAgent(GymAgent):
 
     def _open(self) -> None:
         """Make the environments and look at their spaces."""
+        self._closed = False
         self.envs: list[Env] = [self._make() for _ in range(self.num_envs)]
         self.observation_space = self.envs[0].observation_space
         self.action_space = self.envs[0].action_space
@@ -96,10 +97,12 @@ class ParallelGymAgent(GymAgent):
     def close(self) -> None:
         """Close the environments; they are made anew at the next t = 0."""
         self._rows = None
+        if self._closed:
+            return
+        self._closed = True
         with ExitStack() as stack:  # all of them, also when one fails
             for env in self.envs:
                 stack.callback(env.close)
-            self.envs = []
 
     def forward(self, t: int = 0, **kwargs: Any) -> None:
         """One step of every environment with the action of t - 1; at t = 0 all are reset.
@@ -123,13 +126,16 @@ class ParallelGymAgent(GymAgent):
         else:
             rows = self._rows.step(self._actions.rows(self.workspace, t - 1))
         to_array = self._to_array
-        self.set_obs({entry.name: to_array(pack(entry, rows.observations)) for entry in self._entries}, t)
-        self.set_numbers(self._numbers(rows), t)
-        if self._infos is not None:
-            self.set_obs({name: to_array(one) for name, one in self._infos.of_rows(rows.infos).items()}, t)
+        observations = {entry.name: to_array(pack(entry, rows.observations)) for entry in self._entries}
+        numbers = self._numbers(rows)
+        infos = {} if self._infos is None else self._infos.of_rows(rows.infos)
+        self.set_obs(observations, t)  # once all is known to be right
+        self.set_numbers(numbers, t)
+        if infos:
+            self.set_obs({name: to_array(one) for name, one in infos.items()}, t)
 
     def _reset(self, seed: Any) -> Rows:
-        if not self.envs:
+        if self._closed:
             self._open()
         seeds = self._row_seeds(seed)
         each = [seeds + k for k in range(self.num_envs)] if isinstance(seeds, int) else seeds

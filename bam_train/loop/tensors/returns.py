@@ -94,7 +94,7 @@ def temporal_difference(
         ValueMismatch: The shapes do not fit.
     """
     _require_shapes("temporal_difference", critic.shape, reward=reward)
-    _require_transitions("temporal_difference", critic, must_bootstrap)
+    must_bootstrap = _flags("temporal_difference", critic, must_bootstrap)
     target = reward[1:] + discount_factor * critic[1:].detach() * must_bootstrap.to(critic.dtype)
     return _with_last_row(target - critic[:-1])
 
@@ -131,7 +131,7 @@ def doubleqlearning_temporal_difference(
     name = "doubleqlearning_temporal_difference"
     _require_shapes(name, q.shape, q_target=q_target)
     _require_shapes(name, q.shape[:-1], action=action, reward=reward)
-    _require_transitions(name, reward, must_bootstrap)
+    must_bootstrap = _flags(name, reward, must_bootstrap)
     best = _of_action(q_target, q.argmax(-1)).detach()
     target = reward[1:] + discount_factor * best[1:] * must_bootstrap.to(best.dtype)
     return _with_last_row(target - _of_action(q, action)[:-1])
@@ -170,9 +170,12 @@ def _with_last_row(differences: torch.Tensor) -> torch.Tensor:
     return torch.cat([differences, differences.new_zeros((1, *differences.shape[1:]))])
 
 
-def _require_transitions(function: str, rows: torch.Tensor, must_bootstrap: torch.Tensor) -> None:
-    """Refuse flags that are not one a transition."""
+def _flags(function: str, rows: torch.Tensor, must_bootstrap: torch.Tensor) -> torch.Tensor:
+    """One flag for each transition, (T - 1) x B; of `get_transitions`, where T is 2, (B,) will do."""
+    if len(rows) == 2 and must_bootstrap.shape == rows.shape[1:]:
+        return must_bootstrap.unsqueeze(0)
     _require_shapes(function, rows[1:].shape, must_bootstrap=must_bootstrap)
+    return must_bootstrap
 
 
 def _require_shapes(function: str, expected: torch.Size, **tensors: torch.Tensor) -> None:

@@ -1,3 +1,5 @@
+import os
+import signal
 import tracemalloc
 
 import gymnasium as gym
@@ -12,7 +14,7 @@ from bam_train.deploy.journal import KEPT, Journal
 from bam_train.deploy.loop import Deployment, Ending
 from bam_train.deploy.pacer import Pacer
 from bam_train.errors import WiringError
-from bam_train.loop import Agent
+from bam_train.loop import Agent, CopyTAgent
 
 
 class Right:
@@ -73,7 +75,7 @@ def test_the_sink_gets_every_tick_once_episode_by_episode(corridor, starting_cel
         cells = list(range(starting_cell(seed), 5))
         assert piece["env/env_obs"].ravel().tolist() == cells
         assert piece["env/timestep"].ravel().tolist() == list(range(len(cells)))
-        assert piece["action"].ravel().tolist() == [1] * (len(cells) - 1)
+        assert piece["action"].ravel().tolist() == [1] * len(cells)  # of the last one nothing comes
 
 
 def test_the_sink_gets_the_ticks_of_an_episode_that_was_cut_short(corridor):
@@ -95,6 +97,57 @@ def test_a_sink_that_fails_is_a_fault(corridor):
 
     deployment = Deployment(gym.make(corridor), Right(), Pacer(None), Journal(2), sink=sink)
     assert deployment.run(Silent(), seed=7) == Ending("fault: OSError: [Errno 28] No space left on device", 1)
+
+
+def test_a_sink_is_not_called_again_after_it_failed(corridor):
+    calls = []
+
+    def sink(first, piece):
+        calls.append(first)
+        raise OSError("full")
+
+    deployment = Deployment(Endless(), Right(), Pacer(None), Journal(1), window=40, sink=sink)
+    assert deployment.run(Silent(), seed=0) == Ending("fault: OSError: full", 1)
+    assert calls == [0]
+
+
+def test_a_sink_that_fails_at_the_end_does_not_hide_the_fault(corridor):
+    class Breaks(gym.Wrapper):
+        def step(self, action):
+            raise ValueError("the real cause")
+
+    def sink(first, piece):
+        raise OSError("full")
+
+    deployment = Deployment(Breaks(gym.make(corridor)), Right(), Pacer(None), Journal(1), sink=sink)
+    assert deployment.run(Silent(), seed=0) == Ending("fault: ValueError: the real cause", 1)
+
+
+def test_the_robot_is_halted_before_the_sink_may_take_its_time(corridor):
+    calls = []
+    env = gym.make(corridor)
+    env.unwrapped.robot = type("Robot", (), {"halt": lambda self: calls.append("halt")})()
+    Deployment(env, Right(), Pacer(None), Journal(2), sink=lambda *piece: calls.append("sink")).run(Silent(), seed=7)
+    assert calls == ["halt", "sink", "halt", "sink", "halt"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_inside_the_sink(corridor, number):
+    pieces = []
+
+    def sink(first, piece):
+        pieces.append(first)
+        os.kill(os.getpid(), number)
+
+    deployment = Deployment(gym.make(corridor), Right(), Pacer(None), Journal(3), sink=sink)
+    assert deployment.run(Silent(), seed=7) == Ending("interrupted", 128 + number)
+    assert pieces == [0]
+
+
+def test_agents_behind_the_policy_may_read_its_action_at_the_end(corridor):
+    chain = [CopyTAgent("action", "sent")]
+    deployment = Deployment(gym.make(corridor), Right(), Pacer(None), Journal(3), agents=chain)
+    assert deployment.run(Silent(), seed=7) == Ending("episodes done", 0)
 
 
 def test_agents_of_ones_own_join_the_chain(corridor, starting_cell):

@@ -94,7 +94,7 @@ def test_all_episodes(corridor, starting_cell):
     assert watcher.episodes == [7, 8, 9]
     assert policy.resets == 3
     assert policy.seen[0] == [starting_cell(7)]
-    assert env.robot.calls == ["halt", "close"]
+    assert env.robot.calls == ["halt", "halt", "halt", "halt", "close"]  # after every episode, and at the end
 
 
 def test_the_time_limit_is_not_the_end_of_the_task(corridor):
@@ -129,7 +129,7 @@ def test_a_signal_halts(corridor, number, status):
     env = Driven(gym.make(corridor, slow=True), lambda: os.kill(os.getpid(), number), at=12)
     ending, journal, _ = run(env)
     assert ending == Ending("interrupted", status)
-    assert env.robot.calls == ["halt", "close"]
+    assert env.robot.calls == ["halt", "halt", "close"]  # after the first episode, and at the end
     assert [record.end for record in journal.records] == ["truncated", "stopped"]
     assert signal.getsignal(number) is before
 

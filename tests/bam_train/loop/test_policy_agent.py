@@ -1,8 +1,9 @@
+import gymnasium as gym
 import numpy as np
 import pytest
 
 from bam_train.errors import PolicyError
-from bam_train.loop import PolicyAgent, Workspace
+from bam_train.loop import Agents, ParallelGymAgent, PolicyAgent, TemporalAgent, VecGymAgent, Workspace, make_env
 
 
 class Recorded:
@@ -19,6 +20,14 @@ class Recorded:
         return np.arange(3) if self.action is None else self.action
 
     act = act_batch
+
+
+def make_parallel():
+    return ParallelGymAgent(lambda: make_env("CartPole-v1", autoreset=True), 1, arrays="numpy")
+
+
+def make_vector():
+    return VecGymAgent(lambda: gym.make_vec("CartPole-v1", 1, vectorization_mode="sync"), arrays="numpy")
 
 
 def at(workspace, t, timestep, done=False, **observations):
@@ -38,15 +47,41 @@ def test_rows_whose_episode_begins_are_forgotten():
     assert workspace["action"].tolist() == [[0, 1, 2]] * 5
 
 
-def test_nothing_is_written_when_every_episode_has_ended():
+def test_it_acts_at_ended_rows_too():
+    """An environment with auto-reset reads the action of the row at which all have ended."""
     policy, workspace = Recorded(), Workspace()
-    agent = PolicyAgent(policy)
-    at(workspace, 0, [4, 5, 6], done=[True, True, False])
-    agent(workspace, t=0)
-    at(workspace, 1, [4, 5, 7], done=True)
-    agent(workspace, t=1)
-    assert workspace["action"].shape == (1, 3)
-    assert len(policy.seen) == 1
+    at(workspace, 0, [4, 5, 6], done=True)
+    PolicyAgent(policy)(workspace, t=0)
+    assert workspace["action"].tolist() == [[0, 1, 2]]
+
+
+@pytest.mark.parametrize("make", [make_parallel, make_vector])
+def test_environments_with_auto_reset(make):
+    """Always to the left: every episode of CartPole is over within some ten steps."""
+    workspace = Workspace()
+    agent = PolicyAgent(Recorded(np.zeros(1, np.int64)))
+    TemporalAgent(Agents(make(), agent))(workspace, t=0, n_steps=60)
+    assert workspace["env/done"].sum() >= 4
+    assert workspace["action"].shape == (60, 1)
+
+
+def test_what_is_not_finite_is_forgiven_when_all_have_ended():
+    workspace = Workspace()
+    at(workspace, 0, [4], done=True)
+    PolicyAgent(Recorded(np.array([[np.nan]])))(workspace, t=0)
+    assert np.isnan(workspace["action"]).all()
+
+
+def test_the_policy_may_change_what_it_was_given():
+    class Changes(Recorded):
+        def act(self, observation):
+            observation *= 0
+            return np.int64(1)
+
+    workspace = Workspace()
+    at(workspace, 0, [0], env_obs=np.array([[1.0, 2.0]], np.float32))
+    PolicyAgent(Changes(), single=True)(workspace, t=0)
+    assert workspace["env/env_obs"].tolist() == [[[1.0, 2.0]]]
 
 
 def test_a_single_row_has_no_batch_axis_for_the_policy():

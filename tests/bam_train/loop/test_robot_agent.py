@@ -7,7 +7,7 @@ from bam_envs.robot_env import RobotEnv
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.tasks.pick import PickTask
 from bam_train.errors import LoopError, WiringError
-from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, Workspace
+from bam_train.loop import Agent, Agents, KWAgentWrapper, PolicyAgent, RobotAgent, TemporalAgent, Workspace
 
 
 class Choose(Agent):
@@ -167,3 +167,76 @@ def test_closing_halts_first_and_only_once(corridor):
     robot.close()
     robot.close()
     assert calls == ["halt", "close"]
+
+
+def test_observations_have_the_dtype_of_the_space():
+    """Also where reset and step give different ones."""
+
+    class Mixed(gym.Env):
+        observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+        action_space = gym.spaces.Discrete(2)
+
+        def reset(self, *, seed=None, options=None):
+            return np.zeros(2), {}
+
+        def step(self, action):
+            return np.ones(2, np.float16), 0, False, True, {}
+
+    workspace = Workspace()
+    TemporalAgent(Agents(RobotAgent(Mixed()), Choose(1)))(workspace, stop_variable="env/done")
+    assert workspace["env/env_obs"].dtype == np.float32
+    assert workspace["env/env_obs"].tolist() == [[[0, 0]], [[1, 1]]]
+
+
+def test_the_environment_may_change_the_action_it_was_given(corridor):
+    class Changes(gym.Wrapper):
+        action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+        def step(self, action):
+            action *= 0
+            return super().step(1)
+
+    workspace = Workspace()
+    TemporalAgent(Agents(RobotAgent(Changes(gym.make(corridor))), Choose([0.5, 1.0])))(workspace, n_steps=2)
+    assert workspace["action"].tolist() == [[[0.5, 1.0]]] * 2
+
+
+@pytest.mark.parametrize(
+    "wrap", [lambda robot: robot, Agents, KWAgentWrapper, lambda robot: TemporalAgent(robot.chain)]
+)
+def test_a_robot_is_halted_before_anything_else_is_closed(wrap):
+    calls = []
+
+    class Camera(Agent):
+        reads = writes = ()
+
+        def close(self):
+            calls.append("camera")
+
+    robot = RobotAgent(robot_env())
+    robot.halt = lambda: calls.append("halt")
+    robot.chain = Agents(robot, Choose(np.zeros(5, np.float32)))
+    Agents(Camera(), wrap(robot), Choose(np.zeros(5, np.float32))).close()
+    assert calls == ["halt", "camera"]
+
+
+def test_a_wrong_call_halts_a_robot_that_is_waiting():
+    env = robot_env()
+    robot, workspace = env.unwrapped.robot, Workspace()
+    loop = TemporalAgent(Agents(RobotAgent(env), Choose(np.zeros(5, np.float32))))
+    loop(workspace, n_steps=2)
+    before = robot.halts
+    with pytest.raises(WiringError, match=r"^stop_variable 'env/don' is written by nobody, did you mean 'env/done'\?"):
+        loop(workspace, t=2, stop_variable="env/don")
+    assert robot.halts > before
+
+
+def test_an_agent_that_joins_later_has_to_say_what_it_does():
+    class Silent(Agent):
+        def forward(self, t, **kwargs):
+            pass
+
+    loop = TemporalAgent(Agents(RobotAgent(robot_env()), Choose(np.zeros(5, np.float32))))
+    loop.agent.agents.append(Silent())
+    with pytest.raises(WiringError, match=r"^Silent is in a chain with a robot and does not say"):
+        loop(Workspace(), n_steps=1)

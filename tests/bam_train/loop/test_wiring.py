@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bam_train.errors import WiringError
-from bam_train.loop import Agent, Agents, KWAgentWrapper, TemporalAgent, Workspace
+from bam_train.loop import Agent, Agents, CopyTAgent, KWAgentWrapper, TemporalAgent, Workspace
 
 
 class Step(Agent):
@@ -124,3 +124,14 @@ def test_in_a_chain_with_a_robot_every_agent_has_to_say(agent):
         "Step is in a chain with a robot and does not say what it reads and writes; "
         'give its class reads = ("name", ...) and writes = ("name", ...).'
     )
+
+
+def test_a_container_that_does_more_than_run_its_members_says_nothing():
+    class More(Agents):
+        def __call__(self, workspace, **kwargs):
+            super().__call__(workspace, **kwargs)
+            workspace.set("extra", kwargs["t"], workspace.get("obs", kwargs["t"]))
+
+    workspace = Workspace()
+    TemporalAgent(Agents(More(Step((), ("obs",))), CopyTAgent("extra", "copy")))(workspace, n_steps=2)
+    assert "copy" in workspace
