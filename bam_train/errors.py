@@ -91,17 +91,22 @@ class LoopError(BamTrainError):
 class UnknownVariable(LoopError, LookupError):  # noqa: N818 - reads as what happened
     """A variable that nobody wrote; the text has the closest match.
 
+    Args:
+        name: As it was asked for.
+        known: Names that there are.
+        role: What it was asked for as, such as ``"stop_variable"``.
+
     Attributes:
         name: As it was asked for.
     """
 
-    def __init__(self, name: str, known: Iterable[str]) -> None:
+    def __init__(self, name: str, known: Iterable[str], role: str = "") -> None:
         self.name = name
         names = sorted(known)
         close = difflib.get_close_matches(str(name), names, n=1)
         question = f", did you mean {close[0]!r}?" if close else "."
         has = f" It has {', '.join(map(repr, names))}." if names else " It is empty."
-        super().__init__(f"{name!r} is not in the workspace{question}{has}")
+        super().__init__(f"{role} {name!r} is not in the workspace{question}{has}".lstrip())
 
 
 class TimeNotWritten(LoopError, LookupError):  # noqa: N818

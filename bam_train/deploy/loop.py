@@ -148,11 +148,11 @@ class _Loop(TemporalAgent):
     switch: StopSwitch | None = None
     closing: bool = False
 
-    def _close_after(self, error: BaseException, t: int) -> None:
+    def _close_after(self, error: BaseException) -> None:
         self.closing = True
         if self.switch is not None:
             self.switch.armed = False
-        super()._close_after(error, t)
+        super()._close_after(error)
 
 
 def fault_text(error: Exception) -> str:

@@ -122,7 +122,14 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in _ON_USE:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_ON_USE[name]}"), name)
+    try:
+        value = getattr(importlib.import_module(f"{__name__}.{_ON_USE[name]}"), name)
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        from bam_envs.errors import MissingExtra  # brings Gymnasium
+
+        raise MissingExtra("torch", "train", f"bam_train.loop.{name}") from error
     globals()[name] = value
     return value
 

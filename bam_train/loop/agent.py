@@ -200,15 +200,11 @@ class Agent(_Base):  # type: ignore[misc]
 
     def save_model(self, filename: Any) -> None:
         """Save the whole agent with ``torch.save``: a pickle, which runs code when it is read."""
-        import torch
-
-        torch.save(self, filename)
+        import_torch("Agent.save_model()").save(self, filename)
 
     def load_model(self, filename: Any) -> Any:
         """The agent in a file of `save_model`. It is a pickle and runs what is in it: read only files you trust."""
-        import torch
-
-        return torch.load(filename, weights_only=False)
+        return import_torch("Agent.load_model()").load(filename, weights_only=False)
 
     def set_trace_file(self, filename: Any) -> None:
         """Write a line to this file for every `get` and `set`, until `close_trace_file`."""
@@ -247,6 +243,21 @@ def in_use(agent: Agent) -> AgentInUse:
         f"{agent_name(agent)} is running already, in another thread or around this call; "
         f"give each its own: agent.clone()."
     )
+
+
+def import_torch(purpose: str) -> Any:
+    """The module torch.
+
+    Raises:
+        MissingExtra: It is not installed; says how to install it for `purpose`.
+    """
+    try:
+        import torch
+    except ModuleNotFoundError as error:
+        from bam_envs.errors import MissingExtra  # brings Gymnasium
+
+        raise MissingExtra("torch", "train", purpose) from error
+    return torch
 
 
 def agent_name(agent: Agent) -> str:

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
-from bam_train.errors import LoopError, WiringError
-from bam_train.loop.agent import Agent, in_use
+from bam_train.errors import LoopError, UnknownVariable, WiringError
+from bam_train.loop.agent import Agent, agent_name, in_use
 from bam_train.loop.agents import describe, is_live, members
 from bam_train.loop.wiring import check_built, check_called
 from bam_train.loop.workspace import Workspace
@@ -56,7 +56,7 @@ class TemporalAgent(Agent):
         Args:
             workspace: What it reads and writes.
             t: The first time.
-            n_steps: How many times, at least one; None for until the stop variable says.
+            n_steps: How many times; one at least, as in BBRL. None for until the stop variable says.
             stop_variable: Stop after a time at which it is true for the whole batch.
             kwargs: Given to every agent.
 
@@ -70,7 +70,8 @@ class TemporalAgent(Agent):
             raise LoopError("TemporalAgent: when should it stop? Give n_steps, stop_variable or both.")
         if workspace is None:
             raise LoopError("TemporalAgent needs a workspace, found None.")
-        own, key, time = self.__dict__, object(), [t]
+        _require_steps(n_steps)
+        own, key = self.__dict__, object()
         begun = False
         try:
             if own.setdefault("_call", key) is not key:
@@ -78,10 +79,10 @@ class TemporalAgent(Agent):
             self._check(workspace, stop_variable)
             begun = True
             with self._advance(n_steps, t) as advance:
-                self._run(workspace, time, n_steps, stop_variable, advance, kwargs)
+                self._run(workspace, t, n_steps, stop_variable, advance, kwargs)
         except BaseException as error:
             if begun:
-                self._close_after(error, time[0])
+                self._close_after(error)
             raise
         finally:
             if "_call" in own and own["_call"] is key:
@@ -99,44 +100,46 @@ class TemporalAgent(Agent):
     def _run(
         self,
         workspace: Workspace,
-        time: list[int],
+        t: int,
         n_steps: int | None,
         stop_variable: str | None,
         advance: Callable[[int], None] | None,
         kwargs: dict[str, Any],
     ) -> None:
-        """The loop itself; ``time[0]`` is where it is."""
+        """The loop itself."""
         # Of each member of an `Agents`: its dictionary, unless it is called in a way of its own, and its forward.
         plain = Agent.__call__
         calls = [
             (one, one.__dict__ if type(one).__call__ is plain else None, one.forward) for one in members(self.agent)
         ]
         key = object()
-        t = time[0]
         end = None if n_steps is None else t + n_steps
         while True:
-            for agent, own, forward in calls:
-                if own is None:
-                    agent(workspace, t=t, **kwargs)
-                    continue
-                # What Agent.__call__ does, without its frame and a second copy of the keywords: 0.25 µs less each.
-                try:
-                    if own.setdefault("_call", key) is not key:
-                        raise in_use(agent)
-                    own["workspace"] = workspace
-                    forward(t=t, **kwargs)
-                finally:
-                    if "_call" in own and own["_call"] is key:
-                        own["workspace"] = None
-                        del own["_call"]
+            try:
+                for agent, own, forward in calls:
+                    if own is None:
+                        agent(workspace, t=t, **kwargs)
+                        continue
+                    # What Agent.__call__ does, without its frame and a second copy of the keywords: 0.25 µs less each.
+                    try:
+                        if own.setdefault("_call", key) is not key:
+                            raise in_use(agent)
+                        own["workspace"] = workspace
+                        forward(t=t, **kwargs)
+                    finally:
+                        if "_call" in own and own["_call"] is key:
+                            own["workspace"] = None
+                            del own["_call"]
+            except BaseException as error:
+                _note(error, f"In {agent_name(agent)} of {describe(self.agent)} at t={t}.")
+                raise
             if advance is not None:
                 advance(1)
-            if stop_variable is not None and workspace.get(stop_variable, t).all():
+            if stop_variable is not None and _is_reached(workspace, stop_variable, t):
                 return
             t += 1
             if end is not None and t >= end:
                 return
-            time[0] = t
 
     def _advance(self, n_steps: int | None, t: int) -> Any:
         if self.progress is False:
@@ -145,16 +148,12 @@ class TemporalAgent(Agent):
 
         return progress_display(self.progress, n_steps, t, self.name or "steps")
 
-    def _close_after(self, error: BaseException, t: int) -> None:
-        """Close all agents, and note in the error where it came from."""
-        notes = [f"In {describe(self.agent)} at t={t}."]
+    def _close_after(self, error: BaseException) -> None:
+        """Close all agents."""
         try:
             self.agent.close()
         except Exception as failure:  # the first error is the one to be seen
-            notes.append(f"Closing failed too: {type(failure).__name__}: {failure}")
-        if hasattr(error, "add_note"):  # Python 3.11
-            for note in notes:
-                error.add_note(note)
+            _note(error, f"Closing failed too: {type(failure).__name__}: {failure}")
 
     def _inner(self) -> tuple[Agent, ...]:
         return (self.agent,)
@@ -185,3 +184,26 @@ class TemporalAgent(Agent):
     def get_by_name(self, n: str) -> list[Agent]:
         """The agents of that name in the tree: members first, then the container."""
         return self.agent.get_by_name(n) + super().get_by_name(n)
+
+
+def _require_steps(n_steps: Any) -> None:
+    """Refuse what is no number.
+
+    Raises:
+        LoopError: It is none.
+    """
+    if not (n_steps is None or isinstance(n_steps, (int, float)) or hasattr(n_steps, "__index__")):
+        raise LoopError(f"n_steps: expected a whole number, found {n_steps!r}.")
+
+
+def _is_reached(workspace: Workspace, stop_variable: str, t: int) -> bool:
+    """Whether the stop variable is true for the whole batch."""
+    try:
+        return bool(workspace.get(stop_variable, t).all())
+    except UnknownVariable:
+        raise UnknownVariable(stop_variable, workspace.keys(), "stop_variable") from None
+
+
+def _note(error: BaseException, text: str) -> None:
+    if hasattr(error, "add_note"):  # Python 3.11
+        error.add_note(text)

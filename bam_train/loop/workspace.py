@@ -68,6 +68,8 @@ class Workspace:
     ) -> None:
         if window is not None and window < 2:
             raise WorkspaceError(f"window: expected at least 2 times (the last and the one before), found {window}.")
+        if sink is not None and not callable(sink):
+            raise WorkspaceError(f"sink: expected sink(first_time, values), found {type(sink).__name__}.")
         self.variables: dict[str, Variable] = {}
         self.first_time = 0
         self.window, self._sink = window, sink
@@ -93,7 +95,10 @@ class Workspace:
         except KeyError:
             self._set_first(name, t, value)
         else:
-            variable.set(t, value)
+            try:
+                variable.set(t, value)
+            except (TypeError, IndexError):
+                raise _no_time(name, t) from None
 
     def get(self, name: str, t: int) -> Any:
         """The value at time t, B x ...; -1 is the last.
@@ -106,7 +111,10 @@ class Workspace:
             variable = self.variables[name]
         except KeyError:
             raise UnknownVariable(name, self.variables) from None
-        return variable.get(t)
+        try:
+            return variable.get(t)
+        except (TypeError, IndexError):
+            raise _no_time(name, t) from None
 
     def set_full(self, name: str, value: Any) -> None:
         """Write all times at once, T x B x ....
@@ -347,6 +355,8 @@ class Workspace:
         """
         if no_final_state:
             return self._of({name: self._pairs(name, None) for name in self.variables})
+        if filter_key not in self.variables:
+            raise UnknownVariable(filter_key, self.variables, "filter_key")
         inside = ~_as_bool(self.get_full(filter_key)[:-1])
         for name, one in self.variables.items():
             if one.time_size() != self.variables[filter_key].time_size():
@@ -530,6 +540,10 @@ class Workspace:
             if one.stop > first
         }
         self._outbox.append((first, piece))
+
+
+def _no_time(name: str, t: Any) -> WorkspaceError:
+    return WorkspaceError(f"{name!r}: expected a whole number as time, found {t!r}.")
 
 
 def _as_bool(array: Any) -> Any:

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import Space, spaces
 
 from bam_train.errors import LoopError, SettingsError, ValueMismatch
-from bam_train.loop.agent import agent_name
+from bam_train.loop.agent import agent_name, import_torch
 from bam_train.loop.conventions import SeedableAgent, SerializableAgent, TimeAgent
 from bam_train.loop.gym.infos import InfoRecorder
 from bam_train.loop.gym.observations import names
@@ -73,8 +73,8 @@ class GymAgent(TimeAgent, SeedableAgent, SerializableAgent, ABC):
             raise SettingsError(f'arrays: expected "torch" or "numpy", found {arrays!r}.')
         if isinstance(info_keys, str):
             raise SettingsError(f"info_keys: expected several names, found {info_keys!r}; write ({info_keys!r},).")
-        if arrays == "torch":
-            import torch  # before Agent.__init__, which then makes this a module
+        if arrays == "torch":  # before Agent.__init__, which then makes this a module
+            torch = import_torch(f'{type(self).__name__} (unless arrays="numpy" is given)')
         super().__init__(*args, **kwargs)
         self.input, self.output = input_string, output_string
         self.reward_at_t, self.include_last_state = reward_at_t, include_last_state

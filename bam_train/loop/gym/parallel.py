@@ -15,10 +15,11 @@ environments depend on the number of resets; rewards that are NumPy float32 are 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from bam_train.errors import SettingsError, ValueMismatch
@@ -69,6 +70,11 @@ class ParallelGymAgent(GymAgent):
         *args: Any,
         **kwargs: Any,
     ) -> None:
+        if "autoreset" in kwargs or "auto_reset" in kwargs:
+            raise SettingsError(
+                "ParallelGymAgent begins new episodes where the environment has Gymnasium's Autoreset wrapper: "
+                "give autoreset=True to make_env, not to it."
+            )
         super().__init__(*args, **kwargs)
         if isinstance(num_envs, bool) or not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
             raise SettingsError(f"num_envs: expected a whole number of at least 1, found {num_envs!r}.")
@@ -83,6 +89,7 @@ class ParallelGymAgent(GymAgent):
         """Make the environments and look at their spaces."""
         self._closed = False
         self.envs: list[Env] = [self._make() for _ in range(self.num_envs)]
+        _require_envs(self.envs)
         self.observation_space = self.envs[0].observation_space
         self.action_space = self.envs[0].action_space
         self._is_autoreset = has_autoreset(self.envs[0])
@@ -92,6 +99,11 @@ class ParallelGymAgent(GymAgent):
         self._declare(ParallelGymAgent, reads=None, writes=self._written())
 
     def _make(self) -> Env:
+        if not callable(self.make_env_fn):
+            raise SettingsError(
+                f"make_env_fn: expected a function that makes an environment, found {self.make_env_fn!r}; "
+                f'write partial(make_env, "CartPole-v1") or a lambda.'
+            )
         return self.make_env_fn(**self._make_env_args)
 
     def close(self) -> None:
@@ -170,3 +182,18 @@ class ParallelGymAgent(GymAgent):
 
         found = entries(frame, None, for_torch=True)
         return {entry.name: torch.from_numpy(pack(entry, [frame])) for entry in found}
+
+
+def _require_envs(envs: Sequence[Any]) -> None:
+    """Refuse what cannot be stepped one by one.
+
+    Raises:
+        SettingsError: Not an environment, a vector environment, or one environment several times.
+    """
+    for env in envs:
+        if isinstance(env, gym.vector.VectorEnv):
+            raise SettingsError("make_env_fn: expected single environments, found a vector one: use VecGymAgent.")
+        if not all(hasattr(env, name) for name in ("reset", "step", "observation_space", "action_space")):
+            raise SettingsError(f"make_env_fn: expected it to return a gymnasium.Env, found {type(env).__name__}.")
+    if len({id(env) for env in envs}) < len(envs):
+        raise SettingsError("make_env_fn: expected a new environment at every call, found the same one again.")

@@ -57,6 +57,11 @@ class VecGymAgent(GymAgent):
     def _open(self) -> None:
         """Make the environment and look at its spaces."""
         self.envs: Any = self.make_envs_fn(**self._vec_env_args)
+        if not isinstance(self.envs, VectorEnv):
+            raise SettingsError(
+                f"make_envs_fn: expected it to return a gymnasium.vector.VectorEnv, found {type(self.envs).__name__}; "
+                f"single environments are ParallelGymAgent's."
+            )
         self.num_envs = self.envs.num_envs
         self.observation_space = self.envs.single_observation_space
         self.action_space = self.envs.single_action_space

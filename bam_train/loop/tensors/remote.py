@@ -123,7 +123,12 @@ class NRemoteAgent(Agent):
         if num_processes < 0:
             raise WorkspaceError(f"num_processes: expected at least 0, found {num_processes}.")
         workspace, trial = Workspace(), copy.deepcopy(agent)
-        trial.seed(0)
+        try:
+            trial.seed(0)
+        except LoopError as error:
+            raise LoopError(
+                f"NRemoteAgent.create: give it an agent without a seed, and seed what it returns. {error}"
+            ) from error
         try:
             trial(workspace, **extra_kwargs)
         finally:

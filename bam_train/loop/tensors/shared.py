@@ -194,7 +194,7 @@ def _index(name: str, t: int, times: int) -> int:
     if t >= times:
         raise WorkspaceError(
             f"{name!r} at t={t}: a shared workspace has a fixed length, and this one has {times} times; "
-            f"make it longer: NRemoteAgent.create(..., time_size={t + 1})."
+            f"make it as long as the run: NRemoteAgent.create(..., time_size=...), {t + 1} at least."
         )
     if t < -times:
         raise not_written(name, t, 0, times)

@@ -1,11 +1,14 @@
 """What a workspace refuses, word for word; every refusal leaves it as it was."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
 
 from bam_train.errors import BamTrainError, LoopError, TimeNotWritten, UnknownVariable, ValueMismatch, WorkspaceError
-from bam_train.loop import Workspace
+from bam_train.loop import Agents, TemporalAgent, Workspace
 
 
 @pytest.fixture
@@ -45,7 +48,6 @@ def test_exceptions_are_python_exceptions_of_the_same_kind():
         lambda ws: ws.remove_variable("rewrd"),
         lambda ws: ws.copy_time(0, 1, 1, var_names=["rewrd"]),
         lambda ws: ws.copy_n_last_steps(1, var_names=["rewrd"]),
-        lambda ws: ws.get_transitions(filter_key="rewrd"),
     ],
 )
 def test_an_unknown_name(ws, read):
@@ -54,7 +56,7 @@ def test_an_unknown_name(ws, read):
 
 
 def test_an_unknown_name_like_no_other(ws):
-    text = "'env/done' is not in the workspace. It has 'action', 'obs', 'reward'."
+    text = "filter_key 'env/done' is not in the workspace. It has 'action', 'obs', 'reward'."
     assert text_of(UnknownVariable, ws.get_transitions) == text
     assert text_of(UnknownVariable, lambda: Workspace()["x"]) == "'x' is not in the workspace. It is empty."
 
@@ -232,3 +234,52 @@ def test_arrays_go_to_no_other_device():
     ws.set("x", 0, np.zeros(1))
     text = text_of(WorkspaceError, lambda: ws.to("cuda:0"))
     assert text == "A NumPy array cannot be moved to cuda:0; only tensors can."
+
+
+@pytest.mark.parametrize("t", ["a", None, 1.5, (0,)])
+def test_a_time_that_is_no_whole_number(ws, t):
+    text = f"'obs': expected a whole number as time, found {t!r}."
+    assert text_of(WorkspaceError, lambda: ws.get("obs", t)) == text
+
+
+def test_a_sink_that_cannot_be_called():
+    assert text_of(WorkspaceError, lambda: Workspace(window=2, sink=3)) == (
+        "sink: expected sink(first_time, values), found int."
+    )
+
+
+@pytest.mark.parametrize("n_steps", ["3", [2], {}])
+def test_steps_that_are_no_number(n_steps):
+    loop = TemporalAgent(Agents())
+    assert text_of(LoopError, lambda: loop(Workspace(), n_steps=n_steps)) == (
+        f"n_steps: expected a whole number, found {n_steps!r}."
+    )
+
+
+WITHOUT_TORCH = """
+import sys
+sys.modules["torch"] = None
+import bam_train.loop as loop
+from bam_envs.errors import MissingExtra
+for use in (
+    lambda: loop.ReplayBuffer,
+    lambda: loop.ParallelGymAgent(None, 1),
+    lambda: loop.Agent().save_model("x"),
+    lambda: loop.Agent().load_model("x"),
+):
+    try:
+        use()
+    except MissingExtra as error:
+        print(error)
+"""
+
+
+def test_without_torch_it_says_what_to_install():
+    done = subprocess.run([sys.executable, "-c", WITHOUT_TORCH], capture_output=True, text=True, check=True)
+    needs = 'needs torch, which is not installed. Run: pip install "bam-train[train]"'
+    assert done.stdout.splitlines() == [
+        f"bam_train.loop.ReplayBuffer {needs}",
+        f'ParallelGymAgent (unless arrays="numpy" is given) {needs}',
+        f"Agent.save_model() {needs}",
+        f"Agent.load_model() {needs}",
+    ]

@@ -150,8 +150,8 @@ def test_an_exception_halts_the_robot_and_earlier_times_stay():
     with pytest.raises(ResetNeeded, match="not connected"):
         robot.step(np.zeros((1, 7)))
     assert workspace["env/timestep"].ravel().tolist() == [0, 1, 2]
-    assert getattr(caught.value, "__notes__", ["In Agents(RobotAgent, Choose, Fails) at t=2."]) == [
-        "In Agents(RobotAgent, Choose, Fails) at t=2."
+    assert getattr(caught.value, "__notes__", ["In Fails of Agents(RobotAgent, Choose, Fails) at t=2."]) == [
+        "In Fails of Agents(RobotAgent, Choose, Fails) at t=2."
     ]
     loop.agent.agents[2].forward = lambda t, **kwargs: None
     loop(workspace, t=0, n_steps=3)  # it can begin again

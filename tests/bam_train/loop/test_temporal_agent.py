@@ -100,7 +100,7 @@ def test_neither_steps_nor_a_stop_variable(kind):
 def test_a_stop_variable_that_nobody_writes(kind):
     with pytest.raises(UnknownVariable) as error:
         TemporalAgent(Clock(kind))(Workspace(), stop_variable="dnoe")
-    assert str(error.value) == "'dnoe' is not in the workspace, did you mean 'done'? It has 'done', 'x'."
+    assert str(error.value) == "stop_variable 'dnoe' is not in the workspace, did you mean 'done'? It has 'done', 'x'."
 
 
 def test_no_workspace(kind):
@@ -205,7 +205,7 @@ def test_an_exception_leaves_what_was_written_and_closes_every_agent(kind):
     assert (clock.closed, later.closed) == (1, 1)
     assert clock.workspace is later.workspace is None
     if hasattr(error.value, "__notes__"):
-        assert error.value.__notes__ == ["In Agents(Clock, Later) at t=2."]
+        assert error.value.__notes__ == ["In Clock of Agents(Clock, Later) at t=2."]
     clock.fails_at = None
     TemporalAgent(Agents(clock, later))(ws, t=2, n_steps=2)
     kind.check(ws["y"][2:], [[-2.0, -2.0], [-3.0, -3.0]])
@@ -236,7 +236,7 @@ def test_the_first_error_is_the_one_that_is_seen(kind):
     assert (clock.closed, stuck.closed) == (1, 1)
     if hasattr(error.value, "__notes__"):
         assert error.value.__notes__ == [
-            "In Agents(Clock, Stuck) at t=0.",
+            "In Clock of Agents(Clock, Stuck) at t=0.",
             "Closing failed too: OSError: will not close",
         ]
 

@@ -7,7 +7,7 @@ import torch
 from gymnasium.wrappers import Autoreset
 
 from bam_train.errors import LoopError, SettingsError
-from bam_train.loop import ParallelGymAgent, Workspace
+from bam_train.loop import ParallelGymAgent, VecGymAgent, Workspace
 
 
 def test_variables_are_those_of_bbrl(toys):
@@ -217,3 +217,41 @@ def test_float32_rewards_are_summed_as_bbrl_sums_them(toys):
     for _ in range(59):
         expected = expected + np.float32(0.1)
     assert ws["env/cumulated_reward"][-1].item() == float(np.float32(expected))
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        ("CartPole-v1", "make_env_fn: expected a function that makes an environment, found 'CartPole-v1'; "),
+        (lambda: None, "make_env_fn: expected it to return a gymnasium.Env, found NoneType."),
+        (
+            lambda: gym.make_vec("CartPole-v1", 2),
+            "make_env_fn: expected single environments, found a vector one: use VecGymAgent.",
+        ),
+    ],
+)
+def test_what_makes_no_environment(make, text):
+    with pytest.raises(SettingsError) as caught:
+        ParallelGymAgent(make, 2)
+    assert str(caught.value).startswith(text)
+
+
+def test_one_environment_twice():
+    env = gym.make("CartPole-v1")
+    with pytest.raises(SettingsError) as caught:
+        ParallelGymAgent(lambda: env, 2)
+    assert str(caught.value) == "make_env_fn: expected a new environment at every call, found the same one again."
+
+
+def test_autoreset_is_the_environments():
+    with pytest.raises(SettingsError, match=r"give autoreset=True to make_env, not to it\.$"):
+        ParallelGymAgent(lambda: gym.make("CartPole-v1"), 2, autoreset=True)
+
+
+def test_a_single_environment_is_no_vector_environment():
+    with pytest.raises(SettingsError) as caught:
+        VecGymAgent(lambda: gym.make("CartPole-v1"))
+    assert str(caught.value) == (
+        "make_envs_fn: expected it to return a gymnasium.vector.VectorEnv, found TimeLimit; "
+        "single environments are ParallelGymAgent's."
+    )

@@ -125,15 +125,15 @@ def test_numpy_memory_survives_pickling():
         (
             lambda shared, x: shared.set("x", 3, x),
             WorkspaceError,
-            "'x' at t=3: a shared workspace has a fixed length, and this one has 3 times; make it longer: "
-            "NRemoteAgent.create(..., time_size=4).",
+            "'x' at t=3: a shared workspace has a fixed length, and this one has 3 times; make it as long as the run: "
+            "NRemoteAgent.create(..., time_size=...), 4 at least.",
         ),
         (lambda shared, x: shared.set("x", -4, x), TimeNotWritten, "'x' is not written at t=-4; it has times 0 to 2."),
         (
             lambda shared, x: shared.set_full("x", shared["x"][[0, 0, 0, 0]]),
             WorkspaceError,
-            "'x' at t=3: a shared workspace has a fixed length, and this one has 3 times; make it longer: "
-            "NRemoteAgent.create(..., time_size=4).",
+            "'x' at t=3: a shared workspace has a fixed length, and this one has 3 times; make it as long as the run: "
+            "NRemoteAgent.create(..., time_size=...), 4 at least.",
         ),
         (lambda shared, x: shared.set("x", 0, x[:1]), ValueMismatch, "'x' at t=0: expected shape (2,), found (1,)."),
         (
