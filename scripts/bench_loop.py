@@ -428,7 +428,7 @@ def deploy(length: int, ticks: int) -> tuple[Watch, int, float]:
     watch, clock, left = Watch(), Clock(), [0]
 
     def sink(first: int, piece: Mapping[str, Any]) -> None:
-        left[0] += len(piece["action"])
+        left[0] += int(np.count_nonzero(piece["env/timestep"]))  # 0 is a reset
 
     pacer = Pacer(0.05, now=clock.now, sleep=clock.sleep)
     deployment = Deployment(Still(length), Linear(), pacer, Journal(ticks // length), sink=sink)
