@@ -244,7 +244,9 @@ def test_an_agent_that_is_seeded_already():
     class Seeded(SeedableAgent, Walker):
         pass
 
-    with pytest.raises(LoopError, match=r"^NRemoteAgent.create: give it an agent without a seed, and seed what it returns. Seeded is seeded with 3 already"):
+    with pytest.raises(
+        LoopError, match=r"give it an agent without a seed, and seed what it returns\. Seeded is seeded with 3"
+    ):
         NRemoteAgent.create(Seeded(seed=3), 1, t=0)
 
 
