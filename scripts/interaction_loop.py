@@ -9,8 +9,13 @@ Example:
 
 # %% script only
 import argparse
+import sys
+from importlib.util import find_spec
 
 argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+for package, extra in (("torch", "train"), ("matplotlib", "notebook")):
+    if find_spec(package) is None:
+        sys.exit(f'interaction_loop: {package} is not installed. Run: pip install "bam-train[{extra}]"')
 
 # %% [markdown]
 # # The interaction loop in practice

@@ -42,7 +42,7 @@ def test_no_interruption_leaves_an_agent_in_use():
             with suppress(InterruptError):
                 signal.setitimer(signal.ITIMER_REAL, 5e-5)
                 workspace = Workspace()
-                while True:
+                for _ in range(10_000):
                     loop(workspace, n_steps=3)
                     single(workspace, t=0)
     finally:
