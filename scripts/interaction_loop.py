@@ -17,6 +17,16 @@ for package, extra in (("torch", "train"), ("matplotlib", "notebook")):
     if find_spec(package) is None:
         sys.exit(f'interaction_loop: {package} is not installed. Run: pip install "bam-train[{extra}]"')
 
+
+def say_stopped(kind, error, trace):
+    if kind is not KeyboardInterrupt:
+        sys.__excepthook__(kind, error, trace)
+    else:
+        print("interaction_loop: stopped by Ctrl-C", file=sys.stderr)
+
+
+sys.excepthook = say_stopped
+
 # %% [markdown]
 # # The interaction loop in practice
 #

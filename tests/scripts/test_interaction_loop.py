@@ -3,6 +3,7 @@
 import importlib.util
 import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -43,6 +44,27 @@ def test_it_solves_cartpole():
     last = re.fullmatch(r"epoch \d+: ([\d.]+) over 100 episodes: solved", lines[-1])
     assert last, lines[-1]
     assert float(last[1]) >= 475
+
+
+def test_ctrl_c_is_one_line():
+    """Once it has begun to train."""
+    with subprocess.Popen(
+        [sys.executable, "-u", str(SCRIPT)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "MPLBACKEND": "agg"},
+    ) as process:
+        try:
+            for line in process.stdout:
+                if line.startswith("epoch "):
+                    break
+            process.send_signal(signal.SIGINT)
+            _, errors = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert errors == "interaction_loop: stopped by Ctrl-C\n"
+    assert process.returncode in (130, -signal.SIGINT)
 
 
 def test_help():

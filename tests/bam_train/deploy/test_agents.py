@@ -171,7 +171,7 @@ def test_an_agent_that_reads_what_nobody_writes_is_refused_before_the_robot_is_c
 
 @pytest.mark.parametrize("limit", [None, 4], ids=["one endless episode", "many short ones"])
 def test_memory_stays_flat(limit):
-    """A sink that keeps nothing; 3,000 ticks fill the window, 20,000 more add nothing."""
+    """A sink that keeps nothing; 8,000 ticks fill the window and all records, 20,000 more add nothing."""
     held = []
 
     class Looks(Silent):
