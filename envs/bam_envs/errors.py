@@ -8,7 +8,15 @@
     ├── MissingExtra           an optional dependency is not installed; carries the pip command
     ├── ResetNeeded            `step` before `reset`, or after the episode ended
     └── RobotFault             the robot or the link to it went wrong; never an episode's end
-        └── PhysicsDiverged    the simulation left the finite numbers
+        ├── PhysicsDiverged    the simulation left the finite numbers
+        ├── LinkLost           the link is down: nothing was sent, nothing is kept to be sent later
+        │   ├── NoServer       nobody there, or not what was expected: refused, silent, certificate, token
+        │   └── StaleState     the link is there, and no fresh state came in time
+        ├── ProtocolError      the other end said what it must not: which field, expected, found
+        ├── RemoteError        the other end refused or failed; carries its own text
+        │   └── NotInCommand   another client is in command there
+        ├── StartNotReached    the start pose was not reached in time; carries the joints
+        └── SafetyStop         a guard stopped the robot; latched until a person resumes; carries the guard
 
 Third-party errors are mapped to these at the border, with the cause kept by ``from``.
 """
@@ -75,3 +83,68 @@ class RobotFault(BamEnvsError, RuntimeError):  # noqa: N818
 
 class PhysicsDiverged(RobotFault):
     """The simulated state is no longer finite; carries the rows in its text."""
+
+
+class LinkLost(RobotFault):
+    """The link is down. Nothing was sent, and nothing is kept to be sent later."""
+
+
+class NoServer(LinkLost):
+    """No usable server at an address: the text says what was tried, what came back, and how to start one.
+
+    Attributes:
+        url: The address.
+    """
+
+    def __init__(self, url: str, message: str) -> None:
+        self.url = url
+        super().__init__(f"{url}: {message}")
+
+
+class StaleState(LinkLost):
+    """No fresh state came in time.
+
+    Attributes:
+        age: Age of the newest state [s]; infinite if there was none.
+        limit: Oldest that is allowed [s].
+    """
+
+    def __init__(self, message: str, age: float = float("inf"), limit: float = 0.0) -> None:
+        self.age, self.limit = age, limit
+        super().__init__(message)
+
+
+class ProtocolError(RobotFault):
+    """The other end said what it must not say: the text names topic or field, what was expected, what was found."""
+
+
+class RemoteError(RobotFault):
+    """The other end refused a request, or failed at it; the text is its own."""
+
+
+class NotInCommand(RemoteError):  # noqa: N818
+    """Another client is in command of what was asked for."""
+
+
+class StartNotReached(RobotFault):
+    """The start pose was not reached in time.
+
+    Attributes:
+        joints: The joints that are not there, with how far they are from it [rad].
+    """
+
+    def __init__(self, message: str, joints: dict[str, float]) -> None:
+        self.joints = joints
+        super().__init__(message)
+
+
+class SafetyStop(RobotFault):
+    """A guard stopped the robot. It stays stopped until a person resumes it.
+
+    Attributes:
+        guard: Name of the guard.
+    """
+
+    def __init__(self, guard: str, message: str) -> None:
+        self.guard = guard
+        super().__init__(message)
