@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -67,15 +68,35 @@ class FakeRobot:
 
     def step(self, command: Array) -> RobotState:
         """Send `command` (n, 7): six joint positions [rad] and the gripper's width [m]; one period later, measure."""
+        return next(self.slices(command, 1))
+
+    def slices(self, command: Array, parts: int) -> Iterator[RobotState]:
+        """Send `command` (n, 7), and give the state after each of `parts` equal parts of the period."""
         self._require_link()
         self._command = checked_command(command, (self.num_robots, 7))
         self.sent.append(self._command.copy())
-        target = np.clip(self._command, self._low, self._high)
-        near = np.abs(target - self._position) <= self._reach
-        travel = np.clip(target - self._position, -self._reach, self._reach)
-        self._position = np.where(near, target, self._position + travel)
-        self._velocity = travel[:, :6] / self.spec.period
-        self._stamp = self._stamp + self.spec.period
+        return self._slices(np.clip(self._command, self._low, self._high), parts)
+
+    def _slices(self, target: Array, parts: int) -> Iterator[RobotState]:
+        start, began, halts = self._position, self._stamp, self.halts
+        near = np.abs(target - start) <= self._reach
+        travel = np.clip(target - start, -self._reach, self._reach)
+        for part in range(1, parts + 1):
+            if self.halts == halts:
+                last = part == parts
+                self._position = np.where(near & last, target, start + travel * (part / parts))
+                self._velocity = travel[:, :6] / self.spec.period
+            else:
+                self._velocity = np.zeros_like(self._velocity)
+            self._stamp = began + self.spec.period * part / parts
+            yield self._measure()
+
+    def place_object(self, pose: Array | None, seeds: NDArray[np.int64]) -> RobotState:
+        """Put the object at x, y [m] and yaw [rad] of `pose` (n, 3), or leave it; nothing is drawn from `seeds`."""
+        self._require_link()
+        if pose is not None:
+            self._object = self._object.copy()
+            self._place_object(np.arange(self.num_robots), pose)
         return self._measure()
 
     def _measure(self) -> RobotState:

@@ -1,7 +1,11 @@
 """Every robot keeps the same promises."""
 
+import numpy as np
+from numpy.typing import NDArray
+
 from bam_envs.robots.fake import FakeRobot
-from bam_envs.robots.robot import Robot
+from bam_envs.robots.robot import Robot, RobotState
+from bam_envs.robots.safe import SafeRobot
 from bam_envs.robots.simulated.arm import SimulatedArm
 from bam_envs.testing import RobotContract
 
@@ -24,6 +28,17 @@ class TestSimulatedArm(RobotContract):
 class TestSimulatedArmWithoutObject(RobotContract):
     def make(self, num_robots: int) -> Robot:
         return SimulatedArm(num_robots, with_object=False)
+
+
+class TestGuardedArm(RobotContract):
+    sizes = (1,)
+    holds_what_is_not_finite = True
+
+    def make(self, num_robots: int) -> Robot:
+        return SafeRobot(SimulatedArm(num_robots))
+
+    def move(self, robot: Robot, state: RobotState) -> NDArray[np.float64]:
+        return self.stay(state) - 0.005
 
 
 class TestRandomizedArm(RobotContract):

@@ -74,3 +74,35 @@ def test_saved_and_restored():
         np.testing.assert_array_equal(here.signals[name], array)
     np.testing.assert_array_equal(here.stamp, there.stamp)
     np.testing.assert_array_equal(here.command, there.command)
+
+
+def test_the_parts_of_a_period_end_where_the_period_does():
+    whole, state = started()
+    parted, _ = started()
+    command = state.command - 0.01
+    expected = whole.step(command)
+    states = list(parted.slices(command, 5))
+    np.testing.assert_allclose([one.stamp[0] for one in states], [0.01, 0.02, 0.03, 0.04, 0.05])
+    way = [one.signals["joint_position"][0, 0] - ARM_HOME[0] for one in states]
+    np.testing.assert_allclose(way, [-0.002, -0.004, -0.006, -0.008, -0.01])
+    np.testing.assert_array_equal(states[-1].signals["joint_position"], expected.signals["joint_position"])
+    np.testing.assert_array_equal(parted.sent, whole.sent)
+
+
+def test_a_halt_between_two_parts_holds():
+    robot, state = started()
+    parts = robot.slices(state.command - 0.01, 5)
+    before = next(parts)
+    robot.halt()
+    after = next(parts)
+    np.testing.assert_array_equal(after.signals["joint_position"], before.signals["joint_position"])
+    np.testing.assert_array_equal(after.signals["joint_velocity"], np.zeros((1, 6)))
+
+
+def test_the_object_is_placed_elsewhere():
+    robot, before = started()
+    state = robot.place_object(np.array([[0.4, -0.1, 0.0]]), np.zeros(1, np.int64))
+    np.testing.assert_allclose(state.signals["object_position"], [[0.4, -0.1, 0.02]])
+    np.testing.assert_allclose(before.signals["object_position"], [[0.5, 0.1, 0.02]])
+    same = robot.place_object(None, np.zeros(1, np.int64))
+    np.testing.assert_array_equal(same.signals["object_position"], state.signals["object_position"])

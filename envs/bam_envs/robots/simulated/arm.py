@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.errors import PhysicsDiverged, ResetNeeded
+from bam_envs.errors import InvalidValue, PhysicsDiverged, ResetNeeded
 from bam_envs.robots.robot import Initial, RobotState, Rows, checked_command
 from bam_envs.robots.ur5e import COMMAND, GRIPPER_OPEN, GRIPPER_SPEED, arm_spec
 
@@ -69,6 +70,12 @@ class SimulatedArm:
             raise ResetNeeded("The simulated robot is not connected. Call reset() first.")
         return self._physics
 
+    @property
+    def setpoint(self) -> Array:
+        """Where the controllers pull now: joint positions [rad] and the gripper's width [m]. Shape: (n, 7)."""
+        setpoint: Array = self._setpoint.copy()
+        return setpoint
+
     def reset(self, rows: Rows, initial: Initial) -> RobotState:
         """Set `rows` to the initial joint positions and object pose, at rest, the gripper open."""
         physics, signals = self.physics, initial.signals
@@ -83,12 +90,34 @@ class SimulatedArm:
             for row, seed in zip(rows, initial.seeds, strict=True):
                 self._imperfection.reset(int(row), int(seed), self._setpoint[row])
         if self._with_object:
-            self._place_object(rows, initial)
+            self._lay_object(rows, signals["object_pose"])
         return self._measure(rows)
 
-    def _place_object(self, rows: Rows, initial: Initial) -> None:
-        """Put the object flat on the table at x, y [m] and yaw [rad] of ``object_pose`` (k, 3)."""
-        physics, pose = self.physics, initial.signals["object_pose"]
+    def place_object(self, pose: Array | None, seeds: NDArray[np.int64]) -> RobotState:
+        """Put the object elsewhere, at rest, and draw a new episode's differences; the arms stay as they are.
+
+        Args:
+            pose: x, y [m] and yaw [rad] on the table; None leaves it where it is. Shape: (n, 3).
+            seeds: Seeds for what the robot itself draws. Shape: (n,).
+
+        Raises:
+            InvalidValue: There is no object.
+        """
+        physics = self.physics
+        if pose is not None and not self._with_object:
+            raise InvalidValue(f"The robot {self.spec.name!r} has no object that could be placed.")
+        if self._imperfection is not None:
+            for row, seed in enumerate(seeds):
+                self._imperfection.reset(row, int(seed), self._command[row])
+        if pose is not None:
+            physics.state = physics.state.copy()  # states handed out earlier are views of the old array
+            physics.qvel[:, 8:] = 0.0
+            self._lay_object(self._all_rows, pose)
+        return self._measure(self._all_rows)
+
+    def _lay_object(self, rows: Rows, pose: Array) -> None:
+        """Put the object flat on the table at x, y [m] and yaw [rad] of `pose` (k, 3)."""
+        physics = self.physics
         qpos = physics.qpos
         qpos[rows, 8:10] = pose[:, :2]
         geom = physics.model.geom("object").id
@@ -97,8 +126,28 @@ class SimulatedArm:
 
     def step(self, command: Array) -> RobotState:
         """Send `command` (n, 7): six joint positions [rad] and the gripper's width [m]; one period later, measure."""
-        physics = self.physics
-        command = checked_command(command, (self.num_robots, 7))
+        return next(self.slices(command, 1))
+
+    def slices(self, command: Array, parts: int) -> Iterator[RobotState]:
+        """Send `command` (n, 7), and give the state after each of `parts` equal parts of the period.
+
+        Set points are those of `step`, and so is the last state, but for the last bits: where bodies touch, the solver
+        of the physics starts anew with each part. A halt between two parts holds for the rest of the period; whoever
+        stops asking leaves the robots in the middle of the period, where the next command begins.
+
+        Args:
+            command: As for `step`.
+            parts: 1, 2, 5 or 10.
+
+        Raises:
+            InvalidValue: The period cannot be divided so.
+        """
+        if parts not in range(1, PHYSICS_STEPS + 1) or PHYSICS_STEPS % parts:
+            raise InvalidValue(f"A period has {PHYSICS_STEPS} physics steps; it cannot be divided into {parts!r}.")
+        return self._slices(self._travel(checked_command(command, (self.num_robots, 7))), parts)
+
+    def _travel(self, command: Array) -> Array:
+        """How far the set points go in this period, if `command` is sent now. Shape: (n, 7)."""
         reach = MAX_RATE * self.spec.period
         within = np.clip(command, self._command - reach, self._command + reach)  # no faster than the arm can
         within[:, 6] = command[:, 6]  # the gripper takes a width and goes there at its own speed
@@ -106,9 +155,17 @@ class SimulatedArm:
         arriving = self._command if self._imperfection is None else self._imperfection.delayed(self._command)
         travel = arriving - self._setpoint
         travel[:, 6] = self._gripper_travel(arriving[:, 6])
-        physics.step(self._setpoint[:, None] + travel[:, None] * self._ramp)
-        self._setpoint = self._setpoint + travel
-        return self._measure(self._all_rows)
+        return travel
+
+    def _slices(self, travel: Array, parts: int) -> Iterator[RobotState]:
+        start = here = self._setpoint
+        for ramp in np.split(self._ramp, parts, axis=1):
+            if self._setpoint is not here:  # halted between two parts
+                start, travel = self._setpoint, np.zeros_like(travel)
+            self.physics.step(start[:, None] + travel[:, None] * ramp)
+            self._setpoint = here = start + travel * ramp[:, -1]
+            last = ramp[0, -1, 0] == 1.0
+            yield self._measure(self._all_rows if last else self._all_rows[:0])
 
     def _gripper_travel(self, width: Array) -> Array:
         """How far the gripper's set point goes towards `width` (n,) [m]: at its speed, and near the fingers."""

@@ -1,0 +1,66 @@
+"""The MiR100 mobile base: its signals, limits and lasers.
+
+Sources: MiR100 user guide and robot description (footprint 0.90 x 0.58 m, differential drive, two SICK S300 laser
+scanners at opposite corners); SICK S300 data sheet (541 rays, 270 degrees, 0.05 to 29 m).
+"""
+
+from __future__ import annotations
+
+import math
+
+from bam_envs.robots.robot import RobotSpec, SignalSpec
+
+PERIOD = 0.1
+"""Time between two commands [s]."""
+MAX_SPEED = (1.0, 1.5)
+"""Fastest the drive goes: forwards [m/s], turning [rad/s]."""
+MAX_ACCELERATION = (2.0, 2.5)
+"""Fastest the drive changes its speed: forwards [m/s^2], turning [rad/s^2]."""
+FOOTPRINT = (0.90, 0.58)
+"""Length and width [m]."""
+SCAN_RAYS = 541
+"""Rays of one scanner, half a degree apart."""
+SCAN_SPAN = (math.radians(-135.0), math.radians(135.0))
+"""Bearing of the first and of the last ray, in the scanner's frame [rad]."""
+SCAN_RANGE = (0.05, 29.0)
+"""Nearest and farthest that is measured [m]."""
+FRONT_MASKED, BACK_MASKED = (30, 10), (10, 20)
+"""Rays that the robot's own body hides, at the beginning and at the end of a scan; always 0 on the robot."""
+FRONT_RAYS = SCAN_RAYS - sum(FRONT_MASKED)
+"""Rays of the front scanner that see something: 501."""
+BACK_RAYS = SCAN_RAYS - sum(BACK_MASKED)
+"""Rays of the back scanner that see something: 511."""
+FRONT_MOUNT, BACK_MOUNT = (0.4288, 0.2358, math.radians(45.0)), (-0.3548, -0.2352, math.radians(-135.0))
+"""Where the scanners are in the base's frame: x, y [m], yaw [rad]."""
+
+_FAR = 1000.0
+_VELOCITY_LABELS, _VELOCITY_UNITS = ("linear_velocity", "angular_velocity"), ("m/s", "rad/s")
+
+
+def _scan(name: str, rays: int) -> SignalSpec:
+    labels = tuple(f"{name}_{ray}" for ray in range(rays))
+    return SignalSpec(name, labels, ("m",) * rays, (0.0,) * rays, (SCAN_RANGE[1],) * rays)
+
+
+_POSE = SignalSpec(
+    "base_pose",
+    ("base_x", "base_y", "base_yaw"),
+    ("m", "m", "rad"),
+    (-_FAR, -_FAR, -math.pi),
+    (_FAR, _FAR, math.pi),
+)
+_VELOCITY = SignalSpec("base_velocity", _VELOCITY_LABELS, _VELOCITY_UNITS, (-MAX_SPEED[0], -MAX_SPEED[1]), MAX_SPEED)
+COMMAND = SignalSpec(
+    "command",
+    _VELOCITY_LABELS,
+    _VELOCITY_UNITS,
+    (-MAX_SPEED[0], -MAX_SPEED[1]),
+    MAX_SPEED,
+    MAX_ACCELERATION,
+)
+
+
+def base_spec(name: str = "mir100", *, with_scans: bool = True) -> RobotSpec:
+    """The signals of a MiR100: pose in the map, speeds, and what its two scanners see."""
+    scans = (_scan("f_scan", FRONT_RAYS), _scan("b_scan", BACK_RAYS)) if with_scans else ()
+    return RobotSpec(name, (_POSE, _VELOCITY, *scans), COMMAND, PERIOD)

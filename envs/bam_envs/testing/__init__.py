@@ -1,0 +1,27 @@
+"""Contract tests for robots, tasks and transports of one's own: inherit, say how to make one, run pytest.
+
+::
+
+    from bam_envs.testing import RobotContract, TaskContract, TransportContract
+
+    class TestMyRobot(RobotContract):
+        def make(self, num_robots):
+            return MyRobot(num_robots)
+
+    class TestMyTask(TaskContract):
+        def make(self, num_rows):
+            return MyTask(num_rows)
+
+    class TestMyTransport(TransportContract):
+        def make(self, env):
+            return MyTransport(address_of_a_server_of(env))
+
+They need nothing but NumPy and Gymnasium, and hold for arms with the signals of `bam_envs.robots.ur5e`; for another
+robot, override the hooks that name an arm.
+"""
+
+from bam_envs.testing.robots import ARM_HOME, RobotContract
+from bam_envs.testing.tasks import TaskContract
+from bam_envs.testing.transports import TransportContract
+
+__all__ = ["ARM_HOME", "RobotContract", "TaskContract", "TransportContract"]

@@ -1,0 +1,73 @@
+"""What the contract tests assert with."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+from unittest import mock
+
+import numpy as np
+
+from bam_envs.robots.robot import RobotState
+
+
+@contextmanager
+def no_io() -> Iterator[None]:
+    """Files, sockets, processes and threads are refused inside."""
+    names = ("builtins.open", "socket.socket.connect", "threading.Thread.start", "subprocess.Popen")
+    with ExitStack() as stack:
+        for name in names:
+            stack.enter_context(mock.patch(name, side_effect=AssertionError(f"the constructor used {name}")))
+        yield
+
+
+def raised(kind: type[Exception], act: Callable[[], Any]) -> Exception:
+    """The exception of `kind` that `act` raises."""
+    try:
+        act()
+    except kind as error:
+        return error
+    raise AssertionError(f"{kind.__name__} was not raised")
+
+
+def in_thread(act: Callable[[], None]) -> None:
+    """Run `act` in another thread; it must not raise."""
+    errors: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            act()
+        except Exception as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    assert not errors, f"raised in another thread: {errors[0]!r}"
+
+
+def assert_same_state(one: RobotState, two: RobotState) -> None:
+    """All rows are equal, number by number."""
+    assert_same_rows(one, two, list(range(len(one.stamp))))
+
+
+def assert_same_rows(one: RobotState, two: RobotState, rows: list[int]) -> None:
+    """`rows` are equal, number by number."""
+    assert list(one.signals) == list(two.signals)
+    for name, array in one.signals.items():
+        np.testing.assert_array_equal(array[rows], two.signals[name][rows], err_msg=name)
+    np.testing.assert_array_equal(one.stamp[rows], two.stamp[rows], err_msg="stamp")
+    np.testing.assert_array_equal(one.command[rows], two.command[rows], err_msg="command")
+
+
+def assert_same_tree(one: Any, two: Any, name: str = "state_dict") -> None:
+    """Nested dicts, lists, arrays and plain values are equal."""
+    assert type(one) is type(two), f"{name}: {type(one).__name__} and {type(two).__name__}"
+    if isinstance(one, dict):
+        assert list(one) == list(two), f"{name}: keys {list(one)} and {list(two)}"
+        for key, value in one.items():
+            assert_same_tree(value, two[key], f"{name}[{key!r}]")
+    else:
+        np.testing.assert_array_equal(one, two, err_msg=name)

@@ -1,0 +1,243 @@
+"""The contract test for tasks of one's own.
+
+Longer than other modules because the contract is one list of promises.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from bam_envs.robots.fake import FakeRobot
+from bam_envs.robots.robot import Robot, RobotState, Rows
+from bam_envs.robots.ur5e import GEOMETRY
+from bam_envs.tasks.task import Score, Task
+from bam_envs.testing.assertions import assert_same_state, assert_same_tree
+
+Array = NDArray[np.float64]
+
+
+class TaskContract:
+    """What every task promises, on robots that `make_robot` makes."""
+
+    joint_step = 0.05
+    """Farthest a commanded joint may go in a period [rad]."""
+    tool_step = 0.0125
+    """Farthest the commanded tool may go in a period [m]."""
+    steps = 60
+    """How long each test runs."""
+
+    def make(self, num_rows: int) -> Task:
+        """Hook: a task for `num_rows` robots."""
+        raise NotImplementedError("Override make(num_rows) to return the task under test.")
+
+    def make_robot(self, num_robots: int) -> Robot:
+        """Hook: robots for the task."""
+        return FakeRobot(num_robots)
+
+    def tool_position(self, joints: Array) -> Array:
+        """Hook: forward kinematics, (n, 6) [rad] -> (n, 3) [m]."""
+        return GEOMETRY.tool_position(joints)
+
+    @contextmanager
+    def running(self, num_rows: int = 1, seed: int = 0) -> Iterator[tuple[Task, Robot, RobotState]]:
+        """A task at the start of an episode, its robot and the state; row i is seeded ``seed + i``."""
+        task, robot = self.make(num_rows), self.make_robot(num_rows)
+        try:
+            robot.connect()
+            yield task, robot, _start(task, robot, np.arange(num_rows), seed)
+        finally:
+            robot.close()
+
+    def actions(self, task: Task, first: int = 0) -> Iterator[NDArray[np.float32]]:
+        """Actions of rows `first` and on. Shape: (n, a) each."""
+        rows = [self.actions_of_row(task, first + row) for row in range(task.num_rows)]
+        return map(np.stack, zip(*rows, strict=True))
+
+    def actions_of_row(self, task: Task, row: int) -> Iterator[NDArray[np.float32]]:
+        """Random actions, to the limit or inside, each kept for ten steps to get somewhere. Shape: (a,) each."""
+        rng = np.random.default_rng(row)
+        for step in range(self.steps):
+            if step % 10 == 0:
+                action = rng.uniform(-1, 1, task.action_space.shape).astype(np.float32)
+                action = np.sign(action) if step % 20 == 0 else action
+            yield action
+
+    def test_spaces_have_a_label_for_each_number(self) -> None:
+        """One-dimensional float32 boxes; names differ; the limits are those of the labels."""
+        task = self.make(2)
+        assert isinstance(task, Task), f"{type(task).__name__} lacks a member of the Task protocol"
+        assert task.num_rows == 2
+        for space, labels in (
+            (task.observation_space, task.observation_labels),
+            (task.action_space, task.action_labels),
+        ):
+            assert isinstance(space, spaces.Box)
+            assert space.dtype == np.float32
+            assert space.shape == (len(labels),), f"{len(labels)} labels for a space of shape {space.shape}"
+            assert len({label.name for label in labels}) == len(labels), "label names repeat"
+            np.testing.assert_array_equal(space.low, np.array([label.low for label in labels], np.float32))
+            np.testing.assert_array_equal(space.high, np.array([label.high for label in labels], np.float32))
+        assert (task.action_space.low == -1).all()
+        assert (task.action_space.high == 1).all()
+
+    def test_observations_are_in_their_space(self) -> None:
+        """Float32, one row a robot, finite, inside the limits."""
+        with self.running(3) as (task, robot, state):
+            for action in self.actions(task):
+                _check_observation(task, task.observe(state))
+                state = robot.step(task.command(action, state))
+
+    def test_commands_keep_the_robots_limits(self) -> None:
+        """Inside the command's limits; no joint and no tool faster than allowed, from the first command on."""
+        with self.running(3) as (task, robot, state):
+            last = state.signals["joint_position"]
+            for action in self.actions(task):
+                command = task.command(action, state)
+                self._check_command(robot, last, command)
+                state, last = robot.step(command), command[:, :6]
+
+    def _check_command(self, robot: Robot, last: Array, command: Array) -> None:
+        spec = robot.spec.command
+        assert command.shape == (robot.num_robots, len(spec.labels))
+        assert command.dtype == np.float64
+        assert (command >= np.array(spec.low)).all()
+        assert (command <= np.array(spec.high)).all()
+        turn = np.abs(command[:, :6] - last).max()
+        assert turn <= self.joint_step * (1 + 1e-9), f"a joint turned {turn} rad in a period"
+        tool = np.linalg.norm(self.tool_position(command[:, :6]) - self.tool_position(last), axis=1).max()
+        assert tool <= self.tool_step * (1 + 1e-9), f"the tool went {tool} m in a period"
+
+    def test_actions_beyond_the_space_are_cut(self) -> None:
+        """An action of 100 does what 1 does."""
+        with self.running() as (task, _, state), self.running() as (other, _, same):
+            action = np.ones((1, *task.action_space.shape), np.float32)
+            np.testing.assert_array_equal(task.command(100 * action, state), other.command(action, same))
+
+    def test_scores_are_one_a_row(self) -> None:
+        """Finite float64 rewards, boolean ends, success ends the episode, infos of shape (n,)."""
+        with self.running(3) as (task, robot, state):
+            for action in self.actions(task):
+                state = robot.step(task.command(action, state))
+                _check_score(task, task.score(state, action))
+
+    def test_nothing_given_is_changed(self) -> None:
+        """States and actions are the caller's; observing twice is seeing the same."""
+        with self.running(2) as (task, robot, state):
+            for action in self.actions(task):
+                kept, given = copy.deepcopy(state), action.copy()
+                np.testing.assert_array_equal(task.observe(state), task.observe(state))
+                command = task.command(action, state)
+                sent = command.copy()
+                after = robot.step(command)
+                task.score(after, action)
+                assert_same_state(state, kept)
+                np.testing.assert_array_equal(action, given)
+                np.testing.assert_array_equal(command, sent)
+                state = after
+
+    def test_row_of_many_is_the_row_alone(self) -> None:
+        """Observation, command and score of row i are bit for bit those of a single task with its seed."""
+        many = self._record(3, first=0)
+        for row in range(3):
+            for together, alone in zip(many, self._record(1, first=row), strict=True):
+                np.testing.assert_array_equal(together[row], alone[0])
+
+    def _record(self, num_rows: int, first: int) -> list[NDArray[Any]]:
+        """Everything that `num_rows` rows say in an episode; row k has the seed and the actions of ``first + k``."""
+        said: list[NDArray[Any]] = []
+        with self.running(num_rows, seed=first) as (task, robot, state):
+            for action in self.actions(task, first):
+                command = task.command(action, state)
+                state = robot.step(command)
+                score = task.score(state, action)
+                said += [command, task.observe(state), score.reward, score.terminated, score.success]
+        return said
+
+    def test_beginning_one_row_leaves_the_others(self) -> None:
+        """A new episode of row 1 changes nothing of rows 0 and 2."""
+        with self.running(3) as (task, robot, state):
+            for action in self.actions(task):
+                state = robot.step(task.command(action, state))
+            before = task.observe(state)
+            state = _start(task, robot, np.array([1]), seed=9)
+            np.testing.assert_array_equal(task.observe(state)[[0, 2]], before[[0, 2]])
+
+    def test_begin_follows_the_generators(self) -> None:
+        """The same seeds begin the same episodes."""
+        with self.running(2, seed=5) as (task, _, state), self.running(2, seed=5) as (other, _, same):
+            np.testing.assert_array_equal(task.observe(state), other.observe(same))
+            assert_same_tree(task.state_dict(), other.state_dict())
+
+    def test_memory_is_saved_and_restored(self) -> None:
+        """What `state_dict` returned stays as it was, and another task goes on from it exactly."""
+        with self.running(2) as (task, robot, state):
+            actions = list(self.actions(task))
+            for action in actions[: self.steps // 2]:
+                state = robot.step(task.command(action, state))
+                task.score(state, action)
+            saved, kept = task.state_dict(), copy.deepcopy(task.state_dict())
+            other = self.make(2)
+            other.load_state_dict(copy.deepcopy(saved))
+            for action in actions[self.steps // 2 :]:
+                np.testing.assert_array_equal(task.observe(state), other.observe(state))
+                command = task.command(action, state)
+                np.testing.assert_array_equal(command, other.command(action, state))
+                state = robot.step(command)
+                _assert_same_score(task.score(state, action), other.score(state, action))
+            assert_same_tree(saved, kept)
+
+    def test_saved_memory_is_a_copy(self) -> None:
+        """Beginning another episode right after `state_dict` does not reach into what it returned."""
+        with self.running(2) as (task, robot, state):
+            for action in self.actions(task):
+                state = robot.step(task.command(action, state))
+            saved = task.state_dict()
+            kept = copy.deepcopy(saved)
+            _start(task, robot, np.array([1]), seed=9)
+            assert_same_tree(saved, kept)
+
+    def test_marks_are_places_and_colours(self) -> None:
+        """For pictures."""
+        with self.running() as (task, _, _):
+            for position, colour in task.marks():
+                assert np.shape(position) == (3,)
+                assert len(colour) == 4
+
+
+def _start(task: Task, robot: Robot, rows: Rows, seed: int) -> RobotState:
+    """Begin an episode on `rows`; row k of them is seeded ``seed + k``."""
+    state = robot.reset(rows, task.begin(rows, [np.random.default_rng(seed + k) for k in range(len(rows))]))
+    task.start(rows, state)
+    return state
+
+
+def _check_observation(task: Task, observation: NDArray[np.float32]) -> None:
+    assert observation.dtype == np.float32
+    assert observation.shape == (task.num_rows, *task.observation_space.shape)
+    for row in observation:
+        assert task.observation_space.contains(row), f"not in the space: {row.tolist()}"
+
+
+def _check_score(task: Task, score: Score) -> None:
+    n = task.num_rows
+    assert score.reward.shape == score.terminated.shape == score.success.shape == (n,)
+    assert score.reward.dtype == np.float64
+    assert np.isfinite(score.reward).all()
+    assert score.terminated.dtype == score.success.dtype == np.bool_
+    assert not (score.success & ~score.terminated).any(), "a success did not end the episode"
+    for name, values in score.info.items():
+        assert values.shape == (n,), f"info {name} has shape {values.shape}"
+        assert not name.startswith("_"), f"info {name} looks like a mask"
+
+
+def _assert_same_score(one: Score, two: Score) -> None:
+    for name in ("reward", "terminated", "success"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name), err_msg=name)
+    assert_same_tree(one.info, two.info)

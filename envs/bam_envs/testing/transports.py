@@ -1,0 +1,294 @@
+"""The contract of transports, and the environment that it serves. Longer than most files: one list of promises."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import Space, spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from numpy.typing import NDArray
+
+from bam_envs.errors import InvalidValue, LinkLost, RemoteError
+from bam_envs.remote_env import RemoteEnv, RemoteVectorEnv
+from bam_envs.serve.describe import Env
+from bam_envs.spaces import space_to_json
+from bam_envs.testing.assertions import raised
+from bam_envs.transports.transport import EnvSpecMessage, Info, Transport
+
+_INF = np.inf
+_INT64 = np.iinfo(np.int64)
+
+
+class MirrorEnv(gym.Env[Any, Any]):
+    """Shows each action as the next observation, so that one sees what the way there and back does to it.
+
+    Args:
+        space: Of actions and observations.
+        episode_steps: Steps after which an episode is terminated.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012 - as Gymnasium declares it
+
+    def __init__(self, space: Space[Any], episode_steps: int = 1000) -> None:
+        self.observation_space, self.action_space = copy.deepcopy(space), space  # a space's generator is one thread's
+        self.episode_steps, self.elapsed = episode_steps, 0
+        self.seen: list[Any] = []
+        """Every action, as it arrived."""
+        self.given: list[tuple[int | None, Info | None]] = []
+        """Seed and options of every reset."""
+        self.fault: Exception | None = None
+        """Raised by the next step."""
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
+        """A sample of the space, which hangs on the seed alone."""
+        super().reset(seed=seed)
+        self.given.append((seed, options))
+        self.elapsed = 0
+        self.observation_space.seed(int(self.np_random.integers(2**31)))
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
+        """The action."""
+        self.seen.append(action)
+        if self.fault is not None:
+            fault, self.fault = self.fault, None
+            raise fault
+        self.elapsed += 1
+        info = {
+            "elapsed": self.elapsed,
+            "third": self.elapsed / 3,
+            "good": True,
+            "text": "grün",
+            "array": np.arange(3, dtype=np.int16),
+            "nested": {"inside": [1, 2.5, None]},
+        }
+        return action, self.elapsed / 7, self.elapsed >= self.episode_steps, False, info
+
+
+def _box(low: float, high: float, shape: tuple[int, ...], dtype: Any) -> spaces.Box:
+    return spaces.Box(low, high, shape, dtype)
+
+
+def _floats(dtype: Any, *values: float) -> NDArray[Any]:
+    return np.array(values, dtype)
+
+
+_TREE = spaces.Dict({"z": spaces.Discrete(3), "a": spaces.Tuple([_box(-1, 1, (2,), np.float32), spaces.Text(4)])})
+ROUND_TRIPS: dict[str, tuple[Space[Any], list[Any]]] = {
+    "float32": (_box(-_INF, _INF, (4,), np.float32), [_floats(np.float32, -0.0, 1e-45, 3.4e38, 0.1)]),
+    "float64": (_box(-_INF, _INF, (2, 2), np.float64), [np.array([[-0.0, 5e-324], [1.7e308, 0.1]])]),
+    "float16": (_box(-4, 4, (3,), np.float16), [_floats(np.float16, -0.0, 0.1, 4)]),
+    "a number": (_box(-1, 1, (), np.float32), [np.float32(0.1).reshape(())]),
+    "nothing": (_box(-1, 1, (0,), np.float32), []),
+    "int64": (_box(_INT64.min, _INT64.max, (3,), np.int64), [np.array([_INT64.min, _INT64.max, 2**53 + 1])]),
+    "image": (_box(0, 255, (5, 7, 3), np.uint8), [np.arange(105, dtype=np.uint8).reshape(5, 7, 3)]),
+    "Discrete": (spaces.Discrete(5, start=-2), [np.int64(-2), np.int64(2)]),
+    "MultiDiscrete": (spaces.MultiDiscrete(np.array([[3, 2], [4, 9]]), start=np.array([[0, -1], [5, 0]])), []),
+    "MultiBinary": (spaces.MultiBinary([2, 3]), []),
+    "Text": (spaces.Text(8, min_length=0, charset='aé"\\\n€😀'), ["", '"\\\n€😀é']),
+    "Tuple": (spaces.Tuple([spaces.Discrete(2), _box(0, 1, (3,), np.float64)]), []),
+    "Dict": (_TREE, []),
+    "Sequence": (spaces.Sequence(_TREE), [()]),
+    "stacked Sequence": (spaces.Sequence(_box(-1, 1, (2,), np.float32), stack=True), [np.zeros((0, 2), np.float32)]),
+}
+"""Spaces with values that are easily changed on the way, by name; samples come on top."""
+
+
+class TransportContract:
+    """What every transport promises; each test serves an environment of its own."""
+
+    def make(self, env: Env) -> Transport:
+        """Hook: a transport that is not connected, and reaches `env`; start what it needs."""
+        raise NotImplementedError("Override make(env) to return a transport that reaches env.")
+
+    def finish(self) -> None:
+        """Hook: stop what `make` started; it is called after each transport was closed."""
+
+    @contextmanager
+    def serving(self, env: Env) -> Iterator[Transport]:
+        """A transport to `env`; both are closed at the end."""
+        try:
+            transport = self.make(env)
+            try:
+                yield transport
+            finally:
+                transport.close()
+        finally:
+            self.finish()
+            env.close()  # type: ignore[no-untyped-call]
+
+    def test_it_is_a_transport_and_says_what_is_there(self) -> None:
+        """Spaces of the environment, one row; connecting twice is once and moves nothing."""
+        env = MirrorEnv(_TREE)
+        with self.serving(env) as transport:
+            assert isinstance(transport, Transport), f"{type(transport).__name__} lacks a member of Transport"
+            spec = transport.connect()
+            assert isinstance(spec, EnvSpecMessage)
+            assert space_to_json(spec.observation_space) == space_to_json(_TREE)
+            assert space_to_json(spec.action_space) == space_to_json(_TREE)
+            assert (spec.num_envs, spec.vector) == (1, False)
+            assert transport.connect().env_id == spec.env_id
+        assert env.given == [], "connect() reset the environment"
+
+    def test_every_space_comes_back_bit_for_bit(self) -> None:
+        """Actions arrive, and observations come back, with every bit and dtype."""
+        for name, (space, values) in ROUND_TRIPS.items():
+            env = MirrorEnv(space)
+            with self.serving(env) as transport:
+                transport.connect()
+                space.seed(3)
+                samples = [space.sample() for _ in range(3)]
+                first, _ = transport.reset(seed=5)
+                assert space.contains(first), f"{name}: {first!r} is not in {space}"
+                for value in [*values, *samples]:
+                    assert_same_value(transport.step(value)[0], value, f"observation, {name}")
+                    assert_same_value(env.seen[-1], value, f"action, {name}")
+
+    def test_the_rest_of_a_step(self) -> None:
+        """Reward, flags and info as they were given."""
+        with self.serving(MirrorEnv(spaces.Discrete(3), episode_steps=2)) as transport:
+            transport.connect()
+            transport.reset(seed=1)
+            _, reward, terminated, truncated, info = transport.step(1)
+            assert (reward, terminated, truncated) == (1 / 7, False, False)
+            assert [type(one) for one in (reward, terminated, truncated)] == [float, bool, bool]
+            assert (info["elapsed"], info["third"], info["good"], info["text"]) == (1, 1 / 3, True, "grün")
+            assert info["nested"] == {"inside": [1, 2.5, None]}
+            np.testing.assert_array_equal(info["array"], [0, 1, 2])
+            assert transport.step(1)[1:4] == (2 / 7, True, False)
+
+    def test_seeds_reach_the_environment(self) -> None:
+        """Also 0, and also none."""
+        env = MirrorEnv(_box(-1, 1, (3,), np.float32))
+        with self.serving(env) as transport:
+            transport.connect()
+            first, second = transport.reset(seed=0)[0], transport.reset(seed=0)[0]
+            assert_same_value(first, second, "the observation after seed 0")
+            assert (transport.reset(seed=1)[0] != first).any()
+            transport.reset()
+        assert [seed for seed, _ in env.given] == [0, 0, 1, None]
+
+    def test_what_is_no_action_does_not_move_anything(self) -> None:
+        """NaN, infinity beyond a bound and a wrong shape are refused here; the place is named; the episode goes on."""
+        env = MirrorEnv(_box(-1, 1, (2,), np.float32))
+        with self.serving(env) as transport:
+            transport.connect()
+            transport.reset(seed=1)
+            for action, place in (([0, np.nan], "[1]"), ([_INF, 0], "[0]"), ([0, 0, 0], "shape")):
+                error = raised(InvalidValue, lambda action=action: transport.step(np.float32(action)))  # type: ignore[misc]
+                assert place in str(error), f"{place} is not in the text of {error!r}"
+            assert env.seen == []
+            transport.step(np.zeros(2, np.float32))
+
+    def test_a_step_without_an_episode_is_refused(self) -> None:
+        """Before the first reset and after the end; the text says what to do."""
+        env = MirrorEnv(spaces.Discrete(3), episode_steps=1)
+        with self.serving(env) as transport:
+            transport.connect()
+            assert "reset" in str(raised(RemoteError, lambda: transport.step(1)))
+            transport.reset()
+            transport.step(1)
+            assert "reset" in str(raised(RemoteError, lambda: transport.step(1)))
+        assert len(env.seen) == 1
+
+    def test_an_error_of_the_environment_is_told(self) -> None:
+        """With its type and text; a reset goes on from there."""
+        env = MirrorEnv(spaces.Discrete(3))
+        with self.serving(env) as transport:
+            transport.connect()
+            transport.reset()
+            env.fault = ZeroDivisionError("seven by nought")
+            assert "ZeroDivisionError: seven by nought" in str(raised(RemoteError, lambda: transport.step(1)))
+            transport.reset()
+            transport.step(2)
+
+    def test_nan_in_an_observation_is_told(self) -> None:
+        """It is not passed on."""
+        env = MirrorEnv(spaces.Dict({"x": _box(-1, 1, (2,), np.float32)}))
+        with self.serving(env) as transport:
+            transport.connect()
+            transport.reset()
+            env.step = lambda action: ({"x": _floats(np.float32, 0, np.nan)}, 0.0, False, False, {})  # type: ignore[method-assign]
+            error = raised(RemoteError, lambda: transport.step({"x": np.zeros(2, np.float32)}))
+            assert "observation['x'][1] is NaN" in str(error)
+
+    def test_closing_is_for_good(self) -> None:
+        """As often as one likes; a step afterwards is a lost link."""
+        with self.serving(MirrorEnv(spaces.Discrete(3))) as transport:
+            transport.connect()
+            transport.reset()
+            transport.close()
+            transport.close()
+            raised(LinkLost, lambda: transport.step(1))
+
+    def test_closing_before_connecting(self) -> None:
+        """Does nothing."""
+        with self.serving(MirrorEnv(spaces.Discrete(3))) as transport:
+            transport.close()
+
+    def test_it_is_the_environment_in_process(self) -> None:
+        """`RemoteEnv` gives what the environment gives, with the same seed and actions."""
+        space = _box(-1, 1, (3,), np.float32)
+        alone = MirrorEnv(space)
+        with self.serving(MirrorEnv(space)) as transport:
+            env = RemoteEnv(transport)
+            assert_same_value(env.reset(seed=4)[0], alone.reset(seed=4)[0], "the first observation")
+            for value in np.linspace(-1, 1, 15, dtype=np.float32).reshape(5, 3):
+                one, two = env.step(value), alone.step(value)
+                assert_same_value(one[0], two[0], "observation")
+                assert one[1:4] == two[1:4]
+
+    def test_rows_are_those_of_gymnasium(self) -> None:
+        """`RemoteVectorEnv` over a vector environment gives what that gives, automatic resets included."""
+        alone, there = _rows(3), _rows(3)
+        with self.serving(there) as transport:
+            envs = RemoteVectorEnv(transport, 3)
+            assert_same_value(envs.reset(seed=4)[0], alone.reset(seed=4)[0], "the first observation")
+            for value in np.linspace(-1, 1, 30, dtype=np.float32).reshape(5, 3, 2):
+                one: Any = envs.step(value)
+                two: Any = alone.step(value)
+                for name, mine, theirs in zip(("observation", "reward", "end", "cut"), one, two, strict=False):
+                    assert_same_value(mine, theirs, name)
+                _assert_same_final(one[4], two[4])
+        alone.close()
+
+
+def _rows(number: int) -> SyncVectorEnv:
+    """Rows whose episodes end after two steps."""
+    makers = [lambda: MirrorEnv(_box(-1, 1, (2,), np.float32), episode_steps=2)] * number
+    return SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
+
+
+def _assert_same_final(mine: dict[str, Any], theirs: dict[str, Any]) -> None:
+    assert ("final_obs" in mine) == ("final_obs" in theirs)
+    if "final_obs" in theirs:
+        np.testing.assert_array_equal(np.stack(mine["final_obs"]), np.stack(theirs["final_obs"]))
+        np.testing.assert_array_equal(mine["_final_obs"], theirs["_final_obs"])
+        np.testing.assert_array_equal(mine["final_info"]["elapsed"], theirs["final_info"]["elapsed"])
+
+
+def assert_same_value(one: Any, two: Any, name: str) -> None:
+    """Two values of a space are equal bit for bit, with the same dtypes."""
+    if isinstance(two, dict):
+        assert set(one) == set(two), f"{name}: keys {list(one)} and {list(two)}"
+        for key, value in two.items():
+            assert_same_value(one[key], value, f"{name}[{key!r}]")
+    elif isinstance(two, tuple):
+        assert isinstance(one, tuple), f"{name}: {type(one).__name__} and tuple"
+        assert len(one) == len(two), f"{name}: {len(one)} and {len(two)} items"
+        for i, value in enumerate(two):
+            assert_same_value(one[i], value, f"{name}[{i}]")
+    elif isinstance(two, str):
+        assert one == two, f"{name}: {one!r} and {two!r}"
+    else:
+        _assert_same_array(np.asarray(one), np.asarray(two), name)
+
+
+def _assert_same_array(one: Any, two: Any, name: str) -> None:
+    assert (one.dtype, one.shape) == (two.dtype, two.shape), f"{name}: {one.dtype} {one.shape}, {two.dtype} {two.shape}"
+    assert one.tobytes() == two.tobytes(), f"{name}: {one!r} and {two!r}"
