@@ -7,6 +7,7 @@ environment is made.
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,9 @@ import gymnasium as gym
 from bam_envs.errors import InvalidValue, UnknownName
 
 if TYPE_CHECKING:
+    from bam_envs.remote_env import RemoteEnv, RemoteVectorEnv
     from bam_envs.robot_env import RobotEnv, RobotVectorEnv
+    from bam_envs.robots.robot import Robot
 
 
 @dataclass(frozen=True)
@@ -110,14 +113,73 @@ def resolve(reference: str) -> Any:
     return getattr(importlib.import_module(module), name)
 
 
-def make_env(env_id: str, *, render_mode: str | None = None, randomize: bool = False, **task_options: Any) -> RobotEnv:
-    """One robot and its task; what `gymnasium.make` calls."""
+def make_env(
+    env_id: str,
+    *,
+    render_mode: str | None = None,
+    randomize: bool = False,
+    robot: str | None = None,
+    transport: str | None = None,
+    profile: str | None = None,
+    ca_file: str | None = None,
+    token_file: str | None = None,
+    **task_options: Any,
+) -> RobotEnv | RemoteEnv:
+    """One robot and its task; what `gymnasium.make` calls.
+
+    Args:
+        env_id: Key of `ENVIRONMENTS`.
+        render_mode: Of the simulated robot.
+        randomize: Of the simulated robot.
+        robot: Address of a live robot behind rosbridge, such as ``"ws://10.0.0.5:9090"``, instead of the simulated one.
+            The task runs here. A path puts a namespace before the robot's topics.
+        transport: Address of a whole environment that runs elsewhere, such as ``"ws://10.0.0.5:9090/bam_001"`` or
+            ``"tcp://10.0.0.5:9091"``; there is no robot and no task here.
+        profile: What the live robot's topics are: a shipped name or a file; by default that of the simulated robot.
+        ca_file: Certificates that ``wss://`` trusts instead of the system's.
+        token_file: File with the token that the server asks for.
+        task_options: Arguments of the task.
+
+    Raises:
+        InvalidValue: Arguments that exclude each other.
+    """
+    _require_one_place(robot, transport, profile, task_options)
+    _require_simulation(robot or transport, render_mode, randomize)
+    if transport is not None:
+        from bam_envs.remote_env import make_remote_env
+
+        return make_remote_env(env_id, transport, ca_file=ca_file, token_file=token_file)
     from bam_envs.robot_env import RobotEnv
 
     entry = ENVIRONMENTS[env_id]
-    return RobotEnv(
-        resolve(entry.robot)(1, randomize=randomize), resolve(entry.task)(1, **task_options), render_mode=render_mode
-    )
+    task = resolve(entry.task)(1, **task_options)
+    simulated: Robot = resolve(entry.robot)(1, randomize=randomize)
+    if robot is None:
+        return RobotEnv(simulated, task, render_mode=render_mode)
+    from bam_envs.robots.live import live_robot
+
+    live = live_robot(robot, simulated.spec, profile=profile, ca_file=ca_file, token_file=token_file)
+    return RobotEnv(live, task, render_mode=render_mode)
+
+
+def _require_simulation(elsewhere: object, render_mode: str | None, randomize: bool) -> None:
+    """What only a simulation has is not asked of anything else."""
+    asked = [name for name, given in (("render_mode", render_mode is not None), ("randomize", randomize)) if given]
+    if elsewhere is not None and asked:
+        raise InvalidValue(f"{', '.join(asked)}: only the simulation here has that, and not {elsewhere}; leave it out.")
+
+
+def _require_one_place(
+    robot: str | None, transport: str | None, profile: str | None, task_options: Mapping[str, Any]
+) -> None:
+    """The environment runs in one place, and each option belongs to one."""
+    if robot is not None and transport is not None:
+        raise InvalidValue("robot= and transport= exclude each other: the task runs here, or with the robot elsewhere.")
+    if transport is not None and task_options:
+        names = ", ".join(task_options)
+        raise InvalidValue(f"{names}: the task runs at {transport}; give its options to bam-serve there.")
+    if robot is None and profile is not None:
+        raise InvalidValue(f"profile={profile!r} describes a live robot; give its address with robot= too.")
 
 
 def make_vector_env(
@@ -127,14 +189,32 @@ def make_vector_env(
     max_episode_steps: int | None = None,
     render_mode: str | None = None,
     randomize: bool = False,
+    robot: str | None = None,
+    transport: str | Sequence[str] | None = None,
+    ca_file: str | None = None,
+    token_file: str | None = None,
     **task_options: Any,
-) -> RobotVectorEnv:
-    """Simulated robots and their task, stepped together; what `gymnasium.make_vec` calls."""
+) -> RobotVectorEnv | RemoteVectorEnv:
+    """Simulated robots and their task, stepped together; what `gymnasium.make_vec` calls.
+
+    With `transport`, one address or several, they run elsewhere: the rows of one server are one request.
+
+    Raises:
+        InvalidValue: Arguments that exclude each other, or rows that are not there.
+    """
+    if num_envs < 1:
+        raise InvalidValue(f"num_envs must be at least 1, not {num_envs}.")
+    if robot is not None:
+        raise InvalidValue("A live robot is one environment, which nothing may reset unasked; use gymnasium.make.")
+    if transport is not None:
+        from bam_envs.remote_env import make_remote_rows
+
+        _require_one_place(None, str(transport), None, task_options)
+        _require_simulation(transport, render_mode, randomize)
+        return make_remote_rows(env_id, transport, num_envs, ca_file=ca_file, token_file=token_file)
     from bam_envs.robot_env import RobotVectorEnv
 
     entry = ENVIRONMENTS[env_id]
-    if num_envs < 1:
-        raise InvalidValue(f"num_envs must be at least 1, not {num_envs}.")
     return RobotVectorEnv(
         resolve(entry.robot)(num_envs, randomize=randomize),
         resolve(entry.task)(num_envs, **task_options),

@@ -10,6 +10,7 @@ MultiBinary    n: the shape, always a list
 Text           min_length, max_length, charset
 Dict           spaces: by key, in the order of the space
 Tuple          spaces: a list
+Sequence       space, stack
 =============  ==========================================================================
 
 Infinities are the strings ``"inf"`` and ``"-inf"``: JSON has none. Floats keep every bit. A space comes back equal to
@@ -39,7 +40,7 @@ def space_to_json(space: Space[Any]) -> Json:
     """Plain values that `space_from_json` makes the same space of.
 
     Raises:
-        UnknownName: A kind of space that has no fixed shape (Sequence, Graph, OneOf) or is not Gymnasium's.
+        UnknownName: Graph, OneOf, or a kind of space that is not Gymnasium's.
         InvalidValue: A bound or key that JSON cannot say.
     """
     for kind, write in _WRITERS:
@@ -181,6 +182,16 @@ def _make_tuple(value: Mapping[str, Any]) -> Space[Any]:
     return spaces.Tuple([space_from_json(one) for one in value["spaces"]])
 
 
+def _write_sequence(space: spaces.Sequence) -> Json:
+    return {"space": space_to_json(space.feature_space), "stack": bool(space.stack)}
+
+
+def _make_sequence(value: Mapping[str, Any]) -> Space[Any]:
+    if not isinstance(value["stack"], bool):
+        raise InvalidValue(f"stack of the Sequence space must be true or false, not {value['stack']!r}.")
+    return spaces.Sequence(space_from_json(value["space"]), stack=value["stack"])
+
+
 _WRITERS: tuple[tuple[type[Space[Any]], Callable[[Any], Json]], ...] = (
     (spaces.Box, _write_box),
     (spaces.Discrete, _write_discrete),
@@ -189,6 +200,7 @@ _WRITERS: tuple[tuple[type[Space[Any]], Callable[[Any], Json]], ...] = (
     (spaces.Text, _write_text),
     (spaces.Dict, _write_dict),
     (spaces.Tuple, _write_tuple),
+    (spaces.Sequence, _write_sequence),
 )
 _MAKERS: dict[str, Make] = {
     "Box": _make_box,
@@ -198,4 +210,5 @@ _MAKERS: dict[str, Make] = {
     "Text": _make_text,
     "Dict": _make_dict,
     "Tuple": _make_tuple,
+    "Sequence": _make_sequence,
 }

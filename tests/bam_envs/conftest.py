@@ -66,3 +66,16 @@ def actions_of():
         return np.repeat(draws, 5, axis=0)[:steps].astype(np.float32)
 
     return actions
+
+
+@pytest.fixture
+def ros_domain(monkeypatch):
+    """The ROS domain of a graph that stays on loopback; skips where rclpy is not installed."""
+    pytest.importorskip("rclpy", reason="needs rclpy")
+    profile = str(ROOT / "tests" / "peers" / "dds_profile.xml")
+    for name in ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"):
+        monkeypatch.setenv(name, profile)
+    monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
+    # The one range with which the middleware adds no transport of its own to those of the profile.
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SYSTEM_DEFAULT")
+    return 1 + os.getpid() % 100

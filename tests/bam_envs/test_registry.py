@@ -109,3 +109,40 @@ def test_the_time_limit_of_rows_can_be_changed():
 def test_an_option_that_does_not_exist_is_an_error(make):
     with pytest.raises(TypeError, match="randomise"):
         make("bam/pick-v0", randomise=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"robot": "ws://a:1", "transport": "ws://b:2"},
+            "robot= and transport= exclude each other: the task runs here, or with the robot elsewhere.",
+        ),
+        (
+            {"transport": "ws://b:2", "tolerance": 0.1},
+            "tolerance: the task runs at ws://b:2; give its options to bam-serve there.",
+        ),
+        ({"profile": "ur5e"}, "profile='ur5e' describes a live robot; give its address with robot= too."),
+    ],
+)
+def test_options_of_different_places_exclude_each_other(options, message):
+    with pytest.raises(InvalidValue) as caught:
+        gym.make("bam/reach-v0", **options)
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize("place", [{"robot": "ws://a:1"}, {"transport": "ws://a:1"}])
+@pytest.mark.parametrize("option", [{"render_mode": "rgb_array"}, {"randomize": True}])
+def test_what_only_a_simulation_has_is_not_asked_of_anything_else(place, option):
+    with pytest.raises(InvalidValue) as caught:
+        gym.make("bam/reach-v0", **place, **option)
+    (name,) = option
+    assert str(caught.value) == f"{name}: only the simulation here has that, and not ws://a:1; leave it out."
+
+
+def test_a_live_robot_is_not_one_of_many():
+    with pytest.raises(InvalidValue) as caught:
+        gym.make_vec("bam/pick-v0", num_envs=2, robot="ws://a:1")
+    assert str(caught.value) == (
+        "A live robot is one environment, which nothing may reset unasked; use gymnasium.make."
+    )

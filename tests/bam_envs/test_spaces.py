@@ -64,6 +64,7 @@ SPACES = st.recursive(
     lambda inner: st.one_of(
         st.dictionaries(st.text(max_size=5), inner, max_size=3).map(lambda some: spaces.Dict(list(some.items()))),  # type: ignore[arg-type]
         st.lists(inner, max_size=3).map(spaces.Tuple),
+        st.builds(lambda one, stack: spaces.Sequence(one, stack=stack), inner, st.booleans()),
     ),
     max_leaves=5,
 )
@@ -129,6 +130,11 @@ def test_json_forms() -> None:
         "type": "Tuple",
         "spaces": [{"type": "Discrete", "n": 2, "start": 0, "dtype": "int64"}],
     }
+    assert space_to_json(spaces.Sequence(spaces.MultiBinary(2), stack=True)) == {
+        "type": "Sequence",
+        "space": {"type": "MultiBinary", "n": [2]},
+        "stack": True,
+    }
 
 
 def test_a_dict_keeps_its_order() -> None:
@@ -147,12 +153,12 @@ def test_one_dimensional_multi_binary_holds_the_same_arrays() -> None:
 @pytest.mark.parametrize(
     ("space", "name"),
     [
-        (spaces.Sequence(spaces.Discrete(2)), "Sequence"),
+        (spaces.Sequence(spaces.OneOf([spaces.Discrete(2)])), "OneOf"),
         (spaces.Graph(spaces.Discrete(2), None), "Graph"),
         (spaces.Dict({"x": spaces.OneOf([spaces.Discrete(2)])}), "OneOf"),
     ],
 )
-def test_spaces_without_a_fixed_shape_are_refused(space: Space[Any], name: str) -> None:
+def test_other_kinds_of_space_are_refused(space: Space[Any], name: str) -> None:
     with pytest.raises(UnknownName) as caught:
         space_to_json(space)
     assert caught.value.name == name
@@ -199,6 +205,11 @@ BOX = {"type": "Box", "shape": [2], "dtype": "float32", "low": -1.0, "high": 1.0
             "n of the Discrete space must be a whole number, not '4'.",
         ),
         ({"type": "Tuple", "spaces": [{"type": "Box"}]}, "The Box space has no field 'dtype'."),
+        ({"type": "Sequence", "space": BOX}, "The Sequence space has no field 'stack'."),
+        (
+            {"type": "Sequence", "space": BOX, "stack": 1},
+            "stack of the Sequence space must be true or false, not 1.",
+        ),
         ({"type": "Dict", "spaces": [1]}, "The fields of the Dict space do not make one: "),
         ({"type": "MultiBinary", "n": []}, None),
     ],

@@ -1,0 +1,113 @@
+"""Who is in command: one client at a time; the others are told who."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from bam_envs.errors import NotInCommand
+
+Change = Callable[[str | None, str | None], None]
+"""Called with who was in command and who is; None is nobody."""
+
+
+class CommandLease:
+    """Command of one robot or environment. The first to ask has it, until it leaves or another one may take it.
+
+    Silence alone takes nothing away: a client that is silent for longer than `seconds` keeps command until another one
+    asks. Safe to call from any thread.
+
+    Args:
+        seconds: Silence after which another client may take command [s].
+        clock: A monotonic clock [s].
+    """
+
+    def __init__(self, seconds: float = 5.0, clock: Callable[[], float] = time.monotonic) -> None:
+        self.seconds = seconds
+        self._clock, self._lock = clock, threading.Lock()
+        self._holder: str | None = None
+        self._heard = 0.0
+        self._running = 0
+        self._listeners: list[Change] = []
+
+    @property
+    def holder(self) -> str | None:
+        """The client in command, or None."""
+        return self._holder
+
+    def on_change(self, listener: Change) -> None:
+        """Call `listener` whenever command changes, in the thread that changes it, which holds no lock of this."""
+        self._listeners.append(listener)
+
+    def take(self, client: str, *, force: bool = False) -> bool:
+        """Put `client` in command; whether it was not before.
+
+        Args:
+            client: Its name, which the others are told.
+            force: Take it from whoever has it.
+
+        Raises:
+            NotInCommand: Another client has it, and was heard of within `seconds`.
+        """
+        with self._lock:
+            before = self._holder
+            if before not in (None, client) and not force and not self._lapsed():
+                raise NotInCommand(self._refusal(client))
+            self._holder, self._heard = client, self._clock()
+            self._running = self._running if before == client else 0
+        return self._told(before, client)
+
+    def require(self, client: str) -> None:
+        """Take note that `client` was heard of.
+
+        Raises:
+            NotInCommand: It is not in command: another client is, or nobody.
+        """
+        with self._lock:
+            self._hear(client)
+
+    def _hear(self, client: str) -> None:
+        if self._holder != client:
+            raise NotInCommand(self._refusal(client))
+        self._heard = self._clock()
+
+    @contextmanager
+    def busy(self, client: str) -> Iterator[None]:
+        """While a request of `client` runs, however long it takes, it does not count as silent."""
+        with self._lock:
+            self._hear(client)
+            self._running += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                if self._holder == client:
+                    self._running, self._heard = max(0, self._running - 1), self._clock()
+
+    def release(self, client: str) -> bool:
+        """Take command from `client`; whether it had it."""
+        with self._lock:
+            if self._holder != client:
+                return False
+            self._holder, self._running = None, 0
+        return self._told(client, None)
+
+    def _lapsed(self) -> bool:
+        return not self._running and self._clock() - self._heard > self.seconds
+
+    def _refusal(self, client: str) -> str:
+        if self._holder is None:
+            return f"Nobody is in command, {client} neither; reset() takes command."
+        return (
+            f"{self._holder} is in command, not {client}; it passes on when {self._holder} leaves or is silent for "
+            f"{self.seconds:g} s."
+        )
+
+    def _told(self, before: str | None, after: str | None) -> bool:
+        if before == after:
+            return False
+        for listener in self._listeners:
+            listener(before, after)
+        return True

@@ -1,0 +1,173 @@
+"""The service bam_msgs/GymAPI of an environment, as a BAM rack offers it; and the same over a pair of topics."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import TimeoutError as NoAnswer  # not the builtin before Python 3.11
+from contextlib import suppress
+from typing import Any
+
+from bam_envs.bridge.bus import Bus, Caller, Message
+from bam_envs.bridge.freshness import FreshnessCheck
+from bam_envs.errors import BamEnvsError, RemoteError
+from bam_envs.serve.env_server import EnvServer
+from bam_envs.transports.answers import RecentAnswers
+from bam_envs.transports.gymapi import (
+    KIND,
+    GymRequest,
+    RequestType,
+    base_name,
+    read_request,
+    service_name,
+)
+from bam_envs.transports.gymapi_codec import EnvCodec
+from bam_envs.transports.gymapi_info import write_info
+from bam_envs.transports.gymapi_responses import write_failure, write_response
+from bam_envs.transports.string_rpc import StringRpcService
+from bam_envs.transports.trees import spec_to_json
+
+Feedback = list[dict[str, Any]]
+_log = logging.getLogger(__name__)
+_ANSWERS = 8
+"""Kept for requests that come twice; with images they are large."""
+_PATIENCE = 60.0
+"""Longest wait for the answer to a request that came twice while the first one is executed [s]."""
+_MOST_CLIENTS = 1024
+
+
+class GymApiService:
+    """Answers GymAPI requests for an `EnvServer`: those of racks' own clients, and of `RosbridgeTransport`.
+
+    A request with a tag is executed once and only in time; without one it is executed as it comes. One client is in
+    command; its name is ``client_id`` with its session, or with its connection.
+
+    Args:
+        env: What is served.
+        bus: Where.
+        namespace: Put before every name.
+        image_format: ``"png"``, which keeps every bit, or ``"jpeg"``.
+        depth: Name of the part of the observation that is a depth image, to be sent in whole millimetres; or nothing.
+        clock: Wall clock [s], for stamps.
+
+    Raises:
+        InvalidValue: `image_format` or `depth` is not possible.
+    """
+
+    def __init__(
+        self,
+        env: EnvServer,
+        bus: Bus,
+        namespace: str = "",
+        *,
+        image_format: str = "png",
+        depth: Sequence[str] = (),
+        clock: Callable[[], float] = time.time,
+    ) -> None:
+        self.env, self.bus, self.namespace = env, bus, namespace
+        self._spec = env.spec()
+        self._codec = EnvCodec(self._spec, image_format=image_format, depth=depth)
+        self._clock = clock
+        self._freshness, self._answers = FreshnessCheck(), RecentAnswers[Feedback](_ANSWERS)
+        self._lock = threading.Lock()
+        self._connections: OrderedDict[str, str] = OrderedDict()
+        self._leaving = ThreadPoolExecutor(1, "bam-gymapi-leaving")
+        self._topics = StringRpcService(bus, base_name(namespace), self.handle)
+
+    def start(self) -> GymApiService:
+        """Offer the service and the topics; itself."""
+        self.bus.on_leave(self._on_leave)
+        self.bus.serve(service_name(self.namespace), KIND, self.handle)
+        self._topics.start()
+        return self
+
+    def close(self) -> None:
+        """Answer on the topics no more. The service ends with its bus."""
+        self._topics.close()
+        self._leaving.shutdown()
+
+    def handle(self, message: Message, caller: Caller) -> dict[str, Any]:
+        """The response to a request; never raises: what goes wrong is the text of a failure."""
+        begun = time.monotonic()
+        try:
+            feedback = self._once(read_request(message), caller, begun)
+            return write_response(feedback, time.monotonic() - begun)
+        except BamEnvsError as error:
+            return write_failure(error, time.monotonic() - begun)
+        except Exception as error:  # a service always answers, whatever the environment does
+            _log.exception("%s failed", service_name(self.namespace))
+            return write_failure(RemoteError(f"{type(error).__name__}: {error}"), time.monotonic() - begun)
+
+    def _once(self, request: GymRequest, caller: Caller, begun: float) -> Feedback:
+        """The feedback; that of before if the request came before."""
+        tag = request.tag
+        if tag is None:
+            return self._perform(request, caller, None)
+        future, new = self._answers.claim((tag.session, tag.epoch, tag.sequence))
+        if new:
+            try:
+                self._freshness.require(tag)
+                future.set_result(self._perform(request, caller, begun + tag.deadline - tag.sent))
+            except Exception as error:  # whatever it was, it is the answer
+                future.set_exception(error)
+        try:
+            return future.result(_PATIENCE)
+        except NoAnswer:
+            raise RemoteError("The same request came before, and is still being executed.") from None
+
+    def _perform(self, request: GymRequest, caller: Caller, deadline: float | None) -> Feedback:
+        self.env.require_name(request.env_name)
+        client = self._client(request, caller)
+        if request.type is RequestType.STEP:
+            action = self._codec.read_actions(request.actions)
+            return self._written(self.env.step(client, action, deadline=deadline))
+        if request.type is RequestType.RESET:
+            self._remember(client, caller)
+            begun = self.env.reset(client, request.seed, request.options, take=request.take, deadline=deadline)
+            return self._written(begun)
+        if request.type is RequestType.CLOSE:
+            self.env.leave(client)
+            return []
+        return [{"info": write_info({}, {"spec": spec_to_json(self._spec)})}]
+
+    def _written(self, result: tuple[Any, ...]) -> Feedback:
+        stamp: Callable[[float], dict[str, int]] = getattr(self.bus, "stamp", _ros2_stamp)
+        return self._codec.write_result(result, stamp(self._clock()))
+
+    def _client(self, request: GymRequest, caller: Caller) -> str:
+        """Name of who asks, by which a client is known again when it comes back on another connection."""
+        mark = request.tag.session if request.tag is not None else caller.name
+        name = request.client_id or "somebody"
+        return f"{name}#{mark}" if mark else name
+
+    def _remember(self, client: str, caller: Caller) -> None:
+        """On which connection `client` began its episode, to know who leaves when that ends."""
+        if caller.name:
+            with self._lock:
+                self._connections[client] = caller.name
+                self._connections.move_to_end(client)
+                if len(self._connections) > _MOST_CLIENTS:
+                    self._connections.popitem(last=False)
+
+    def _on_leave(self, caller: Caller) -> None:
+        # A client that is back on another connection stays: the end of the old one may come late.
+        with self._lock:
+            clients = [client for client, name in self._connections.items() if name == caller.name]
+            for client in clients:
+                del self._connections[client]
+        # Elsewhere: it waits for a step that is under way, and this is the thread of the network.
+        with suppress(RuntimeError):  # closed meanwhile
+            self._leaving.submit(self._let_go, clients)
+
+    def _let_go(self, clients: list[str]) -> None:
+        for client in clients:
+            self.env.leave(client)
+
+
+def _ros2_stamp(now: float) -> dict[str, int]:
+    seconds, nanoseconds = divmod(round(now * 1e9), 1_000_000_000)
+    return {"sec": seconds, "nanosec": nanoseconds}

@@ -1,0 +1,164 @@
+"""Everything that `bam-serve` runs beside an environment: its robot's topics, its services, and what carries them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Any
+
+from bam_envs.bridge.bus import Bus
+from bam_envs.bridge.link import RosbridgeLink
+from bam_envs.bridge.server import BridgeServer
+from bam_envs.errors import InvalidValue, LinkLost, RemoteError
+from bam_envs.robots.profile import profile_for
+from bam_envs.robots.profile_tables import RobotProfile
+from bam_envs.robots.safe import SafeRobot
+from bam_envs.serve.command import CommandLease
+from bam_envs.serve.describe import Env
+from bam_envs.serve.env_server import EnvServer
+from bam_envs.serve.gymapi_service import GymApiService
+from bam_envs.serve.options import ServeOptions
+from bam_envs.serve.rclpy_bus import RclpyBus
+from bam_envs.serve.robot_service import RobotService
+from bam_envs.serve.served_robot import ServedRobot
+from bam_envs.serve.tcp_server import TcpServer
+from bam_envs.tokens import read_token
+from bam_envs.transports.gymapi import service_name
+
+
+class ServedEnvironment:
+    """An environment and everything that serves it. A context manager; entering starts it.
+
+    Args:
+        env: The environment; it is closed at the end.
+        options: Where and how.
+        tell: Called with a line for people whenever command changes hands, or a link comes and goes.
+
+    Raises:
+        InvalidValue: Options that exclude each other.
+    """
+
+    def __init__(self, env: Env, options: ServeOptions, tell: Callable[[str], None] = lambda line: None) -> None:
+        options.require_sane()
+        self.env, self.options = env, options
+        self.endpoints: list[str] = []
+        """One line for each way in; known when it is started."""
+        self.lease = CommandLease(options.lease)
+        """Who is in command."""
+        self.bus: Bus | None = None
+        """What carries topics and services."""
+        self.tcp: TcpServer | None = None
+        """The TCP transport, if there is one."""
+        self._tell, self._stack = tell, ExitStack()
+        self._robot_service: RobotService | None = None
+        self._token = None if options.token_file is None else read_token(options.token_file)
+
+    def __enter__(self) -> ServedEnvironment:
+        with ExitStack() as started:
+            started.callback(self.env.close)
+            self._start(started)
+            self._stack = started.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Halt the robot, say goodbye, close the environment. As often as one likes."""
+        self._stack.close()
+
+    def require_running(self) -> None:
+        """Nothing that it needs has ended.
+
+        Raises:
+            RemoteError: The robot's clock stands still.
+        """
+        if self._robot_service is not None and not self._robot_service.clock.running:
+            raise RemoteError("The clock of the robot stands still.")
+
+    def _start(self, started: ExitStack) -> None:
+        profile = _profile_of(self.env)
+        realtime = self.options.realtime or (profile is not None and not self.options.fast)
+        robot = None if profile is None else _take_robot(self.env, profile, realtime)
+        server = EnvServer(self.env, lease=self.lease, realtime=realtime and robot is None)
+        started.callback(server.close)
+        self.lease.on_change(self._say_command)
+        self.bus = bus = self._open_bus(started)
+        if robot is not None and profile is not None:
+            self._robot_service = RobotService(robot, profile, bus, self.lease, namespace=self.prefix)
+            started.callback(self._robot_service.close)
+            self._robot_service.start()
+        service = GymApiService(server, bus, self.prefix, image_format=self.options.image_format)
+        started.callback(service.close)
+        service.start()
+        name = server.spec().env_id
+        self.endpoints.append(f"{name} on {self._where(bus)}, {_ways(self.prefix, profile, realtime)}")
+        if self.options.tcp is not None:
+            self.tcp = TcpServer(server, self.options.bind, self.options.tcp, token=self._token)
+            started.callback(self.tcp.close)
+            self.tcp.start()
+            self.endpoints.append(f"{name} on {self.tcp.url}, the environment alone")
+
+    @property
+    def prefix(self) -> str:
+        """What stands before every name; that of the address of ``--via`` if no other is given."""
+        inherited = self.bus.namespace if isinstance(self.bus, RosbridgeLink) else ""
+        return self.options.prefix or inherited
+
+    def _open_bus(self, started: ExitStack) -> Bus:
+        options = self.options
+        if options.rclpy:
+            node = RclpyBus()
+            started.callback(node.close)
+            node.start()
+            return node
+        if options.via is not None:
+            link = RosbridgeLink(options.via, name="serve", ca_file=options.ca_file, token=self._token)
+            started.callback(link.close)
+            link.on_down(self._say_down)
+            link.connect()
+            return link
+        server = BridgeServer(options.bind, options.port, cert=options.cert, key=options.key, token=self._token)
+        started.callback(server.close)
+        return server.start()
+
+    def _where(self, bus: Bus) -> str:
+        if isinstance(bus, RclpyBus):
+            return f"the ROS 2 graph as the node {bus.name}"
+        return str(getattr(bus, "url", "a bus"))
+
+    def _say_command(self, before: str | None, after: str | None) -> None:
+        self._tell(f"{before} is no longer in command" if after is None else f"{after} is in command")
+
+    def _say_down(self, error: LinkLost) -> None:
+        self._tell(f"{error} It is tried again until it is back; the robot rests meanwhile.")
+
+
+def _profile_of(env: Env) -> RobotProfile | None:
+    """The topics of the environment's robot, if it is alone, simulated, and one that a profile describes."""
+    robot: Any = getattr(env.unwrapped, "robot", None)
+    if getattr(robot, "num_robots", 0) != 1 or isinstance(robot, SafeRobot):  # a live one has topics of its own
+        return None
+    try:
+        return profile_for(robot.spec)
+    except InvalidValue:  # then its environment is served without topics
+        return None
+
+
+def _take_robot(env: Env, profile: RobotProfile, realtime: bool) -> ServedRobot:
+    """Put a `ServedRobot` between the environment and its robot, at the start of an episode."""
+    inner: Any = env.unwrapped
+    resting = any(sink.hold == "zero" for way in profile.commands.values() for sink in way)
+    robot = ServedRobot(inner.robot, dead_man=profile.dead_man, zero_rests=resting, realtime=realtime)
+    inner.robot = robot
+    env.reset()
+    return robot
+
+
+def _ways(prefix: str, profile: RobotProfile | None, realtime: bool) -> str:
+    """What is offered there, and how time passes."""
+    topics = "" if profile is None else f" and a {profile.name}'s topics{f' under {prefix}' if prefix else ''}"
+    return f"{'real time' if realtime else 'fast'}: {service_name(prefix)}{topics}"

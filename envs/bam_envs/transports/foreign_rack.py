@@ -1,0 +1,63 @@
+"""What has to be said of a rack that does not describe its environment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+from gymnasium import Space
+
+from bam_envs.errors import InvalidValue
+from bam_envs.registry import resolve_id
+from bam_envs.transports.gymapi_actions import DEFAULT
+from bam_envs.transports.gymapi_codec import EnvCodec
+from bam_envs.transports.transport import EnvSpecMessage
+
+
+@dataclass(frozen=True)
+class ForeignRack:
+    """A rack whose server is not of bam-train."""
+
+    observation_space: Space[Any] | None = None
+    """Of one row."""
+    action_space: Space[Any] | None = None
+    """Of one row."""
+    num_envs: int = 1
+    """Rows (arms)."""
+    period: float | None = None
+    """Time between two actions [s]; None if nobody knows."""
+    action_type: int = DEFAULT
+    """What it is to do with an action: 1 default, 2 pick and lift, 3 pick and place, 4 open, 5 fold."""
+
+    def __post_init__(self) -> None:
+        if self.num_envs < 1:
+            raise InvalidValue(f"num_envs must be at least 1, not {self.num_envs}.")
+
+    @property
+    def is_described(self) -> bool:
+        """Whether both spaces were given."""
+        return self.observation_space is not None and self.action_space is not None
+
+    def codec(self, env_id: str) -> EnvCodec:
+        """How values travel; spaces that were not given are those of the environment registered here as `env_id`.
+
+        Raises:
+            UnknownName: Nothing is registered as `env_id`.
+        """
+        observation_space, action_space = self.observation_space, self.action_space
+        if observation_space is None or action_space is None:
+            observation_space, action_space = _registered_spaces(env_id)
+        vector = self.num_envs > 1
+        spec = EnvSpecMessage(
+            env_id or "rack", observation_space, action_space, self.num_envs, vector=vector, period=self.period
+        )
+        return EnvCodec(spec, foreign=True, action_type=self.action_type)
+
+
+def _registered_spaces(env_id: str) -> tuple[Space[Any], Space[Any]]:
+    env: gym.Env[Any, Any] = gym.make(resolve_id(env_id))
+    try:
+        return env.observation_space, env.action_space
+    finally:
+        env.close()  # type: ignore[no-untyped-call]

@@ -1,0 +1,64 @@
+"""One function that makes the transport of a URL."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.tokens import read_token
+from bam_envs.transports.transport import Transport
+
+_CLASSES = {
+    "tcp": "bam_envs.transports.tcp:TcpTransport",
+    "ws": "bam_envs.transports.rosbridge:RosbridgeTransport",
+    "wss": "bam_envs.transports.rosbridge:RosbridgeTransport",
+    "ros2": "bam_envs.transports.rclpy:RclpyTransport",
+}
+"""By the scheme of the URL; imported on use."""
+
+
+def open_transport(
+    url: str, *, env_id: str = "", ca_file: str | None = None, token_file: str | None = None, **options: Any
+) -> Transport:
+    """The transport of `url`, not connected yet.
+
+    =======================  ====================================================
+    url                      what is there
+    =======================  ====================================================
+    tcp://host:port          ``bam-serve --tcp PORT``
+    ws://host:port/space     a rosbridge server, such as ``bam-serve --port PORT``
+    wss://host:port/space    the same with TLS
+    ros2://space             a ROS 2 graph, where rclpy is installed
+    =======================  ====================================================
+
+    Args:
+        url: Where the environment runs; `space` is a ROS namespace and may be left out.
+        env_id: Which environment is wanted; "" for the one that is there.
+        ca_file: Certificates that the server's is checked against, with wss://.
+        token_file: A file that holds the server's secret.
+        options: Other keywords of the transport's class, such as ``timeout``.
+
+    Raises:
+        InvalidValue: The URL has another scheme, the transport has no such option, or the file cannot be read.
+    """
+    scheme, separator, rest = url.partition("://")
+    if not separator or (not rest.strip("/") and scheme != "ros2"):
+        raise InvalidValue(f"A transport is a URL such as tcp://10.0.0.5:5555 or ws://10.0.0.5:9090, not {url!r}.")
+    if scheme not in _CLASSES:
+        raise InvalidValue(f"{url}: {UnknownName('transport', scheme, _CLASSES)} It must be one of {_schemes()}.")
+    if ca_file is not None:
+        options = {**options, "ca_file": ca_file}
+    if token_file is not None:
+        options = {**options, "token": read_token(token_file)}
+    module, _, name = _CLASSES[scheme].partition(":")
+    make: Any = getattr(importlib.import_module(module), name)
+    try:
+        transport: Transport = make(url, env_id=env_id, **options)
+    except TypeError as error:
+        raise InvalidValue(f"{url} cannot be opened with these options: {error}.") from error
+    return transport
+
+
+def _schemes() -> str:
+    return ", ".join(f"{scheme}://" for scheme in _CLASSES)

@@ -1,0 +1,56 @@
+"""JSON without NaN and infinities, both ways."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from typing import Any
+
+from bam_envs.errors import InvalidValue, ProtocolError
+
+
+def dump_json(value: Any, what: str) -> str:
+    """`value` as strict JSON; bytes as base64, as rosbridge has them.
+
+    Raises:
+        InvalidValue: It holds what JSON has no word for: NaN, an infinity, an array.
+    """
+    try:
+        return json.dumps(value, allow_nan=False, separators=(",", ":"), default=_base64)
+    except (TypeError, ValueError) as error:
+        raise InvalidValue(f"{what} must be plain finite JSON values: {error}.") from error
+
+
+def _base64(value: object) -> str:
+    if isinstance(value, bytes):
+        return base64.b64encode(value).decode("ascii")
+    raise TypeError(f"{type(value).__name__} is none")
+
+
+def load_json(text: object, what: str) -> dict[str, Any]:
+    """The object that `text` is in strict JSON.
+
+    Raises:
+        ProtocolError: It is no JSON object, or a number in it is not finite.
+    """
+    if not isinstance(text, str):
+        raise ProtocolError(f"{what} must be a string with a JSON object, not {type(text).__name__}.")
+    try:
+        value = json.loads(text, parse_constant=_refuse_constant, parse_float=_finite)
+    except (ValueError, RecursionError) as error:
+        raise ProtocolError(f"{what} must be a JSON object: {error}.") from error
+    if not isinstance(value, dict):
+        raise ProtocolError(f"{what} must be a JSON object, not {type(value).__name__}.")
+    return value
+
+
+def _refuse_constant(word: str) -> float:
+    raise ValueError(f"{word} is not a finite number")
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{text} is not a finite number")
+    return number

@@ -1,0 +1,29 @@
+from bam_envs.bridge.bus import UNKNOWN_CALLER, Caller
+from bam_envs.serve.clients import Clients
+
+A, B = Caller("client1", "127.0.0.1:1"), Caller("client2")
+
+
+def test_names():
+    clients = Clients()
+    assert clients.name(A, None) == "127.0.0.1:1"
+    assert clients.name(B, None) == "client2"
+    assert clients.name(A, "4f1c") == "session 4f1c"
+    assert clients.name(UNKNOWN_CALLER, "4f1c") == "session 4f1c"
+    assert clients.name(UNKNOWN_CALLER, None) == "a sender without a name"
+
+
+def test_a_client_has_left_with_its_last_connection():
+    clients = Clients()
+    clients.name(A, "4f1c")
+    clients.name(B, "4f1c")
+    clients.name(B, None)
+    assert clients.left(B) == ["client2"]
+    assert clients.left(A) == ["session 4f1c"]
+    assert clients.left(A) == []
+
+
+def test_who_has_no_name_never_leaves():
+    clients = Clients()
+    clients.name(UNKNOWN_CALLER, "4f1c")
+    assert clients.left(UNKNOWN_CALLER) == []

@@ -1,0 +1,36 @@
+import pytest
+
+from bam_envs.errors import InvalidValue
+from bam_envs.serve.options import ServeOptions
+
+
+def test_the_defaults_are_possible():
+    ServeOptions().require_sane()
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"realtime": True, "fast": True}, "--realtime and --fast exclude each other; give one of the two."),
+        ({"via": "ws://a", "rclpy": True}, "--via and --rclpy exclude each other; give one of the two."),
+        ({"via": "ws://a", "cert": "c"}, "--via and --cert exclude each other; give one of the two."),
+        ({"rclpy": True, "cert": "c"}, "--rclpy and --cert exclude each other; give one of the two."),
+        ({"key": "k"}, "--key means something only with --cert."),
+        ({"ca_file": "k"}, "--ca-file means something only with --via."),
+        ({"lease": 0.0}, "--lease must be above 0 s, not 0."),
+        ({"lease": float("nan")}, "--lease must be above 0 s, not nan."),
+        ({"port": -1}, "--port must be 0 to 65535, not -1."),
+        ({"tcp": 65536}, "--tcp must be 0 to 65535, not 65536."),
+        ({"namespace": "a b"}, "--namespace must be letters, digits and _, such as bam_001, not 'a b'."),
+        ({"namespace": "1a"}, "--namespace must be letters, digits and _, such as bam_001, not '1a'."),
+    ],
+)
+def test_what_cannot_be(options, text):
+    with pytest.raises(InvalidValue) as error:
+        ServeOptions(**options).require_sane()
+    assert str(error.value) == text
+
+
+@pytest.mark.parametrize(("name", "prefix"), [("", ""), ("/", ""), ("a", "/a"), ("/a/b_1/", "/a/b_1")])
+def test_the_prefix_of_every_name(name, prefix):
+    assert ServeOptions(namespace=name).prefix == prefix

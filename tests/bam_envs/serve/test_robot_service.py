@@ -1,0 +1,379 @@
+import json
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bam_envs.bridge.freshness import read_tag
+from bam_envs.errors import LinkLost, PhysicsDiverged
+from bam_envs.robots.codec import RobotInfo, encode_command, read_info
+from bam_envs.robots.fake import FakeRobot
+from bam_envs.robots.fake_base import FakeBase
+from bam_envs.robots.profile import load_profile
+from bam_envs.robots.robot import Initial
+from bam_envs.robots.simulated.arm import SimulatedArm
+from bam_envs.serve.command import CommandLease
+from bam_envs.serve.robot_service import RobotService
+from bam_envs.serve.served_robot import ServedRobot
+
+HOME = np.array([[0.0, -1.2, 1.6, -2.0, -1.57, 0.0]])
+ARM, GRIPPER = "/forward_position_controller/commands", "/gripper/commands"
+UR5E = load_profile("ur5e")
+
+
+def initial():
+    return Initial({"joint_position": HOME, "object_pose": np.array([[0.5, 0.1, 0.3]])}, np.zeros(1, dtype=np.int64))
+
+
+def command(change=0.0, width=0.085):
+    return np.concatenate([HOME[0] + change, [width]])
+
+
+class Service:
+    """A service, its robot, its bus and its lease."""
+
+    def __init__(self, bus, robot, realtime, **options):
+        self.bus, self.lease = bus, CommandLease(5.0)
+        self.robot = ServedRobot(robot, dead_man=0.1, realtime=realtime)
+        self.robot.connect()
+        self.robot.reset(np.zeros(1, dtype=np.int64), initial())
+        self.service = RobotService(self.robot, UR5E, bus, self.lease, **options)
+        self.service.start()
+
+    def send(self, numbers, tag=None, caller="a", namespace=""):
+        """Every message of a command; the first refusal, or None."""
+        for topic, _, message in encode_command(UR5E, self.robot.spec, numbers, tag):
+            refusal = self.bus.say(namespace + topic, message, caller)
+            if refusal is not None:
+                return refusal
+        return None
+
+    def joints(self, condition=lambda message: True):
+        return self.bus.wait_for("/joint_states", condition)
+
+
+@pytest.fixture
+def serve(bus):
+    served = []
+
+    def make(robot=None, realtime=False, **options):
+        served.append(Service(bus, robot or FakeRobot(1), realtime, **options))
+        return served[-1]
+
+    yield make
+    for one in served:
+        one.service.close()
+        one.service.close()
+        one.robot.close()
+
+
+def test_what_it_offers(serve, bus):
+    serve(namespace="/cell")
+    assert bus.advertised == {
+        "/cell/joint_states": "sensor_msgs/JointState",
+        "/cell/gripper/joint_states": "sensor_msgs/JointState",
+        "/cell/object_pose": "geometry_msgs/PoseStamped",
+        "/cell/bam/scene/reply": "std_msgs/String",
+    }
+    assert {topic: entries[0][0] for topic, entries in bus.listeners.items()} == {
+        "/cell/gripper/commands": "std_msgs/Float64MultiArray",
+        "/cell/forward_position_controller/commands": "std_msgs/Float64MultiArray",
+        "/cell/scaled_joint_trajectory_controller/joint_trajectory": "trajectory_msgs/JointTrajectory",
+        "/cell/bam/halt": "std_msgs/Empty",
+        "/cell/bam/scene/request": "std_msgs/String",
+    }
+    assert {name: kind for name, (kind, _) in bus.services.items()} == {"/cell/bam/robot": "std_srvs/Trigger"}
+
+
+@pytest.mark.parametrize(
+    ("realtime", "text"),
+    [
+        (False, "ur5e, served in lockstep: its time goes on with commands, 0.05 s each"),
+        (True, "ur5e, served in real time; it rests 0.1 s after the last command"),
+    ],
+)
+def test_it_says_what_it_is(serve, bus, realtime, text):
+    serve(realtime=realtime)
+    answer = bus.services["/bam/robot"][1]({}, None)
+    assert answer["success"] is True
+    assert read_info(answer["message"], "/bam/robot") == RobotInfo("ur5e", True, not realtime, 0.05, text)
+
+
+def test_in_lockstep_each_command_is_one_period_and_is_echoed(serve, tagger):
+    service = serve()
+    tag = tagger.next(1, 0.1)
+    assert service.send(command(0.01), tag) is None
+    state = service.joints(lambda message: message["header"]["frame_id"] == tag.to_text())
+    np.testing.assert_allclose(state["position"], HOME[0] + 0.01)
+    assert abs(state["header"]["stamp"]["sec"] - time.time()) < 10
+    assert service.robot.state.stamp == pytest.approx(0.05)
+
+
+def test_in_lockstep_nothing_goes_on_before_a_command_is_complete(serve, bus):
+    service = serve()
+    gripper, arm = encode_command(UR5E, service.robot.spec, command(0.01, 0.04), None)
+    assert (gripper[0], arm[0]) == (GRIPPER, ARM)
+    bus.say(GRIPPER, gripper[2])
+    count = len(bus.published)
+    with bus.news:
+        assert bus.news.wait_for(lambda: len(bus.published) > count + 6, 10)
+    assert service.robot.state.stamp == 0.0
+    bus.say(ARM, arm[2])
+    service.joints(lambda message: message["position"][0] == 0.01)
+    np.testing.assert_allclose(service.robot.target(), [command(0.01, 0.04)])
+
+
+def test_in_real_time_states_come_with_or_without_commands(serve, bus):
+    service = serve(SimulatedArm(1), realtime=True)
+    for number in range(1, 11):
+        assert service.send(command(0.005 * number)) is None
+        count = len(bus.published)
+        with bus.news:
+            assert bus.news.wait_for(lambda count=count: len(bus.published) >= count + 9, 10)
+    service.joints(lambda message: message["position"][0] > 0.001)
+    # Nobody says anything any more: it rests, and still says where.
+    deadline = time.monotonic() + 10
+    while not service.robot._resting:
+        assert time.monotonic() < deadline
+        service.joints()
+    stamp = service.robot.state.stamp[0]
+    with bus.news:
+        assert bus.news.wait_for(lambda: service.robot.state.stamp[0] > stamp, 10)
+
+
+def refused(service, tagger):
+    return [
+        ([1.0, 2.0], f"ProtocolError: {ARM}: data must have 6 (", "not 2."),
+        ([None] + [0.0] * 5, f"ProtocolError: {ARM}: data[0] must be a finite number, not null.", ""),
+        ([float("nan")] + [0.0] * 5, f"ProtocolError: {ARM}: data[0] must be a finite number, not nan.", ""),
+        (["1"] + [0.0] * 5, f"ProtocolError: {ARM}: data[0] must be a finite number, not '1'.", ""),
+        (
+            [7.0] + [0.0] * 5,
+            f"ProtocolError: {ARM}: shoulder_pan_joint must be -6.28319 to 6.28319 rad, not 7 rad.",
+            "",
+        ),
+    ]
+
+
+def test_bad_commands_are_refused_and_the_robot_does_not_move(serve, bus, tagger):
+    service = serve()
+    for data, begin, end in refused(service, tagger):
+        text = bus.say(ARM, {"data": data})
+        assert text.startswith(begin)
+        assert text.endswith(end)
+    assert service.robot.state.stamp == 0.0
+    assert service.lease.holder is None
+
+
+def test_old_commands_are_refused(serve, tagger):
+    service = serve()
+    first, second = tagger.next(1, 0.1), tagger.next(1, 0.1)
+    assert service.send(command(0.01), second) is None
+    assert service.send(command(0.5), first) == "RemoteError: old message: number 1 after number 2"
+    late = replace(second, sequence=9, sent=second.sent - 5.0, deadline=second.sent - 4.9)
+    assert service.send(command(0.5), late).startswith("RemoteError: expired: ")
+    assert service.send(command(0.02), replace(tagger.next(2, 0.1), sequence=10)) is None
+    old = replace(tagger.next(1, 0.1), sequence=11)
+    assert service.send(command(0.5), old) == "RemoteError: old connection: epoch 1, and epoch 2 is there"
+
+
+def test_one_client_is_in_command_and_the_others_are_told(serve, bus):
+    service = serve()
+    assert service.send(command(0.01), caller="a") is None
+    assert service.send(command(0.5), caller="b") == (
+        "NotInCommand: a:1 is in command, not b:1; it passes on when a:1 leaves or is silent for 5 s."
+    )
+    bus.leave("a")
+    assert service.lease.holder is None
+    assert service.send(command(0.02), caller="b") is None
+    assert service.lease.holder == "b:1"
+
+
+def test_a_session_is_one_client_on_both_of_its_connections(serve, bus, tagger):
+    service = serve()
+    assert service.send(command(0.01), tagger.next(1, 0.1), "control") is None
+    assert service.send(command(0.02), tagger.next(1, 0.1), "halt") is None
+    bus.leave("halt")
+    assert service.lease.holder == f"session {tagger.session}"
+    bus.leave("control")
+    assert service.lease.holder is None
+
+
+def test_what_a_client_sent_does_not_go_on_under_the_next_one(serve, bus):
+    service = serve(SimulatedArm(1), realtime=True)
+    service.send(command(0.5), caller="a")
+    service.joints(lambda message: message["position"][0] > 0.005)
+    service.lease.take("b", force=True)
+    rest = service.robot.target()
+    assert (rest[0, :6] < HOME[0] + 0.4).all()
+    assert service.robot._resting
+
+
+def test_an_order_that_waits_while_command_changes_is_not_executed(serve, bus):
+    service = serve()
+    service.service.clock.stop()
+    service.send(command(0.5), caller="a")
+    service.lease._holder = "b"  # between the listener's check and the clock
+    service.service._tick_lockstep()
+    assert service.robot.state.stamp == 0.0
+
+
+def test_anybody_may_halt(serve, bus):
+    service = serve(SimulatedArm(1), realtime=True)
+    service.send(command(0.5), caller="a")
+    service.joints(lambda message: message["position"][0] > 0.005)
+    assert bus.say("/bam/halt", {}, "somebody") is None
+    assert service.robot._resting
+    assert service.lease.holder == "a:1"
+
+
+def scene(bus, payload, caller="a", identity="1"):
+    bus.say("/bam/scene/request", {"data": json.dumps({"id": identity, "payload": payload})}, caller)
+    fits = f'"id":"{identity}"'
+    return json.loads(bus.wait_for("/bam/scene/reply", lambda message: fits in message["data"])["data"])
+
+
+def test_the_scene_can_be_set(serve, bus):
+    service = serve()
+    assert scene(bus, {"object_pose": [[0.4, -0.1, 0.0]], "seeds": [7]}) == {"id": "1", "payload": {}}
+    np.testing.assert_allclose(service.robot.state.signals["object_position"][0, :2], [0.4, -0.1])
+    assert scene(bus, {"object_pose": [0.45, 0.1, 0.0]}, identity="2") == {"id": "2", "payload": {}}
+    assert scene(bus, {}, identity="3") == {"id": "3", "payload": {}}
+    np.testing.assert_allclose(service.robot.state.signals["object_position"][0, :2], [0.45, 0.1])
+
+
+@pytest.mark.parametrize(
+    ("payload", "text"),
+    [
+        ({"object_pose": [1.0]}, "object_pose must be a list of numbers, not 1.0."),
+        ({"object_pose": [1.0, 2.0]}, "object_pose must be 3 numbers (x, y [m], yaw [rad]), not 2."),
+        ({"object_pose": [1.0, "x", 0.0]}, "object_pose[1] must be a finite number, not 'x'."),
+        ({"seeds": [-1]}, "seeds must be one number, 0 or more, not [-1]."),
+        ({"seeds": [1.5]}, "seeds must be one number, 0 or more, not [1.5]."),
+        ({"session": 3}, "session must be text, not 3."),
+    ],
+)
+def test_a_wrong_scene_is_refused(serve, bus, payload, text):
+    serve()
+    assert scene(bus, payload) == {"id": "1", "error": text, "kind": "ProtocolError"}
+
+
+def test_only_the_client_in_command_sets_the_scene(serve, bus, tagger):
+    service = serve()
+    service.send(command(), tagger.next(1, 0.1), "a")
+    assert scene(bus, {}, "b")["kind"] == "NotInCommand"
+    assert scene(bus, {"session": tagger.session}, "c", "2") == {"id": "2", "payload": {}}
+    bus.leave("a")
+    assert service.lease.holder == f"session {tagger.session}"
+
+
+def test_a_scene_takes_command(serve, bus):
+    service = serve()
+    scene(bus, {}, "a")
+    assert service.lease.holder == "a:1"
+
+
+def test_a_real_robot_has_no_scene(serve, bus):
+    serve(simulated=False)
+    assert "/bam/scene/request" not in bus.listeners
+
+
+class Failing(FakeRobot):
+    def step(self, command):
+        raise PhysicsDiverged("The simulated state of rows [0] is not finite. Reset these rows.")
+
+
+def test_a_robot_that_failed_takes_no_commands_until_a_reset(serve, bus, caplog):
+    service = serve(Failing(1))
+    assert service.send(command(0.1)) is None
+    deadline = time.monotonic() + 10
+    while service.robot.fault is None:
+        assert time.monotonic() < deadline
+    assert service.send(command(0.1)) == (
+        "RemoteError: ur5e failed, and needs a reset: The simulated state of rows [0] is not finite. Reset these rows."
+    )
+    service.robot.reset(np.zeros(1, dtype=np.int64), initial())
+    service.service.clock.stop()
+    assert service.send(command(0.1)) is None
+
+
+def test_a_link_that_is_down_is_said_once_and_the_clock_goes_on(serve, bus, caplog):
+    service = serve()
+    bus.fails = LinkLost("the link is down")
+    service.service.clock.stop()
+    service.service._publish()
+    service.service._publish()
+    assert [record.getMessage() for record in caplog.records] == ["ur5e: the link is down"]
+    bus.fails = None
+    count = len(bus.published)
+    service.service._publish()
+    assert len(bus.published) == count + 3
+
+
+def test_stamps_are_as_the_bus_spells_them(serve, bus):
+    bus.stamp = lambda seconds: {"secs": 1, "nsecs": 2}
+    assert serve().joints()["header"]["stamp"] == {"secs": 1, "nsecs": 2}
+
+
+def test_the_tag_of_the_last_command_stays_until_command_changes(serve, bus, tagger):
+    service = serve()
+    service.send(command(), tagger.next(1, 0.1), "a")
+    service.joints(lambda message: read_tag(message["header"]["frame_id"]) is not None)
+    bus.leave("a")
+    count = len(bus.published)
+    with bus.news:
+        assert bus.news.wait_for(lambda: len(bus.published) > count + 6, 10)
+    assert service.joints()["header"]["frame_id"] == ""
+
+
+def test_nothing_is_published_where_nobody_listens(serve, bus):
+    bus.clients = 0
+    service = serve()
+    service.service.clock.stop()
+    bus.published.clear()
+    service.service._publish()
+    assert bus.published == []
+
+
+@pytest.fixture
+def base(bus):
+    """A base in real time whose clocks are set by hand: ``tick()`` is one part of a period."""
+    profile, now = load_profile("mir100"), [0.0]
+    robot = ServedRobot(FakeBase(1), dead_man=profile.dead_man, zero_rests=True, realtime=True, now=lambda: now[0])
+    robot.connect()
+    robot.reset(np.zeros(1, dtype=np.int64), Initial({}, np.zeros(1, dtype=np.int64)))
+    service = RobotService(robot, profile, bus, CommandLease(5.0))
+    service.start()
+    service.clock.stop()
+
+    def tick(number):
+        for _ in range(number):
+            service._tick()
+            now[0] += robot.tick_period
+        return robot.state.signals["base_velocity"][0]
+
+    yield tick
+    service.close()
+    robot.close()
+
+
+def drive(forwards):
+    return {"linear": {"x": forwards, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": 0.1}}
+
+
+def test_a_base_stands_still_half_a_second_after_the_last_command(base, bus):
+    assert bus.say("/cmd_vel", drive(0.2)) is None
+    assert base(25).tolist() == [0.2, 0.1]
+    assert base(10).tolist() == [0.0, 0.0]
+    assert bus.say("/cmd_vel", drive(0.1)) is None
+    assert base(5).tolist() == [0.1, 0.1]
+    odometry = bus.wait_for("/odom")
+    assert odometry["twist"]["twist"]["linear"]["x"] == 0.1
+
+
+def test_a_base_is_told_no_speed_that_it_has_not(base, bus):
+    assert bus.say("/cmd_vel", drive(1.5)) == (
+        "ProtocolError: /cmd_vel: linear_velocity must be -1 to 1 m/s, not 1.5 m/s."
+    )
+    assert base(5).tolist() == [0.0, 0.0]

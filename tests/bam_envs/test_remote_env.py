@@ -1,0 +1,136 @@
+"""An environment behind a transport is the environment."""
+
+import contextlib
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env
+
+from bam_envs.errors import InvalidValue, LinkLost, ResetNeeded
+from bam_envs.remote_env import RemoteEnv, RemoteVectorEnv, make_remote_env, make_remote_rows
+from bam_envs.serve.env_server import EnvServer
+from bam_envs.serve.tcp_server import TcpServer
+from bam_envs.transports.fake import FakeEnv, FakeTransport
+from bam_envs.transports.local import LocalTransport
+from bam_envs.transports.tcp import TcpTransport
+
+
+@contextlib.contextmanager
+def local(env):
+    yield LocalTransport(env)
+
+
+@contextlib.contextmanager
+def tcp(env):
+    with TcpServer(EnvServer(env)) as server:
+        yield TcpTransport(server.url)
+
+
+THROUGH = pytest.mark.parametrize("through", [local, tcp])
+
+
+@THROUGH
+@pytest.mark.parametrize("env_id", ["bam/reach-v0", "CartPole-v1"])
+@pytest.mark.filterwarnings("ignore:.*Not able to test alternative render modes.*")
+@pytest.mark.filterwarnings("ignore:.*Box observation space m(in|ax)imum value is (-)?infinity.*")
+def test_gymnasiums_checker_passes(make, through, env_id):
+    with through(make(env_id)) as transport:
+        env = RemoteEnv(transport)
+        check_env(env)
+        env.close()
+
+
+@THROUGH
+def test_same_seed_and_actions_give_the_same_bit_for_bit(make, actions_of, through):
+    alone = make("bam/reach-v0")
+    with through(make("bam/reach-v0")) as transport:
+        env = RemoteEnv(transport)
+        first, info = env.reset(seed=11)
+        theirs, their_info = alone.reset(seed=11)
+        assert first.tobytes() == theirs.tobytes()
+        assert info == their_info
+        for action in actions_of(0, 100, 6):
+            one, two = env.step(action), alone.step(action)
+            assert (one[0].dtype, one[0].tobytes()) == (two[0].dtype, two[0].tobytes())
+            assert one[1:] == two[1:]
+        assert one[3]
+        env.close()
+
+
+def test_what_the_other_end_says(make):
+    there = make("bam/reach-v0")
+    env = RemoteEnv(LocalTransport(there))
+    assert (env.observation_space, env.action_space) == (there.observation_space, there.action_space)
+    assert (env.env_id, env.period, env.max_episode_steps) == ("bam/reach-v0", 0.05, 100)
+    assert env.describe() == there.unwrapped.describe()
+    env.close()
+
+
+def test_it_connects_when_something_is_needed():
+    transport = FakeTransport()
+    env = RemoteEnv(transport)
+    assert transport.calls == []
+    assert env.action_space == spaces.Box(-1, 1, (2,))
+    env.reset(seed=3, options={"a": 1})
+    assert transport.calls == [("connect",), ("reset", 3, {"a": 1})]
+    assert env.transport is transport
+
+
+def test_a_step_needs_an_episode():
+    env = RemoteEnv(FakeTransport(FakeEnv(episode_steps=1)))
+    for _ in range(2):
+        with pytest.raises(ResetNeeded) as caught:
+            env.step(np.zeros(2))
+        assert str(caught.value) == "No episode is running: it ended, or never began. Call reset() first."
+        env.reset()
+        env.step(np.zeros(2))
+
+
+def test_a_lost_link_is_no_end_of_an_episode():
+    transport = FakeTransport()
+    env = RemoteEnv(transport)
+    env.reset()
+    transport.faults.append(LinkLost("the cable is out"))
+    with pytest.raises(LinkLost) as caught:
+        env.step(np.zeros(2))
+    assert str(caught.value) == "the cable is out"
+
+
+def test_rows_are_for_the_other_class(make_rows):
+    env = RemoteEnv(LocalTransport(make_rows("bam/reach-v0", 3)))
+    with pytest.raises(InvalidValue) as caught:
+        env.reset()
+    assert str(caught.value) == "bam/reach-v0 has 3 rows there; make it with num_envs=3."
+
+
+def test_gymnasiums_wrappers_work():
+    env = gym.wrappers.TimeLimit(gym.wrappers.ClipAction(RemoteEnv(FakeTransport())), 3)
+    env.reset(seed=0)
+    assert [env.step(np.ones(2, np.float32))[3] for _ in range(3)] == [False, False, True]
+    assert env.render() is None
+    env.close()
+
+
+def test_making_it_of_a_url(make):
+    with TcpServer(EnvServer(make("bam/reach-v0"))) as server:
+        env = make_remote_env("bam/reach", server.url, timeout=5.0, ca_file=None, token_file=None)
+        assert env.reset(seed=0)[0].shape == env.observation_space.shape
+        env.close()
+        with pytest.raises(LinkLost) as caught:
+            make_remote_env("bam/pick-v0", server.url).reset()
+        assert str(caught.value) == (
+            f"{server.url}: There is no environment 'bam/pick-v0' here; bam/reach-v0 is served."
+        )
+
+
+def test_making_rows_of_urls_and_transports(make):
+    with TcpServer(EnvServer(make("bam/reach-v0"))) as server:
+        rows = make_remote_rows("bam/reach-v0", [server.url, LocalTransport(make("bam/reach-v0"))], 2)
+        assert type(rows) is RemoteVectorEnv
+        assert rows.reset(seed=0)[0].shape[0] == 2
+        rows.close()
+        alone = make_remote_rows("bam/reach-v0", server.url)
+        assert alone.num_envs == 1
+        alone.close()
