@@ -15,6 +15,7 @@ from bam_envs.registry import ENVIRONMENTS
 from bam_envs.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint
 from bam_train.errors import CheckpointMismatch, SettingsError
+from bam_train.place import HERE, Place
 
 T = TypeVar("T")
 AnyEnv = gym.Env[Any, Any] | VectorEnv[Any, Any, Any]
@@ -26,26 +27,59 @@ def is_batched(env_id: str) -> bool:
 
 
 def make_env(
-    env_id: str, env_kwargs: Mapping[str, Any] | None = None, *, render_mode: str | None = None
+    env_id: str,
+    env_kwargs: Mapping[str, Any] | None = None,
+    *,
+    render_mode: str | None = None,
+    place: Place = HERE,
 ) -> gym.Env[Any, Any]:
-    """One environment, with its time limit and without Gymnasium's (slow) checker.
+    """One environment, with its time limit and without Gymnasium's (slow) checker; nothing is connected yet.
+
+    Args:
+        env_id: Its full id.
+        env_kwargs: Its keyword arguments; those of an environment elsewhere are its own.
+        render_mode: What `render` shows.
+        place: Where it runs.
 
     Raises:
         SettingsError: It cannot be made: a package is missing, or it does not take these arguments.
     """
+    if place.transport:
+        from bam_envs.remote_env import make_remote_env
+
+        return make_remote_env(env_id, require_one(place.transport), **place.link_options)
+    given = dict(env_kwargs or {})
+    kwargs = given if place.robot is None else place.robot_kwargs(env_id, given)
     rendering = {} if render_mode is None else {"render_mode": render_mode}
-    return _made(env_id, lambda: gym.make(env_id, disable_env_checker=True, **{**(env_kwargs or {}), **rendering}))
+    return _made(env_id, lambda: gym.make(env_id, disable_env_checker=True, **{**kwargs, **rendering}))
 
 
-def make_rows(env_id: str, env_kwargs: Mapping[str, Any] | None, num_envs: int) -> VectorEnv[Any, Any, Any]:
+def require_one(transports: tuple[str, ...]) -> str:
+    """The one address that there has to be.
+
+    Raises:
+        SettingsError: There are several.
+    """
+    if len(transports) > 1:
+        raise SettingsError(f"--transport: expected one address, found {len(transports)}: {', '.join(transports)}")
+    return transports[0]
+
+
+def make_rows(
+    env_id: str, env_kwargs: Mapping[str, Any] | None, num_envs: int, place: Place = HERE
+) -> VectorEnv[Any, Any, Any]:
     """`num_envs` environments stepped together, with automatic resets in the same step.
 
     Ours are one batched simulation; of others, `num_envs` Python environments take turns (their own vector forms differ
-    in resets and seeds).
+    in resets and seeds). Elsewhere there are as many as the servers have.
 
     Raises:
         SettingsError: It cannot be made.
     """
+    if place.transport:
+        from bam_envs.remote_env import make_remote_rows
+
+        return make_remote_rows(env_id, place.transport, **place.link_options)
     if is_batched(env_id):
         return _made(env_id, lambda: gym.make_vec(env_id, num_envs=num_envs, **(env_kwargs or {})))
     arguments = {"disable_env_checker": True, **(env_kwargs or {})}
@@ -65,10 +99,11 @@ def control_period(env: gym.Env[Any, Any]) -> float | None:
     return 1.0 / float(rate) if rate else None
 
 
-def require_fit(checkpoint: Checkpoint, env: AnyEnv) -> None:
+def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: Place = HERE) -> None:
     """Prove that `env` takes and gives what the checkpoint's policy was trained with.
 
-    Compared: both spaces, the labels and units of every signal, and the control period, as far as both sides say.
+    Compared: both spaces, the labels and units of every signal, and the control period, as far as both sides say. An
+    environment that runs elsewhere is asked over its link.
 
     Raises:
         CheckpointMismatch: Names the first thing that differs, and both values.
@@ -79,15 +114,17 @@ def require_fit(checkpoint: Checkpoint, env: AnyEnv) -> None:
         ("action_space", manifest.action_space, space_to_json(_single(env, "action_space"))),
     ]
     describe = getattr(env.unwrapped, "describe", None)
-    if describe is not None and manifest.signals:
-        pairs.append(("signals", _names_and_units(manifest.signals), _names_and_units(describe())))
+    signals = {} if describe is None else describe()
+    if signals and manifest.signals:
+        pairs.append(("signals", _names_and_units(manifest.signals), _names_and_units(signals)))
     for name, theirs, ours in pairs:
         difference = first_difference(_plain(theirs), _plain(ours), name)
         if difference is not None:
-            raise CheckpointMismatch(checkpoint.path, _mismatch(manifest.env, *difference))
+            raise CheckpointMismatch(checkpoint.path, _mismatch(manifest.env, place, *difference))
     period = getattr(env.unwrapped, "period", None)
     if period is not None and manifest.period is not None and not math.isclose(period, manifest.period, rel_tol=1e-9):
-        raise CheckpointMismatch(checkpoint.path, _mismatch(manifest.env, "period [s]", manifest.period, float(period)))
+        difference = ("period [s]", manifest.period, float(period))
+        raise CheckpointMismatch(checkpoint.path, _mismatch(manifest.env, place, *difference))
 
 
 def first_difference(theirs: Any, ours: Any, name: str) -> tuple[str, Any, Any] | None:
@@ -107,10 +144,12 @@ def _names_and_units(signals: Mapping[str, Any]) -> dict[str, Any]:
     return {kind: [{key: row.get(key) for key in ("name", "unit")} for row in rows] for kind, rows in signals.items()}
 
 
-def _mismatch(env: str, name: str, theirs: Any, ours: Any) -> str:
+def _mismatch(env: str, place: Place, name: str, theirs: Any, ours: Any) -> str:
+    where = f"at {place.text}" if place.transport else f"in {env} as installed"
+    remedy = "serve the version" if place.transport else "install the version"
     return (
-        f"{name} is {_short(theirs)} in the checkpoint and {_short(ours)} in {env} as installed; "
-        f"train it anew, or install the version it was trained with"
+        f"{name} is {_short(theirs)} in the checkpoint and {_short(ours)} {where}; "
+        f"train it anew, or {remedy} it was trained with"
     )
 
 

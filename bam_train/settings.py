@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from bam_train.errors import SettingsError
+from bam_train.place import Place
 from bam_train.values import closest, fit, parse_assignment
 
 tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
@@ -50,6 +51,12 @@ class TrainSettings:
     """Episodes of one evaluation."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the environment."""
+    transport: list[str] = field(default_factory=list)
+    """Addresses of environments that run elsewhere, such as tcp://10.0.0.5:9091, all stepped at once; [] for here."""
+    ca_file: str | None = None
+    """Certificates that wss:// trusts instead of the system's."""
+    token_file: str | None = None
+    """File with the token that the servers at `transport` ask for."""
     normalize: bool | dict[str, Any] = False
     """Normalise observations and rewards by running statistics; a table gives VecNormalize's arguments."""
     hyperparameters: dict[str, Any] = field(default_factory=dict)
@@ -74,6 +81,11 @@ class TrainSettings:
         settings = cls(**json.loads(json.dumps(fitted)))  # a deep copy: nothing shares the caller's tables
         check_ranges(settings)
         return settings
+
+    @property
+    def place(self) -> Place:
+        """Where the environment runs."""
+        return Place(transport=tuple(self.transport), ca_file=self.ca_file, token_file=self.token_file)
 
     def to_mapping(self) -> dict[str, Any]:
         """The settings as plain JSON values, in the order of the fields."""
@@ -101,6 +113,7 @@ def check_ranges(settings: TrainSettings) -> None:
         value = getattr(settings, name)
         if value is not None and value < lowest:
             raise SettingsError(f"{name}: expected at least {lowest}, found {value}")
+    settings.place.require_sane()
     share = settings.until_success
     if share is not None and not 0 < share <= 1:
         raise SettingsError(f"until_success: expected a share above 0 and at most 1, such as 0.99, found {share}")

@@ -6,7 +6,7 @@ import json as json_module
 import math
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,11 +25,12 @@ if TYPE_CHECKING:
     from bam_train.deploy.journal import Journal
     from bam_train.deploy.loop import Deployment
     from bam_train.deploy.pacer import Pacer
+    from bam_train.place import Place
 
 
 @dataclass(frozen=True)
 class DeployConfig:
-    """Run the frozen policy of a checkpoint on its (simulated) robot, at the rate it was made for."""
+    """Run the frozen policy of a checkpoint on a robot, simulated here or live, at the rate it was made for."""
 
     checkpoint: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CHECKPOINT")]
     """The checkpoint.zip that bam-train wrote."""
@@ -37,6 +38,18 @@ class DeployConfig:
     """How many episodes."""
     seed: int = 1_000_000
     """Seed of the first episode; episode k gets seed + k, as in bam-eval."""
+    robot: Annotated[str | None, tyro.conf.arg(metavar="URL")] = None
+    """Live robot behind rosbridge, such as ws://10.0.0.5:9090; by default the simulated one here."""
+    transport: Annotated[str | None, tyro.conf.arg(metavar="URL")] = None
+    """Whole environment that runs elsewhere: ws://10.0.0.5:9090/bam_001 (GymAPI), tcp://10.0.0.5:9091."""
+    profile: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """What the live robot's topics are: a shipped name, or a .toml or .yaml file."""
+    ca_file: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Certificates that wss:// trusts instead of the system's."""
+    token_file: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """File with the token that the server asks for."""
+    yes: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Do not ask before a real robot moves."""
     rate: Annotated[float | None, tyro.conf.arg(metavar="HZ")] = None
     """Actions a second [Hz]; by default the environment's own."""
     fast: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -65,13 +78,15 @@ def deploy_checkpoint(config: DeployConfig) -> int:
     policy = FrozenPolicy.from_checkpoint(checkpoint)
     startup.mark("policy")
     manifest = checkpoint.manifest
-    env = make_env(manifest.env, manifest.env_kwargs, render_mode="human" if config.render else None)
+    place = place_of(config)
+    env = make_env(manifest.env, manifest.env_kwargs, render_mode="human" if config.render else None, place=place)
     try:
-        require_fit(checkpoint, env)
+        require_fit(checkpoint, env, place)
         pacer = Pacer(period_of(config, checkpoint, env))
         journal = Journal(config.episodes, startup)
         deployment = Deployment(env, policy, pacer, journal)
         deployment.connect()
+        require_consent(config, env)
     except BaseException:
         env.close()  # type: ignore[no-untyped-call]
         raise
@@ -91,12 +106,15 @@ def _run(
     from bam_train.deploy.signals import stop_signals
 
     with stop_signals():  # a second Ctrl-C must not lose the report
-        with _display(f"{checkpoint.path} on {checkpoint.manifest.env}", env, journal) as watcher:
+        place = place_of(config).text
+        title = f"{checkpoint.path} on {checkpoint.manifest.env}{place and f' at {place}'}"
+        with _display(title, env, journal) as watcher:
             journal.startup.mark("display")
             ending = deployment.run(watcher, seed=config.seed)
         if ending.status:
             say(f"bam-deploy: {ending.reason}")
-        report = DeployReport(checkpoint, config.seed, ending, journal, pacer)
+        guards = guards_of(env)
+        report = DeployReport(checkpoint, config.seed, ending, journal, pacer, place or "simulated here", guards)
         text = json_module.dumps(report.to_json(), allow_nan=False) if config.json else "\n".join(report.lines())
         print(text, flush=True)
     return ending.status
@@ -124,11 +142,71 @@ def _require_sane(config: DeployConfig) -> None:
         raise SettingsError(f"rate: expected more than 0 Hz, found {config.rate:g}")
     if config.rate is not None and config.fast:
         raise SettingsError("--fast does not wait for deadlines, so --rate has no meaning with it; give one of the two")
+    if config.transport is not None and not place_of(config).transport:
+        raise SettingsError("--transport: expected an address, found none; leave it out for the simulation here")
+    place_of(config).require_sane()
+    if config.robot is not None and (config.rate is not None or config.fast):
+        raise SettingsError(
+            "a live robot is driven at the rate that its policy was made for; leave out --rate and --fast"
+        )
+    if config.render and place_of(config).is_remote:
+        raise SettingsError(
+            "--render shows the simulation here, and there is none with --robot or --transport; leave it out"
+        )
     if config.render and sys.platform == "linux" and not (os.environ.keys() & {"DISPLAY", "WAYLAND_DISPLAY"}):
         raise SettingsError(
             "--render needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set; "
             "leave it out, or make a film: bam-eval CHECKPOINT --video film.gif"
         )
+
+
+def place_of(config: DeployConfig) -> Place:
+    """Where the flags say that the environment runs."""
+    from bam_train.place import Place, addresses
+
+    files = {name: None if path is None else str(path) for name, path in _files(config)}
+    return Place(config.robot, addresses(config.transport), config.profile, **files)
+
+
+def _files(config: DeployConfig) -> list[tuple[str, Path | None]]:
+    return [("ca_file", config.ca_file), ("token_file", config.token_file)]
+
+
+def guards_of(env: gym.Env[Any, Any]) -> dict[str, dict[str, Any]]:
+    """What the guards of a live robot did; empty for a simulated one."""
+    report = getattr(getattr(env.unwrapped, "robot", None), "report", None)
+    return {} if report is None else dict(report())
+
+
+def limit_lines(guards: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """One line for each guard that has a limit, such as ``  G8 joint speed: 1.0 rad/s``."""
+    limited = [(name, row) for name, row in guards.items() if row["limit"] not in (None, "")]
+    return [f"  {row['number']} {name}: {row['limit']} {row['unit']}".rstrip() for name, row in limited]
+
+
+def require_consent(config: DeployConfig, env: gym.Env[Any, Any]) -> None:
+    """Ask once before a real robot moves; it is connected, and stands still.
+
+    Raises:
+        SettingsError: The answer is not yes, or there is nobody to ask.
+    """
+    from bam_train.errors import SettingsError
+
+    info = getattr(getattr(env.unwrapped, "robot", None), "info", None)
+    if info is None or info.simulated:
+        return
+    for line in (f"bam-deploy: {config.checkpoint} will move {info.text}, within", *limit_lines(guards_of(env))):
+        say(line)
+    if config.yes:
+        return
+    if not sys.stdin.isatty():
+        raise SettingsError("a real robot would move, and there is nobody to ask; give --yes to go on without asking")
+    print(
+        "Is the robot clear of people, and a hand on its emergency stop? Type yes to go on: ", end="", file=sys.stderr
+    )
+    sys.stderr.flush()
+    if sys.stdin.readline().strip().lower() != "yes":
+        raise SettingsError("the answer was not yes; nothing has moved")
 
 
 def period_of(config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> float | None:

@@ -69,6 +69,12 @@ class TrainConfig:
     """Steps between two evaluations (default a twentieth of the run)."""
     eval_episodes: Whole = None
     """Episodes of one evaluation."""
+    transport: Annotated[str | None, _flag("URL,...")] = None
+    """Train on an environment that runs elsewhere, such as ws://host:9090/name or tcp://host:port, or on several."""
+    ca_file: File = None
+    """Certificates that wss:// trusts instead of the system's."""
+    token_file: File = None
+    """File with the token that the servers ask for."""
     force: bool = False
     """Overwrite the checkpoint at --out instead of adding a number to its name."""
     runs: Path = Path("runs")
@@ -97,6 +103,7 @@ def train(config: TrainConfig) -> int:
 
 
 def _settings(config: TrainConfig, checkpoint: Checkpoint | None) -> TrainSettings:
+    from bam_train.place import addresses
     from bam_train.settings import merge, read_assignments, read_config
     from bam_train.trainers.resolve import resolve, resolve_resumed
 
@@ -106,6 +113,9 @@ def _settings(config: TrainConfig, checkpoint: Checkpoint | None) -> TrainSettin
         for field in fields(config)
         if field.name not in _NOT_SETTINGS and getattr(config, field.name) is not None
     }
+    flags |= {name: str(flags[name]) for name in ("ca_file", "token_file") if name in flags}
+    if "transport" in flags:
+        flags["transport"] = list(addresses(flags["transport"]))
     given = merge(file, read_assignments(config.set), flags)
     return resolve(given) if checkpoint is None else resolve_resumed(given, checkpoint)
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from bam_envs.errors import BamEnvsError
+from bam_envs.errors import BamEnvsError, LinkLost, SafetyStop
 from bam_train.deploy.agents import JournalAgent, PacerAgent, StartupAgent, Watcher
 from bam_train.deploy.journal import Journal
 from bam_train.deploy.pacer import Pacer
@@ -31,9 +31,9 @@ class Ending:
     """Why the loop stopped."""
 
     reason: str
-    """``"episodes done"``, ``"interrupted"`` or ``"fault: ..."``."""
+    """``"episodes done"``, ``"interrupted"``, ``"link lost: ..."``, ``"safety stop: ..."`` or ``"fault: ..."``."""
     status: int
-    """Exit status of the program: 0, 128 + the signal, or 1."""
+    """Exit status of the program: 0, 128 + the signal, 4, 3 or 1."""
 
 
 class Deployment:
@@ -103,7 +103,7 @@ class Deployment:
             except Stopped as stopped:
                 ending = Ending("interrupted", 128 + stopped.signal)
             except Exception as error:  # whatever went wrong: the robot has to be halted and the report made
-                ending = Ending(f"fault: {fault_text(error)}", 1)
+                ending = _ending_of(error)
             except BaseException:
                 if not self._loop.closing:
                     self._robot.halt()
@@ -116,6 +116,19 @@ class Deployment:
             self._loop(self._workspace, t=0, stop_variable="env/done", seed=seed + k, watcher=watcher)
             self._robot.halt()  # a sink may take its time, and so may the next reset
             self._workspace.flush()
+
+
+LINK_LOST, SAFETY_STOP = 4, 3
+"""Exit statuses."""
+
+
+def _ending_of(error: Exception) -> Ending:
+    """What the operator has to look for first: the network, the robot, or the program."""
+    if isinstance(error, LinkLost):
+        return Ending(f"link lost: {fault_text(error)}", LINK_LOST)
+    if isinstance(error, SafetyStop):
+        return Ending(f"safety stop: {fault_text(error)}", SAFETY_STOP)
+    return Ending(f"fault: {fault_text(error)}", 1)
 
 
 def _unless_it_fails(ending: Ending, what: str, end: Callable[[], None]) -> Ending:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from bam_train.checkpoint import Checkpoint
@@ -21,6 +23,10 @@ class DeployReport:
     ending: Ending
     journal: Journal
     pacer: Pacer
+    robot: str = "simulated here"
+    """What was driven: an address, or the simulation."""
+    guards: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """What the guards of a live robot did, by name; see `SafeRobot.report`."""
 
     def to_json(self) -> dict[str, Any]:
         """Plain values; times in the unit that their name says."""
@@ -39,14 +45,18 @@ class DeployReport:
             "env": manifest.env,
             "algorithm": manifest.algorithm,
             "checkpoint": str(self.checkpoint.path),
+            "robot": self.robot,
+            "guards": {name: _finite(row) for name, row in self.guards.items()},
             "per_episode": [record.to_json() for record in journal.records],
         }
 
     def lines(self) -> list[str]:
         """The same for people, a few lines."""
+        reason, ticks = self.ending.reason.rstrip("."), f"{self.pacer.ticks} ticks"
         return [
-            f"{self.ending.reason}: {episodes_text(self.journal)}, {self.pacer.ticks} ticks, {rate_text(self.pacer)}",
+            f"{reason}: {episodes_text(self.journal)}, {ticks}, {rate_text(self.pacer)}",
             *([f"lateness {lateness_text(self.pacer)}"] if self.pacer.period is not None else []),
+            *([guards_text(self.guards)] if self.guards else []),
             *([startup_text(self.journal)] if self.journal.startup.finished else []),
         ]
 
@@ -71,10 +81,21 @@ def lateness_text(pacer: Pacer) -> str:
     return ", ".join([*figures, f"{pacer.missed} missed"])
 
 
+def guards_text(guards: Mapping[str, Mapping[str, Any]]) -> str:
+    """Such as ``guards changed the command: joint speed in 3 ticks``."""
+    altered = [f"{name} in {row['altered']} ticks" for name, row in guards.items() if row.get("altered")]
+    return f"guards changed the command: {', '.join(altered)}" if altered else "no guard changed a command"
+
+
 def startup_text(journal: Journal) -> str:
     """Where the CPU time up to the first action went."""
     stages = ", ".join(f"{name} {seconds:.2f}" for name, seconds in journal.startup.stages.items())
     return f"first action after {journal.startup.total:.2f} s of CPU time: {stages}"
+
+
+def _finite(row: Mapping[str, Any]) -> dict[str, Any]:
+    """The row of one guard; a limit that is off is infinite, which JSON does not have."""
+    return {**row, "limit": None} if row.get("limit") == math.inf else dict(row)
 
 
 def _milliseconds(lateness: Lateness | None) -> dict[str, float] | None:

@@ -13,8 +13,20 @@ from bam_train.trainers import load_trainer, require_algorithm
 from bam_train.trainers.presets import read_preset
 from bam_train.values import closest
 
-CHANGEABLE = frozenset({"steps", "until_success", "eval_every", "eval_episodes", "device", "threads"})
-"""Settings that a resumed run may have otherwise: when to stop, how to measure, where to compute; not what to learn."""
+CHANGEABLE = frozenset(
+    {"steps", "until_success", "eval_every", "eval_episodes", "device", "threads", "transport", "ca_file", "token_file"}
+)
+"""Settings that a resumed run may have otherwise: when to stop, how to measure, where to compute and where the
+environment runs; not what to learn."""
+
+_NOT_OF_THE_ENVIRONMENT = frozenset({"env_id", "render_mode", "task_options"}) | {
+    "robot",
+    "transport",
+    "profile",
+    "ca_file",
+    "token_file",
+}
+"""Arguments of `make_env` that are no settings, or say where the environment runs, which has settings of its own."""
 
 
 def resolve(given: Mapping[str, Any]) -> TrainSettings:
@@ -28,11 +40,25 @@ def resolve(given: Mapping[str, Any]) -> TrainSettings:
     for name in ("env", "algo"):
         if given.get(name) is None:
             raise SettingsError(f"{name}: expected a name, found nothing. Give --{name} NAME")
-    env = resolve_env(given["env"])
+    env = resolve_env(given["env"], elsewhere=bool(given.get("transport")))
     require_algorithm(given.get("trainer", "sb3"), given["algo"])
     settings = TrainSettings.from_mapping(merge(read_preset(env, given["algo"]), given, {"env": env}))
     require_env_kwargs(env, settings.env_kwargs)
-    return load_trainer(settings.trainer).complete(settings)
+    _require_own(given, settings)
+    completed = load_trainer(settings.trainer).complete(settings)
+    if given.get("num_envs") not in (None, completed.num_envs):
+        there = f"there are {completed.num_envs} at {settings.place.text}"
+        raise SettingsError(f"num_envs: {settings.num_envs} were asked for, and {there}; leave it out")
+    return completed
+
+
+def _require_own(given: Mapping[str, Any], settings: TrainSettings) -> None:
+    """Refuse arguments of an environment that is made elsewhere."""
+    if settings.transport and given.get("env_kwargs"):
+        names = ", ".join(given["env_kwargs"])
+        raise SettingsError(
+            f"env_kwargs: {names}: the environment runs at {settings.place.text}; give its arguments to bam-serve there"
+        )
 
 
 def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSettings:
@@ -43,8 +69,12 @@ def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSe
         SettingsError: An unknown setting, or the run has all its steps already.
     """
     check_names(given, "settings")
-    own = checkpoint.manifest.settings
-    asked = {**given, "env": resolve_env(given["env"])} if given.get("env") is not None else dict(given)
+    own = dict(checkpoint.manifest.settings)
+    if given.get("transport") == []:  # from there to here, where there is no link
+        own |= {"ca_file": None, "token_file": None}
+    asked = dict(given)
+    if given.get("env") is not None:
+        asked["env"] = resolve_env(given["env"], elsewhere=bool(given.get("transport")))
     if asked.get("normalize") is True and own.get("normalize"):
         del asked["normalize"]
     settings = TrainSettings.from_mapping(merge(own, asked), str(checkpoint.path))
@@ -58,17 +88,27 @@ def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSe
     return completed
 
 
-def resolve_env(name: str) -> str:
+def resolve_env(name: str, *, elsewhere: bool = False) -> str:
     """The full id of an environment.
+
+    Args:
+        name: With or without its version.
+        elsewhere: It runs on another computer, and need not be installed on this one.
 
     Raises:
         UnknownName: No such environment; it carries the closest match.
         InvalidValue: ``module:Env-v0`` whose module is not there.
     """
     import bam_envs  # noqa: F401 - registers our environments
+    from bam_envs.errors import UnknownName
     from bam_envs.registry import resolve_id
 
-    return resolve_id(name)
+    try:
+        return resolve_id(name)
+    except UnknownName:
+        if elsewhere:
+            return name  # the server says whether it has it
+        raise
 
 
 def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
@@ -83,7 +123,7 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
     entry = ENVIRONMENTS.get(env.rpartition(":")[2])
     if entry is None or not given:
         return
-    own = set(inspect.signature(make_env).parameters) - {"env_id", "render_mode", "task_options"}
+    own = set(inspect.signature(make_env).parameters) - _NOT_OF_THE_ENVIRONMENT
     of_task = set(inspect.signature(resolve_reference(entry.task)).parameters) - {"num_rows"}
     for name in given:
         if name not in own | of_task | {"max_episode_steps"}:

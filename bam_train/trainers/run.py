@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from bam_envs.errors import RobotFault
 from bam_train.errors import OutputError, TrainingFailed
 from bam_train.evaluation import EvaluationReport
 from bam_train.settings import TrainSettings
@@ -138,7 +139,8 @@ class TrainingRun:
         """Train to the end.
 
         Raises:
-            TrainingFailed: The loss or a weight is no longer finite; its text names the last good checkpoint.
+            TrainingFailed: The loss or a weight is no longer finite, or the robot or its link failed; its text names
+                the last good checkpoint.
         """
         try:
             self.trainer.train(self.settings.steps, self._between)
@@ -147,6 +149,10 @@ class TrainingRun:
         except TrainingFailed as error:
             kept = f"the last good checkpoint is {self.last}" if self.last else "no checkpoint had been saved yet"
             raise TrainingFailed(f"{error}; {kept}") from error
+        except RobotFault as error:  # what was learnt so far is not lost with the link
+            self._save_last()
+            kept = f"go on with --resume {self.folder.last}" if self._last_steps else "nothing had been learnt yet"
+            raise TrainingFailed(f"at step {self.trainer.steps}: {error} What was learnt is kept: {kept}") from error
         self._save_last()
         if self._stop and self._kept is None and not self.out.exists():
             self._kept = self.out if self._write(self.out, None, "--out") else None  # the newest: none was evaluated
@@ -196,8 +202,9 @@ class TrainingRun:
     def _evaluate(self) -> None:
         """Evaluate the frozen policy; the best is kept."""
         steps = self._evaluated_at = self.trainer.steps
-        with self.trainer.undisturbed():
-            report, self._reached = judge(self.trainer.freeze(), self.settings, last=steps >= self.settings.steps)
+        with self.trainer.undisturbed(), self.trainer.evaluation_rows() as rows:
+            last = steps >= self.settings.steps
+            report, self._reached = judge(self.trainer.freeze(), self.settings, last=last, rows=rows)
         if report.success_rate is None and self.settings.until_success is not None and self._report is None:
             self.watcher.note(f"{self.settings.env} reports no is_success, so --until-success has no effect")
         self._report = report

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
+    from gymnasium.vector import VectorEnv
     from typing_extensions import Self
 
     from bam_train.checkpoint import Checkpoint
@@ -103,6 +104,9 @@ class Trainer(Protocol):
 
     def undisturbed(self) -> AbstractContextManager[None]:
         """Do something between two updates, an evaluation say, that leaves training's random numbers as they were."""
+
+    def evaluation_rows(self) -> AbstractContextManager[VectorEnv[Any, Any, Any] | None]:
+        """What to evaluate on between two updates, where no other environments can be made; None: make some."""
 
     def log(self, metrics: Mapping[str, float]) -> None:
         """Put numbers next to the trainer's own in TensorBoard."""

@@ -22,6 +22,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from bam_envs.robots.safe import SafeRobot
 from bam_train.errors import SettingsError, ValueMismatch
 from bam_train.loop.gym.actions import ActionReader
 from bam_train.loop.gym.env_rows import EnvRows, Rows, has_autoreset
@@ -188,12 +189,15 @@ def _require_envs(envs: Sequence[Any]) -> None:
     """Refuse what cannot be stepped one by one.
 
     Raises:
-        SettingsError: Not an environment, a vector environment, or one environment several times.
+        SettingsError: Not an environment, a vector environment, one environment several times, or a live robot, whose
+            chain has to be checked before it moves.
     """
     for env in envs:
         if isinstance(env, gym.vector.VectorEnv):
             raise SettingsError("make_env_fn: expected single environments, found a vector one: use VecGymAgent.")
         if not all(hasattr(env, name) for name in ("reset", "step", "observation_space", "action_space")):
             raise SettingsError(f"make_env_fn: expected it to return a gymnasium.Env, found {type(env).__name__}.")
+        if isinstance(getattr(getattr(env, "unwrapped", env), "robot", None), SafeRobot):
+            raise SettingsError("make_env_fn: expected a simulation, found a live robot: use RobotAgent.")
     if len({id(env) for env in envs}) < len(envs):
         raise SettingsError("make_env_fn: expected a new environment at every call, found the same one again.")

@@ -51,7 +51,7 @@ def members(
     tree = {
         "counters": state.counters(model),
         "normaliser": state.normaliser(normaliser),
-        "env": venv.state_dict() if isinstance(venv, RowsVecEnv) and model._last_obs is not None else None,
+        "env": venv.state_dict() if _can_be_saved(venv) and model._last_obs is not None else None,
         "random": waiting.random if waiting else state.random_states(model),
         "noise": waiting.noise if waiting else state.noise(model),
     }
@@ -101,12 +101,17 @@ def _fits(checkpoint: Checkpoint, name: str) -> Iterator[None]:
 
 def _load_episodes(model: Any, venv: VecEnv, tree: Mapping[str, Any] | None) -> bool:
     """Go on with the running episodes, or let `learn` begin new ones, seeded by how far the run is."""
-    if isinstance(venv, RowsVecEnv) and tree is not None:
+    if _can_be_saved(venv) and tree is not None:
         venv.load_state_dict(tree)
         return True
     model._last_obs = None
     venv.seed(model.seed + model.num_timesteps)
     return False
+
+
+def _can_be_saved(venv: VecEnv) -> bool:
+    """Whether running episodes can."""
+    return isinstance(venv, RowsVecEnv) and venv.can_be_saved
 
 
 def _read(checkpoint: Checkpoint, name: str) -> Any:

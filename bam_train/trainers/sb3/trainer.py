@@ -15,12 +15,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium import Space
+from gymnasium.vector import VectorEnv
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from bam_envs.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint, write_checkpoint
-from bam_train.environments import make_env, require_fit
+from bam_train.environments import make_env, make_rows, require_fit
 from bam_train.errors import TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
@@ -36,6 +38,15 @@ from bam_train.trainers.sb3.vec_env import RowsVecEnv, make_training_env
 from bam_train.trainers.trainer import OnProgress, Progress, Statistics
 
 _FINITE = "expected finite numbers: try a smaller learning_rate"
+
+
+def _look(settings: TrainSettings) -> tuple[int, Space[Any], Space[Any]]:
+    """How many environments there are, as many as the servers have where they run elsewhere; what they see and do."""
+    if settings.transport:
+        with contextlib.closing(make_rows(settings.env, {}, 1, settings.place)) as rows:
+            return rows.num_envs, rows.single_observation_space, rows.single_action_space
+    with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
+        return settings.num_envs, env.observation_space, env.action_space
 
 
 class _Stop(Exception):  # noqa: N818 - never leaves this module
@@ -59,18 +70,20 @@ class SB3Trainer:
     def complete(cls, settings: TrainSettings) -> TrainSettings:
         """Check the algorithm's own settings and fill in its defaults."""
         algorithm = ALGORITHMS[settings.algo]
-        with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
-            algorithm.require_actions(settings.env, type(env.action_space).__name__)
-            values = hyperparameters.complete(algorithm, settings.hyperparameters, env.observation_space)
+        num_envs, observation_space, action_space = _look(settings)
+        algorithm.require_actions(settings.env, type(action_space).__name__)
+        values = hyperparameters.complete(algorithm, settings.hyperparameters, observation_space)
         normalize = hyperparameters.complete_normalize(settings.normalize, values["gamma"])
         eval_every = settings.eval_every or max(1000, settings.steps // 20)
-        return dataclasses.replace(settings, hyperparameters=values, normalize=normalize, eval_every=eval_every)
+        return dataclasses.replace(
+            settings, num_envs=num_envs, hyperparameters=values, normalize=normalize, eval_every=eval_every
+        )
 
     @classmethod
     def create(cls, settings: TrainSettings) -> SB3Trainer:
         """Set up a new run of complete settings."""
         torch.set_num_threads(settings.threads)
-        venv = make_training_env(settings.env, settings.env_kwargs, settings.num_envs)
+        venv = make_training_env(settings.env, settings.env_kwargs, settings.num_envs, settings.place)
         with library_notices() as notices, refusals(settings):
             model = make_model(settings, venv)
         model.set_logger(Logger(None, []))
@@ -83,7 +96,7 @@ class SB3Trainer:
         """Set up a run that goes on from a checkpoint, with its settings or with these."""
         settings = settings or TrainSettings.from_mapping(checkpoint.manifest.settings, str(checkpoint.path))
         trainer = cls.create(settings)
-        require_fit(checkpoint, one_env(trainer.venv))
+        require_fit(checkpoint, one_env(trainer.venv), settings.place)
         trainer._waiting = resume.load(checkpoint, trainer.model, trainer.venv, trainer._normaliser)
         if not trainer._waiting.same_episodes:
             trainer.notices.append(
@@ -220,6 +233,23 @@ class SB3Trainer:
         """Do something between two updates that leaves training's random numbers as they were."""
         with undisturbed(self.model):
             yield
+
+    @contextlib.contextmanager
+    def evaluation_rows(self) -> Iterator[VectorEnv[Any, Any, Any] | None]:
+        """The rows that training uses, where there can be no others; its running episodes end there."""
+        if not self.settings.transport:
+            yield None
+            return
+        try:
+            yield one_env(self.venv)
+        finally:
+            self.venv.interrupt(self._last_observation())
+
+    def _last_observation(self) -> Any:
+        """What training observed last, before normalisation; None before its first step."""
+        if self.model._last_obs is None or self._normaliser is None:
+            return self.model._last_obs
+        return self._normaliser.get_original_obs()
 
     def log(self, metrics: Mapping[str, float]) -> None:
         """Put numbers next to the trainer's own in TensorBoard."""

@@ -15,20 +15,21 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from bam_train.environments import is_batched, make_env, make_rows
 from bam_train.errors import SettingsError
+from bam_train.place import HERE, Place
 from bam_train.trainers.sb3.from_zero import from_zero
 
 Observations = Any
 """An array (n, …), or a mapping of them."""
 
 
-def make_training_env(env_id: str, env_kwargs: Mapping[str, Any], num_envs: int) -> VecEnv:
+def make_training_env(env_id: str, env_kwargs: Mapping[str, Any], num_envs: int, place: Place = HERE) -> VecEnv:
     """`num_envs` environments to train on; our own can save and restore their state.
 
     Raises:
         SettingsError: The environment cannot be made.
     """
-    if is_batched(env_id):
-        return RowsVecEnv(make_rows(env_id, env_kwargs, num_envs))
+    if is_batched(env_id) or place.transport:
+        return RowsVecEnv(make_rows(env_id, env_kwargs, num_envs, place))
     return DummyVecEnv([lambda: Monitor(from_zero(make_env(env_id, env_kwargs))) for _ in range(num_envs)])
 
 
@@ -36,16 +37,19 @@ class RowsVecEnv(VecEnv):  # type: ignore[misc]
     """A Gymnasium vector environment whose rows restart in the same step, as a stable-baselines3 `VecEnv`.
 
     Args:
-        rows: The environment; with ``state_dict`` and ``load_state_dict``.
+        rows: The environment.
 
     Raises:
-        SettingsError: Its rows do not restart in the same step.
+        SettingsError: Its rows do not restart in the same step, or its actions count from another number than 0.
     """
 
     def __init__(self, rows: VectorEnv[Any, Any, Any]) -> None:
         mode = rows.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
             raise SettingsError(f"{rows}: expected autoreset mode SAME_STEP, found {mode}")
+        start = getattr(rows.single_action_space, "start", 0)
+        if np.any(start):
+            raise SettingsError(f"{rows}: expected actions that count from 0, found {rows.single_action_space}")
         self.rows = rows
         super().__init__(rows.num_envs, rows.single_observation_space, rows.single_action_space)
         self._dict = isinstance(rows.single_observation_space, spaces.Dict)
@@ -53,6 +57,12 @@ class RowsVecEnv(VecEnv):  # type: ignore[misc]
         self._lengths = np.zeros(self.num_envs, dtype=np.int64)
         self._started = time.monotonic()
         self._actions: NDArray[Any] = np.empty(0)
+        self._interrupted: Observations = None
+
+    @property
+    def can_be_saved(self) -> bool:
+        """Whether running episodes can be saved and gone on with; those of a robot elsewhere cannot."""
+        return hasattr(self.rows, "state_dict")
 
     def reset(self) -> Observations:
         """Begin an episode on every row, with the seeds that `seed` left."""
@@ -60,7 +70,16 @@ class RowsVecEnv(VecEnv):  # type: ignore[misc]
         observations, _ = self.rows.reset(seed=seeds)
         self._reset_seeds()
         self._returns[:], self._lengths[:] = 0, 0
+        self._interrupted = None
         return self._own(observations)
+
+    def interrupt(self, last: Observations) -> None:
+        """Somebody else used the rows: at the next step the running episodes are truncated, and new ones begin.
+
+        Args:
+            last: What was observed last in the running episodes; None if there are none.
+        """
+        self._interrupted = last
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Keep the actions for `step_wait`."""
@@ -68,6 +87,8 @@ class RowsVecEnv(VecEnv):  # type: ignore[misc]
 
     def step_wait(self) -> tuple[Observations, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         """Step all rows. Shapes: observations (n, …), rewards (n,) float32, done (n,) bool, n infos."""
+        if self._interrupted is not None:
+            return self._begin_anew()
         observations, rewards, terminated, truncated, extra = self.rows.step(self._actions)
         done = terminated | truncated
         self._returns += rewards
@@ -76,6 +97,15 @@ class RowsVecEnv(VecEnv):  # type: ignore[misc]
         for row in np.flatnonzero(done):
             infos[row] = self._end(int(row), bool(terminated[row]), extra)
         return self._own(observations), np.asarray(rewards, dtype=np.float32), done, infos
+
+    def _begin_anew(self) -> tuple[Observations, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        """The step after `interrupt`: the actions are not sent, and no episode is counted."""
+        last = self._interrupted
+        observations = self.reset()
+        infos = [
+            {"terminal_observation": self._row(last, row), "TimeLimit.truncated": True} for row in range(self.num_envs)
+        ]
+        return observations, np.zeros(self.num_envs, np.float32), np.ones(self.num_envs, dtype=bool), infos
 
     def _end(self, row: int, terminated: bool, extra: Mapping[str, Any]) -> dict[str, Any]:
         """The info of a row whose episode ended, in the words of stable-baselines3; its sums begin again."""

@@ -5,7 +5,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from bam_envs.errors import RobotFault
+from bam_envs.errors import LinkLost, RobotFault, SafetyStop, StaleState
 from bam_envs.robot_env import RobotEnv
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.tasks.pick import PickTask
@@ -237,3 +237,22 @@ def test_the_same_loop_drives_any_robot():
     assert [(record.length, record.end) for record in journal.records] == [(7, "truncated")] * 2
     assert len(robot.sent) == pacer.ticks == 14
     assert robot.halts >= 1
+
+
+@pytest.mark.parametrize(
+    ("error", "ending"),
+    [
+        (LinkLost("ws://127.0.0.1:9: the link dropped."), Ending("link lost: ws://127.0.0.1:9: the link dropped.", 4)),
+        (StaleState("no state for 0.3 s", 0.3, 0.1), Ending("link lost: no state for 0.3 s", 4)),
+        (SafetyStop("joint speed", "joint 2 at 4 rad/s"), Ending("safety stop: joint 2 at 4 rad/s", 3)),
+        (RobotFault("no power"), Ending("fault: no power", 1)),
+    ],
+)
+def test_what_the_operator_looks_for_first_is_in_the_status(corridor, error, ending):
+    def happens():
+        raise error
+
+    env = Driven(gym.make(corridor), happens, at=1)
+    deployment = Deployment(env, Right(), Pacer(None), Journal(1, Startup()))
+    assert deployment.run(Silent(), seed=0) == ending
+    assert "halt" in env.robot.calls

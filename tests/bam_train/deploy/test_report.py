@@ -1,4 +1,5 @@
 import json
+import math
 
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.journal import Journal, Startup
@@ -54,6 +55,21 @@ def test_everything_is_in_the_report(corridor_checkpoint):
     assert values["per_episode"][2] == {"seed": 2, "length": 1, "return": 1.5, "success": False, "end": "stopped"}
 
 
+def test_a_limit_that_is_off_is_null(corridor_checkpoint):
+    guards = {"state age": {"number": "G3", "limit": math.inf, "unit": "s", "altered": 0, "stopped": 0}}
+    report = DeployReport(
+        Checkpoint.open(corridor_checkpoint()),
+        0,
+        Ending("episodes done", 0),
+        journal(),
+        Pacer(None),
+        "ws://a:1",
+        guards,
+    )
+    values = json.loads(json.dumps(report.to_json(), allow_nan=False))
+    assert values["guards"] == {"state age": {**guards["state age"], "limit": None}}
+
+
 def test_lines(corridor_checkpoint):
     checkpoint = Checkpoint.open(corridor_checkpoint())
     first, second, third = DeployReport(
@@ -63,6 +79,13 @@ def test_lines(corridor_checkpoint):
     assert second.startswith("lateness p50 1.00 ms, p99 ")
     assert second.endswith(" ms, max 121.00 ms, 2 missed")
     assert third == "first action after 0.75 s of CPU time: python 0.50, first action 0.25"
+
+
+def test_a_reason_that_is_a_sentence_loses_its_full_stop(corridor_checkpoint):
+    ending = Ending("link lost: the cable is out.", 4)
+    report = DeployReport(Checkpoint.open(corridor_checkpoint()), 0, ending, Journal(2), Pacer(0.05))
+    assert report.lines()[0].startswith("link lost: the cable is out: 0 of 2 episodes, ")
+    assert report.to_json()["stop_reason"] == ending.reason
 
 
 def test_before_the_first_tick(corridor_checkpoint):

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 
+import gymnasium as gym
 import pytest
 
 from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.serve.env_server import EnvServer
+from bam_envs.serve.tcp_server import TcpServer
 from bam_train.checkpoint import Checkpoint, write_checkpoint
 from bam_train.errors import CheckpointMismatch, OutputError, SettingsError
 from bam_train.settings import TrainSettings
@@ -46,6 +49,36 @@ def test_without_a_preset_there_are_the_defaults():
     settings = resolve({"env": "CartPole-v1", "algo": "dqn"})
     assert (settings.steps, settings.num_envs, settings.trainer) == (100_000, 1, "sb3")
     assert settings.hyperparameters["learning_rate"] == 1e-4
+
+
+@pytest.fixture
+def served():
+    """Address of two environments."""
+    with TcpServer(EnvServer(gym.make_vec("bam/reach-v0", num_envs=2))) as server:
+        yield server.url
+
+
+def test_there_are_as_many_environments_as_the_servers_have(served):
+    given = {"env": "bam/reach", "algo": "ppo", "transport": [served]}
+    assert resolve(given).num_envs == 2
+    assert resolve({**given, "num_envs": 2}).num_envs == 2
+    with pytest.raises(SettingsError) as caught:
+        resolve({**given, "num_envs": 8})
+    assert str(caught.value) == f"num_envs: 8 were asked for, and there are 2 at {served}; leave it out"
+
+
+def test_an_environment_elsewhere_has_its_own_arguments():
+    with pytest.raises(SettingsError) as caught:
+        resolve({"env": "bam/reach", "algo": "ppo", "transport": ["tcp://a:1"], "env_kwargs": {"randomize": True}})
+    assert str(caught.value) == (
+        "env_kwargs: randomize: the environment runs at tcp://a:1; give its arguments to bam-serve there"
+    )
+
+
+@pytest.mark.parametrize("name", ["robot", "transport", "profile", "ca_file", "token_file"])
+def test_where_an_environment_runs_is_none_of_its_arguments(name):
+    with pytest.raises(SettingsError, match=rf"^env_kwargs: unknown setting '{name}' of bam/reach-v0\."):
+        resolve({"env": "bam/reach", "algo": "ppo", "env_kwargs": {name: "ws://a:1"}})
 
 
 def test_names_are_completed_and_unknown_ones_refused():
@@ -131,6 +164,12 @@ def saved(tmp_path):
 
 def test_a_resumed_run_has_its_own_settings(saved):
     assert resolve_resumed({}, saved.checkpoint) == saved.settings
+
+
+def test_a_run_that_was_elsewhere_goes_on_here(saved, tmp_path):
+    link = {"transport": ["wss://a:1"], "ca_file": "ca.pem", "token_file": "token"}
+    there = saved(tmp_path / "there.zip", **link)
+    assert resolve_resumed({"transport": []}, there) == saved.settings
 
 
 def test_what_is_said_again_is_no_difference(saved):

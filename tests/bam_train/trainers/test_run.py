@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from bam_envs.errors import LinkLost
 from bam_train.errors import OutputError, TrainingFailed
 from bam_train.evaluation import EvaluationReport
 from bam_train.settings import TrainSettings
@@ -44,12 +45,15 @@ class Counter:
         self.settings, self.steps, self.clock = settings, 0, clock
         self.saved, self.refuse, self.fails_at, self.logged = [], [], None, []
         self.statistics = STATISTICS
+        self.rows = self.link = None
 
     def train(self, steps, on_progress):
         while self.steps < steps:
             self.steps += 10
             if self.clock is not None:
                 self.clock.now += 1.0
+            if self.link is not None and self.steps >= 60:
+                raise self.link
             if self.fails_at is not None and self.steps >= self.fails_at:
                 raise TrainingFailed("train/loss is nan at step 60; expected finite numbers")
             if not on_progress(Progress(self.steps, steps, lambda: self.statistics)):
@@ -69,6 +73,9 @@ class Counter:
 
     def undisturbed(self):
         return nullcontext()
+
+    def evaluation_rows(self):
+        return nullcontext(self.rows)
 
     def log(self, metrics):
         self.logged.append(dict(metrics))
@@ -105,7 +112,8 @@ def start(tmp_path, monkeypatch):
         settings = TrainSettings.from_mapping({**given, **extra})
         start.seeds = []
 
-        def evaluate(policy, env_id, env_kwargs, *, episodes, seed):
+        def evaluate(policy, env_id, env_kwargs, *, episodes, seed, env):
+            assert env is trainer.rows
             start.seeds.append((policy.steps, seed, episodes))
             found = results[policy.steps]
             return found.pop(0) if isinstance(found, list) else found
@@ -340,3 +348,21 @@ def test_settings_without_a_number_of_steps_between_evaluations(start):
     run.settings = replace(run.settings, eval_every=None)
     run.run()
     assert [row[0] for row in watcher.evaluations] == [100]
+
+
+def test_where_there_are_no_other_environments_training_lends_its_own(start):
+    run, trainer, _ = start({100: report(0.5)}, eval_every=100)
+    trainer.rows = object()  # `evaluate` of the fixture looks at it
+    assert run.run().best.success_rate == 0.5
+
+
+def test_a_lost_link_loses_nothing_that_was_learnt(start, tmp_path):
+    run, trainer, _ = start({30: report(0.5)})
+    trainer.link = LinkLost("tcp://127.0.0.1:9: the link dropped.")
+    last = run.folder.last
+    with pytest.raises(TrainingFailed) as caught:
+        run.run()
+    assert str(caught.value) == (
+        f"at step 60: tcp://127.0.0.1:9: the link dropped. What was learnt is kept: go on with --resume {last}"
+    )
+    assert last.read_text() == "60"

@@ -6,6 +6,10 @@ import pytest
 import torch
 from gymnasium.wrappers import Autoreset
 
+from bam_envs.robot_env import RobotEnv
+from bam_envs.robots.fake import FakeRobot
+from bam_envs.robots.safe import SafeRobot
+from bam_envs.tasks.pick import PickTask
 from bam_train.errors import LoopError, SettingsError
 from bam_train.loop import ParallelGymAgent, VecGymAgent, Workspace
 
@@ -227,6 +231,10 @@ def test_float32_rewards_are_summed_as_bbrl_sums_them(toys):
         (
             lambda: gym.make_vec("CartPole-v1", 2),
             "make_env_fn: expected single environments, found a vector one: use VecGymAgent.",
+        ),
+        (
+            lambda: RobotEnv(SafeRobot(FakeRobot()), PickTask()),
+            "make_env_fn: expected a simulation, found a live robot: use RobotAgent.",
         ),
     ],
 )

@@ -95,7 +95,11 @@ class OneWalk(gym.Env):
 def walk(monkeypatch):
     """Registers ``test/Walk-v0`` for one test and trains on its rows as on our own environments; its id."""
 
-    def make(env_id, env_kwargs, num_envs):
+    real = vec_env.make_training_env
+
+    def make(env_id, env_kwargs, num_envs, place):
+        if place.transport:
+            return real(env_id, env_kwargs, num_envs, place)
         return vec_env.RowsVecEnv(Walk(num_envs, **env_kwargs))
 
     monkeypatch.setattr(trainer_module, "make_training_env", make)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import zipfile
 
@@ -11,6 +12,9 @@ import pytest
 import torch
 from stable_baselines3 import PPO
 
+from bam_envs.errors import LinkLost
+from bam_envs.serve.env_server import EnvServer
+from bam_envs.serve.tcp_server import TcpServer
 from bam_train.checkpoint import Checkpoint
 from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.policy import FrozenPolicy
@@ -45,6 +49,40 @@ def test_the_manifest_says_where_it_comes_from(walk, trained):
     assert TrainSettings.from_mapping(manifest.settings) == trainer.settings
     assert {"python", "torch", "stable-baselines3", "gymnasium"} <= manifest.versions.keys()
     assert manifest.created.endswith("+00:00")
+
+
+@contextlib.contextmanager
+def served(*envs):
+    """Their addresses."""
+    with contextlib.ExitStack() as stack:
+        yield [stack.enter_context(TcpServer(EnvServer(env, env_id="test/Walk-v0"))).url for env in envs]
+
+
+@pytest.mark.parametrize("counts", [(None,), (3,), (None, 2)])
+def test_it_trains_on_as_many_rows_as_the_servers_have(walk, rows, counts, tmp_path):
+    with served(*(gym.make(walk) if count is None else rows(count) for count in counts)) as urls:
+        settings = completed(walk, hyperparameters=FIRST, transport=urls, num_envs=8)
+        assert settings.num_envs == sum(count or 1 for count in counts)
+        trainer = SB3Trainer.create(settings)
+        trainer.train(96, lambda progress: True)
+        with trainer.evaluation_rows() as lent:
+            assert lent.num_envs == settings.num_envs
+            lent.reset(seed=1)
+        trainer.train(trainer.steps + 32 * settings.num_envs, lambda progress: True)
+        trainer.save(tmp_path / "a.zip", {}, {"best": None})
+        trainer.close()
+        again = SB3Trainer.load(Checkpoint.open(tmp_path / "a.zip"))
+        assert again.steps == trainer.steps
+        again.close()
+
+
+def test_a_link_that_drops_ends_training_with_its_own_error(walk, rows):
+    with TcpServer(EnvServer(rows(2), env_id=walk)) as server:
+        trainer = SB3Trainer.create(completed(walk, hyperparameters=FIRST, transport=[server.url]))
+        trainer.train(64, lambda progress: True)
+    with pytest.raises(LinkLost, match=r"the link is down|closed"):
+        trainer.train(640, lambda progress: True)
+    trainer.close()
 
 
 def test_stable_baselines3_loads_it(trained):

@@ -153,3 +153,30 @@ def test_adapting_64_rows_costs_tens_of_microseconds(rows):
         venv.step(actions)
         times.append(time.perf_counter() - before)
     assert float(np.median(times)) < 200e-6  # about 15 µs on an idle machine
+
+
+def test_rows_that_somebody_else_used_begin_anew(rows):
+    venv = RowsVecEnv(rows(2))
+    venv.seed(3)
+    first = venv.reset()
+    venv.step(right(venv))
+    last = venv.step(right(venv))[0]
+    assert venv.can_be_saved
+    venv.rows.reset(seed=[100, 101])  # an evaluation
+    venv.interrupt(last)
+    venv.seed(3)
+    observations, rewards, done, infos = venv.step(right(venv))
+    np.testing.assert_array_equal(observations, first)
+    assert (rewards.tolist(), done.tolist()) == ([0.0, 0.0], [True, True])
+    for row in range(2):
+        assert sorted(infos[row]) == ["TimeLimit.truncated", "terminal_observation"]
+        assert infos[row]["TimeLimit.truncated"] is True
+        np.testing.assert_array_equal(infos[row]["terminal_observation"], last[row])
+    assert not venv.step(right(venv))[2].any()
+
+
+def test_actions_that_count_from_another_number_are_refused(rows):
+    some = rows(1)
+    some.single_action_space = gym.spaces.Discrete(3, start=1)
+    with pytest.raises(SettingsError, match=r"expected actions that count from 0, found Discrete\(3, start=1\)$"):
+        RowsVecEnv(some)

@@ -1,0 +1,126 @@
+"""`bam-serve`: an environment and its simulated robot for many clients, over rosbridge, TCP or ROS 2.
+
+It is stopped by signals only, at any moment, so nothing else is imported before they are answered.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from bam_train.cli.program import Terminated, guarded, run_program
+
+if TYPE_CHECKING:
+    from bam_envs.serve.describe import Env
+    from bam_train.cli.serve_config import ServeConfig
+
+_LOOK = 1.0
+"""How often it is seen to that everything still runs [s]."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of the console script."""
+    sys.exit(guarded(lambda: _main(arguments), "bam-serve"))
+
+
+def _main(arguments: Sequence[str] | None) -> None:
+    from bam_train.cli.serve_config import ServeConfig
+
+    run_program(serve, ServeConfig, prog="bam-serve", description=ServeConfig.__doc__ or "", arguments=arguments)
+
+
+def serve(config: ServeConfig) -> int:
+    """The program, with its arguments read."""
+    import logging
+
+    config.serving.require_sane()
+    with SignalMemory() as signals:
+        from bam_envs.serve.program import ServedEnvironment
+
+        logging.basicConfig(level=logging.WARNING, format="bam-serve: %(message)s")
+        with ServedEnvironment(make_env(config), config.serving, _tell) as served:
+            for line in served.endpoints:
+                _tell(line)
+            forever = threading.Event()
+            while not forever.wait(_LOOK):
+                signals.raise_again()
+                served.require_running()
+    return 0
+
+
+class SignalMemory:
+    """Within this, a signal is remembered: what its handler raises is lost where Python ignores it, as in `__del__`."""
+
+    def __init__(self) -> None:
+        self._came: list[int] = []
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> SignalMemory:
+        if threading.current_thread() is threading.main_thread():
+            handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+            self._before = {number: handler for number, handler in handlers.items() if callable(handler)}
+            for number in self._before:
+                signal.signal(number, self._handle)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        self._came.append(number)
+        self._before[number](number, frame)
+
+    def raise_again(self) -> None:
+        """What a signal raised that came before now, if one did."""
+        if self._came:
+            raise KeyboardInterrupt if self._came[0] == signal.SIGINT else Terminated(self._came[0])
+
+
+def _tell(line: str) -> None:
+    from bam_train.cli.console import say
+
+    say(f"bam-serve: {line}")
+
+
+def make_env(config: ServeConfig) -> Env:
+    """The environment that is asked for.
+
+    Raises:
+        SettingsError: It cannot be made.
+        UnknownName: Nothing of that name is registered.
+    """
+    from bam_envs.registry import resolve_id
+    from bam_train.environments import make_env, make_rows
+    from bam_train.errors import SettingsError
+
+    if config.num_envs < 1:
+        raise SettingsError(f"--num-envs: expected at least 1, found {config.num_envs}")
+    env_id, kwargs = resolve_id(config.env), env_kwargs(config.set)
+    return make_env(env_id, kwargs) if config.num_envs == 1 else make_rows(env_id, kwargs, config.num_envs)
+
+
+def env_kwargs(assignments: Sequence[str]) -> dict[str, Any]:
+    """Keyword arguments out of ``name=value``.
+
+    Raises:
+        SettingsError: One of them is none.
+    """
+    from bam_train.errors import SettingsError
+    from bam_train.values import parse_assignment
+
+    kwargs = {}
+    for text in assignments:
+        path, value = parse_assignment(text)
+        if len(path) > 1:
+            raise SettingsError(f"--set {text}: expected the name of an argument, found one with a dot")
+        kwargs[path[0]] = value
+    return kwargs
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,24 @@
+"""The flags of `bam-serve`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import tyro
+
+from bam_envs.serve.options import ServeOptions
+
+
+@dataclass(frozen=True)
+class ServeConfig:
+    """Serve a Gymnasium environment, and the topics of its simulated robot, to clients of rosbridge, TCP or ROS 2."""
+
+    env: Annotated[str, tyro.conf.arg(metavar="ID")] = "bam/pick"
+    """Environment: any Gymnasium id."""
+    num_envs: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """Environments stepped together; several have no robot topics."""
+    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    """One keyword argument of the environment, any number of times: randomize=true."""
+    serving: tyro.conf.OmitArgPrefixes[ServeOptions] = field(default_factory=ServeOptions)
+    """Where, and how time passes."""

@@ -1,0 +1,86 @@
+"""Where an environment runs: here and simulated, here with a live robot, or whole on another computer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from bam_envs.registry import ENVIRONMENTS
+from bam_train.errors import SettingsError
+
+_OF_SIMULATIONS = frozenset({"randomize"})
+"""Arguments that say how a robot is simulated."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """An address, or none for the simulation here."""
+
+    robot: str | None = None
+    """Of a live robot behind rosbridge."""
+    transport: tuple[str, ...] = ()
+    """Of whole environments that run elsewhere."""
+    profile: str | None = None
+    """What the live robot's topics are: a shipped name or a file."""
+    ca_file: str | None = None
+    """Certificates that wss:// trusts instead of the system's."""
+    token_file: str | None = None
+    """File with the token that the server asks for."""
+
+    def require_sane(self) -> None:
+        """Refuse addresses and options that exclude each other.
+
+        Raises:
+            SettingsError: Names them.
+        """
+        if self.robot is not None and self.transport:
+            raise SettingsError(
+                "--robot and --transport exclude each other: the task runs here, or over there; give one"
+            )
+        if self.profile is not None and self.robot is None:
+            raise SettingsError("--profile describes a live robot; give its address with --robot too")
+        for flag, value in (("--ca-file", self.ca_file), ("--token-file", self.token_file)):
+            if value is not None and not self.is_remote:
+                raise SettingsError(
+                    f"{flag} is for a link, and the robot is simulated here; give --robot or --transport"
+                )
+
+    @property
+    def is_remote(self) -> bool:
+        """Whether there is a link to anything."""
+        return self.robot is not None or bool(self.transport)
+
+    @property
+    def text(self) -> str:
+        """For people; empty for the simulation here."""
+        return self.robot or ", ".join(self.transport)
+
+    @property
+    def link_options(self) -> dict[str, Any]:
+        """What opening a link takes beside the address."""
+        return {"ca_file": self.ca_file, "token_file": self.token_file}
+
+    def robot_kwargs(self, env_id: str, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+        """Arguments with which `env_id` is made with the live robot.
+
+        Raises:
+            SettingsError: The environment is none of ours, so that it has no robot to exchange.
+        """
+        if env_id.rpartition(":")[2] not in ENVIRONMENTS:
+            raise SettingsError(
+                f"{env_id} has no robot that --robot could exchange; serve it next to the robot with "
+                f"bam-serve --env {env_id}, and give --transport"
+            )
+        own = {name: value for name, value in env_kwargs.items() if name not in _OF_SIMULATIONS}
+        return {**own, "robot": self.robot, "profile": self.profile, **self.link_options}
+
+
+HERE = Place()
+"""The simulation here."""
+
+
+def addresses(text: str | Sequence[str] | None) -> tuple[str, ...]:
+    """Addresses out of ``a,b,c``."""
+    parts = text.split(",") if isinstance(text, str) else (text or ())
+    return tuple(part.strip() for part in parts if part.strip())

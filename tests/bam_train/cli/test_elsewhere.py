@@ -1,0 +1,236 @@
+"""The programs with robots and environments behind a link, over loopback."""
+
+from __future__ import annotations
+
+import json
+import socket
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from bam_envs.errors import LinkLost
+from bam_envs.serve.env_server import EnvServer
+from bam_envs.serve.options import ServeOptions
+from bam_envs.serve.program import ServedEnvironment
+from bam_envs.serve.tcp_server import TcpServer
+from bam_train.checkpoint import Checkpoint
+from bam_train.cli.deploy import main as deploy
+from bam_train.cli.program import guarded
+from bam_train.cli.train import TrainConfig, train
+
+PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
+
+
+@pytest.fixture
+def serve():
+    """Serves an environment at free ports: ``serve(env, **options)``."""
+    started = []
+
+    def serve(env, **options):
+        started.append(ServedEnvironment(env, ServeOptions(**{"port": 0, "tcp": 0, **options})))
+        return started[-1].__enter__()
+
+    yield serve
+    for one in started:
+        one.close()
+
+
+@pytest.fixture
+def over_tcp():
+    """Serves an environment over TCP alone: ``over_tcp(env)`` is its address."""
+    started = []
+
+    def over_tcp(env, env_id=None):
+        server = EnvServer(env, env_id=env_id)
+        started.append((TcpServer(server), server))
+        started[-1][0].start()
+        over_tcp.server = started[-1][0]
+        return over_tcp.server.url
+
+    yield over_tcp
+    for tcp, server in started:
+        tcp.close()
+        server.close()
+
+
+@pytest.fixture
+def nobody():
+    """An address where nobody listens."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture
+def bam_train(capsys, tmp_path, monkeypatch):
+    """Runs bam-train in this process; its status, standard output and standard error."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(**flags):
+        given = {
+            "env": "CartPole-v1",
+            "algo": "ppo",
+            "steps": 128,
+            "eval_every": 64,
+            "eval_episodes": 2,
+            "set": ("n_steps=32", "batch_size=32", "n_epochs=2", "policy_kwargs.net_arch=[8]"),
+        }
+        status = guarded(lambda: train(TrainConfig(**{**given, **flags})), "bam-train")
+        return status, *capsys.readouterr()
+
+    return run
+
+
+# bam-deploy
+
+
+def episodes(out):
+    return [(record["length"], record["return"], record["success"]) for record in json.loads(out)["per_episode"]]
+
+
+def test_a_policy_does_elsewhere_what_it_does_here(serve, run):
+    served = serve(gym.make("bam/pick-v0", disable_env_checker=True), fast=True)
+    flags = ("--fast", "--json", "--episodes", 2)
+    _, here, _ = run(deploy, PICK, *flags)
+    for url in (served.tcp.url, served.bus.url):
+        status, there, _ = run(deploy, PICK, *flags, "--transport", url)
+        assert status == 0
+        assert episodes(there) == episodes(here)
+        assert json.loads(there)["robot"] == url
+
+
+def test_a_policy_drives_a_robot_over_its_topics(serve, run):
+    served = serve(gym.make("bam/pick-v0", disable_env_checker=True), fast=True)
+    status, out, err = run(deploy, PICK, "--json", "--episodes", 1, "--robot", served.bus.url)
+    report = json.loads(out)
+    assert (status, report["stop_reason"], report["successes"]) == (0, "episodes done", 1), err
+    assert report["robot"] == served.bus.url
+    assert {row["number"] for row in report["guards"].values()} == {"G2", "G3", "G7", "G8", "G9", "G10", "G14"}
+    assert all(row["stopped"] == 0 for row in report["guards"].values())
+    assert "will move" not in err  # it said that it is simulated
+
+
+class Cut(gym.Env):
+    """Its server loses its network at the third step."""
+
+    observation_space = gym.spaces.Box(0.0, 4.0, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+    metadata = {"render_fps": 20}  # noqa: RUF012
+
+    def __init__(self):
+        self.steps, self.cut = 0, lambda: None
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps == 3:
+            self.cut()
+        return np.zeros(1, np.float32), 0.0, False, False, {}
+
+
+def test_a_lost_link_ends_with_a_reason_and_status_4(corridor, corridor_checkpoint, over_tcp, run):
+    env = Cut()
+    url = over_tcp(env, corridor)
+    path = corridor_checkpoint()
+    env.cut = lambda: [connection.drop() for connection in list(over_tcp.server._connections)]
+    status, out, err = run(deploy, path, "--fast", "--json", "--transport", url)
+    report = json.loads(out)
+    assert status == 4
+    assert report["stop_reason"].startswith(f"link lost: {url}")
+    assert err == f"bam-deploy: {report['stop_reason']}\n"
+    assert [record["end"] for record in report["per_episode"]] == ["stopped"]
+
+
+@pytest.mark.parametrize(("flag", "scheme"), [("--robot", "ws"), ("--transport", "tcp"), ("--transport", "ws")])
+def test_nobody_there_is_one_line(run, nobody, flag, scheme):
+    url = f"{scheme}://{nobody}"
+    status, out, err = run(deploy, PICK, flag, url)
+    assert (status, out) == (1, "")
+    assert err.startswith(f"bam-deploy: {url}: ")
+    assert "bam-serve --env" in err
+    assert err.count("\n") == 1
+
+
+def test_another_environment_is_one_line(serve, run):
+    served = serve(gym.make("bam/reach-v0", disable_env_checker=True), fast=True)
+    status, out, err = run(deploy, PICK, "--transport", served.tcp.url)
+    assert (status, out) == (1, "")
+    assert "bam/pick-v0" in err
+    assert "bam/reach-v0" in err
+    assert err.count("\n") == 1
+
+
+def test_spaces_that_do_not_fit_are_one_line(corridor_checkpoint, over_tcp, run):
+    url = over_tcp(gym.make("CartPole-v1"))
+    path = corridor_checkpoint(env="CartPole-v1")
+    status, out, err = run(deploy, path, "--fast", "--transport", url)
+    assert (status, out) == (1, "")
+    assert err == (
+        f"bam-deploy: {path}: observation_space.shape[0] is 1 in the checkpoint and 4 at {url}; "
+        "train it anew, or serve the version it was trained with\n"
+    )
+
+
+# bam-train
+
+
+def test_training_on_an_environment_elsewhere(bam_train, over_tcp):
+    url = over_tcp(gym.make("CartPole-v1"))
+    status, out, err = bam_train(transport=url)
+    assert (status, out) == (0, ""), err
+    checkpoint = Checkpoint.open("checkpoints/CartPole-v1-ppo.zip")
+    assert checkpoint.manifest.env_kwargs == {}
+    assert checkpoint.manifest.settings["transport"] == [url]
+    assert checkpoint.manifest.settings["num_envs"] == 1
+    assert checkpoint.manifest.scores["episodes"] == 2
+
+
+def test_training_on_several_at_once(bam_train, over_tcp):
+    rows = gym.make_vec("bam/reach-v0", num_envs=3)
+    urls = [over_tcp(rows), over_tcp(gym.make("bam/reach-v0", disable_env_checker=True))]
+    status, _, err = bam_train(env="bam/reach", transport=",".join(urls), steps=256)
+    assert status == 0, err
+    settings = Checkpoint.open("checkpoints/reach-ppo.zip").manifest.settings
+    assert (settings["transport"], settings["num_envs"]) == (urls, 4)
+
+
+def test_training_goes_on_elsewhere(bam_train, over_tcp):
+    url = over_tcp(gym.make("CartPole-v1"))
+    assert bam_train()[0] == 0
+    resumed = {"env": None, "algo": None, "set": (), "eval_every": None, "eval_episodes": None}
+    status, _, err = bam_train(**resumed, resume=Path("runs/CartPole-v1-ppo/last.zip"), steps=192, transport=url)
+    assert status == 0, err
+    assert Checkpoint.open("runs/CartPole-v1-ppo-2/last.zip").manifest.steps == 192
+
+
+def test_a_link_that_drops_while_training_loses_nothing(bam_train, over_tcp, monkeypatch):
+    url = over_tcp(gym.make("CartPole-v1"))
+    from bam_envs.transports.tcp import TcpTransport
+
+    steps, step = [], TcpTransport.step
+
+    def dropping(self, action):
+        steps.append(action)
+        if len(steps) == 100:
+            raise LinkLost(f"{url}: the link dropped.")
+        return step(self, action)
+
+    monkeypatch.setattr(TcpTransport, "step", dropping)
+    status, _, err = bam_train(transport=url, eval_every=10_000, steps=10_000)
+    assert status == 1
+    line = err.splitlines()[-1]
+    assert line.startswith("bam-train: at step ")
+    assert line.endswith("What was learnt is kept: go on with --resume runs/CartPole-v1-ppo/last.zip")
+    assert Checkpoint.open("runs/CartPole-v1-ppo/last.zip").manifest.steps > 0
+
+
+def test_a_server_that_is_not_there_is_one_line(bam_train, nobody):
+    status, out, err = bam_train(transport=f"tcp://{nobody}")
+    assert (status, out) == (1, "")
+    assert err.startswith(f"bam-train: tcp://{nobody}: ")
+    assert err.count("\n") == 1

@@ -1,0 +1,131 @@
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from bam_train.cli.program import Terminated
+from bam_train.cli.serve import SignalMemory, env_kwargs, main
+from bam_train.errors import SettingsError
+
+
+@pytest.fixture
+def start():
+    """Start `bam-serve` as a program of its own; its process and its first line."""
+    processes = []
+
+    def run(*arguments):
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+        command = [sys.executable, "-m", "bam_train.cli.serve", *arguments]
+        processes.append(subprocess.Popen(command, env=environment, text=True, stderr=subprocess.PIPE))
+        return processes[-1], processes[-1].stderr.readline()
+
+    yield run
+    for process in processes:
+        process.kill()
+        process.wait()
+        process.stderr.close()
+
+
+@pytest.mark.parametrize(
+    ("number", "status", "text"),
+    [(signal.SIGINT, 130, "bam-serve: interrupted\n"), (signal.SIGTERM, 143, "bam-serve: ended by SIGTERM\n")],
+)
+def test_it_serves_until_it_is_stopped(start, number, status, text):
+    process, line = start("--env", "CartPole-v1", "--port", "0")
+    assert re.fullmatch(r"bam-serve: CartPole-v1 on ws://127\.0\.0\.1:\d+, fast: /gym_env/gym_api_request\n", line)
+    process.send_signal(number)
+    assert process.wait(30) == status
+    assert process.stderr.read() == text
+
+
+def test_it_says_who_is_in_command_and_one_line_for_each_way_in(start):
+    from bam_envs.transports.tcp import TcpTransport
+
+    process, _ = start("--env", "CartPole-v1", "--port", "0", "--tcp", "0", "--lease", "2.5")
+    url = re.fullmatch(
+        r"bam-serve: CartPole-v1 on (tcp://127\.0\.0\.1:\d+), the environment alone\n", process.stderr.readline()
+    )[1]
+    transport = TcpTransport(url)
+    transport.connect()
+    transport.reset(1)
+    said = process.stderr.readline()
+    transport.close()
+    assert re.fullmatch(r"bam-serve: .* is in command\n", said)
+    assert process.stderr.readline() == said.replace("is in command", "is no longer in command")
+
+
+def test_wrong_flags_are_one_line(run):
+    status, out, err = run(main, "--fast", "--realtime")
+    assert (status, out) == (1, "")
+    assert err == "bam-serve: --realtime and --fast exclude each other; give one of the two.\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["--env", "bam/pik"], "Unknown environment 'bam/pik'. Did you mean 'bam/pick-v0'?"),
+        (["--env", "CartPole-v1", "--set", "nope=1"], "CartPole-v1 cannot be made with these arguments: "),
+        (["--num-envs", "0"], "--num-envs: expected at least 1, found 0"),
+        (["--env", "CartPole-v1", "--token-file", "/no/such"], "The token file /no/such cannot be read: No such file"),
+        (
+            ["--env", "CartPole-v1", "--cert", "/no/such", "--port", "0"],
+            "Certificate: /no/such cannot be read: No such",
+        ),
+        (["--env", "CartPole-v1", "--via", "ws://127.0.0.1:1"], "ws://127.0.0.1:1: refused: nothing listens there."),
+        (["--env", "CartPole-v1", "--image-format", "gif"], "The image format must be png or jpeg, not 'gif'."),
+        (["--namespace", "a b"], "--namespace must be letters, digits and _, such as bam_001, not 'a b'."),
+    ],
+)
+def test_what_cannot_be_is_one_line(run, arguments, text):
+    if "--port" not in arguments:
+        arguments = [*arguments, "--port", "0"]
+    status, out, err = run(main, *arguments)
+    assert (status, out) == (1, "")
+    assert err.startswith(f"bam-serve: {text}")
+    assert err.count("\n") == 1
+
+
+def test_a_port_in_use(run):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        status, _, err = run(main, "--env", "CartPole-v1", "--port", port)
+    assert status == 1
+    assert err.startswith(f"bam-serve: Port {port} on 127.0.0.1 is in use.")
+
+
+def test_arguments_of_the_environment():
+    assert env_kwargs(["randomize=true", "x=3"]) == {"randomize": True, "x": 3}
+    with pytest.raises(SettingsError, match=r"--set a\.b=1: expected the name of an argument, found one with a dot"):
+        env_kwargs(["a.b=1"])
+
+
+def test_help_names_every_flag(run):
+    status, out, _ = run(main, "--help")
+    assert status == 0
+    flags = ("env", "num-envs", "set", "port", "bind", "namespace", "tcp", "via", "rclpy", "realtime", "fast", "lease")
+    assert all(f"--{flag}" in out for flag in (*flags, "cert", "key", "token-file", "ca-file", "image-format"))
+
+
+def test_a_signal_that_was_lost_is_raised_again():
+    def lose(number, error):
+        with SignalMemory() as signals:
+            signals.raise_again()
+            with pytest.raises(error):
+                signal.raise_signal(number)
+            with pytest.raises(error):
+                signals.raise_again()
+
+    def terminate(number, frame):
+        raise Terminated(number)
+
+    lose(signal.SIGINT, KeyboardInterrupt)
+    before = signal.signal(signal.SIGTERM, terminate)
+    try:
+        lose(signal.SIGTERM, Terminated)
+        assert signal.getsignal(signal.SIGTERM) is terminate
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,68 @@
+"""Where an environment runs."""
+
+import pytest
+
+from bam_train.errors import SettingsError
+from bam_train.place import HERE, Place, addresses
+
+
+def test_the_simulation_is_here():
+    HERE.require_sane()
+    assert (HERE.is_remote, HERE.text) == (False, "")
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        (None, ()),
+        ("", ()),
+        ("tcp://a:1", ("tcp://a:1",)),
+        ("tcp://a:1, ws://b:2 ,", ("tcp://a:1", "ws://b:2")),
+        (["a", "b"], ("a", "b")),
+    ],
+)
+def test_addresses(text, found):
+    assert addresses(text) == found
+
+
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [
+        (
+            Place(robot="ws://a:1", transport=("tcp://b:2",)),
+            "--robot and --transport exclude each other: the task runs here, or over there; give one",
+        ),
+        (Place(profile="ur5e"), "--profile describes a live robot; give its address with --robot too"),
+        (
+            Place(ca_file="ca.pem"),
+            "--ca-file is for a link, and the robot is simulated here; give --robot or --transport",
+        ),
+        (
+            Place(token_file="token"),
+            "--token-file is for a link, and the robot is simulated here; give --robot or --transport",
+        ),
+    ],
+)
+def test_what_excludes_each_other_is_refused(place, message):
+    with pytest.raises(SettingsError) as caught:
+        place.require_sane()
+    assert str(caught.value) == message
+
+
+def test_a_live_robot_is_as_it_is():
+    place = Place(robot="ws://a:1", profile="mine.toml", ca_file="ca.pem")
+    assert place.robot_kwargs("bam/pick-v0", {"randomize": True}) == {
+        "robot": "ws://a:1",
+        "profile": "mine.toml",
+        "ca_file": "ca.pem",
+        "token_file": None,
+    }
+
+
+def test_an_environment_without_a_robot_says_so():
+    with pytest.raises(SettingsError) as caught:
+        Place(robot="ws://a:1").robot_kwargs("CartPole-v1", {})
+    assert str(caught.value) == (
+        "CartPole-v1 has no robot that --robot could exchange; serve it next to the robot with "
+        "bam-serve --env CartPole-v1, and give --transport"
+    )
