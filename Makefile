@@ -5,15 +5,19 @@ BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 DEMO := build/demo
 
-.PHONY: demo test lint format docs clean
+.PHONY: demo test peers lint format docs clean
 
 demo: $(VENV)/.run
 	$(BIN)/bam-train --env bam/pick --algo ppo --out $(DEMO)/pick-ppo.zip --runs $(DEMO)/runs --force
 	$(BIN)/bam-eval $(DEMO)/pick-ppo.zip
 	$(BIN)/bam-deploy $(DEMO)/pick-ppo.zip
 
-test: $(VENV)/.dev
+test: $(VENV)/.dev peers
 	$(BIN)/python -m pytest
+
+# ROS 2, a rosbridge server and roslibjs for tests/peers; where they cannot be installed, those tests are skipped.
+peers:
+	PYTHON=$(PYTHON) scripts/install_peers
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

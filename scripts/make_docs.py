@@ -99,6 +99,23 @@ def environment(env_id: str) -> str:
     return "\n\n".join(parts)
 
 
+def guards() -> str:
+    """The guards of an arm and of a base, with their limits."""
+    from bam_envs.robots.guards import default_guards
+    from bam_envs.robots.live import profile_limits
+    from bam_envs.robots.profile import load_profile
+
+    robots: dict[tuple[str, ...], list[str]] = {}
+    for name in ("ur5e", "mir100"):
+        profile = load_profile(name)
+        for guard in default_guards(profile.spec(), profile_limits(profile)):
+            does = code(inspect.cleandoc(type(guard).__doc__ or "").partition("\n\n")[0])
+            key = (guard.number, guard.name, f"{guard.limit_value:g} {guard.unit}", does)
+            robots.setdefault(key, []).append(profile.kind)
+    rows = [[*key, " and ".join(dict.fromkeys(kinds))] for key, kinds in robots.items()]
+    return table(["number", "guard", "limit", "what it does", "of"], rows)
+
+
 def robot_signals() -> str:
     """What the arm measures and what it is sent."""
     spec = resolve(ENVIRONMENTS["bam/pick-v0"].robot)(1).spec
@@ -148,10 +165,19 @@ def default_of(field: dataclasses.Field[Any]) -> str:
 
 def flags_of(reference: str) -> str:
     """The flags of a program whose configuration is the dataclass ``"module:Class"``."""
-    kind = resolve(reference)
+    return table(["flag", "default", "meaning"], _flag_rows(resolve(reference)))
+
+
+def _flag_rows(kind: type) -> list[list[object]]:
+    """One row for each flag; a field that is a dataclass itself stands for its own fields."""
     docs = field_docs(kind)
-    rows = [[flag(field), flag_default(field), docs[field.name]] for field in dataclasses.fields(kind)]
-    return table(["flag", "default", "meaning"], rows)
+    rows: list[list[object]] = []
+    for field in dataclasses.fields(kind):
+        if isinstance(field.default_factory, type) and dataclasses.is_dataclass(field.default_factory):
+            rows += _flag_rows(field.default_factory)
+        else:
+            rows.append([flag(field), flag_default(field), docs[field.name]])
+    return rows
 
 
 def flag_default(field: dataclasses.Field[Any]) -> str:
@@ -209,6 +235,7 @@ PARTS: dict[str, Callable[..., str]] = {
     "environments": environments,
     "environment": environment,
     "robot-signals": robot_signals,
+    "guards": guards,
     "fields": fields_of,
     "defaults": defaults_of,
     "flags": flags_of,

@@ -21,6 +21,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = sorted((ROOT / "docs").glob("*.md"))
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "checkpoints" / "README.md", *DOCS]
 PROGRAMS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+FLAGS_OF = {"bam-train": "training.md", "bam-serve": "remote.md"}
 EXAMPLES = {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "envs")]), "OMP_NUM_THREADS": "1"}
 
 
@@ -143,8 +144,8 @@ def test_flags_in_the_tables_are_those_of_the_programs(program, monkeypatch, cap
         main()
     assert caught.value.code == 0
     there = set(re.findall(r"--[a-z][a-z-]*", capsys.readouterr().out)) - {"--help"}
-    page = (ROOT / "docs" / ("training.md" if program == "bam-train" else "deploying.md")).read_text()
-    table = re.search(rf"generated: flags {module}:.*?<!-- /generated -->", page, re.DOTALL)[0]
+    page = (ROOT / "docs" / FLAGS_OF.get(program, "deploying.md")).read_text()
+    table = re.search(rf"generated: flags {module}(?:_config)?:.*?<!-- /generated -->", page, re.DOTALL)[0]
     assert set(re.findall(r"^\| `(--[a-z-]+)`", table, re.MULTILINE)) == there
 
 
@@ -157,7 +158,7 @@ def test_commands_exist(page):
         elif words[0] == "python":
             assert (ROOT / words[1]).exists() or f"`{words[1]}`" in page.read_text()
         else:
-            assert words[0] in {*PROGRAMS, "pip", "pytest"}
+            assert words[0] in {*PROGRAMS, "pip", "pytest", "ros2"}
 
 
 TRAINING = [words for page in PAGES for words in commands(page) if words[0] == "bam-train" and "--resume" not in words]

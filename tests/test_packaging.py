@@ -2,6 +2,7 @@
 
 import email
 import os
+import re
 import subprocess
 import sys
 import zipfile
@@ -66,13 +67,26 @@ def test_console_scripts(wheel):
         "bam-deploy = bam_train.cli.deploy:main",
         "bam-envs = bam_train.cli.envs:main",
         "bam-eval = bam_train.cli.eval:main",
+        "bam-serve = bam_train.cli.serve:main",
         "bam-train = bam_train.cli.train:main",
     ]
 
 
 def test_the_base_install_is_small(metadata):
-    names = sorted(one.split(";")[0].rstrip("<>=,.0123456789 ") for one in base_requirements(metadata))
-    assert names == ["gymnasium", "numpy", "onnxruntime", "rich", "roslibpy", "tomli", "tyro"]
+    names = sorted(re.split("[<>=; ]", one)[0] for one in base_requirements(metadata))
+    assert names == [
+        "cbor2",
+        "gymnasium",
+        "msgpack",
+        "numpy",
+        "onnxruntime",
+        "pyyaml",
+        "rich",
+        "roslibpy",
+        "tomli",
+        "tyro",
+        "websockets",
+    ]
 
 
 def test_extras(metadata):

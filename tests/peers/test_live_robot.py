@@ -1,0 +1,156 @@
+"""Our live robot, behind its guards, through a rosbridge server that is not ours, on a robot that is a ROS 2 node."""
+
+import contextlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bam_envs.errors import LinkLost, NoServer, SafetyStop, StaleState
+from bam_envs.robots.live import live_robot, profile_limits
+from bam_envs.robots.profile import load_profile
+from bam_envs.robots.robot import Initial
+from bam_envs.robots.ur5e import arm_spec
+
+ROW = np.zeros(1, np.int64)
+HOME = np.array([[0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0]])
+SPEC = arm_spec("ur5e", with_object=True)
+POSITIONS, GRIPPER, TRAJECTORY = "positions", "gripper", "trajectory"
+
+
+@contextlib.contextmanager
+def live(server, spec=SPEC, **options):
+    robot = live_robot(server.url, spec, **options)
+    try:
+        robot.connect()
+        yield robot
+    finally:
+        robot.close()
+
+
+def start(robot, position=HOME):
+    return robot.reset(ROW, Initial({"joint_position": position}, np.zeros(1, np.int64)))
+
+
+def received(node, topic):
+    return [entry["values"] for entry in node.ask("report")["received"] if entry["topic"] == topic]
+
+
+def test_its_state_is_what_the_node_publishes_by_name(rosbridge, robot_node):
+    with live(rosbridge) as robot:
+        signals = start(robot).signals
+        np.testing.assert_allclose(signals["joint_position"], HOME, atol=0.02)
+        np.testing.assert_allclose(signals["object_position"], [[0.5, 0.1, 0.02]])
+        np.testing.assert_allclose(signals["object_quaternion"], [[1.0, 0.0, 0.0, 0.0]])
+        np.testing.assert_allclose(signals["gripper_width"], [[0.085]], atol=1e-3)
+        assert robot.age() < 0.1
+
+
+@pytest.mark.parametrize("command", ["position", "trajectory"])
+def test_it_moves_where_it_is_told(command, rosbridge, robot_node):
+    with live(rosbridge, command=command) as robot:
+        target = start(robot).command.copy()
+        target[0, 0] += 0.1
+        target[0, 6] = 0.05
+        for _ in range(30):
+            state = robot.step(target)
+        np.testing.assert_allclose(state.signals["joint_position"], target[:, :6], atol=1e-3)
+        np.testing.assert_allclose(state.signals["gripper_width"], [[0.05]], atol=1e-3)
+        joints = received(robot_node, POSITIONS if command == "position" else TRAJECTORY)
+        np.testing.assert_allclose(joints[-1], target[0, :6])
+        assert received(robot_node, GRIPPER)[-1] == pytest.approx([0.05])
+
+
+def test_the_start_pose_is_reached_slowly(rosbridge, robot_node):
+    away = HOME + 0.1
+    with live(rosbridge) as robot:
+        np.testing.assert_allclose(start(robot, away).signals["joint_position"], away, atol=0.02)
+        steps = np.diff(received(robot_node, POSITIONS), axis=0)
+        assert np.abs(steps).max() <= robot.limits.reset_speed * SPEC.period + 1e-9
+        np.testing.assert_allclose(start(robot).signals["joint_position"], HOME, atol=0.02)
+
+
+def test_no_number_that_is_not_finite_reaches_the_node(rosbridge, robot_node):
+    with live(rosbridge) as robot:
+        command = start(robot).command
+        robot_node.ask("forget")
+        bad = np.where(np.arange(7) == 2, np.nan, command)
+        for _ in range(robot.limits.bad_ticks - 1):
+            np.testing.assert_array_equal(robot.step(bad).command, command)
+        with pytest.raises(SafetyStop):
+            robot.step(bad)
+        values = [value for kind in (POSITIONS, GRIPPER) for row in received(robot_node, kind) for value in row]
+        assert values
+        assert all(isinstance(value, float) for value in values)
+
+
+def test_halt_stops_the_node(rosbridge, robot_node, wait_until):
+    with live(rosbridge) as robot:
+        start(robot)  # which halts it first
+        wait_until(lambda: robot_node.ask("report")["halts"] > 0, True)
+        before = robot_node.ask("report")["halts"]
+        robot.halt()
+        wait_until(lambda: robot_node.ask("report")["halts"] > before, True)
+
+
+def test_a_hundred_commands_a_second_arrive(rosbridge, robot_node, wait_until):
+    """On a busy machine a state may be late and ROS may drop a command: neither is what is tested here."""
+    count = 300
+    patient = replace(profile_limits(load_profile("ur5e")), max_age=5.0)
+    with live(rosbridge, replace(SPEC, period=0.01), limits=patient) as robot:
+        command = start(robot).command
+        robot_node.ask("forget")
+        stamps = [robot.step(command).stamp[0] for _ in range(count)]
+        wait_until(lambda: len(received(robot_node, POSITIONS)) >= 0.95 * count, True)
+        assert (np.diff(stamps) >= 0).all()
+        assert stamps[-1] - stamps[0] >= 0.9 * 0.01 * count  # no quicker than its clock
+
+
+def step_on(robot, command):
+    for _ in range(20):
+        robot.step(command)
+
+
+def test_the_server_dies_and_comes_back(mortal_rosbridge, robot_node):
+    with live(mortal_rosbridge) as robot:
+        command = start(robot).command
+        robot.step(command)
+        mortal_rosbridge.kill()
+        with pytest.raises(LinkLost):
+            step_on(robot, command)
+        robot_node.ask("forget")
+        with pytest.raises(LinkLost):
+            robot.step(command)
+        mortal_rosbridge.start()
+        mortal_rosbridge.wait_for_robot()
+        assert robot_node.ask("report")["received"] == []
+        np.testing.assert_allclose(start(robot).signals["joint_position"], HOME, atol=0.02)
+        robot.step(command)
+
+
+def test_nobody_there(mortal_rosbridge):
+    mortal_rosbridge.kill()
+    robot = live_robot(mortal_rosbridge.url, SPEC)
+    with pytest.raises(NoServer, match="refused"):
+        robot.connect()
+    robot.close()
+
+
+def with_source(signal, **changes):
+    profile = load_profile("ur5e")
+    sources = (replace(one, **changes) if one.signal == signal else one for one in profile.state)
+    return replace(profile, state=tuple(sources))
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"topic": "/fingers/joint_states"}, r"/fingers/joint_states \(sensor_msgs/JointState\): no message in 3 s"),
+        ({"type": "std_msgs/String"}, r"The server said: .*/gripper/joint_states has another type"),
+    ],
+)
+def test_a_topic_that_is_not_what_the_profile_says(changes, text, rosbridge, robot_node):
+    robot = live_robot(rosbridge.url, SPEC, profile=with_source("gripper_width", **changes))
+    with pytest.raises(StaleState, match=text):
+        robot.connect()
+    robot.close()

@@ -1,0 +1,84 @@
+"""The simulated robot of `bam-serve` in a ROS graph: through a rosbridge server that is not ours, and as a node."""
+
+import contextlib
+import runpy
+import threading
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+
+import bam_envs  # noqa: F401 - registers the environments
+from bam_envs.bridge.link import RosbridgeLink
+
+player = runpy.run_path(str(Path(__file__).parent / "play.py"))
+POSITIONS, GRIPPER = "/forward_position_controller/commands", "/gripper/commands"
+ARRAY = "std_msgs/Float64MultiArray"
+FAR = 1.0
+NEAR = 0.6
+"""What a joint turns at its full speed until the dead-man stops it is half of this [rad]."""
+
+
+@pytest.fixture(params=["via", "rclpy"])
+def served(request, rosbridge, running_robot, python, ros_python):
+    """Serves bam/pick at the pace that is asked for; the robot's address."""
+
+    def serve(pace):
+        name = f"{request.param}_{pace}"
+        arguments = ["-m", "bam_train.cli.serve", "--env", "bam/pick", f"--{pace}", "--namespace", name]
+        if request.param == "via":
+            program = python(*arguments, "--via", rosbridge.url)
+        else:
+            program = ros_python(*arguments, "--rclpy")
+        program.line("bam-serve: bam/pick-v0 on ")
+        rosbridge.wait_for(f"/{name}/bam/robot", "std_srvs/Trigger")
+        return f"{rosbridge.url}/{name}"
+
+    return serve
+
+
+def test_the_policy_picks_with_it(served):
+    """The task runs here, the robot there; its time goes on with the commands."""
+    policy = player["FrozenPolicy"].load(player["CHECKPOINT"])
+    with contextlib.closing(gym.make("bam/pick-v0", robot=served("fast"))) as env:
+        episodes = [player["play_one"](env, seed, policy.act, 200) for seed in player["POLICY_SEEDS"]]
+    assert [episode[-1]["success"] for episode in episodes] == [True, True, True]
+
+
+class Watch:
+    """Looks at the last joint until it has moved and rests again."""
+
+    def __init__(self):
+        self.newest, self.angles = None, []
+        self.began, self.moved, self.rests = threading.Event(), threading.Event(), threading.Event()
+
+    def __call__(self, message, _):
+        self.newest = message["position"]
+        self.angles.append(message["position"][5])
+        self.began.set()
+        if abs(self.turned) > 0.01:
+            self.moved.set()
+        if self.moved.is_set() and abs(message["velocity"][5]) < 1e-3:
+            self.rests.set()
+
+    @property
+    def turned(self):
+        return self.angles[-1] - self.angles[0]
+
+
+def test_it_stops_by_itself_when_commands_stop(served):
+    """A single command goes far; the dead-man ends the motion on its way."""
+    watch, link = Watch(), RosbridgeLink(served("realtime"))
+    joints, gripper, states = (link.namespace + topic for topic in (POSITIONS, GRIPPER, "/joint_states"))
+    with contextlib.closing(link):
+        link.connect()
+        link.advertise(joints, ARRAY)
+        link.advertise(gripper, ARRAY)
+        link.subscribe(states, "sensor_msgs/JointState", watch)
+        assert watch.began.wait(10.0)
+        target = [*watch.newest[:5], watch.newest[5] + FAR]
+        while not watch.moved.wait(0.3):  # ROS loses what it sends before it knows who listens
+            link.publish(gripper, {"data": [0.085]})
+            link.publish(joints, {"data": target})
+        assert watch.rests.wait(10.0)
+    assert 0.01 < watch.turned < NEAR
