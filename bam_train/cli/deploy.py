@@ -6,7 +6,7 @@ import json as json_module
 import math
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from bam_train.cli.consent import guards_of, require_consent
 from bam_train.cli.console import is_terminal, make_console, say
 from bam_train.cli.program import run_program
 
@@ -86,7 +87,7 @@ def deploy_checkpoint(config: DeployConfig) -> int:
         journal = Journal(config.episodes, startup)
         deployment = Deployment(env, policy, pacer, journal)
         deployment.connect()
-        require_consent(config, env)
+        require_consent(env, f"bam-deploy: {config.checkpoint}", yes=config.yes)
     except BaseException:
         env.close()  # type: ignore[no-untyped-call]
         raise
@@ -170,43 +171,6 @@ def place_of(config: DeployConfig) -> Place:
 
 def _files(config: DeployConfig) -> list[tuple[str, Path | None]]:
     return [("ca_file", config.ca_file), ("token_file", config.token_file)]
-
-
-def guards_of(env: gym.Env[Any, Any]) -> dict[str, dict[str, Any]]:
-    """What the guards of a live robot did; empty for a simulated one."""
-    report = getattr(getattr(env.unwrapped, "robot", None), "report", None)
-    return {} if report is None else dict(report())
-
-
-def limit_lines(guards: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """One line for each guard that has a limit, such as ``  G8 joint speed: 1.0 rad/s``."""
-    limited = [(name, row) for name, row in guards.items() if row["limit"] not in (None, "")]
-    return [f"  {row['number']} {name}: {row['limit']} {row['unit']}".rstrip() for name, row in limited]
-
-
-def require_consent(config: DeployConfig, env: gym.Env[Any, Any]) -> None:
-    """Ask once before a real robot moves; it is connected, and stands still.
-
-    Raises:
-        SettingsError: The answer is not yes, or there is nobody to ask.
-    """
-    from bam_train.errors import SettingsError
-
-    info = getattr(getattr(env.unwrapped, "robot", None), "info", None)
-    if info is None or info.simulated:
-        return
-    for line in (f"bam-deploy: {config.checkpoint} will move {info.text}, within", *limit_lines(guards_of(env))):
-        say(line)
-    if config.yes:
-        return
-    if not sys.stdin.isatty():
-        raise SettingsError("a real robot would move, and there is nobody to ask; give --yes to go on without asking")
-    print(
-        "Is the robot clear of people, and a hand on its emergency stop? Type yes to go on: ", end="", file=sys.stderr
-    )
-    sys.stderr.flush()
-    if sys.stdin.readline().strip().lower() != "yes":
-        raise SettingsError("the answer was not yes; nothing has moved")
 
 
 def period_of(config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> float | None:

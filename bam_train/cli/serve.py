@@ -42,7 +42,7 @@ def serve(config: ServeConfig) -> int:
         from bam_envs.serve.program import ServedEnvironment
 
         logging.basicConfig(level=logging.WARNING, format="bam-serve: %(message)s")
-        with ServedEnvironment(make_env(config), config.serving, _tell) as served:
+        with ServedEnvironment(consented_env(config), config.serving, _tell) as served:
             for line in served.endpoints:
                 _tell(line)
             forever = threading.Event()
@@ -85,6 +85,26 @@ def _tell(line: str) -> None:
     from bam_train.cli.console import say
 
     say(f"bam-serve: {line}")
+
+
+def consented_env(config: ServeConfig) -> Env:
+    """The environment; if its robot is a real one, somebody agreed that clients move it.
+
+    Raises:
+        SettingsError: Nobody did.
+    """
+    from bam_train.cli.consent import require_consent
+
+    env = make_env(config)
+    robot = getattr(env.unwrapped, "robot", None)
+    try:
+        if hasattr(robot, "report"):  # a live one has guards
+            robot.connect()
+        require_consent(env, "bam-serve: whoever connects", yes=config.yes)
+    except BaseException:
+        env.close()
+        raise
+    return env
 
 
 def make_env(config: ServeConfig) -> Env:

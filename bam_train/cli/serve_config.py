@@ -20,5 +20,7 @@ class ServeConfig:
     """Environments stepped together; several have no robot topics."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """One keyword argument of the environment, any number of times: randomize=true."""
+    yes: bool = False
+    """Do not ask before clients may move a real robot (--set robot=ws://...)."""
     serving: tyro.conf.OmitArgPrefixes[ServeOptions] = field(default_factory=ServeOptions)
     """Where, and how time passes."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from itertools import accumulate
@@ -41,6 +42,7 @@ class RemoteVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
         self._wanted, self._racks = num_envs, list[Rack]()
         self._threads: ThreadPoolExecutor | None = None
+        self._process = 0
         self._rows: list[Any] | None = None
         """The last observation of each row; None while a reset is needed."""
         self._batched: tuple[Space[Any], Space[Any]] | None = None
@@ -185,8 +187,9 @@ class RemoteVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         """`call` of every item at the same time; the first fault, once all have ended."""
         if len(items) == 1:
             return [call(items[0])]
-        if self._threads is None:
+        if self._threads is None or self._process != os.getpid():  # a forked child has no threads of its parent's
             self._threads = ThreadPoolExecutor(len(items), thread_name_prefix="bam-racks")
+            self._process = os.getpid()
         futures = [self._threads.submit(call, item) for item in items]
         wait(futures)
         return [future.result() for future in futures]
@@ -197,7 +200,7 @@ class RemoteVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         for transport in self.transports:
             transport.close()
         threads, self._threads = self._threads, None
-        if threads is not None:
+        if threads is not None and self._process == os.getpid():
             threads.shutdown()
 
 

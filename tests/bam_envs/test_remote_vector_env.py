@@ -1,5 +1,7 @@
 """Rows behind transports: one rack with n rows, and several racks."""
 
+import os
+import signal
 import threading
 
 import gymnasium as gym
@@ -281,3 +283,20 @@ def test_closing_closes_every_transport_and_ends_the_threads():
     with pytest.raises(LinkLost):
         envs.reset()
     envs.close_extras()
+
+
+def test_a_forked_child_has_threads_of_its_own():
+    envs = RemoteVectorEnv([FakeTransport(), FakeTransport()])
+    envs.reset(seed=0)
+    reads, writes = os.pipe()
+    child = os.fork()
+    if child == 0:
+        signal.alarm(20)
+        envs.reset(seed=0)
+        os.write(writes, b"done")
+        os._exit(0)
+    os.close(writes)
+    assert os.read(reads, 4) == b"done"
+    os.waitpid(child, 0)
+    os.close(reads)
+    envs.close()

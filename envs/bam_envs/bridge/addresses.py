@@ -53,6 +53,8 @@ def _split(url: str) -> SplitResult:
     try:
         parts = urlsplit(url)
         (parts.hostname or "").encode("idna")
+        if "\0" in url:
+            raise ValueError("a NUL character")
     except ValueError as error:  # brackets, or a name that cannot be looked up
         raise InvalidValue(f"Address {url!r} has a host that is none: {error}. {_EXAMPLE}") from error
     return parts

@@ -16,6 +16,8 @@ from bam_envs.bridge.refusals import no_connection, no_websocket, refused_status
 from bam_envs.errors import InvalidValue, LinkLost, NoServer, RemoteError
 
 _CLOCK_PROBES = 3
+_DEAD_NODE = "context is invalid"
+"""What rosbridge_suite answers to everything after its node was told to end."""
 
 
 @dataclass(frozen=True)
@@ -148,6 +150,9 @@ async def _ask_time(connection: Connection, probe: int, deadline: float) -> Mapp
         text = f"closed the connection before it answered a request: {connection.reason}."
         raise NoServer(connection.url, text) from error
     values = answer.get("values")
+    if isinstance(values, str) and _DEAD_NODE in values:
+        text = f"its ROS node has ended and its socket has not ({values}). Restart the bridge."
+        raise NoServer(connection.url, text)
     found = values.get("time") if isinstance(values, Mapping) else None
     return found if isinstance(found, Mapping) else None
 

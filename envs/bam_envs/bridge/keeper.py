@@ -198,7 +198,11 @@ class Keeper:
         for request in self._declarations.greeting():
             frame = encode_frame(request)
             connection.announced[request["id"]] = frame
-            connection.send(frame)
+            try:
+                connection.send(frame)
+            except BamEnvsError as error:
+                connection.drop(error)
+                raise
         if self._closed:
             await connection.close()
         self._require_open()

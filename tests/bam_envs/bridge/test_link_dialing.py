@@ -116,6 +116,13 @@ def test_a_websocket_server_that_is_not_rosbridge(scripted):
     scripted.wait_connected(0)
 
 
+def test_a_bridge_whose_node_has_ended(scripted):
+    text = "Failed to create client: rcl node's context is invalid"
+    scripted.responses["/rosapi/get_time"] = lambda args: text
+    expected = f"{scripted.url}: its ROS node has ended and its socket has not ({text}). Restart the bridge."
+    assert _failure(scripted.url) == expected
+
+
 def test_a_websocket_server_that_hangs_up_on_a_request(scripted):
     scripted.responses["/rosapi/get_time"] = lambda args: scripted._stop.set()
     assert _failure(scripted.url) == (
@@ -240,6 +247,12 @@ def test_an_address_that_is_none(url, text):
     with pytest.raises(InvalidValue) as raised:
         RosbridgeLink(url)
     assert str(raised.value) == text
+
+
+def test_a_host_with_a_character_that_ends_texts():
+    with pytest.raises(InvalidValue) as raised:
+        RosbridgeLink("ws://a\0b:9090")
+    assert str(raised.value) == (f"Address 'ws://a\\x00b:9090' has a host that is none: a NUL character. {EXAMPLE}")
 
 
 @pytest.mark.parametrize("host", ["[::1", "[robot]", "a..b", ".", "x" * 64])

@@ -4,22 +4,13 @@ import os
 import signal
 import subprocess
 import sys
-from pathlib import Path
-from types import SimpleNamespace
 
 import gymnasium as gym
 import pytest
 
 from bam_envs.errors import MissingExtra
-from bam_envs.serve.env_server import EnvServer
-from bam_envs.serve.options import ServeOptions
-from bam_envs.serve.program import ServedEnvironment
-from bam_envs.serve.tcp_server import TcpServer
-from bam_train.cli.deploy import DeployConfig, main, require_consent
+from bam_train.cli.deploy import main
 from bam_train.deploy.report import guards_text
-from bam_train.errors import SettingsError
-
-PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
 
 
 def corridor_class(corridor):
@@ -251,53 +242,6 @@ GUARDS = {
 }
 
 
-class RealArm:
-    """What `require_consent` looks at."""
-
-    info = SimpleNamespace(simulated=False, text="ur5e at ws://10.0.0.5:9090")
-
-    def report(self):
-        return GUARDS
-
-
-def consent(monkeypatch, robot, answer=None, **flags):
-    """Ask, with somebody who types `answer` or with nobody there."""
-    monkeypatch.setattr(sys, "stdin", io.StringIO(answer or ""))
-    monkeypatch.setattr(sys.stdin, "isatty", lambda: answer is not None, raising=False)
-    require_consent(DeployConfig(Path("pick.zip"), **flags), SimpleNamespace(unwrapped=SimpleNamespace(robot=robot)))
-
-
-def test_before_a_real_robot_moves_its_limits_are_shown_and_somebody_asked(monkeypatch, capsys):
-    consent(monkeypatch, RealArm(), "yes\n")
-    assert capsys.readouterr().err == (
-        "bam-deploy: pick.zip will move ur5e at ws://10.0.0.5:9090, within\n"
-        "  G8 joint speed: 1.0 rad/s\n"
-        "Is the robot clear of people, and a hand on its emergency stop? Type yes to go on: "
-    )
-
-
-@pytest.mark.parametrize("answer", ["no\n", "\n", "", "y\n"])
-def test_any_other_answer_than_yes_is_no(monkeypatch, answer):
-    with pytest.raises(SettingsError, match=r"^the answer was not yes; nothing has moved$"):
-        consent(monkeypatch, RealArm(), answer)
-
-
-def test_nobody_to_ask_is_no(monkeypatch):
-    message = "a real robot would move, and there is nobody to ask; give --yes to go on without asking"
-    with pytest.raises(SettingsError) as caught:
-        consent(monkeypatch, RealArm())
-    assert str(caught.value) == message
-    consent(monkeypatch, RealArm(), yes=True)
-
-
-def test_simulated_robots_move_without_asking(monkeypatch, capsys):
-    served = RealArm()
-    served.info = SimpleNamespace(simulated=True, text="ur5e, simulated")
-    consent(monkeypatch, served)
-    consent(monkeypatch, None)
-    assert capsys.readouterr().err == ""
-
-
 def test_what_the_guards_did_is_reported():
     assert guards_text(GUARDS) == "guards changed the command: joint speed in 3 ticks"
     assert guards_text({"finite": GUARDS["finite"]}) == "no guard changed a command"
@@ -331,50 +275,3 @@ def test_what_the_guards_did_is_reported():
 )
 def test_flags_that_do_not_fit_are_one_line(corridor_checkpoint, run, arguments, message):
     assert run(main, corridor_checkpoint(), *arguments) == (1, "", f"bam-deploy: {message}\n")
-
-
-def serving(env, **options):
-    return ServedEnvironment(env, ServeOptions(port=0, tcp=0, **options))
-
-
-@pytest.mark.parametrize("way", ["tcp", "bus"])
-def test_an_environment_elsewhere_is_driven_as_the_one_here(corridor, corridor_checkpoint, run, way):
-    path = corridor_checkpoint()
-    here = json.loads(run(main, path, "--fast", "--json", "--episodes", 2)[1])
-    with serving(gym.make(corridor, disable_env_checker=True)) as served:
-        url = getattr(served, way).url
-        status, out, _ = run(main, path, "--fast", "--json", "--episodes", 2, "--transport", url)
-    there = json.loads(out)
-    assert (status, there["robot"]) == (0, url)
-    assert there["per_episode"] == here["per_episode"]
-
-
-def test_a_link_that_drops_is_a_stop_reason_and_status_4(corridor, corridor_checkpoint, run):
-    class Cut(gym.Wrapper):
-        def step(self, action):
-            for connection in list(server._connections):
-                connection.drop()
-            return super().step(action)
-
-    with TcpServer(EnvServer(Cut(gym.make(corridor, disable_env_checker=True)))) as server:
-        status, out, err = run(main, corridor_checkpoint(), "--fast", "--transport", server.url)
-    assert status == 4
-    assert out.startswith(f"link lost: {server.url}: ")
-    assert f"bam-deploy: link lost: {server.url}: " in err
-
-
-def test_a_simulated_robot_behind_rosbridge_moves_behind_its_guards(run):
-    with serving(gym.make("bam/pick-v0", disable_env_checker=True), fast=True) as served:
-        status, out, err = run(main, PICK, "--robot", served.bus.url, "--episodes", 1, "--json")
-    report = json.loads(out)
-    assert (status, report["stop_reason"], report["robot"]) == (0, "episodes done", served.bus.url)
-    assert report["successes"] == 1
-    assert report["guards"]["tool speed"] == {**report["guards"]["tool speed"], "number": "G10", "limit": 0.25}
-    assert "success after" in err
-
-
-def test_nobody_there_is_one_line(run):
-    status, out, err = run(main, PICK, "--robot", "ws://127.0.0.1:9")
-    assert (status, out) == (1, "")
-    assert err.startswith("bam-deploy: ws://127.0.0.1:9: refused: nothing listens there.")
-    assert err.count("\n") == 1

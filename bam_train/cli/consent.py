@@ -1,0 +1,50 @@
+"""Asking a person before a real robot moves."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+from bam_train.cli.console import say
+
+_QUESTION = "Is the robot clear of people, and a hand on its emergency stop? Type yes to go on: "
+
+
+def guards_of(env: Any) -> dict[str, dict[str, Any]]:
+    """What the guards of an environment's live robot did; empty for a simulated one."""
+    report = getattr(getattr(env.unwrapped, "robot", None), "report", None)
+    return {} if report is None else dict(report())
+
+
+def limit_lines(guards: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """One line for each guard that has a limit, such as ``  G8 joint speed: 1.0 rad/s``."""
+    limited = [(name, row) for name, row in guards.items() if row["limit"] not in (None, "")]
+    return [f"  {row['number']} {name}: {row['limit']} {row['unit']}".rstrip() for name, row in limited]
+
+
+def require_consent(env: Any, who: str, *, yes: bool) -> None:
+    """Ask once before a real robot moves; it is connected, and stands still.
+
+    Args:
+        env: The environment, single or vector; without a real robot nobody is asked.
+        who: What will move it, as the first line begins.
+        yes: Show it, and do not ask.
+
+    Raises:
+        SettingsError: The answer is not yes, or there is nobody to ask.
+    """
+    from bam_train.errors import SettingsError
+
+    info = getattr(getattr(env.unwrapped, "robot", None), "info", None)
+    if info is None or info.simulated:
+        return
+    for line in (f"{who} will move {info.text}, within", *limit_lines(guards_of(env))):
+        say(line)
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise SettingsError("a real robot would move, and there is nobody to ask; give --yes to go on without asking")
+    print(_QUESTION, end="", file=sys.stderr, flush=True)
+    if sys.stdin.readline().strip().lower() != "yes":
+        raise SettingsError("the answer was not yes; nothing has moved")

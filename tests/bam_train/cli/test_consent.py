@@ -1,0 +1,63 @@
+"""Asking a person before a real robot moves."""
+
+import io
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from bam_train.cli.consent import require_consent
+from bam_train.errors import SettingsError
+
+GUARDS = {
+    "joint speed": {"number": "G8", "limit": 1.0, "unit": "rad/s", "altered": 3, "stopped": 0},
+    "finite": {"number": "G2", "limit": "", "unit": "", "altered": 0, "stopped": 0},
+}
+
+
+class RealArm:
+    """What `require_consent` looks at."""
+
+    info = SimpleNamespace(simulated=False, text="ur5e at ws://10.0.0.5:9090")
+
+    def report(self):
+        return GUARDS
+
+
+def consent(monkeypatch, robot, answer=None, yes=False):
+    """Ask, with somebody who types `answer` or with nobody there."""
+    monkeypatch.setattr(sys, "stdin", io.StringIO(answer or ""))
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: answer is not None, raising=False)
+    env = SimpleNamespace(unwrapped=SimpleNamespace(robot=robot))
+    require_consent(env, "bam-deploy: pick.zip", yes=yes)
+
+
+def test_before_a_real_robot_moves_its_limits_are_shown_and_somebody_asked(monkeypatch, capsys):
+    consent(monkeypatch, RealArm(), "yes\n")
+    assert capsys.readouterr().err == (
+        "bam-deploy: pick.zip will move ur5e at ws://10.0.0.5:9090, within\n"
+        "  G8 joint speed: 1.0 rad/s\n"
+        "Is the robot clear of people, and a hand on its emergency stop? Type yes to go on: "
+    )
+
+
+@pytest.mark.parametrize("answer", ["no\n", "\n", "", "y\n"])
+def test_any_other_answer_than_yes_is_no(monkeypatch, answer):
+    with pytest.raises(SettingsError, match=r"^the answer was not yes; nothing has moved$"):
+        consent(monkeypatch, RealArm(), answer)
+
+
+def test_nobody_to_ask_is_no(monkeypatch):
+    message = "a real robot would move, and there is nobody to ask; give --yes to go on without asking"
+    with pytest.raises(SettingsError) as caught:
+        consent(monkeypatch, RealArm())
+    assert str(caught.value) == message
+    consent(monkeypatch, RealArm(), yes=True)
+
+
+def test_simulated_robots_move_without_asking(monkeypatch, capsys):
+    served = RealArm()
+    served.info = SimpleNamespace(simulated=True, text="ur5e, simulated")
+    consent(monkeypatch, served)
+    consent(monkeypatch, None)
+    assert capsys.readouterr().err == ""
