@@ -46,7 +46,8 @@ class RemoteEnv(gym.Env[Any, Any]):
             there = self.transport.connect()
             if there.vector:
                 raise InvalidValue(
-                    f"{there.env_id} has {there.num_envs} rows there; make it with num_envs={there.num_envs}."
+                    f"{there.env_id} has {there.num_envs} rows there, and one is wanted. Make it with "
+                    f"num_envs={there.num_envs}, or serve one (bam-serve without --num-envs)."
                 )
             self._there = there
         return self._there

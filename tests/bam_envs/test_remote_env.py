@@ -102,7 +102,10 @@ def test_rows_are_for_the_other_class(make_rows):
     env = RemoteEnv(LocalTransport(make_rows("bam/reach-v0", 3)))
     with pytest.raises(InvalidValue) as caught:
         env.reset()
-    assert str(caught.value) == "bam/reach-v0 has 3 rows there; make it with num_envs=3."
+    assert str(caught.value) == (
+        "bam/reach-v0 has 3 rows there, and one is wanted. Make it with num_envs=3, or serve one "
+        "(bam-serve without --num-envs)."
+    )
 
 
 def test_gymnasiums_wrappers_work():
