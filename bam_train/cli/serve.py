@@ -95,8 +95,8 @@ def consented_env(config: ServeConfig) -> Env:
     """
     from bam_train.cli.consent import require_consent
 
-    env = make_env(config)
-    robot = getattr(env.unwrapped, "robot", None)
+    env: Any = make_env(config)
+    robot: Any = getattr(env.unwrapped, "robot", None)
     try:
         if hasattr(robot, "report"):  # a live one has guards
             robot.connect()
@@ -104,7 +104,8 @@ def consented_env(config: ServeConfig) -> Env:
     except BaseException:
         env.close()
         raise
-    return env
+    made: Env = env
+    return made
 
 
 def make_env(config: ServeConfig) -> Env:

@@ -6,6 +6,7 @@ CI=true they fail.
 Longer than other files: the test files here share nothing but what is in this one.
 """
 
+import contextlib
 import json
 import os
 import queue
@@ -215,28 +216,28 @@ class Rosbridge:
 def rosbridge(ros2: dict[str, str]) -> Iterator[Rosbridge]:
     """The server, in the graph of `robot_node`."""
     server = Rosbridge(ros2)
-    server.start()
-    yield server
-    server.close()
+    with contextlib.closing(server):
+        server.start()
+        yield server
 
 
 @pytest.fixture
 def mortal_rosbridge(ros2: dict[str, str], robot_node: "Peer") -> Iterator[Rosbridge]:
     """A second server in the graph of `robot_node`, for a test that ends it."""
     server = Rosbridge(ros2)
-    server.start()
-    server.wait_for_robot()
-    yield server
-    server.close()
+    with contextlib.closing(server):
+        server.start()
+        server.wait_for_robot()
+        yield server
 
 
 @pytest.fixture(scope="session")
 def running_robot(ros2: dict[str, str], rosbridge: Rosbridge) -> Iterator[Peer]:
     robot = Peer([ROS / "bin" / "python", "-W", "ignore", HERE / "robot_node.py"], ros2)
-    robot.line("ready")
-    rosbridge.wait_for_robot()
-    yield robot
-    robot.close()
+    with contextlib.closing(robot):
+        robot.line("ready")
+        rosbridge.wait_for_robot()
+        yield robot
 
 
 @pytest.fixture
@@ -300,10 +301,8 @@ class OurRobot:
 
 @pytest.fixture(scope="session")
 def our_robot(peers):
-    with BridgeServer(port=0) as server:
-        robot = OurRobot(server)
+    with BridgeServer(port=0) as server, contextlib.closing(OurRobot(server)) as robot:
         yield robot
-        robot.close()
 
 
 @pytest.fixture

@@ -98,6 +98,8 @@ def float_check(limit: float, first: float) -> Check:
     """Check of a number up to `limit` either way; `first` where it is left out."""
 
     def check(value: Any, depth: int) -> float:
+        if type(value) is float and -limit <= value <= limit:  # what it is nearly always
+            return value
         if value is MISSING:
             return first
         if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -113,6 +115,8 @@ def integer_check(kind: str, low: int, high: int) -> Check:
     """Check of an integer in [`low`, `high`]; 0 where it is left out."""
 
     def check(value: Any, depth: int) -> int:
+        if type(value) is int and low <= value <= high:
+            return value
         if value is MISSING:
             return 0
         if isinstance(value, bool) or not isinstance(value, int):
@@ -135,6 +139,8 @@ def bool_check(value: Any, depth: int) -> bool:
 
 def string_check(value: Any, depth: int) -> str:
     """Check of a text that can be written as UTF-8; empty where it is left out."""
+    if type(value) is str and value.isascii():
+        return value
     if value is MISSING:
         return ""
     if not isinstance(value, str):
@@ -168,6 +174,17 @@ def number_array_check(kind: str, one: Check, size: int | None) -> Check:
     return check
 
 
+def string_array_check(size: int | None) -> Check:
+    """Check of a list of texts; `size` is the length if it is fixed."""
+
+    def check(value: Any, depth: int) -> list[Any]:
+        values = zeros(value, size)
+        usual = type(values) is list and set(map(type, values)) == {str} and size in (None, len(values))
+        return list(values) if usual and "".join(values).isascii() else array_check(values, depth, string_check, size)
+
+    return check
+
+
 def array_check(value: Any, depth: int, one: Check, size: int | None) -> list[Any]:
     """Check of a list, item by item."""
     if not isinstance(value, (list, tuple)):
@@ -176,8 +193,7 @@ def array_check(value: Any, depth: int, one: Check, size: int | None) -> list[An
         raise Misfit(f"a list of {size}", value)
     checked: list[Any] = []
     try:
-        for item in value:
-            checked.append(one(item, depth + 1))
+        checked.extend(one(item, depth + 1) for item in value)
     except Misfit as misfit:
         raise misfit.under(f"[{len(checked)}]") from None
     return checked

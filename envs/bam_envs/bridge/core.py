@@ -96,6 +96,8 @@ class Bridge:
     def next_deadline(self) -> float | None:
         """When `tick` is needed next [s], clock of `receive`; None if nothing waits."""
         times = [self.services.deadline, self.topics.deadline]
+        if not self._fragmented and times == [None, None]:
+            return None
         times += [session.fragments.deadline for session in self._fragmented]
         return min((one for one in times if one is not None), default=None)
 

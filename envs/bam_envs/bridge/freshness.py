@@ -13,11 +13,13 @@ import uuid
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 from bam_envs.errors import RemoteError
 
 _MARK = "bam1"
 _MOST_SESSIONS = 1024
+_LONGEST = 256  # characters of a tag: what is read is kept for a while
 
 
 @dataclass(frozen=True)
@@ -37,13 +39,22 @@ class Tag:
 
     def to_text(self) -> str:
         """As it travels."""
+        return self._text
+
+    @cached_property
+    def _text(self) -> str:
         return f"{_MARK} s={self.session} e={self.epoch} q={self.sequence} t={self.sent:.6f} d={self.deadline:.6f}"
 
 
 def read_tag(text: object) -> Tag | None:
     """The tag that `text` is, or None for anything else: other people's messages have none."""
-    if not isinstance(text, str) or not text.startswith(_MARK + " "):
+    if not isinstance(text, str) or len(text) > _LONGEST or not text.startswith(_MARK + " "):
         return None
+    return _read_tag(text)
+
+
+@lru_cache(maxsize=64)  # every message of a command has the same one
+def _read_tag(text: str) -> Tag | None:
     fields = dict(part.split("=", 1) for part in text.split()[1:] if "=" in part)
     try:
         tag = Tag(fields["s"], int(fields["e"]), int(fields["q"]), float(fields["t"]), float(fields["d"]))
@@ -118,7 +129,7 @@ class FreshnessCheck:
             epoch, sequence = latest.get(channel, (0, 0))
             now = self._clock()
             late = offset.age(tag.sent, now) - (tag.deadline - tag.sent)
-            newest = max((one[0] for one in latest.values()), default=0)
+            newest = max(latest.values(), default=(0, 0))[0]
             if tag.epoch < newest:
                 raise RemoteError(f"old connection: epoch {tag.epoch}, and epoch {newest} is there")
             if tag.sequence <= sequence:

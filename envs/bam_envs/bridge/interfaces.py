@@ -7,7 +7,7 @@ an unknown type only plain values are taken. Nothing that is not finite, and no 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -29,6 +29,7 @@ from bam_envs.bridge.checks import (
     number_array_check,
     require_object,
     require_plain,
+    string_array_check,
     string_check,
     zeros,
 )
@@ -107,7 +108,7 @@ def complete(kind: str, message: object) -> dict[str, Any]:
     Raises:
         InvalidValue: It does not fit: the text names type, field, expected and found.
     """
-    name = kind if kind in _table() else normal_name(kind)
+    name = kind if isinstance(kind, str) and kind in _table() else normal_name(kind)
     try:
         # Unknown types are not kept: a client could name any number of them.
         check = _checker(name, None) if name in _table() else any_check
@@ -162,6 +163,8 @@ def _checker(kind: str, array: str | None, first: float = 0) -> Check:
     size = int(array) if array else None
     if kind in BYTES:
         return lambda value, depth: byte_array_check(value, size)
+    if kind == "string":
+        return string_array_check(size)
     if kind in FLOATS or kind in INTEGERS:
         return number_array_check(kind, one, size)
     return lambda value, depth: array_check(zeros(value, size), depth, one, size)
@@ -185,22 +188,24 @@ def _message_check(kind: str) -> Check:
         if value is MISSING:
             return left_out
         given = require_object(value)
-        plan = usual if given.keys() <= usual.keys() else next((one for one in plans if given.keys() <= one.keys()), {})
-        if not plan and given:
-            raise _unknown_field(given, usual)
-        return _checked_fields(plan, given, depth + 1)
+        plan = usual if given.keys() <= usual.keys() else _fitting(plans, given)
+        checked, name = {}, ""
+        try:  # one for all fields, and no function for each: this runs for every part of every message
+            for name, one in plan.items():
+                checked[name] = one(given.get(name, MISSING), depth + 1)
+        except Misfit as misfit:
+            raise misfit.under(f".{name}") from None
+        return checked
 
     return check
 
 
-def _checked_fields(plan: Mapping[str, Check], given: Mapping[str, Any], depth: int) -> dict[str, Any]:
-    checked, name = {}, ""
-    try:  # one for all fields: this runs for every message
-        for name, check in plan.items():
-            checked[name] = check(given.get(name, MISSING), depth)
-    except Misfit as misfit:
-        raise misfit.under(f".{name}") from None
-    return checked
+def _fitting(plans: Sequence[Mapping[str, Check]], given: Mapping[str, Any]) -> Mapping[str, Check]:
+    """The first spelling that has all the fields of `given`."""
+    for plan in plans:
+        if given.keys() <= plan.keys():
+            return plan
+    raise _unknown_field(given, plans[0])
 
 
 def _unknown_field(given: Mapping[str, Any], plan: Mapping[str, Check]) -> Misfit:

@@ -188,7 +188,7 @@ class RosbridgeLink:
         """Send several messages, each on its topic, in this order and with one hand-over to the network thread.
 
         Raises:
-            LinkLost: As `publish`; what came before the one that failed was sent, what came after it was not.
+            LinkLost: As `publish`; not all of them were sent.
             InvalidValue: As `publish`; nothing was sent.
         """
         self._hand_over(self._require_up(), *map(Parcel, self._frames(messages)))
@@ -299,8 +299,7 @@ class RosbridgeLink:
 
     def _hand_over(self, connection: Connection, *parcels: Parcel) -> None:
         if threading.get_ident() == self._keeper.thread:
-            for parcel in parcels:
-                connection.send(parcel.frame)
+            connection.send(*(parcel.frame for parcel in parcels))
             return
         self._keeper.post(connection.post, *parcels)
         try:

@@ -11,7 +11,6 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 from bam_envs.bridge.encoding import Fragments
@@ -69,45 +68,38 @@ class Connection:
 
     # ---- sending
 
-    def send(self, frame: bytes) -> None:
-        """Write a frame to the socket now.
+    def send(self, *frames: bytes) -> None:
+        """Write frames to the socket now, all of them or none.
 
         Raises:
             LinkLost: The connection has ended, or the server does not read.
-            InvalidValue: The frame is larger than allowed.
+            InvalidValue: A frame is larger than allowed.
         """
         if self._protocol is None or self.error is not None:
             raise LinkLost(f"{self.url}: the link is down ({self.error or 'not open'}). Nothing was sent.")
         if self._held_up:
             raise LinkLost(f"{self.url}: the server does not read what it is sent. Nothing more was sent.")
-        if len(frame) > self._max_message:
+        largest = max(map(len, frames), default=0)
+        if largest > self._max_message:
             raise InvalidValue(
-                f"{self.url}: a message of {len(frame)} bytes is above the limit of {self._max_message}; nothing was "
+                f"{self.url}: a message of {largest} bytes is above the limit of {self._max_message}; nothing was "
                 "sent. Send less at once, or raise max_message on both ends."
             )
-        self._protocol.write(frame)
+        self._protocol.write(*frames)
 
     def post(self, *parcels: Parcel) -> None:
-        """Send what another thread has handed over, in this order and one piece, unless that took it back."""
-        broken = LinkLost(f"{self.url}: the link broke. The message was not sent.")
-        errors: dict[Parcel, BamEnvsError | None] = {parcel: broken for parcel in parcels if parcel.take()}
+        """Send what another thread has handed over, in this order and at once, unless that took it back."""
+        mine = [parcel for parcel in parcels if parcel.take()]
+        error: BamEnvsError | None = LinkLost(f"{self.url}: the link broke. The message was not sent.")
         try:
-            with nullcontext() if self._protocol is None else self._protocol.in_one_piece():
-                for parcel in errors:
-                    errors[parcel] = self._post(parcel)
-        finally:
-            for parcel, error in errors.items():
-                parcel.settle(error)
-
-    def _post(self, parcel: Parcel) -> BamEnvsError | None:
-        """Send one; why it was not sent, if it was not."""
-        try:
-            self.send(parcel.frame)
+            self.send(*(parcel.frame for parcel in mine))
+            error = None
+            self._pending.update({parcel.identity: parcel.answer for parcel in mine if parcel.answer is not None})
         except BamEnvsError as refused:
-            return refused
-        if parcel.answer is not None:
-            self._pending[parcel.identity] = parcel.answer
-        return None
+            error = refused
+        finally:
+            for parcel in mine:
+                parcel.settle(error)
 
     def ask(self, identity: str, request: Mapping[str, Any]) -> asyncio.Future[dict[str, Any]]:
         """Send a request; what is returned resolves to the whole answer.

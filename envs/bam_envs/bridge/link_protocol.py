@@ -9,14 +9,12 @@ import asyncio
 import os
 import ssl
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any, Protocol
 
-from autobahn.exception import Disconnected
 from roslibpy.comm import comm_asyncio
 
 from bam_envs.bridge.addresses import Address
+from bam_envs.bridge.text_frames import split_texts, text_frame
 from bam_envs.errors import LinkLost
 
 _UNSENT_HIGH = 1024 * 1024
@@ -46,43 +44,29 @@ class Receiver(Protocol):
 class LinkProtocol(comm_asyncio.AsyncioRosBridgeProtocol):  # type: ignore[misc]
     """One WebSocket connection of roslibpy's, that tells its `Receiver` everything."""
 
-    _pieces: list[bytes] | None = None
-
     def connection_made(self, transport: Any) -> None:  # noqa: D102 - asyncio's
         transport.set_write_buffer_limits(high=_UNSENT_HIGH)
         super().connection_made(transport)
 
     def data_received(self, data: bytes) -> None:
         """asyncio: bytes came. Autobahn puts them into a queue that it empties a turn of the loop later."""
-        self._dataReceived(data)
+        if self.state == self.STATE_OPEN and self.current_frame is None and not self.inside_message and not self.data:
+            texts, data = split_texts(data, self.maxMessagePayloadSize)
+            for text in texts:
+                self.onMessage(text, isBinary=False)
+        if data:
+            self._dataReceived(data)
 
-    def write(self, frame: bytes) -> None:
-        """Send a text frame now.
+    def write(self, *payloads: bytes) -> None:
+        """Send texts now, each as a frame, with one system call.
 
         Raises:
             LinkLost: A closing handshake is going on, or is over.
         """
-        try:
-            self.sendMessage(frame)
-        except Disconnected as error:
-            raise LinkLost(f"{self.factory.url}: the link is being closed. Nothing was sent.") from error
-
-    @contextmanager
-    def in_one_piece(self) -> Iterator[None]:
-        """What is written in the block goes to the socket at its end, with one system call."""
-        self._pieces = []
-        try:
-            yield
-        finally:
-            pieces, self._pieces = self._pieces, None
-            if pieces:
-                self.transport.write(b"".join(pieces))
-
-    def sendData(self, data: bytes, sync: bool = False, chopsize: int | None = None) -> None:  # noqa: D102, N802
-        if self._pieces is None:
-            super().sendData(data, sync, chopsize)
-        else:
-            self._pieces.append(data)
+        if self.state != self.STATE_OPEN:
+            raise LinkLost(f"{self.factory.url}: the link is being closed. Nothing was sent.")
+        # Autobahn's sendMessage does the same in several times the time, which a control loop waits for.
+        self.transport.write(b"".join(map(text_frame, payloads)))
 
     def pause_writing(self) -> None:
         """asyncio: more than `_UNSENT_HIGH` bytes wait for the server to read."""

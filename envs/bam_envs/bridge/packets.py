@@ -72,12 +72,13 @@ class Publication:
 
     def __init__(self, topic: str, kind: str, message: Mapping[str, Any]) -> None:
         self.topic, self.kind, self.message = topic, kind, message
-        self._packets: dict[tuple[str, Wire], Packet] = {}
+        self._packets: dict[tuple[str, str, int], Packet] = {}
 
     def packet(self, name: str, wire: Wire) -> Packet:
         """Packed for those who call the topic `name`, and want it like `wire`; the same one for all of them."""
-        key = (name, wire)
-        if key not in self._packets:
+        key = (name, wire.compression, wire.fragment_size)  # not `wire`: its hash is made in Python
+        packet = self._packets.get(key)
+        if packet is None:
             message = {"op": "publish", "topic": name, "msg": self.message}
-            self._packets[key] = pack(message, wire, stream=self.topic, kind=self.kind)
-        return self._packets[key]
+            packet = self._packets[key] = pack(message, wire, stream=self.topic, kind=self.kind)
+        return packet

@@ -140,7 +140,9 @@ class BridgeServer:
     def publish_all(self, messages: Sequence[tuple[str, Message]]) -> None:
         """Send several messages, each with its topic, in this order."""
         publications = [self._bridge.publication(topic, message) for topic, message in messages]
-        if not self._post(lambda: self._publish(publications)):
+        if self._thread.is_current:  # in a listener: what made that run flushes afterwards
+            self._publish(publications)
+        elif not self._post(lambda: self._publish(publications)):
             raise LinkLost(f"{messages[0][0]}: the server is not running; nothing was sent.")
 
     def subscribe(self, topic: str, kind: str, listener: Listener) -> Callable[[], None]:

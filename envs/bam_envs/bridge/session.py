@@ -6,6 +6,7 @@ import re
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from bam_envs.bridge.bus import Caller, Handler, Message
@@ -110,6 +111,7 @@ def read_name(message: Mapping[str, Any], what: str) -> str:
     return canonical(read_text(message, what))
 
 
+@lru_cache(maxsize=1024)
 def canonical(name: str) -> str:
     """A name with its leading slash.
 

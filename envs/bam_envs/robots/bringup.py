@@ -13,7 +13,7 @@ from bam_envs.errors import InvalidValue, LinkLost, ProtocolError, RemoteError, 
 from bam_envs.robots.codec import INFO_SERVICE, RobotInfo, read_info
 from bam_envs.robots.command_messages import has_room
 from bam_envs.robots.live_state import LiveState
-from bam_envs.robots.messages import same_type
+from bam_envs.robots.messages import bare_type, same_type
 from bam_envs.robots.profile_tables import RobotProfile, Sink
 
 if TYPE_CHECKING:
@@ -95,14 +95,17 @@ class TopicTypes:
         """
         found = self._found(topic)
         if found and not same_type(found, expected):
-            raise ProtocolError(
-                f"{topic} is a {found} there, and {expected} was expected. "
-                f"Correct the topic or its type in the profile of {self._profile.name}."
-            )
+            raise self._misfit(topic, expected, found)
         return found or expected
 
+    def _misfit(self, topic: str, expected: str, found: str) -> ProtocolError:
+        return ProtocolError(
+            f"{topic} is a {found} there, and {expected} was expected. "
+            f"Correct the topic or its type in the profile of {self._profile.name}."
+        )
+
     def check_listened(self, topic: str, expected: str) -> str:
-        """As `check`, for a topic of commands, which somebody must listen to.
+        """As `check`, for a topic of commands, which somebody must listen to; stamped or not must be as expected.
 
         Raises:
             ProtocolError: `topic` has another type there, or nobody knows it.
@@ -115,7 +118,10 @@ class TopicTypes:
                     f"Topics are in the profile of {self._profile.name}."
                 )
             time.sleep(_ASK_AGAIN)  # nodes of a ROS graph find each other after a while
-        return self.check(topic, expected)
+        found = self._found(topic) or expected
+        if bare_type(found) != bare_type(expected):  # what is stamped is read like what is not, and written otherwise
+            raise self._misfit(topic, expected, found)
+        return found
 
     def _found(self, topic: str) -> str:
         """The type of `topic` there; empty if the server does not know, or does not say."""

@@ -28,6 +28,7 @@ from bam_envs.robots.messages import (
     require_names,
     shown,
     tag_text,
+    usual_numbers,
     value_at,
 )
 from bam_envs.robots.profile_tables import RobotProfile, Sink, Source
@@ -125,8 +126,9 @@ def _in_order(source: Source, message: Message, where: str, size: int) -> Array:
 
 def _by_name(source: Source, message: Message, where: str) -> Array:
     """The numbers of the names of `source`, whatever their order in the message."""
-    if message.get("name") == list(source.names) and source.missing is None:
-        return _in_order(source, message, where, len(source.names))
+    usual = usual_numbers(message.get(source.field)) if message.get("name") == list(source.names) else None
+    if usual is not None and len(usual) == len(source.names):
+        return usual
     found = names_of(message, "name", where)
     require_names(source.names, found, where, source.ignore)
     values = value_at(message, source.field, where)
@@ -146,20 +148,16 @@ def _joint(value: object, where: str, missing: float | None) -> float:
 
 
 def _to_si(entry: Source | Sink, raw: Array) -> Array:
-    if _is_si(entry):
+    if entry.is_si:
         return raw
     values: Array = raw * np.array(entry.scale) + np.array(entry.offset)
     return values
 
 
 def _from_si(entry: Source | Sink, values: Array) -> list[float]:
-    raw = values if _is_si(entry) else (values - np.array(entry.offset)) / np.array(entry.scale)
+    raw = values if entry.is_si else (values - np.array(entry.offset)) / np.array(entry.scale)
     numbers: list[float] = raw.tolist()
     return numbers
-
-
-def _is_si(entry: Source | Sink) -> bool:
-    return entry.scale == (1.0,) and entry.offset == (0.0,)
 
 
 @cache
@@ -185,9 +183,10 @@ def encode_state(
     for source in profile.state:
         if source.signal not in state.signals:
             continue
-        new = (source.topic, source.type, _new_state(source, stamp))
-        message = messages.setdefault((source.topic, source.names), new)[2]
-        _write_source(message, source, state.signals[source.signal][row])
+        key = (source.topic, source.names)
+        if key not in messages:
+            messages[key] = (source.topic, source.type, _new_state(source, stamp))
+        _write_source(messages[key][2], source, state.signals[source.signal][row])
     stamped = [envelope for envelope in messages.values() if has_header(envelope[1])]
     if not stamped:
         return list(messages.values())
@@ -255,7 +254,7 @@ def decode_command(
     Raises:
         ProtocolError: The message is not what the profile says, or no command comes on `topic`.
     """
-    sink = next((sink for way in profile.commands.values() for sink in way if sink.topic == topic), None)
+    sink = profile.sinks_by_topic.get(topic)
     if sink is None:
         raise ProtocolError(f"{topic}: no command of {profile.name} comes here.")
     content = require_message(message, topic)

@@ -13,6 +13,7 @@ from bam_envs.robots.profile_tables import RobotProfile
 from bam_envs.robots.robot import RobotSpec
 from bam_envs.robots.rosbridge import RosbridgeRobot
 from bam_envs.robots.safe import SafeRobot
+from bam_envs.tokens import read_token
 
 DEFAULT_PROFILE = "ur5e"
 
@@ -48,7 +49,7 @@ def live_robot(
     _require_robot_address(url)
     chosen = _profile(profile, spec)
     robot = RosbridgeRobot(
-        url, chosen, spec=spec, ca_file=ca_file, token=_token(token_file) if token_file else None, command=command
+        url, chosen, spec=spec, ca_file=ca_file, token=read_token(token_file) if token_file else None, command=command
     )
     return SafeRobot(robot, limits=limits or profile_limits(chosen), tool_position=tool_position)
 
@@ -76,13 +77,3 @@ def _require_robot_address(url: str) -> None:
         raise InvalidValue(f"{expected}; {url!r} is that of a whole environment. Give it as transport={url!r}.")
     address = url.partition("://")[2] if separator else url
     raise InvalidValue(f"{expected}, not {url!r}. Did you mean {f'ws://{address}'!r}?")
-
-
-def _token(path: str) -> str:
-    try:
-        token = Path(path).read_text(encoding="utf-8").strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InvalidValue(f"The token file {path} cannot be read: {error}.") from error
-    if not token:
-        raise InvalidValue(f"The token file {path} is empty.")
-    return token

@@ -7,7 +7,6 @@ not be ours: how far it is off comes from the server's clock where the link know
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from bam_envs.bridge.bus import Caller, Listener, Message
 from bam_envs.bridge.freshness import ClockOffset
 from bam_envs.errors import StaleState
 from bam_envs.robots.codec import decode_source
-from bam_envs.robots.mailbox import Letter, Mailbox
+from bam_envs.robots.mailbox import Alarm, Letter, Mailbox
 from bam_envs.robots.messages import read_stamp, require_message, tag_text
 from bam_envs.robots.profile_tables import RobotProfile, Source
 from bam_envs.robots.robot import RobotSpec
@@ -111,7 +110,7 @@ class LiveState:
         self._extra = self._allowed_extra(profile)
         self._ages: dict[str, SourceAge] = {}
         self._seen: dict[str, _Seen] = {}
-        self._expected, self._answered = "", threading.Event()
+        self._expected, self._answered = "", Alarm()
 
     def _allowed_extra(self, profile: RobotProfile) -> dict[str, float]:
         """How much older than `max_age` the messages of each head may be [s]."""
@@ -136,7 +135,7 @@ class LiveState:
         def listen(message: Message, caller: Caller) -> None:
             self.mailbox.put([*always, *(source.signal for source in shared if _is_ours(source, message))], message)
             if self._expected and tag_text(message) == self._expected:
-                self._answered.set()
+                self._answered.ring()
 
         return listen
 
@@ -184,12 +183,12 @@ class LiveState:
 
     def expect(self, tag: str) -> None:
         """From now on look for the answer to the command with the text `tag`, which is about to be sent."""
-        self._answered.clear()
+        self._answered.stop()
         self._expected = tag
 
     def stop_waiting(self) -> None:
         """Something happened that `stop` of `await_answer` knows."""
-        self._answered.set()
+        self._answered.ring()
 
     def await_answer(self, stop: Callable[[], bool], timeout: float) -> bool:
         """Wait until the expected answer came, and no source is from before it; whether it did, or `stop` says so.
@@ -229,8 +228,12 @@ class LiveState:
                 message = require_message(letter.message, source.topic)
                 stamp = read_stamp(message, source.topic)
                 self._seen[source.signal] = _Seen(letter.number, stamp is not None, stamp or 0.0, tag_text(message))
-                age = self._ages.setdefault(source.signal, SourceAge(self._wall() - self._clock()))
-                age.look(letter.arrived, stamp, self.server_offset())
+                self._age(source.signal).look(letter.arrived, stamp, self.server_offset())
+
+    def _age(self, signal: str) -> SourceAge:
+        if signal not in self._ages:
+            self._ages[signal] = SourceAge(self._wall() - self._clock())
+        return self._ages[signal]
 
     def _stamp(self, letters: Mapping[str, Letter]) -> float:
         """The stamp of the first source that has one; without any, when the newest message came [s]."""

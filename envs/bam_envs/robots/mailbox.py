@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +20,27 @@ class Letter:
     """When it came [s], our monotonic clock."""
     number: int
     """Counts what came for its slot, from 1."""
+
+
+class Alarm:
+    """Wakes the one thread that waits. A lock used as a flag: an Event costs several times as much."""
+
+    def __init__(self) -> None:
+        self._silent = threading.Lock()
+        self._silent.acquire()
+
+    def ring(self) -> None:
+        """End the wait, or the next one. As often as one likes, from any thread."""
+        with suppress(RuntimeError):  # it rings already
+            self._silent.release()
+
+    def stop(self) -> None:
+        """Let the next wait be one."""
+        self._silent.acquire(blocking=False)
+
+    def wait(self, timeout: float) -> None:
+        """Wait until it rings, at most `timeout` [s]; afterwards it is silent."""
+        self._silent.acquire(timeout=timeout)
 
 
 class Mailbox:

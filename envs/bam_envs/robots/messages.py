@@ -111,10 +111,18 @@ def shown(value: object) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def numbers(value: object, where: str, *, missing: float | None = None) -> Array:
-    """The list `value` of plain finite numbers; `missing`, if given, is what the others become. Shape: (k,)."""
+def usual_numbers(value: object) -> Array | None:
+    """The list `value` if all of it is finite floats, as it nearly always is; None for anything else. Shape: (k,)."""
     if type(value) is list and set(map(type, value)) == {float} and math.isfinite(sum(value)):
         return np.array(value)  # a finite sum has finite terms
+    return None
+
+
+def numbers(value: object, where: str, *, missing: float | None = None) -> Array:
+    """The list `value` of plain finite numbers; `missing`, if given, is what the others become. Shape: (k,)."""
+    usual = usual_numbers(value)
+    if usual is not None:
+        return usual
     if isinstance(value, np.ndarray) and value.ndim == 1:
         value = value.tolist()
     if not isinstance(value, Sequence) or isinstance(value, (str, bytes, bytearray)):
@@ -183,18 +191,21 @@ def read_stamp(message: Message, where: str) -> float | None:
     stamp = header.get("stamp") if isinstance(header, _OBJECT) else None
     if stamp is None:
         return None
-    stamp = require_message(stamp, f"{where}: header.stamp")
-    seconds, nano = (_either(stamp, names, where) for names in (("sec", "secs"), ("nanosec", "nsecs")))
+    if not isinstance(stamp, _OBJECT):
+        require_message(stamp, f"{where}: header.stamp")
+    seconds, nano = _either(stamp, "sec", "secs", where), _either(stamp, "nanosec", "nsecs", where)
     if seconds < 0 or not 0 <= nano < _NANO:
         raise ProtocolError(f"{where}: header.stamp must be seconds and nanoseconds, not {shown(stamp)}.")
     return seconds + nano / _NANO or None
 
 
-def _either(stamp: Message, names: tuple[str, str], where: str) -> float:
-    for name in names:
-        if name in stamp:
-            return number(stamp[name], f"{where}: header.stamp.{name}")
-    raise ProtocolError(f"{where}: header.stamp has no {names[0]}; found: {', '.join(stamp)}.")
+def _either(stamp: Message, ros2: str, ros1: str, where: str) -> float:
+    name = ros2 if ros2 in stamp else ros1
+    if name not in stamp:
+        raise ProtocolError(f"{where}: header.stamp has no {ros2}; found: {', '.join(stamp)}.")
+    value = stamp[name]
+    # What comes a thousand times a second is not to make a text that nobody reads.
+    return value if type(value) is int and value < 2**63 else number(value, f"{where}: header.stamp.{name}")
 
 
 def write_stamp(seconds: float, *, ros1: bool = False) -> dict[str, int]:

@@ -69,6 +69,6 @@ def _parsed(where: str, text: str) -> Table:
     language = "TOML" if where.endswith(".toml") else "YAML"
     try:
         data = tomllib.loads(text) if language == "TOML" else yaml.safe_load(text)
-    except (tomllib.TOMLDecodeError, yaml.YAMLError) as error:
+    except (ValueError, RecursionError, yaml.YAMLError) as error:  # YAML's dates and numbers are left to Python's
         raise InvalidValue(f"{where} is not {language}: {' '.join(str(error).split())}.") from error
     return require_table(data, where)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 from bam_envs.errors import InvalidValue, UnknownName
@@ -47,6 +48,11 @@ class Source:
     constants: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Further fields of the message, as a simulated robot sends them."""
 
+    @cached_property
+    def is_si(self) -> bool:
+        """Whether its numbers travel in SI units, as they are."""
+        return set(self.scale) == {1.0} and set(self.offset) == {0.0}
+
 
 @dataclass(frozen=True)
 class Sink:
@@ -73,6 +79,11 @@ class Sink:
     tag: bool = True
     """Whether the message says who sent it when, if its type has room for a text: ``header.frame_id``, or the label of
     an array's first dimension."""
+
+    @cached_property
+    def is_si(self) -> bool:
+        """Whether its numbers travel in SI units, as they are."""
+        return set(self.scale) == {1.0} and set(self.offset) == {0.0}
 
 
 IMAGE_TYPES = ("sensor_msgs/CompressedImage", "sensor_msgs/Image")
@@ -119,6 +130,11 @@ class RobotProfile:
     """Limits of the guards that differ from their defaults, by their names in `bam_envs.robots.guards`."""
     cameras: tuple[CameraSource, ...] = ()
     """Its cameras."""
+
+    @cached_property
+    def sinks_by_topic(self) -> Mapping[str, Sink]:
+        """What is sent on each topic, in the first way that uses it."""
+        return {sink.topic: sink for way in reversed([*self.commands.values()]) for sink in reversed(way)}
 
     def source(self, signal: str) -> Source:
         """Where `signal` comes from."""

@@ -93,8 +93,9 @@ class RosbridgeRobot:
         self._epoch = 0  # of the connection that was verified; another one needs a reset
         self._cut = threading.Event()
         self._sending, self._halts = threading.Lock(), 0
-        self._refusals: list[str] = []
-        self._unsent: list[BamEnvsError] = []
+        self._halt_failed = False  # and somebody was told
+        self._commanded = False  # since `connect`
+        self._refusals: list[BamEnvsError] = []
         self._sent: Array | None = None
 
     def connect(self) -> None:
@@ -155,7 +156,6 @@ class RosbridgeRobot:
         self._state.forget_ages()
         await_first(control, self._state, self.profile)
         self._refusals.clear()
-        self._unsent.clear()
         self._state.read()
         self._sent = None
 
@@ -170,8 +170,13 @@ class RosbridgeRobot:
             text = str(status.get("msg"))
             _LOG.debug("%s: %s", self.url, text)
             if not any(reason in text for reason in _LATE):
-                self._refusals.append(text)
-                self._state.stop_waiting()
+                refusal = NotInCommand if " in command" in text else RemoteError
+                self._on_refusal(refusal(f"{self.url}: {text}"))
+
+    def _on_refusal(self, error: BamEnvsError) -> None:
+        """The command that was sent last is refused, there or here."""
+        self._refusals.append(error)
+        self._state.stop_waiting()
 
     def reset(self, rows: Rows, initial: Initial) -> RobotState:
         """A fresh state. Nothing real moves; the object of a simulated robot is put where `initial` says.
@@ -250,7 +255,7 @@ class RosbridgeRobot:
         with self._sending:
             if self._halts == halts:
                 control.publish_all(messages)
-        self._sent = command.copy()
+        self._sent, self._commanded = command.copy(), True
 
     def _ask(self, control: RosbridgeLink, command: Array, tag: Tag) -> None:
         """Send as `_send`, and wait for the answer; that they were sent need not be waited for before."""
@@ -259,8 +264,8 @@ class RosbridgeRobot:
         try:
             with self._sending:
                 if self._halts == halts:
-                    take_back = control.begin_publishing(messages, self._on_unsent)
-            self._sent = command.copy()
+                    take_back = control.begin_publishing(messages, self._on_refusal)
+            self._sent, self._commanded = command.copy(), True
             self._await_answer()
         finally:
             take_back()
@@ -271,14 +276,8 @@ class RosbridgeRobot:
         envelopes = [encode_sink(sink, self.spec, command, tag, ros1=ros1) for sink in self._sinks]
         return [(self.namespace + topic, message) for topic, _, message in envelopes]
 
-    def _on_unsent(self, error: BamEnvsError) -> None:
-        self._unsent.append(error)
-        self._state.stop_waiting()
-
     def _await_answer(self) -> None:
-        if not self._state.await_answer(
-            lambda: self._cut.is_set() or bool(self._refusals) or bool(self._unsent), ANSWER_TIMEOUT
-        ):
+        if not self._state.await_answer(lambda: self._cut.is_set() or bool(self._refusals), ANSWER_TIMEOUT):
             raise StaleState(
                 f"{self.url}: no state answered the command in {ANSWER_TIMEOUT:g} s. Does the simulation run?",
                 self.age(),
@@ -315,8 +314,11 @@ class RosbridgeRobot:
         first = self._sending.acquire(timeout=_HALT_WAITS)
         try:
             self._publish_halt(halting)
+            self._halt_failed = False
         except BamEnvsError as error:  # nobody can be told; the robot's dead-man holds it
-            _LOG.warning("%s: the halt could not be sent: %s", self.url, error)
+            if not self._halt_failed:
+                _LOG.warning("%s: the halt could not be sent: %s", self.url, error)
+            self._halt_failed = True
         finally:
             if first:
                 self._sending.release()
@@ -335,16 +337,19 @@ class RosbridgeRobot:
     def _hold(self) -> Array:
         """What a halt sends, NaN for nothing. Shape: (m,)."""
         try:
-            signals = self._state.signals()
+            # To go back to where it was some time ago would be a motion.
+            signals = self._state.signals() if self._state.age() <= self.profile.max_age else {}
         except BamEnvsError:  # what it measures cannot be read: it holds what it was sent
             signals = {}
         return hold_command(self.spec, self._sinks, signals, self._sent)
 
     def close(self) -> None:
-        """Halt, then drop both connections. As often as one likes."""
-        self.halt()
+        """Halt what was commanded from here, then drop both connections. As often as one likes."""
+        if self._commanded:  # who only looked moves nothing, and stops nobody else
+            self.halt()
         control, halting = self._control, self._halting
         self._control = self._halting = None
+        self._commanded = False
         self._cut.set()
         for link in (control, halting):
             if link is not None:
@@ -366,14 +371,10 @@ class RosbridgeRobot:
             raise LinkLost(f"{self.url}: the connection that halts the robot is down. Nothing is sent without it.")
 
     def _require_accepted(self) -> None:
-        if self._unsent:
-            error = self._unsent[0]
-            self._unsent.clear()
-            raise error
         if self._refusals:
-            text = self._refusals[0]
+            refusal = self._refusals[0]
             self._refusals.clear()
-            raise (NotInCommand if " in command" in text else RemoteError)(f"{self.url}: {text}")
+            raise refusal
 
 
 def _nothing() -> None:

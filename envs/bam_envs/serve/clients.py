@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import threading
+from collections import Counter
 
 from bam_envs.bridge.bus import Caller
+from bam_envs.errors import RemoteError
+
+_MOST_SESSIONS = 64
+"""Of one connection: each is remembered until that ends."""
 
 
 class Clients:
@@ -13,19 +18,33 @@ class Clients:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._callers: dict[str, set[str]] = {}
+        self._sessions: Counter[str] = Counter()  # of each caller
 
     def name(self, caller: Caller, session: str | None) -> str:
-        """What to call the client that sent a message of `session`, if it says one, through `caller`."""
+        """What to call the client that sent a message of `session`, if it says one, through `caller`.
+
+        Raises:
+            RemoteError: It said too many sessions.
+        """
         nameless = caller.address or caller.name or "a sender without a name"
         name = nameless if session is None else f"session {session}"
         if caller.name:  # else nobody says when it leaves
             with self._lock:
-                self._callers.setdefault(name, set()).add(caller.name)
+                self._remember(name, caller.name)
         return name
+
+    def _remember(self, client: str, caller: str) -> None:
+        if caller in self._callers.get(client, ()):
+            return
+        if self._sessions[caller] >= _MOST_SESSIONS:
+            raise RemoteError(f"One connection may send for at most {_MOST_SESSIONS} sessions; open another one.")
+        self._sessions[caller] += 1
+        self._callers.setdefault(client, set()).add(caller)
 
     def left(self, caller: Caller) -> list[str]:
         """The clients whose last connection `caller` was."""
         with self._lock:
+            del self._sessions[caller.name]
             mine = [client for client, callers in self._callers.items() if caller.name in callers]
             for client in mine:
                 self._callers[client].discard(caller.name)

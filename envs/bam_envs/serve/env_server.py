@@ -58,7 +58,7 @@ class EnvServer:
         self._spec = describe_env(env, env_id)
         self._values = CheckedValues(self._spec, env.observation_space if isinstance(env, VectorEnv) else None)
         self._pace = Pace(_period(self._spec), clock, sleep) if realtime else None
-        self._clock, self._closed = clock, False
+        self._clock, self._ended, self._closed = clock, False, False
         self._episode: str | None = None  # whose is running
         self._callbacks: list[Callable[[], None]] = []
         self.lease.on_change(self._end_episode)
@@ -150,8 +150,14 @@ class EnvServer:
             with self.lock:
                 self._halt()
 
+    def end(self) -> None:
+        """Refuse whatever comes from now on; returns when what was under way is done."""
+        with self.lock:
+            self._ended = True
+
     def close(self) -> None:
         """Halt the robot and close the environment. As often as one likes."""
+        self.end()
         with self.lock:
             if not self._closed:
                 self._closed, self._episode = True, None
@@ -170,7 +176,7 @@ class EnvServer:
             self.lease.require(client)
             if deadline is not None and self._clock() > deadline:
                 raise RemoteError(f"expired: its turn came {self._clock() - deadline:.3f} s after its deadline")
-            if self._closed:
+            if self._ended:
                 raise RemoteError("The environment is closed.")
             yield
 

@@ -38,6 +38,8 @@ _ANSWERS = 8
 _PATIENCE = 60.0
 """Longest wait for the answer to a request that came twice while the first one is executed [s]."""
 _MOST_CLIENTS = 1024
+_LONGEST_NAME = 100
+"""Characters of a client's name that are kept, and told to others."""
 
 
 class GymApiService:
@@ -141,7 +143,7 @@ class GymApiService:
     def _client(self, request: GymRequest, caller: Caller) -> str:
         """Name of who asks, by which a client is known again when it comes back on another connection."""
         mark = request.tag.session if request.tag is not None else caller.name
-        name = request.client_id or "somebody"
+        name = request.client_id[:_LONGEST_NAME] or "somebody"
         return f"{name}#{mark}" if mark else name
 
     def _remember(self, client: str, caller: Caller) -> None:

@@ -56,6 +56,8 @@ class ServeOptions:
         for flag, value, needed in (("key", self.key, "cert"), ("ca-file", self.ca_file, "via")):
             if value and not getattr(self, needed):
                 raise InvalidValue(f"--{flag} means something only with --{needed}.")
+        if self.rclpy and self.token_file and self.tcp is None:
+            raise InvalidValue("--token-file protects nothing with --rclpy: ROS 2 has no token. Leave it out.")
         if not self.lease > 0:
             raise InvalidValue(f"--lease must be above 0 s, not {self.lease:g}.")
         for flag, port in (("port", self.port), ("tcp", self.tcp)):

@@ -91,6 +91,7 @@ class ServedEnvironment:
             self._robot_service = RobotService(robot, profile, bus, self.lease, namespace=self.prefix)
             started.callback(self._robot_service.close)
             self._robot_service.start()
+        started.callback(server.end)  # while the robot's clock still ticks: a step that runs waits for it
         service = GymApiService(server, bus, self.prefix, image_format=self.options.image_format)
         started.callback(service.close)
         service.start()

@@ -36,6 +36,7 @@ class RclpyBus:
         self._node: Any = None  # topics
         self._caller: Any = None  # services, which may take long: a node of their own, so that no topic waits for them
         self._clients: dict[str, Any] = {}
+        self._waiting: set[threading.Event] = set()  # of calls for their answers
         self._executors: list[Any] = []
         self._threads: list[threading.Thread] = []
 
@@ -152,7 +153,7 @@ class RclpyBus:
 
         Raises:
             InvalidValue: `request` does not fit `kind`, or that is in no package here.
-            LinkLost: There was no answer within `timeout` [s].
+            LinkLost: There was no answer within `timeout` [s], or before the node was closed.
         """
         types, answered = interface(kind, "srv"), threading.Event()
         made = to_message(types.Request, request, service)
@@ -162,10 +163,16 @@ class RclpyBus:
                 self._clients[service] = self._caller.create_client(types, service)
             client = self._clients[service]
             future = client.call_async(made)
+            self._waiting.add(answered)
         future.add_done_callback(lambda _: answered.set())
-        if not answered.wait(timeout):
-            client.remove_pending_request(future)
-            raise LinkLost(f"{service} did not answer in {timeout:g} s; whether it did what was asked is unknown.")
+        answered.wait(timeout)
+        with self._lock:
+            self._waiting.discard(answered)
+            if not future.done():
+                if self._node is not None:
+                    client.remove_pending_request(future)
+                why = f"in {timeout:g} s" if self._node is not None else "before this node was closed"
+                raise LinkLost(f"{service} did not answer {why}; whether it did what was asked is unknown.")
         return to_dict(future.result())
 
     def is_offered(self, service: str) -> bool:
@@ -190,6 +197,8 @@ class RclpyBus:
             nodes = [node for node in (self._node, self._caller) if node is not None]
             self._node = self._caller = None
             self._publishers, self._clients = {}, {}
+            for answered in self._waiting:
+                answered.set()
         executors, threads = self._executors, self._threads
         self._executors, self._threads = [], []
         for executor in executors:
@@ -210,6 +219,9 @@ def _refusal(listener: Listener, message: Message) -> str:
         listener(message, UNKNOWN_CALLER)
     except BamEnvsError as error:
         return str(error)
+    except Exception as error:  # it must not end the thread of every topic, among them the one that halts
+        _log.exception("a listener failed")
+        return f"{type(error).__name__}: {error}"
     return ""
 
 

@@ -118,26 +118,27 @@ class RobotService:
     def _command_listener(self, topic: str) -> Listener:
         def listen(message: Message, caller: Caller) -> None:
             places, values, tag = decode_command(self._profile, self._robot.spec, topic, message)
-            self._require_within(topic, places, values)
+            told = values.tolist()
+            self._require_within(topic, places, told)
             self._require_sound()
             if tag is not None:
                 self._fresh.require(tag, topic)
             client = self._clients.name(caller, None if tag is None else tag.session)
             self._lease.take(client)
             text, complete = "" if tag is None else tag.to_text(), topic in self._completing
-            self._slot.put(client, places, values.tolist(), complete=complete, tag=text)
+            self._slot.put(client, places, told, complete=complete, tag=text)
             if complete and self.info.lockstep:
                 self._go_on()
 
         return listen
 
-    def _require_within(self, topic: str, places: list[int], values: Any) -> None:
+    def _require_within(self, topic: str, places: list[int], values: list[float]) -> None:
         """Every number is one that the robot can be told at all; how fast it goes there is its own affair."""
         command = self._robot.spec.command
         for place, value in zip(places, values, strict=True):
-            label, unit = command.labels[place], command.units[place]
             low, high = command.low[place], command.high[place]
             if not low - _ROUNDING <= value <= high + _ROUNDING:
+                label, unit = command.labels[place], command.units[place]
                 raise ProtocolError(f"{topic}: {label} must be {low:g} to {high:g} {unit}, not {value:g} {unit}.")
 
     def _require_sound(self) -> None:
@@ -209,8 +210,9 @@ class RobotService:
 
     def _merged(self, order: Order) -> Any:
         command = self._robot.target()
-        command[0, list(order.values)] = list(order.values.values())
-        return np.clip(command, self._low, self._high)
+        for place, value in order.values.items():
+            command[0, place] = value
+        return np.minimum(np.maximum(command, self._low), self._high)  # as np.clip, in a third of the time
 
     def _publish(self) -> None:
         state = self._robot.state

@@ -146,7 +146,10 @@ def _raw_depth(message: Mapping[str, Any], data: bytes) -> NDArray[np.float32]:
         pixels = np.frombuffer(data, order + dtype).reshape(message["height"], -1)[:, : message["width"]]
     except (KeyError, TypeError, ValueError) as error:
         raise ProtocolError(f"A depth image must have height x width pixels: {error}.") from error
-    return np.array(pixels, dtype=np.float32) if dtype == "f4" else _metres(pixels)
+    if dtype != "f4":
+        return _metres(pixels)
+    # As in a PNG, 0 is where nothing was measured.
+    return np.nan_to_num(pixels.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def _metres(millimetres: NDArray[Any]) -> NDArray[np.float32]:
@@ -229,10 +232,13 @@ def _encode_pillow(image: NDArray[Any], kind: str) -> bytes:
 
 
 def _decode_pillow(data: bytes) -> NDArray[Any]:
+    pillow = _pillow()
+    # SyntaxError is what a broken PNG is to Pillow, and a DecompressionBombError what would fill the memory.
+    errors = (OSError, SyntaxError, ValueError, pillow.DecompressionBombError)
     try:
-        with _pillow().open(io.BytesIO(data)) as image:
+        with pillow.open(io.BytesIO(data)) as image:
             wide = image.mode.startswith("I")
             array = np.asarray(image.convert("RGB") if image.mode in ("P", "CMYK", "1") else image)
-    except (OSError, SyntaxError, ValueError) as error:  # SyntaxError is what a broken PNG is to Pillow
+    except errors as error:
         raise ProtocolError(f"An image cannot be read: {error}.") from error
     return array.astype(np.uint16) if wide else array

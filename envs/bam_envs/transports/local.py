@@ -26,6 +26,7 @@ class LocalTransport:
 
     def connect(self) -> EnvSpecMessage:
         """What is there."""
+        self._require_open()
         return self.server.spec()
 
     def reset(self, seed: int | list[int | None] | None = None, options: Info | None = None) -> tuple[Any, Any]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import inspect
+from collections.abc import Mapping
 from typing import Any
 
 from bam_envs.errors import InvalidValue, UnknownName
@@ -53,11 +55,17 @@ def open_transport(
         options = {**options, "token": read_token(token_file)}
     module, _, name = _CLASSES[scheme].partition(":")
     make: Any = getattr(importlib.import_module(module), name)
-    try:
-        transport: Transport = make(url, env_id=env_id, **options)
-    except TypeError as error:
-        raise InvalidValue(f"{url} cannot be opened with these options: {error}.") from error
+    _require_options(url, make, options)
+    transport: Transport = make(url, env_id=env_id, **options)
     return transport
+
+
+def _require_options(url: str, make: type[Transport], options: Mapping[str, Any]) -> None:
+    """Each option is one of the transport's."""
+    known = [name for name in inspect.signature(make).parameters if name not in ("url", "env_id")]
+    for name in options:
+        if name not in known:
+            raise InvalidValue(f"{url} takes no {name}; its options are {', '.join(known)}.")
 
 
 def _schemes() -> str:

@@ -23,7 +23,17 @@ def test_a_tag_travels_as_text():
 
 @pytest.mark.parametrize(
     "text",
-    ["", "base_link", None, 3, "bam1", "bam1 s=a e=1 q=2", "bam1 s=a e=x q=2 t=0 d=0", "bam1 s=a e=1 q=2 t=nan d=0"],
+    [
+        "",
+        "base_link",
+        None,
+        3,
+        "bam1",
+        "bam1 s=a e=1 q=2",
+        "bam1 s=a e=x q=2 t=0 d=0",
+        "bam1 s=a e=1 q=2 t=nan d=0",
+        f"bam1 s={'a' * 256} e=1 q=2 t=0 d=0",
+    ],
 )
 def test_other_text_is_no_tag(text):
     assert read_tag(text) is None

@@ -194,3 +194,12 @@ def test_fields_can_be_looked_up():
     assert fields[2].type == "float64"
     assert fields[2].array == ""
     assert variants("my_msgs/Thing") == ()
+
+
+def test_texts_in_a_list():
+    assert complete("sensor_msgs/JointState", {"name": ["a", "\u00e9"]})["name"] == ["a", "\u00e9"]
+    assert complete("sensor_msgs/JointState", {"name": ("a", "b")})["name"] == ["a", "b"]
+    for names, found in ((["a", 1], "[1]: expected a text, found 1."), (["\ud800"], "[0]: expected a text of whole")):
+        with pytest.raises(InvalidValue) as raised:
+            complete("sensor_msgs/JointState", {"name": names})
+        assert str(raised.value).startswith(f"sensor_msgs/JointState.name{found}")

@@ -142,3 +142,27 @@ def test_several_messages_with_one_hand_over(server, new_link, heard):
             link.publish_all([("/a", {"data": "nothing of it"}), second])
     link.publish_all([("/a", {"data": "1"}), ("/b", {"data": "2"}), ("/a", {"data": "3"})])
     assert heard.wait(3) == [{"data": "1"}, {"data": "2"}, {"data": "3"}]
+
+
+def test_what_is_not_waited_for_comes_in_order_too(server, new_link, heard, new_heard):
+    server.subscribe("/a", STRING, heard)
+    link, refused = new_link(server), new_heard()
+    link.advertise("/a", STRING)
+    link.begin_publishing([("/a", {"data": "1"}), ("/a", {"data": "2"})], refused)
+    link.publish("/a", {"data": "3"})
+    assert heard.wait(3) == [{"data": "1"}, {"data": "2"}, {"data": "3"}]
+    assert refused.messages == []
+
+
+def test_a_listener_answers_before_what_comes_next(server, new_link, heard):
+    server.advertise("/pong", STRING)
+
+    def answer(message, caller):
+        server.publish_all([("/pong", message), ("/pong", {"data": "and"})])
+
+    server.subscribe("/ping", STRING, answer)
+    link = new_link(server)
+    link.subscribe("/pong", STRING, heard)
+    link.advertise("/ping", STRING)
+    link.publish_all([("/ping", {"data": "1"}), ("/ping", {"data": "2"})])
+    assert [message["data"] for message in heard.wait(4)] == ["1", "and", "2", "and"]

@@ -490,3 +490,36 @@ def test_a_held_up_network_thread_sends_nothing_late(scripted, link):
     )
     link.publish("/cmd", {"data": "now"})
     assert [frame["msg"] for frame in scripted.wait_for("publish")] == [{"data": "now"}]
+
+
+def test_who_does_not_wait_hears_what_was_not_sent(scripted, new_link, heard):
+    link = new_link(scripted, max_message=4096)
+    link.advertise("/large", STRING)
+    link.begin_publishing([("/large", {"data": "small"}), ("/large", {"data": "x" * 5000})], heard)
+    (error,) = {str(one) for one in heard.wait(2)}
+    assert error.startswith(f"{scripted.url}: a message of 50")
+    assert "is above the limit of 4096; nothing was sent." in error
+    link.publish("/large", {"data": "last"})
+    assert [frame["msg"]["data"] for frame in scripted.wait_for("publish")] == ["last"]
+
+
+def test_what_is_taken_back_in_time_is_never_sent(scripted, link, heard):
+    link.advertise("/cmd", STRING)
+    busy, go_on = threading.Event(), threading.Event()
+    link._keeper.post(lambda: (busy.set(), go_on.wait(10.0)))
+    assert busy.wait(10.0)
+    take_back = link.begin_publishing([("/cmd", {"data": "1"}), ("/cmd", {"data": "2"})], heard)
+    take_back()
+    go_on.set()
+    link.publish("/cmd", {"data": "3"})
+    assert [frame["msg"]["data"] for frame in scripted.wait_for("publish")] == ["3"]
+    assert heard.messages == []
+
+
+def test_while_the_link_is_down_nothing_is_begun(scripted, link, lost, heard):
+    link.advertise("/cmd", STRING)
+    scripted.stop()
+    assert lost.wait(10.0)
+    with pytest.raises(LinkLost, match=r"the link is down \(.*\)\. Nothing was sent, and nothing is kept\.$"):
+        link.begin_publishing([("/cmd", {"data": "1"})], heard)
+    assert heard.messages == []

@@ -137,7 +137,7 @@ def test_its_token(tmp_path):
     with pytest.raises(InvalidValue, match=r"^The token file .* cannot be read: "):
         live_robot("ws://robot", token_file=str(path))
     path.write_text(" \n")
-    with pytest.raises(InvalidValue, match=r"^The token file .* is empty\.$"):
+    with pytest.raises(InvalidValue, match=r"^The token file .* is empty; put a secret into it\.$"):
         live_robot("ws://robot", token_file=str(path))
 
 

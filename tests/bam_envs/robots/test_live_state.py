@@ -1,6 +1,7 @@
 """The newest messages as a state, and how old that is; clocks are the test's."""
 
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from bam_envs.bridge.bus import UNKNOWN_CALLER
 from bam_envs.errors import ProtocolError, StaleState
 from bam_envs.robots.grid import Grid
 from bam_envs.robots.live_state import LiveState, SourceAge
-from bam_envs.robots.mailbox import Mailbox
+from bam_envs.robots.mailbox import Alarm, Mailbox
 from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import JOINTS, arm_spec
 
@@ -250,3 +251,21 @@ def test_an_even_grid():
     assert grid.next(5.46) == pytest.approx(5.56)
     grid.restart()
     assert grid.next(5.5) == pytest.approx(5.6)
+
+
+def test_an_alarm_wakes_once_and_can_be_stopped():
+    alarm, woken = Alarm(), threading.Event()
+    alarm.ring()
+    alarm.ring()
+    alarm.wait(10.0)
+    thread = threading.Thread(target=lambda: (alarm.wait(10.0), woken.set()))
+    thread.start()
+    assert not woken.is_set()
+    alarm.ring()
+    thread.join(10.0)
+    assert woken.is_set()
+    alarm.ring()
+    alarm.stop()
+    began = time.monotonic()
+    alarm.wait(0.05)
+    assert time.monotonic() - began >= 0.05

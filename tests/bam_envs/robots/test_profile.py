@@ -1,5 +1,7 @@
 """Profiles are checked on load: file and key are named, and the closest right one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -283,7 +285,8 @@ def test_files(write, tmp_path):
     (tmp_path / "folder.toml").mkdir()
     assert refusal(missing) == ("There is no robot profile FILE. Give the path of a file, or one of: mir100, ur5e.")
     assert refusal(write("name =")).startswith("FILE is not TOML: ")
-    assert refusal(write("a: [", "b.yaml")).startswith("FILE is not YAML: ")
+    for text in ("a: [", "a: 2020-13-45", "a: !!int b", "[" * 3000):
+        assert refusal(write(text, "b.yaml")).startswith("FILE is not YAML: ")
     assert refusal(write("- 1", "b.yaml")) == "FILE must be a table of named values, not [1]."
     assert (
         refusal(write("state: 3\nname: a\nkind: arm\nrobot: ur5e", "b.yaml"))
@@ -298,3 +301,13 @@ def test_files(write, tmp_path):
     assert refusal(tmp_path / "folder.toml") == (
         "The robot profile FILE cannot be read: [Errno 21] Is a directory: 'FILE'."
     )
+
+
+def test_what_is_sent_on_a_topic_and_in_which_units():
+    profile = load_profile("ur5e")
+    (gripper, arm), (_, trajectory) = profile.commands.values()
+    assert profile.sinks_by_topic == {sink.topic: sink for sink in (gripper, arm, trajectory)}
+    assert profile.sinks_by_topic[gripper.topic] is gripper
+    assert (arm.is_si, replace(arm, scale=(2.0,)).is_si, replace(arm, offset=(0.1,)).is_si) == (True, False, False)
+    joints = profile.source("joint_position")
+    assert (joints.is_si, replace(joints, scale=(1.0,) * 5 + (-1.0,)).is_si) == (True, False)

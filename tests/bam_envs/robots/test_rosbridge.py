@@ -2,6 +2,7 @@
 
 import multiprocessing
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -183,6 +184,19 @@ def test_lockstep(server, robot_on, connect, simulation):
         np.testing.assert_array_equal(state.signals["joint_position"], command[:, :6])
 
 
+def test_in_lockstep_a_command_that_cannot_be_sent_is_told_at_once(server, robot_on, connect, simulation):
+    scripted = robot_on(server, info=simulation)
+    robot, gate = connect(server.url)
+    connection = robot._control._keeper.up
+    connection.held_up(True)
+    text = raised(LinkLost, lambda: gate.step(gate.state.command))
+    assert text == f"{server.url}: the server does not read what it is sent. Nothing more was sent."
+    assert scripted.on(JOINT_COMMANDS) == []
+    connection.held_up(False)
+    gate.step(gate.state.command)
+    assert len(scripted.on(JOINT_COMMANDS)) == 1
+
+
 def test_lockstep_without_an_answer(server, robot_on, connect, simulation, monkeypatch):
     monkeypatch.setattr("bam_envs.robots.rosbridge.ANSWER_TIMEOUT", 0.2)
     scripted = robot_on(server, info=simulation)
@@ -281,6 +295,30 @@ def test_what_a_halt_says(server, robot_on, connect):
     assert {caller for _, caller, _ in (halt, gripper, joints)} != {scripted.commands[before - 1][1]}
 
 
+def test_who_only_looks_commands_nothing(server, robot_on, connect):
+    scripted = robot_on(server)
+    robot, gate = connect(server.url)
+    robot.close()
+    assert scripted.commands == []
+    robot.connect()
+    gate.step(gate.state.command)
+    robot.close()
+    scripted.wait_for(lambda: len(scripted.on(HALT_TOPIC)) == 1)
+
+
+def test_a_halt_does_not_go_back_to_where_the_robot_was_some_time_ago(server, robot_on, connect):
+    scripted, ahead = robot_on(server), [0.0]
+    robot, gate = connect(server.url, clock=lambda: time.monotonic() + ahead[0])
+    command = gate.state.command.copy()
+    command[0, 5] += 0.02
+    gate.step(command)
+    scripted.mangle = lambda topic, message: None  # nothing more is heard of it
+    ahead[0] = 1.0
+    robot.halt()
+    scripted.wait_for(lambda: len(scripted.on(HALT_TOPIC)) == 1 and len(scripted.on(JOINT_COMMANDS)) == 2)
+    assert scripted.on(JOINT_COMMANDS)[-1]["data"] == command[0, :6].tolist()
+
+
 def test_a_base_is_halted_with_zeros(server, robot_on, connect):
     scripted = robot_on(server, "mir100")
     robot, gate = connect(server.url, "mir100")
@@ -317,6 +355,23 @@ def test_a_topic_of_another_type(server, robot_on):
     assert raised(ProtocolError, robot.connect) == (
         "/object_pose is a std_msgs/String there, and geometry_msgs/PoseStamped was expected. "
         "Correct the topic or its type in the profile of ur5e."
+    )
+
+
+def test_a_command_that_must_be_stamped(server, robot_on):
+    """A bridge would drop what is not, and say nothing."""
+    for topic, kind in (
+        ("/odom", "nav_msgs/Odometry"),
+        ("/robot_pose", "geometry_msgs/PoseStamped"),
+        ("/f_scan", "sensor_msgs/LaserScan"),
+        ("/b_scan", "sensor_msgs/LaserScan"),
+    ):
+        server.advertise(topic, kind)
+    server.subscribe("/cmd_vel", "geometry_msgs/msg/TwistStamped", lambda message, caller: None)
+    robot = robot_at(server.url, "mir100")
+    assert raised(ProtocolError, robot.connect) == (
+        "/cmd_vel is a geometry_msgs/TwistStamped there, and geometry_msgs/Twist was expected. "
+        "Correct the topic or its type in the profile of mir100."
     )
 
 

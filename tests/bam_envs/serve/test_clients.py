@@ -1,4 +1,7 @@
+import pytest
+
 from bam_envs.bridge.bus import UNKNOWN_CALLER, Caller
+from bam_envs.errors import RemoteError
 from bam_envs.serve.clients import Clients
 
 A, B = Caller("client1", "127.0.0.1:1"), Caller("client2")
@@ -21,6 +24,19 @@ def test_a_client_has_left_with_its_last_connection():
     assert clients.left(B) == ["client2"]
     assert clients.left(A) == ["session 4f1c"]
     assert clients.left(A) == []
+
+
+def test_a_connection_has_so_many_sessions():
+    clients = Clients()
+    for number in range(64):
+        clients.name(A, str(number))
+    with pytest.raises(RemoteError) as error:
+        clients.name(A, "64")
+    assert str(error.value) == "One connection may send for at most 64 sessions; open another one."
+    assert clients.name(A, "0") == "session 0"
+    assert clients.name(B, "64") == "session 64"
+    assert len(clients.left(A)) == 64
+    assert clients.name(A, "64") == "session 64"
 
 
 def test_who_has_no_name_never_leaves():

@@ -300,6 +300,17 @@ def test_closing_halts_and_closes_once():
     assert raised(RemoteError, lambda: server.reset("ann")) == "The environment is closed."
 
 
+def test_at_its_end_it_refuses_and_halts_nothing_yet():
+    env = Halting()
+    server = EnvServer(env)
+    server.reset("ann")
+    server.end()
+    assert raised(RemoteError, lambda: server.step("ann", 0)) == "The environment is closed."
+    assert (env.halts, env.closes) == (0, 0)
+    server.close()
+    assert (env.halts, env.closes) == (1, 1)
+
+
 def test_in_real_time_steps_last_a_period():
     now, slept = [0.0], []
 

@@ -149,6 +149,12 @@ def test_one_client_is_in_command(serve):
     assert code_of(ask(RESET, client_id="ann")) == 1
 
 
+def test_a_long_name_is_cut(serve):
+    ask = serve(MirrorEnv(spaces.Discrete(3)))
+    ask(RESET, client_id="a" * 1000)
+    assert refusal(ask(RESET, OTHER)).startswith(f"{'a' * 100}#c1 is in command, not somebody#c2;")
+
+
 def test_who_hangs_up_is_no_longer_in_command(serve, bus):
     ask = serve(MirrorEnv(spaces.Discrete(3)))
     ask(RESET, client_id="ann")

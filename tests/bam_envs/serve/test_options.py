@@ -8,6 +8,10 @@ def test_the_defaults_are_possible():
     ServeOptions().require_sane()
 
 
+def test_a_token_of_the_tcp_port_beside_a_ros_2_node():
+    ServeOptions(rclpy=True, token_file="t", tcp=0).require_sane()
+
+
 @pytest.mark.parametrize(
     ("options", "text"),
     [
@@ -17,6 +21,10 @@ def test_the_defaults_are_possible():
         ({"rclpy": True, "cert": "c"}, "--rclpy and --cert exclude each other; give one of the two."),
         ({"key": "k"}, "--key means something only with --cert."),
         ({"ca_file": "k"}, "--ca-file means something only with --via."),
+        (
+            {"rclpy": True, "token_file": "t"},
+            "--token-file protects nothing with --rclpy: ROS 2 has no token. Leave it out.",
+        ),
         ({"lease": 0.0}, "--lease must be above 0 s, not 0."),
         ({"lease": float("nan")}, "--lease must be above 0 s, not nan."),
         ({"port": -1}, "--port must be 0 to 65535, not -1."),

@@ -1,10 +1,12 @@
+import threading
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
 from bam_envs.bridge.link import RosbridgeLink
 from bam_envs.bridge.server import BridgeServer
-from bam_envs.errors import InvalidValue, NoServer, NotInCommand, RemoteError
+from bam_envs.errors import InvalidValue, NoServer, NotInCommand, RemoteError, RobotFault
 from bam_envs.robots.codec import encode_command, read_info
 from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import arm_spec
@@ -135,6 +137,32 @@ def test_in_real_time_a_step_is_a_period(serve, transport):
         remote.step(RISE)
     assert isinstance(robot, ServedRobot)
     assert robot.state.stamp[0] - before >= 0.15 - 1e-9
+
+
+def test_it_ends_at_once_while_a_client_steps(serve, transport):
+    served = serve()
+    remote, several, failed = transport(RosbridgeTransport, served.bus.url), threading.Event(), []
+
+    def play():
+        try:
+            for number in range(1000):
+                remote.step(RISE)
+                if number == 2:
+                    several.set()
+        except RobotFault as fault:
+            failed.append(fault)
+
+    remote.reset(5)
+    player = threading.Thread(target=play)
+    player.start()
+    assert several.wait(10.0)
+    ending = threading.Thread(target=served.close)
+    ending.start()
+    ending.join(5.0)
+    assert not ending.is_alive()  # a step would wait longer for a clock that stands still
+    player.join(10.0)
+    assert len(failed) == 1
+    ending.join()
 
 
 def test_real_time_needs_a_period(serve):

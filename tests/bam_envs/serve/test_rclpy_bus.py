@@ -116,6 +116,22 @@ def test_a_listener_that_refuses_is_logged_once(node, caplog):
     assert caplog.messages == ["/test/topic: not now"]
 
 
+def test_a_listener_that_fails_ends_no_topic(node, caplog):
+    speaker, hearer, box = node("speaker"), node("hearer"), Box()
+
+    def fail(message, caller):
+        box(message, caller)
+        raise ZeroDivisionError
+
+    hearer.subscribe("/test/topic", "std_msgs/String", fail)
+    speaker.advertise("/test/topic", "std_msgs/String")
+    wait_for(lambda: speaker.is_heard("/test/topic"))
+    for number in (1, 2):
+        speaker.publish("/test/topic", {"data": "it"})
+        box.wait(number)
+    assert "a listener failed" in caplog.messages
+
+
 def test_a_service_answers_and_topics_do_not_wait_for_it(node):
     server, client, box, go = node("server"), node("client"), Box(), threading.Event()
 
@@ -135,6 +151,31 @@ def test_a_service_answers_and_topics_do_not_wait_for_it(node):
     client.publish("/test/stop", {})
     call.join(10)
     assert answers == [{"success": True, "message": "done"}]
+
+
+def test_closing_ends_a_call_at_once(node):
+    server, client, asked, go, lost = node("server"), node("client"), threading.Event(), threading.Event(), []
+
+    def handle(request, caller):
+        asked.set()
+        assert go.wait(10)
+        return {}
+
+    def call():
+        try:
+            client.call("/test/slow", "std_srvs/Trigger", {}, 60.0)
+        except LinkLost as error:
+            lost.append(str(error))
+
+    server.serve("/test/slow", "std_srvs/Trigger", handle)
+    wait_for(lambda: client.is_offered("/test/slow"))
+    caller = threading.Thread(target=call)
+    caller.start()
+    assert asked.wait(10)
+    client.close()
+    caller.join(10)
+    go.set()
+    assert lost == ["/test/slow did not answer before this node was closed; whether it did what was asked is unknown."]
 
 
 def test_a_service_that_fails_answers_too(node, caplog):

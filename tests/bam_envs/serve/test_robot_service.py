@@ -1,4 +1,5 @@
 import json
+import threading
 import time
 from dataclasses import replace
 
@@ -122,6 +123,54 @@ def test_in_lockstep_nothing_goes_on_before_a_command_is_complete(serve, bus):
     bus.say(ARM, arm[2])
     service.joints(lambda message: message["position"][0] == 0.01)
     np.testing.assert_allclose(service.robot.target(), [command(0.01, 0.04)])
+
+
+class Watched(FakeRobot):
+    """Keeps in which threads it is stepped."""
+
+    def __init__(self):
+        super().__init__(1)
+        self.threads = []
+
+    def step(self, command):
+        self.threads.append(threading.current_thread())
+        return super().step(command)
+
+
+def stepped(service, number):
+    """Send one more command, and wait for the answer."""
+    assert service.send(command(0.001 * number)) is None
+    service.joints(lambda message: message["position"][0] == 0.001 * number)
+
+
+def test_a_quick_robot_is_moved_where_its_command_arrives(serve, monkeypatch):
+    monkeypatch.setattr("bam_envs.serve.robot_service.QUICK", 1e6)
+    robot = Watched()
+    service = serve(robot)
+    for number in range(1, 4):  # how quick it is turns out at the first
+        stepped(service, number)
+    assert robot.threads == [service.service.clock._thread, threading.current_thread(), threading.current_thread()]
+
+
+def test_a_slow_robot_is_moved_by_the_clock(serve, monkeypatch):
+    monkeypatch.setattr("bam_envs.serve.robot_service.QUICK", 0.0)
+    robot = Watched()
+    service = serve(robot)
+    for number in range(1, 4):
+        stepped(service, number)
+    assert set(robot.threads) == {service.service.clock._thread}
+
+
+def test_while_the_clock_is_at_it_a_command_waits_for_it(serve, monkeypatch):
+    monkeypatch.setattr("bam_envs.serve.robot_service.QUICK", 1e6)
+    robot = Watched()
+    service = serve(robot)
+    stepped(service, 1)
+    with service.service._ticking:
+        assert service.send(command(0.002)) is None
+        assert len(robot.threads) == 1
+    service.joints(lambda message: message["position"][0] == 0.002)
+    assert set(robot.threads) == {service.service.clock._thread}
 
 
 def test_in_real_time_states_come_with_or_without_commands(serve, bus):

@@ -1,7 +1,9 @@
 """Images as messages: both libraries, exact pixels, errors."""
 
 import base64
+import struct
 import sys
+import zlib
 
 import numpy as np
 import pytest
@@ -93,6 +95,8 @@ def test_raw_depth_of_a_rack():
     np.testing.assert_array_equal(images.read_depth_message(big), np.array([[0.5, 1.0]], np.float32))
     metres = {**message, "encoding": "32FC1", "data": np.array([[0.5, 2.0]], "<f4").tobytes()}
     np.testing.assert_array_equal(images.read_depth_message(metres), np.array([[0.5, 2.0]], np.float32))
+    nothing = {**metres, "data": np.array([[np.nan, np.inf]], "<f4").tobytes()}
+    np.testing.assert_array_equal(images.read_depth_message(nothing), np.zeros((1, 2), np.float32))
 
 
 @pytest.mark.parametrize(
@@ -122,6 +126,15 @@ def test_a_color_message_as_bytes_and_as_base64(library):
 def test_an_empty_message_holds_no_image():
     assert images.read_color_message({"format": "", "data": ""}) is None
     assert images.read_depth_message({"data": b""}) is None
+
+
+def test_a_file_that_would_fill_the_memory(library):
+    def chunk(name, data):
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0))
+    with pytest.raises(ProtocolError, match="An image cannot be read: "):
+        images.decode_image(b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", b"") + chunk(b"IEND", b""))
 
 
 def test_damaged_files(library):

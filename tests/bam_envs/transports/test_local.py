@@ -38,6 +38,8 @@ def test_a_shared_server_goes_on():
     with pytest.raises(LinkLost) as lost:
         one.reset()
     assert str(lost.value) == "This transport is closed; make a new one."
+    with pytest.raises(LinkLost):
+        one.connect()
 
 
 def test_errors_are_those_of_every_transport():

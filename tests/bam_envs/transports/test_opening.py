@@ -46,8 +46,9 @@ def test_what_is_no_address(url, text):
 def test_options_that_a_transport_does_not_have():
     with pytest.raises(InvalidValue) as caught:
         open_transport("tcp://x:1", ca_file="ca.pem")
-    assert str(caught.value).startswith("tcp://x:1 cannot be opened with these options: ")
-    assert "'ca_file'" in str(caught.value)
+    assert str(caught.value) == (
+        "tcp://x:1 takes no ca_file; its options are timeout, connect_timeout, token, name, take."
+    )
 
 
 def test_a_token_file(tmp_path):
