@@ -73,9 +73,9 @@ def serve_echo() -> None:
 
 def serve_robot() -> None:
     """The embedded server with a robot that moves at once, and a camera of 640 x 480 at 30 Hz."""
-    from bam_envs.bridge.server import BridgeServer
+    from bam_envs.bridge.server.server import BridgeServer
     from bam_envs.robots.fake import FakeRobot
-    from bam_envs.robots.profile import load_profile
+    from bam_envs.robots.profiles.profile import load_profile
     from bam_envs.robots.robot import Initial
     from bam_envs.serve.command import CommandLease
     from bam_envs.serve.robot_service import RobotService
@@ -100,7 +100,7 @@ def serve_robot() -> None:
 
 def serve_environment(shape: tuple[int, ...]) -> None:
     """A trivial environment over GymAPI and over TCP."""
-    from bam_envs.bridge.server import BridgeServer
+    from bam_envs.bridge.server.server import BridgeServer
     from bam_envs.serve.env_server import EnvServer
     from bam_envs.serve.gymapi_service import GymApiService
     from bam_envs.serve.tcp_server import TcpServer
@@ -116,7 +116,7 @@ def serve_environment(shape: tuple[int, ...]) -> None:
 
 def serve_joint_states() -> None:
     """The embedded server, with joint states at 100 Hz."""
-    from bam_envs.bridge.server import BridgeServer
+    from bam_envs.bridge.server.server import BridgeServer
     from bam_envs.robots.ur5e import JOINTS
 
     joints = {"name": list(JOINTS), "position": [0.1] * 6, "velocity": [0.0] * 6, "effort": []}
@@ -239,7 +239,7 @@ def live_arm(url: str, period: float | None = None) -> tuple[Any, Any]:
     """A connected UR5e behind its guards, and its state."""
     from dataclasses import replace
 
-    from bam_envs.robots.live import live_robot
+    from bam_envs.robots.live.building import live_robot
     from bam_envs.robots.robot import Initial
     from bam_envs.robots.ur5e import arm_spec
 
@@ -322,8 +322,8 @@ def measure_steps(name: str, scheme: str, target: float, rounds: int, count: int
 
 def measure_camera(seconds: float) -> Iterator[str]:
     """What a camera beside 100 Hz control does to the time from command to state."""
-    from bam_envs.robots.camera import LiveCamera
-    from bam_envs.robots.profile import CameraSource
+    from bam_envs.robots.live.camera import LiveCamera
+    from bam_envs.robots.profiles.profile import CameraSource
 
     with Server("robot") as server:
         url = f"ws://127.0.0.1:{server.ports[0]}"

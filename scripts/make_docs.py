@@ -101,9 +101,9 @@ def environment(env_id: str) -> str:
 
 def guards() -> str:
     """The guards of an arm and of a base, with their limits."""
-    from bam_envs.robots.guards import default_guards
-    from bam_envs.robots.live import profile_limits
-    from bam_envs.robots.profile import load_profile
+    from bam_envs.robots.live.building import profile_limits
+    from bam_envs.robots.profiles.profile import load_profile
+    from bam_envs.robots.safety.guards import default_guards
 
     robots: dict[tuple[str, ...], list[str]] = {}
     for name in ("ur5e", "mir100"):

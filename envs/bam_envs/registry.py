@@ -156,7 +156,7 @@ def make_env(
     simulated: Robot = resolve(entry.robot)(1, randomize=randomize)
     if robot is None:
         return RobotEnv(simulated, task, render_mode=render_mode)
-    from bam_envs.robots.live import live_robot
+    from bam_envs.robots.live.building import live_robot
 
     live = live_robot(robot, simulated.spec, profile=profile, ca_file=ca_file, token_file=token_file)
     return RobotEnv(live, task, render_mode=render_mode)

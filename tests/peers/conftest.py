@@ -22,7 +22,7 @@ from pathlib import Path
 import pytest
 from websockets.sync.client import connect
 
-from bam_envs.bridge.server import BridgeServer
+from bam_envs.bridge.server.server import BridgeServer
 from bam_envs.errors import RemoteError
 
 HERE = Path(__file__).parent

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from bam_envs.bridge.link import RosbridgeLink
+from bam_envs.bridge.link.link import RosbridgeLink
 from bam_envs.errors import LinkLost, RemoteError
 
 GRIPPER = "/gripper/commands"

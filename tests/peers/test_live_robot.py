@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from bam_envs.errors import LinkLost, NoServer, SafetyStop, StaleState
-from bam_envs.robots.live import live_robot, profile_limits
-from bam_envs.robots.profile import load_profile
+from bam_envs.robots.live.building import live_robot, profile_limits
+from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.robots.robot import Initial
 from bam_envs.robots.ur5e import arm_spec
 

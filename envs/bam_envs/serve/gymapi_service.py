@@ -17,7 +17,9 @@ from bam_envs.bridge.freshness import FreshnessCheck
 from bam_envs.errors import BamEnvsError, RemoteError
 from bam_envs.serve.env_server import EnvServer
 from bam_envs.transports.answers import RecentAnswers
-from bam_envs.transports.gymapi import (
+from bam_envs.transports.gymapi.codec import EnvCodec
+from bam_envs.transports.gymapi.info import write_info
+from bam_envs.transports.gymapi.requests import (
     KIND,
     GymRequest,
     RequestType,
@@ -25,9 +27,7 @@ from bam_envs.transports.gymapi import (
     read_request,
     service_name,
 )
-from bam_envs.transports.gymapi_codec import EnvCodec
-from bam_envs.transports.gymapi_info import write_info
-from bam_envs.transports.gymapi_responses import write_failure, write_response
+from bam_envs.transports.gymapi.responses import write_failure, write_response
 from bam_envs.transports.string_rpc import StringRpcService
 from bam_envs.transports.trees import spec_to_json
 

@@ -8,12 +8,12 @@ from types import TracebackType
 from typing import Any
 
 from bam_envs.bridge.bus import Bus
-from bam_envs.bridge.link import RosbridgeLink
-from bam_envs.bridge.server import BridgeServer
+from bam_envs.bridge.link.link import RosbridgeLink
+from bam_envs.bridge.server.server import BridgeServer
 from bam_envs.errors import InvalidValue, LinkLost, RemoteError
-from bam_envs.robots.profile import profile_for
-from bam_envs.robots.profile_tables import RobotProfile
-from bam_envs.robots.safe import SafeRobot
+from bam_envs.robots.profiles.profile import profile_for
+from bam_envs.robots.profiles.tables import RobotProfile
+from bam_envs.robots.safety.safe import SafeRobot
 from bam_envs.serve.command import CommandLease
 from bam_envs.serve.describe import Env
 from bam_envs.serve.env_server import EnvServer
@@ -24,7 +24,7 @@ from bam_envs.serve.robot_service import RobotService
 from bam_envs.serve.served_robot import ServedRobot
 from bam_envs.serve.tcp_server import TcpServer
 from bam_envs.tokens import read_token
-from bam_envs.transports.gymapi import service_name
+from bam_envs.transports.gymapi.requests import service_name
 
 
 class ServedEnvironment:

@@ -19,7 +19,8 @@ import numpy as np
 from bam_envs.bridge.bus import Bus, Caller, Listener, Message
 from bam_envs.bridge.freshness import FreshnessCheck
 from bam_envs.errors import LinkLost, ProtocolError, RemoteError, RobotFault
-from bam_envs.robots.codec import (
+from bam_envs.robots.profiles.tables import RobotProfile
+from bam_envs.robots.wire.codec import (
     HALT_TOPIC,
     INFO_SERVICE,
     SCENE_TOPIC,
@@ -27,8 +28,7 @@ from bam_envs.robots.codec import (
     decode_command,
     encode_state,
 )
-from bam_envs.robots.messages import numbers, write_stamp
-from bam_envs.robots.profile_tables import RobotProfile
+from bam_envs.robots.wire.messages import numbers, write_stamp
 from bam_envs.serve.clients import Clients
 from bam_envs.serve.clock import Clock
 from bam_envs.serve.command import CommandLease

@@ -10,8 +10,8 @@ from gymnasium import Space
 
 from bam_envs.errors import InvalidValue
 from bam_envs.registry import resolve_id
-from bam_envs.transports.gymapi_actions import DEFAULT
-from bam_envs.transports.gymapi_codec import EnvCodec
+from bam_envs.transports.gymapi.actions import DEFAULT
+from bam_envs.transports.gymapi.codec import EnvCodec
 from bam_envs.transports.transport import EnvSpecMessage
 
 

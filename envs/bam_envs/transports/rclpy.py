@@ -9,9 +9,9 @@ from typing import Any
 
 from bam_envs.bridge.bus import Listener, Message
 from bam_envs.errors import InvalidValue, LinkLost, NoServer
-from bam_envs.robots.messages import write_stamp
+from bam_envs.robots.wire.messages import write_stamp
 from bam_envs.serve.rclpy_bus import RclpyBus
-from bam_envs.transports.gymapi import base_name, service_name
+from bam_envs.transports.gymapi.requests import base_name, service_name
 from bam_envs.transports.rosbridge import RosbridgeTransport
 
 _LOOK = 0.02

@@ -13,10 +13,12 @@ from gymnasium import Space
 
 from bam_envs.bridge.freshness import Tagger
 from bam_envs.bridge.interfaces import complete, request_type
-from bam_envs.bridge.link import RosbridgeLink
+from bam_envs.bridge.link.link import RosbridgeLink
 from bam_envs.errors import InvalidValue, LinkLost, NoServer, ProtocolError, RemoteError, UnknownName
 from bam_envs.transports.foreign_rack import ForeignRack
-from bam_envs.transports.gymapi import (
+from bam_envs.transports.gymapi.actions import DEFAULT
+from bam_envs.transports.gymapi.codec import EnvCodec
+from bam_envs.transports.gymapi.requests import (
     KIND,
     GymRequest,
     RequestType,
@@ -26,9 +28,7 @@ from bam_envs.transports.gymapi import (
     service_name,
     write_request,
 )
-from bam_envs.transports.gymapi_actions import DEFAULT
-from bam_envs.transports.gymapi_codec import EnvCodec
-from bam_envs.transports.gymapi_responses import GymResponse, read_response
+from bam_envs.transports.gymapi.responses import GymResponse, read_response
 from bam_envs.transports.string_rpc import StringRpc
 from bam_envs.transports.transport import EnvSpecMessage, Info
 from bam_envs.transports.trees import spec_from_json, spec_to_json

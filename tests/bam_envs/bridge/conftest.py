@@ -199,7 +199,7 @@ def new_scripted():
 @pytest.fixture
 def new_link():
     """Make a connected `RosbridgeLink`; closed at the end."""
-    from bam_envs.bridge.link import RosbridgeLink
+    from bam_envs.bridge.link.link import RosbridgeLink
 
     made = []
 

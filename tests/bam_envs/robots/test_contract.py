@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.robot import Robot, RobotState
-from bam_envs.robots.safe import SafeRobot
+from bam_envs.robots.safety.safe import SafeRobot
 from bam_envs.robots.simulated.arm import SimulatedArm
 from bam_envs.testing import RobotContract
 

@@ -11,7 +11,7 @@ import pytest
 from gymnasium import spaces
 from websockets.sync.client import connect
 
-from bam_envs.bridge.server import BridgeServer
+from bam_envs.bridge.server.server import BridgeServer
 from bam_envs.serve.env_server import EnvServer
 from bam_envs.serve.gymapi_service import GymApiService
 from bam_envs.testing.transports import MirrorEnv

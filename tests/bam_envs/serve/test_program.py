@@ -4,12 +4,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from bam_envs.bridge.link import RosbridgeLink
-from bam_envs.bridge.server import BridgeServer
+from bam_envs.bridge.link.link import RosbridgeLink
+from bam_envs.bridge.server.server import BridgeServer
 from bam_envs.errors import InvalidValue, NoServer, NotInCommand, RemoteError, RobotFault
-from bam_envs.robots.codec import encode_command, read_info
-from bam_envs.robots.profile import load_profile
+from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.robots.ur5e import arm_spec
+from bam_envs.robots.wire.codec import encode_command, read_info
 from bam_envs.serve.options import ServeOptions
 from bam_envs.serve.program import ServedEnvironment
 from bam_envs.serve.served_robot import ServedRobot

@@ -8,12 +8,12 @@ import pytest
 
 from bam_envs.bridge.freshness import read_tag
 from bam_envs.errors import LinkLost, PhysicsDiverged
-from bam_envs.robots.codec import RobotInfo, encode_command, read_info
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.fake_base import FakeBase
-from bam_envs.robots.profile import load_profile
+from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.robots.robot import Initial
 from bam_envs.robots.simulated.arm import SimulatedArm
+from bam_envs.robots.wire.codec import RobotInfo, encode_command, read_info
 from bam_envs.serve.command import CommandLease
 from bam_envs.serve.robot_service import RobotService
 from bam_envs.serve.served_robot import ServedRobot

@@ -2,7 +2,7 @@
 
 import pytest
 
-from bam_envs.bridge.server import BridgeServer
+from bam_envs.bridge.server.server import BridgeServer
 from bam_envs.serve.env_server import EnvServer
 from bam_envs.serve.gymapi_service import GymApiService
 from bam_envs.transports.rosbridge import RosbridgeTransport

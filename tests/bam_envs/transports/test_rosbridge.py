@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from bam_envs.bridge.server import BridgeServer
+from bam_envs.bridge.server.server import BridgeServer
 from bam_envs.errors import InvalidValue, LinkLost, NoServer, NotInCommand, ProtocolError
 from bam_envs.serve.env_server import EnvServer
 from bam_envs.serve.gymapi_service import GymApiService

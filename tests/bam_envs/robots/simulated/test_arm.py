@@ -5,7 +5,7 @@ import pytest
 
 from bam_envs.errors import InvalidValue, ResetNeeded
 from bam_envs.robots.robot import Initial, Robot
-from bam_envs.robots.safe import SafeRobot
+from bam_envs.robots.safety.safe import SafeRobot
 from bam_envs.robots.simulated.arm import SimulatedArm, arm_scene, cube_scene
 from bam_envs.testing import ARM_HOME
 

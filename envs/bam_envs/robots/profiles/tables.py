@@ -1,0 +1,200 @@
+"""What a robot profile holds: sources of its signals, sinks of its commands, cameras, ages and limits."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.robots.robot import RobotSpec, SignalSpec
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where the numbers of one signal come from."""
+
+    signal: str
+    """Which signal."""
+    topic: str
+    """Absolute name, without namespace."""
+    type: str
+    """Message type, ``pkg/Type``. What is stamped (``pkg/TypeStamped``) is read too where `type` is not."""
+    field: str = ""
+    """Where the list of its numbers is, e.g. ``position``; or `fields`."""
+    fields: tuple[str, ...] = ()
+    """Where each number is, e.g. ``pose.position.x``; ``yaw(orientation)`` is the angle about z of a quaternion."""
+    names: tuple[str, ...] = ()
+    """Names of the numbers at the robot, in the order of the signal's labels; they are looked up in the message's
+    ``name``, whatever their order there. Empty: the numbers come in order, without names."""
+    ignore: tuple[str, ...] = ()
+    """Names that may come too, and are not ours."""
+    partial: bool = False
+    """Whether several publishers share the topic, so that messages without any of `names` are somebody else's."""
+    scale: tuple[float, ...] = (1.0,)
+    """SI value = number x scale + offset; one for all, or one for each."""
+    offset: tuple[float, ...] = (0.0,)
+    """See `scale`."""
+    skip: tuple[int, int] = (0, 0)
+    """How many numbers of `field` to leave out at the beginning and at the end."""
+    missing: float | None = None
+    """What null, NaN and infinities in `field` mean; None: they are errors."""
+    max_age: float | None = None
+    """Oldest that is acted on [s]; None: the profile's."""
+    optional: bool = False
+    """Whether it is measured only when it is asked for."""
+    constants: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Further fields of the message, as a simulated robot sends them."""
+
+    @cached_property
+    def is_si(self) -> bool:
+        """Whether its numbers travel in SI units, as they are."""
+        return set(self.scale) == {1.0} and set(self.offset) == {0.0}
+
+
+@dataclass(frozen=True)
+class Sink:
+    """Where some of the numbers of a command go."""
+
+    topic: str
+    """Absolute name, without namespace."""
+    type: str
+    """Message type, ``pkg/Type``."""
+    labels: tuple[str, ...]
+    """Which numbers of the command, by label, in the order of the message."""
+    names: tuple[str, ...] = ()
+    """Names of the numbers at the robot, for types that have names; the labels by default."""
+    fields: tuple[str, ...] = ()
+    """Where each number goes, for types without a list, e.g. ``linear.x``."""
+    scale: tuple[float, ...] = (1.0,)
+    """SI value = number x scale + offset; one for all, or one for each."""
+    offset: tuple[float, ...] = (0.0,)
+    """See `scale`."""
+    reach: float | None = None
+    """When a trajectory's point is to be reached [s]; None: one period after it was sent."""
+    hold: Literal["measured", "last", "zero"] = "measured"
+    """What a halt sends: where it is, what was sent last, or zeros."""
+    tag: bool = True
+    """Whether the message says who sent it when, if its type has room for a text: ``header.frame_id``, or the label of
+    an array's first dimension."""
+
+    @cached_property
+    def is_si(self) -> bool:
+        """Whether its numbers travel in SI units, as they are."""
+        return set(self.scale) == {1.0} and set(self.offset) == {0.0}
+
+
+IMAGE_TYPES = ("sensor_msgs/CompressedImage", "sensor_msgs/Image")
+"""What a camera may send: JPEG or PNG, or raw pixels, which come on a CBOR connection of their own."""
+
+
+@dataclass(frozen=True)
+class CameraSource:
+    """A camera."""
+
+    name: str
+    """What it is called here."""
+    topic: str
+    """Absolute name, without namespace."""
+    type: str = "sensor_msgs/CompressedImage"
+    """One of `IMAGE_TYPES`."""
+    max_age: float = 0.5
+    """Oldest image that is handed out [s]."""
+
+
+@dataclass(frozen=True)
+class RobotProfile:
+    """A live robot, as one file describes it."""
+
+    name: str
+    """What it is called."""
+    kind: Literal["arm", "base"]
+    """What moves."""
+    signals: tuple[SignalSpec, ...]
+    """Every signal that has a source."""
+    command: SignalSpec
+    """What it is sent."""
+    state: tuple[Source, ...]
+    """One source for each of `signals`, in their order."""
+    commands: Mapping[str, tuple[Sink, ...]]
+    """Ways of sending a command, by name, the default first. The last sink of a way makes a command complete."""
+    period: float
+    """Time between two commands [s]."""
+    max_age: float
+    """Oldest state that is acted on [s]."""
+    dead_man: float
+    """For how long a command means something [s]."""
+    limits: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Limits of the guards that differ from their defaults, by their names in `bam_envs.robots.safety.guards`."""
+    cameras: tuple[CameraSource, ...] = ()
+    """Its cameras."""
+
+    @cached_property
+    def sinks_by_topic(self) -> Mapping[str, Sink]:
+        """What is sent on each topic, in the first way that uses it."""
+        return {sink.topic: sink for way in reversed([*self.commands.values()]) for sink in reversed(way)}
+
+    def source(self, signal: str) -> Source:
+        """Where `signal` comes from."""
+        return next(source for source in self.state if source.signal == signal)
+
+    def signal(self, name: str) -> SignalSpec:
+        """The signal called `name`."""
+        return next(signal for signal in self.signals if signal.name == name)
+
+    def camera(self, name: str) -> CameraSource:
+        """The camera called `name`.
+
+        Raises:
+            UnknownName: There is none of that name.
+        """
+        cameras = {camera.name: camera for camera in self.cameras}
+        if name not in cameras:
+            raise UnknownName(f"camera of {self.name}", name, cameras)
+        return cameras[name]
+
+    def age_limit(self, source: Source) -> float:
+        """Oldest state of `source` that is acted on [s]."""
+        return self.max_age if source.max_age is None else source.max_age
+
+    def sinks(self, mode: str | None = None) -> tuple[Sink, ...]:
+        """Where the parts of a command go; `mode` None is the default way.
+
+        Raises:
+            UnknownName: There is no such way.
+        """
+        if mode is None:
+            return next(iter(self.commands.values()))
+        if mode not in self.commands:
+            raise UnknownName(f"way of sending commands to {self.name}", mode, self.commands)
+        return self.commands[mode]
+
+    def spec(self, wanted: RobotSpec | None = None) -> RobotSpec:
+        """What this robot measures and is sent; only the signals of `wanted`, and its period, if it is given.
+
+        Raises:
+            InvalidValue: It does not measure a signal of `wanted`, or takes other commands.
+        """
+        if wanted is None:
+            signals = tuple(signal for signal in self.signals if not self.source(signal.name).optional)
+            return RobotSpec(self.name, signals, self.command, self.period)
+        self._require_what_is(wanted)
+        names = [signal.name for signal in wanted.signals]
+        return RobotSpec(self.name, tuple(self.signal(name) for name in names), self.command, wanted.period)
+
+    def _require_what_is(self, wanted: RobotSpec) -> None:
+        known = {signal.name: signal for signal in self.signals}
+        for signal in wanted.signals:
+            if signal.name not in known:
+                raise InvalidValue(
+                    f"{signal.name} is needed, and {self.name} measures only {', '.join(known)}. "
+                    f"Give its profile a [[state]] table for it."
+                )
+            if signal.labels != known[signal.name].labels:
+                found = ", ".join(known[signal.name].labels)
+                raise InvalidValue(f"{signal.name} must be {', '.join(signal.labels)}; that of {self.name} is {found}.")
+        if wanted.command.labels != self.command.labels:
+            expected, found = ", ".join(wanted.command.labels), ", ".join(self.command.labels)
+            raise InvalidValue(f"Commands are {expected}, and {self.name} takes {found}. Choose another profile.")

@@ -1,0 +1,1 @@
+"""States and commands as messages, and back: pure functions."""

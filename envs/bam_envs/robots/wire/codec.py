@@ -1,0 +1,262 @@
+"""States and commands as ROS messages and back, as a profile says: pure functions on dicts and arrays.
+
+A live robot reads states and writes commands; a served one writes states and reads commands.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.bridge.freshness import Tag, read_tag
+from bam_envs.errors import InvalidValue, ProtocolError
+from bam_envs.robots.profiles.tables import RobotProfile, Sink, Source
+from bam_envs.robots.robot import RobotSpec, RobotState
+from bam_envs.robots.wire.command_messages import read_command, write_command
+from bam_envs.robots.wire.messages import (
+    has_header,
+    names_of,
+    number,
+    number_at,
+    numbers,
+    put_at,
+    require_message,
+    require_names,
+    shown,
+    tag_text,
+    usual_numbers,
+    value_at,
+)
+
+Array = NDArray[np.float64]
+Message = Mapping[str, Any]
+Envelope = tuple[str, str, dict[str, Any]]
+"""Topic, type, message."""
+INFO_SERVICE = "/bam/robot"
+"""Where a served robot says what it is (std_srvs/Trigger; `RobotInfo` in its message)."""
+HALT_TOPIC = "/bam/halt"
+"""Where a served robot hears that it must stop (std_msgs/Empty)."""
+SCENE_TOPIC = "/bam/scene"
+"""Where a simulated robot is told how an episode begins, by requests on ``request`` and replies on ``reply`` below."""
+
+
+@dataclass(frozen=True)
+class RobotInfo:
+    """What a robot says of itself."""
+
+    name: str
+    """Its name."""
+    simulated: bool = False
+    """Whether nothing real moves."""
+    lockstep: bool = False
+    """Whether its time goes on only with commands, one period each."""
+    period: float | None = None
+    """Time between two commands [s], if it says."""
+    text: str = ""
+    """One line for people."""
+
+    def to_json(self) -> str:
+        """As it travels."""
+        return json.dumps(asdict(self))
+
+
+def read_info(text: object, where: str) -> RobotInfo:
+    """The `RobotInfo` that `text` is.
+
+    Raises:
+        ProtocolError: It is something else.
+    """
+    try:
+        data = json.loads(text) if isinstance(text, str) else None
+    except ValueError:
+        data = None
+    if not isinstance(data, dict) or not isinstance(data.get("name"), str):
+        raise ProtocolError(f"{where}: it must say what robot it is, and says {shown(text)}.")
+    known = {key: data[key] for key in RobotInfo.__dataclass_fields__ if key in data}
+    if known.get("period") is not None:
+        known["period"] = number(known["period"], f"{where}: period")
+    return RobotInfo(**known)
+
+
+def decode_state(profile: RobotProfile, messages: Mapping[str, object]) -> dict[str, Array]:
+    """Each signal's numbers [SI] from the message that holds it.
+
+    Args:
+        profile: The robot.
+        messages: Signal -> the newest message of its topic.
+
+    Returns:
+        Signal -> numbers. Shape: (k,).
+
+    Raises:
+        ProtocolError: A message is not what the profile says; it names topic, field or joint, expected and found.
+    """
+    return {
+        signal: decode_source(profile.source(signal), message, len(profile.signal(signal).labels))
+        for signal, message in messages.items()
+    }
+
+
+def decode_source(source: Source, message: object, size: int) -> Array:
+    """The `size` numbers [SI] of one signal. Shape: (size,). Errors as in `decode_state`."""
+    where = source.topic
+    content = require_message(message, where)
+    if source.fields:
+        raw = np.array([number_at(content, path, where) for path in source.fields])
+    elif source.names:
+        raw = _by_name(source, content, where)
+    else:
+        raw = _in_order(source, content, where, size)
+    return _to_si(source, raw)
+
+
+def _in_order(source: Source, message: Message, where: str, size: int) -> Array:
+    values = numbers(value_at(message, source.field, where), f"{where}: {source.field}", missing=source.missing)
+    first, last = source.skip
+    if len(values) != size + first + last:
+        raise ProtocolError(f"{where}: {source.field} must have {size + first + last} numbers, not {len(values)}.")
+    return values[first : first + size]
+
+
+def _by_name(source: Source, message: Message, where: str) -> Array:
+    """The numbers of the names of `source`, whatever their order in the message."""
+    usual = usual_numbers(message.get(source.field)) if message.get("name") == list(source.names) else None
+    if usual is not None and len(usual) == len(source.names):
+        return usual
+    found = names_of(message, "name", where)
+    require_names(source.names, found, where, source.ignore)
+    values = value_at(message, source.field, where)
+    if isinstance(values, (list, tuple)) and not values:
+        raise ProtocolError(f"{where}: {source.field} is empty, and {source.signal} is read from it.")
+    if not isinstance(values, (list, tuple, np.ndarray)) or len(values) != len(found):
+        length = f"{len(values)} numbers" if isinstance(values, (list, tuple, np.ndarray)) else shown(values)
+        raise ProtocolError(f"{where}: {source.field} must have {len(found)} numbers, one for each name, not {length}.")
+    place = {name: values[index] for index, name in enumerate(found)}
+    return np.array(
+        [_joint(place[name], f"{where}: {source.field} of {name}", source.missing) for name in source.names]
+    )
+
+
+def _joint(value: object, where: str, missing: float | None) -> float:
+    return float(numbers([value], where, missing=missing)[0]) if missing is not None else number(value, where)
+
+
+def _to_si(entry: Source | Sink, raw: Array) -> Array:
+    if entry.is_si:
+        return raw
+    values: Array = raw * np.array(entry.scale) + np.array(entry.offset)
+    return values
+
+
+def _from_si(entry: Source | Sink, values: Array) -> list[float]:
+    raw = values if entry.is_si else (values - np.array(entry.offset)) / np.array(entry.scale)
+    numbers: list[float] = raw.tolist()
+    return numbers
+
+
+@cache
+def _places(labels: tuple[str, ...], command: tuple[str, ...]) -> list[int]:
+    """Where `labels` are among those of a command."""
+    return [command.index(label) for label in labels]
+
+
+def encode_state(
+    profile: RobotProfile, state: RobotState, row: int, stamp: Mapping[str, int], tag: str = ""
+) -> list[Envelope]:
+    """The messages that a served robot publishes of one row of `state`.
+
+    Args:
+        profile: The robot; signals that `state` has not are left out.
+        state: Of all rows.
+        row: Which row.
+        stamp: When, as ROS 1 or ROS 2 writes it.
+        tag: Text of the tag of the command that this state is the answer to; it goes into ``frame_id`` of the last
+            of the messages, so that with it everything has arrived.
+    """
+    messages: dict[tuple[str, tuple[str, ...]], Envelope] = {}
+    for source in profile.state:
+        if source.signal not in state.signals:
+            continue
+        key = (source.topic, source.names)
+        if key not in messages:
+            messages[key] = (source.topic, source.type, _new_state(source, stamp))
+        _write_source(messages[key][2], source, state.signals[source.signal][row])
+    stamped = [envelope for envelope in messages.values() if has_header(envelope[1])]
+    if not stamped:
+        return list(messages.values())
+    stamped[0][2]["header"]["frame_id"] = tag
+    return [envelope for envelope in messages.values() if envelope is not stamped[0]] + [stamped[0]]
+
+
+def _new_state(source: Source, stamp: Mapping[str, int]) -> dict[str, Any]:
+    header = {"header": {"stamp": dict(stamp), "frame_id": ""}} if has_header(source.type) else {}
+    return {**header, **source.constants}
+
+
+def _write_source(message: dict[str, Any], source: Source, values: Array) -> None:
+    """Write the numbers [SI] of one signal into `message`, which may hold those of others already."""
+    raw = _from_si(source, values)
+    if source.fields:
+        for path, value in zip(source.fields, raw, strict=True):
+            put_at(message, path, value)
+    elif source.names:
+        message["name"], message[source.field] = list(source.names), raw
+    else:
+        first, last = source.skip
+        message[source.field] = [0.0] * first + raw + [0.0] * last
+
+
+def encode_command(
+    profile: RobotProfile,
+    spec: RobotSpec,
+    command: Array,
+    tag: Tag | None,
+    mode: str | None = None,
+    *,
+    ros1: bool = False,
+) -> list[Envelope]:
+    """The messages that send `command`, in the order in which they must be sent.
+
+    Args:
+        profile: The robot.
+        spec: Labels of the command, and the period.
+        command: Finite numbers [SI]. Shape: (m,).
+        tag: Who sends it when, for how long it means anything.
+        mode: Way of sending it; None is the default.
+        ros1: Whether stamps are spelled as in ROS 1.
+
+    Raises:
+        InvalidValue: A number is not finite.
+    """
+    if command.shape != (len(spec.command.labels),) or not np.isfinite(command).all():
+        raise InvalidValue(f"A command must be {len(spec.command.labels)} finite numbers, not {command.tolist()}.")
+    return [encode_sink(sink, spec, command, tag, ros1=ros1) for sink in profile.sinks(mode)]
+
+
+def encode_sink(sink: Sink, spec: RobotSpec, command: Array, tag: Tag | None, *, ros1: bool = False) -> Envelope:
+    """The message that sends the part of `command` (m,) that goes to `sink`. Arguments as of `encode_command`."""
+    part = command[_places(sink.labels, spec.command.labels)]
+    text = tag.to_text() if tag is not None and sink.tag else ""
+    return sink.topic, sink.type, write_command(sink, _from_si(sink, part), text, spec.period, ros1=ros1)
+
+
+def decode_command(
+    profile: RobotProfile, spec: RobotSpec, topic: str, message: object
+) -> tuple[list[int], Array, Tag | None]:
+    """What a message on `topic` commands: places in the command, numbers [SI] for them, and its tag if it has one.
+
+    Raises:
+        ProtocolError: The message is not what the profile says, or no command comes on `topic`.
+    """
+    sink = profile.sinks_by_topic.get(topic)
+    if sink is None:
+        raise ProtocolError(f"{topic}: no command of {profile.name} comes here.")
+    content = require_message(message, topic)
+    values = _to_si(sink, read_command(sink, content))
+    return list(_places(sink.labels, spec.command.labels)), values, read_tag(tag_text(content))

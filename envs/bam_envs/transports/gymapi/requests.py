@@ -1,0 +1,192 @@
+"""The requests of bam_msgs/GymAPI, the service that a BAM robot rack answers; pure functions on dicts.
+
+A field that is missing has the default of its type, a field that is unknown is ignored, and one of the wrong kind is
+an error that names it. What the message type has no field for travels where it has text: a `Tag` and the seed 0 in
+``header.frame_id``; options, seeds of rows and exact actions in ``prefix`` of an action; exact observations and infos
+in ``info``, under ``bam``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+
+from bam_envs.bridge.freshness import Tag, read_tag
+from bam_envs.bridge.interfaces import complete, request_type, variants
+from bam_envs.errors import InvalidValue, ProtocolError
+from bam_envs.transports.gymapi.actions import PREFIX
+from bam_envs.transports.strict_json import dump_json, load_json
+from bam_envs.transports.transport import Info
+from bam_envs.transports.trees import plain_info, tree_from_json, tree_to_json
+
+KIND = "bam_msgs/GymAPI"
+MAX_SEED = 2**31 - 1
+"""Largest seed that the field holds on every rack."""
+Seed = int | list[int | None] | None
+Message = Mapping[str, Any]
+_SEED_ZERO = " seed=0"
+
+
+class RequestType(IntEnum):
+    """What is asked for."""
+
+    NONE = 0
+    STEP = 1
+    RESET = 2
+    CLOSE = 3
+
+
+@dataclass(frozen=True)
+class GymRequest:
+    """One request."""
+
+    type: RequestType
+    """What is asked for."""
+    client_id: str = ""
+    """Who asks, for people."""
+    env_name: str = ""
+    """Which environment; empty for the one that is there."""
+    actions: tuple[Message, ...] = ()
+    """GymAction of each row."""
+    seed: Seed = None
+    """Of a reset, as Gymnasium's."""
+    options: Info | None = None
+    """Of a reset, as Gymnasium's."""
+    tag: Tag | None = None
+    """When it was sent and until when it counts; None from clients that say nothing."""
+    take: bool = False
+    """Take command from whoever has it."""
+    expected_duration: float = 0.0
+    """How long it may take [s]."""
+
+
+def service_name(namespace: str = "") -> str:
+    """Name of the service in `namespace`."""
+    return f"{base_name(namespace)}/gym_api_request"
+
+
+def base_name(namespace: str = "") -> str:
+    """What the service, and the topics ``request`` and ``reply``, are under."""
+    stripped = namespace.strip("/")
+    return f"/{stripped}/gym_env" if stripped else "/gym_env"
+
+
+def write_request(request: GymRequest, stamp: Mapping[str, int]) -> dict[str, Any]:
+    """The message of `request`, for one of our servers. `stamp` is the time in the spelling of the ROS there."""
+    in_field = request.seed if isinstance(request.seed, int) and 0 < request.seed <= MAX_SEED else 0
+    zero = _SEED_ZERO if request.seed == 0 and isinstance(request.seed, int) else ""
+    beside = None if in_field or zero else request.seed
+    header = {
+        "client_id": request.client_id,
+        "request_type": int(request.type),
+        "force_priority": request.take,
+        "stamp": dict(stamp),
+        "frame_id": (request.tag.to_text() if request.tag else "") + zero,
+        "expected_duration": request.expected_duration,
+        "blocking": True,
+    }
+    actions = [dict(one) for one in request.actions] + _beside(beside, request.options)
+    return {"header": header, "seed": in_field, "env_name": request.env_name, "action": actions}
+
+
+def _beside(seed: Seed, options: Info | None) -> list[dict[str, Any]]:
+    """What a reset says that has no field, as one action."""
+    if seed is None and options is None:
+        return []
+    words = {"seed": tree_to_json(seed), "options": tree_to_json(plain_info(options))}
+    return [{"prefix": PREFIX + dump_json(words, "The seed and options of a reset")}]
+
+
+def plain_seed(seed: Any) -> Seed:
+    """A seed, or one for each row, as Python's numbers.
+
+    Raises:
+        InvalidValue: It is not a whole number from 0 on.
+    """
+    if seed is None:
+        return None
+    if isinstance(seed, (list, tuple, np.ndarray)):
+        return [plain_seed(one) for one in seed]  # type: ignore[misc]
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise InvalidValue(f"A seed must be a whole number from 0 on, not {seed!r}.")
+    return int(seed)
+
+
+def refuse_foreign(seed: Seed, options: Info | None) -> None:
+    """Refuse what only our own servers understand.
+
+    Raises:
+        InvalidValue: A seed or an option for which GymAPI has no field.
+    """
+    if options:
+        raise InvalidValue(f"GymAPI has no field for options of reset, and this rack is not of bam-train: {options}.")
+    if seed is not None and (not isinstance(seed, int) or not 0 < seed <= MAX_SEED):
+        raise InvalidValue(
+            f"The seed must be a whole number from 1 to {MAX_SEED} or None, not {seed}: 0 means no seed to this rack."
+        )
+
+
+def read_request(message: object) -> GymRequest:
+    """The request in `message`, whoever sent it.
+
+    Raises:
+        InvalidValue: A field is of the wrong kind: its name, what was expected, what was found.
+        ProtocolError: The words beside the fields cannot be read.
+    """
+    whole = completed(request_type(KIND), message)
+    header = whole["header"]
+    if header["request_type"] not in list(RequestType):
+        known = ", ".join(f"{one.value} {one.name}" for one in RequestType)
+        raise InvalidValue(f"{KIND}: header.request_type must be one of {known}, not {header['request_type']}.")
+    kind = RequestType(header["request_type"])
+    seed, options = _seed_and_options(whole) if kind is RequestType.RESET else (None, None)
+    return GymRequest(
+        type=kind,
+        client_id=header["client_id"],
+        env_name=whole["env_name"],
+        actions=tuple(whole["action"]) if kind is RequestType.STEP else (),
+        seed=seed,
+        options=options,
+        tag=read_tag(header["frame_id"]),
+        take=header["force_priority"],
+        expected_duration=header["expected_duration"],
+    )
+
+
+def _seed_and_options(whole: Message) -> tuple[Seed, Info | None]:
+    in_field = whole["seed"] or (0 if whole["header"]["frame_id"].endswith(_SEED_ZERO) else None)
+    prefix = whole["action"][0]["prefix"] if whole["action"] else ""
+    if not prefix.startswith(PREFIX):
+        return in_field, None
+    words = load_json(prefix.removeprefix(PREFIX), "prefix")
+    beside, options = tree_from_json(words.get("seed")), tree_from_json(words.get("options"))
+    if not (options is None or isinstance(options, dict)):
+        raise ProtocolError(f"The options of a reset must be an object, not {options!r}.")
+    return (in_field if beside is None else beside), options
+
+
+def completed(kind: str, message: object) -> dict[str, Any]:
+    """`message` checked and with all fields of `kind`; those that it does not have are ignored.
+
+    Raises:
+        InvalidValue: A field is of the wrong kind.
+    """
+    try:
+        return complete(kind, message)
+    except InvalidValue:  # perhaps only because there are fields of a newer version
+        return complete(kind, _known_fields(kind, message))
+
+
+def _known_fields(kind: str, value: Any) -> Any:
+    """A message, or a list of them, without the fields that `kind` does not have."""
+    if isinstance(value, (list, tuple)):
+        return [_known_fields(kind, one) for one in value]
+    spellings = variants(kind)
+    if not spellings or not isinstance(value, Mapping):
+        return value
+    fields = max(spellings, key=lambda one: len({field.name for field in one} & value.keys()))
+    return {field.name: _known_fields(field.type, value[field.name]) for field in fields if field.name in value}

@@ -1,0 +1,116 @@
+"""The answers of bam_msgs/GymAPI; see `gymapi` for the requests."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+from bam_envs.bridge.interfaces import response_type
+from bam_envs.errors import BamEnvsError, InvalidValue, NotInCommand, ProtocolError, RemoteError
+from bam_envs.transports.gymapi.info import read_info, write_info
+from bam_envs.transports.gymapi.requests import KIND, Message, completed
+from bam_envs.transports.strict_json import dump_json
+from bam_envs.transports.transport import Info
+
+
+class ErrorCode(IntEnum):
+    """How it went."""
+
+    UNDEFINED = 0
+    SUCCESS = 1
+    FAILURE = 2
+    NO_SENSOR_DATA = 5
+
+
+@dataclass(frozen=True)
+class GymResponse:
+    """One answer."""
+
+    error: RemoteError | None
+    """What went wrong, if anything."""
+    feedback: tuple[Message, ...]
+    """Complete GymFeedback of each row."""
+    infos: tuple[Info, ...]
+    """What each feedback's info says to people and programs."""
+    exact: tuple[Info, ...]
+    """What it says to us, under ``bam``; empty dicts from everybody else's servers."""
+
+    @property
+    def ours(self) -> bool:
+        """Whether one of our servers made it, as far as one can see."""
+        return any(self.exact)
+
+
+def write_feedback(
+    fields: Mapping[str, Any], trees: Mapping[str, Any], ends: tuple[float, bool, bool], info: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The message of one row.
+
+    Args:
+        fields: What holds the observation.
+        trees: The parts of it that the fields cannot say, as JSON.
+        ends: Reward, terminated, truncated.
+        info: Gymnasium's, as a tree.
+
+    Raises:
+        InvalidValue: The reward is not finite.
+    """
+    reward, terminated, truncated = ends
+    if not math.isfinite(reward):
+        raise InvalidValue(f"The reward must be finite to be sent, not {reward}.")
+    text = write_info(info, {"observation": dict(trees)} if trees else {})
+    flags = {"executed": True, "reward": reward, "terminated": terminated, "truncated": truncated}
+    return {**fields, **flags, "info": text}
+
+
+def write_response(feedback: Sequence[Message], duration: float = 0.0) -> dict[str, Any]:
+    """The message of a success that took `duration` [s]."""
+    code = {"value": int(ErrorCode.SUCCESS)}
+    header = {"duration": duration, "error_code": code, "error_msg": "", "calibrated": True}
+    return {"header": header, "feedback": list(feedback)}
+
+
+def write_failure(error: BamEnvsError, duration: float = 0.0) -> dict[str, Any]:
+    """The message of a request that was refused or failed."""
+    message = write_response([{"info": dump_json({"bam": {"error": type(error).__name__}}, "info")}], duration)
+    message["header"] |= {"error_code": {"value": int(ErrorCode.FAILURE)}, "error_msg": str(error)}
+    return message
+
+
+def read_response(message: object) -> GymResponse:
+    """The answer in `message`, whoever sent it.
+
+    Raises:
+        ProtocolError: A field is of the wrong kind.
+    """
+    try:
+        whole = completed(response_type(KIND), message)
+    except InvalidValue as error:
+        raise ProtocolError(str(error)) from error
+    read = [read_info(one["info"]) for one in whole["feedback"]]
+    infos, exact = tuple(info for info, _ in read), tuple(bam for _, bam in read)
+    failure = _error(whole["header"]["error_code"]["value"], whole["header"]["error_msg"], exact[0] if exact else {})
+    return GymResponse(failure, tuple(_filled(whole["feedback"])), infos, exact)
+
+
+def _error(code: int, text: str, bam: Info) -> RemoteError | None:
+    if code == ErrorCode.SUCCESS:
+        return None
+    name = ErrorCode(code).name if code in list(ErrorCode) else "not in the list"
+    kind = NotInCommand if bam.get("error") == NotInCommand.__name__ else RemoteError
+    return kind(text or f"The rack answered error code {code} ({name}).")
+
+
+def _filled(feedback: list[Message]) -> list[Message]:
+    """Entries that are marked as equal to another one of their namespace get its observation."""
+    whole = {one["ns"]: one for one in reversed(feedback) if not one["duplicate_obs_ns"]}
+    own = ("ns", "duplicate_obs_ns", "executed", "reward", "terminated", "truncated", "info")
+    return [
+        {**whole[one["ns"]], **{key: one[key] for key in own}}
+        if one["duplicate_obs_ns"] and one["ns"] in whole
+        else one
+        for one in feedback
+    ]

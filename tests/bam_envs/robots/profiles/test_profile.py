@@ -1,0 +1,313 @@
+"""Profiles are checked on load: file and key are named, and the closest right one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.robots.fake import FakeRobot
+from bam_envs.robots.mir100 import base_spec
+from bam_envs.robots.profiles.profile import load_profile, profile_for, shipped_profiles
+from bam_envs.robots.ur5e import JOINTS, arm_spec
+
+OWN = """
+name = "lift"
+kind = "arm"
+period = 0.02
+
+[command]
+labels = ["height"]
+units = "m"
+low = 0.0
+high = 2
+max_rate = 0.5
+
+[[signals]]
+name = "lift_height"
+labels = ["height"]
+units = ["m"]
+low = 0
+high = 2.0
+
+[[state]]
+signal = "lift_height"
+topic = "/lift/joint_states"
+type = "sensor_msgs/msg/JointState"
+field = "position"
+names = ["lift_joint"]
+scale = 0.001
+
+[[commands.position]]
+topic = "/lift/command"
+type = "std_msgs/Float64"
+labels = ["height"]
+fields = ["data"]
+scale = 0.001
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Write a profile; its path."""
+
+    def write_file(text, name="mine.toml"):
+        path = tmp_path / name
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write_file
+
+
+def refusal(path):
+    with pytest.raises(InvalidValue) as caught:
+        load_profile(path)
+    return str(caught.value).replace(str(path), "FILE")
+
+
+def test_shipped():
+    assert shipped_profiles() == ["mir100", "ur5e"]
+
+
+def test_the_ur5e_is_the_simulated_arm():
+    profile, arm = load_profile("ur5e"), arm_spec("ur5e", with_object=True)
+    assert profile.spec() == arm
+    assert (profile.kind, profile.period, profile.max_age, profile.dead_man) == ("arm", 0.05, 0.1, 0.1)
+    assert [signal.name for signal in profile.signals[5:]] == ["tool_position", "tool_quaternion"]
+    assert profile.source("joint_velocity").names == JOINTS
+    position, trajectory = profile.sinks("position"), profile.sinks("trajectory")
+    assert profile.sinks() == position
+    assert [sink.topic for sink in position] == ["/gripper/commands", "/forward_position_controller/commands"]
+    assert trajectory[1].topic == "/scaled_joint_trajectory_controller/joint_trajectory"
+    assert [sink.hold for sink in position] == ["last", "measured"]
+
+
+def test_the_mir100():
+    profile = load_profile("mir100")
+    assert profile.spec() == base_spec()
+    assert (profile.kind, profile.period, profile.max_age, profile.dead_man) == ("base", 0.1, 0.5, 0.5)
+    sizes = {signal.name: len(signal.labels) for signal in profile.signals}
+    assert sizes == {"base_pose": 3, "base_velocity": 2, "f_scan": 501, "b_scan": 511}
+    assert {source.topic for source in profile.state} == {"/odom", "/robot_pose", "/f_scan", "/b_scan"}
+    assert profile.sinks()[0].hold == "zero"
+    assert [(way, sinks[0].type) for way, sinks in profile.commands.items()] == [
+        ("velocity", "geometry_msgs/Twist"),
+        ("stamped", "geometry_msgs/TwistStamped"),
+    ]
+
+
+def test_only_what_a_task_needs_is_measured():
+    profile = load_profile("ur5e")
+    wanted = FakeRobot(with_object=False).spec
+    assert [signal.name for signal in profile.spec(wanted).signals] == [
+        "joint_position",
+        "joint_velocity",
+        "gripper_width",
+    ]
+
+
+def test_what_is_needed_and_not_measured():
+    with pytest.raises(InvalidValue) as caught:
+        load_profile("mir100").spec(FakeRobot(with_object=False).spec)
+    assert str(caught.value) == (
+        "joint_position is needed, and mir100 measures only base_pose, base_velocity, f_scan, b_scan. "
+        "Give its profile a [[state]] table for it."
+    )
+
+
+def test_the_profile_for_a_robot():
+    assert profile_for(FakeRobot().spec).name == "ur5e"
+    assert profile_for(base_spec("base")).name == "mir100"
+
+
+def test_unknown_names():
+    with pytest.raises(UnknownName) as caught:
+        load_profile("ur5")
+    assert str(caught.value) == "Unknown robot profile 'ur5'. Did you mean 'ur5e'?"
+    with pytest.raises(UnknownName) as caught:
+        load_profile("ur5e").sinks("trajectories")
+    assert str(caught.value) == "Unknown way of sending commands to ur5e 'trajectories'. Did you mean 'trajectory'?"
+
+
+def test_a_profile_of_ones_own(write):
+    profile = load_profile(write(OWN))
+    assert profile.spec().describe() == {
+        "state": [{"name": "height", "unit": "m", "low": 0.0, "high": 2.0}],
+        "command": [{"name": "height", "unit": "m", "low": 0.0, "high": 2.0}],
+    }
+    assert (profile.period, profile.max_age, profile.command.max_rate) == (0.02, 0.1, (0.5,))
+    assert profile.source("lift_height").type == "sensor_msgs/JointState"
+    assert profile.sinks()[0].names == ("height",)
+
+
+def test_yaml(write):
+    text = """
+extends: ur5e
+name: my arm
+kind: arm
+max_age: 0.2
+limits: {joint_speed: 0.5}
+rename: {/joint_states: /ur/joint_states}
+ignore: [finger_joint, elbow_joint]
+"""
+    for name in ("mine.yaml", "mine.yml"):
+        profile = load_profile(write(text, name))
+        assert (profile.name, profile.max_age, profile.limits) == ("my arm", 0.2, {"joint_speed": 0.5})
+        assert profile.source("joint_position").topic == "/ur/joint_states"
+        assert profile.source("joint_position").ignore == ("finger_joint",)
+        assert profile.source("gripper_width").ignore == ("finger_joint", "elbow_joint")
+        assert profile.source("object_position").topic == "/object_pose"
+        assert profile.source("object_position").ignore == ()
+        np.testing.assert_array_equal(profile.command.low, load_profile("ur5e").command.low)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('kind = "arm"', 'kind = "leg"', "FILE: kind must be one of arm, base, not 'leg'."),
+        ('name = "lift"\n', "", "FILE: the key 'name' is missing."),
+        ("period = 0.02", "perod = 0.02", "FILE: unknown key 'perod'. Did you mean 'period'?"),
+        ("period = 0.02", 'period = "fast"', "FILE: period must be a finite number, not 'fast'."),
+        ("period = 0.02", "period = true", "FILE: period must be a finite number, not True."),
+        ("period = 0.02", "period = nan", "FILE: period must be a finite number, not nan."),
+        ("period = 0.02", "period = -1", "FILE: period must be above 0, not -1."),
+        ("period = 0.02", "", "FILE: give robot (ur5e, mir100), or [command] with max_rate, and period."),
+        ("period = 0.02", 'robot = "ur5"', "FILE: Unknown robot 'ur5'. Did you mean 'ur5e'?"),
+        ("period = 0.02", "period = 0.02\nstate = 3", "FILE is not TOML: "),
+        ("max_rate = 0.5", "", "FILE: command needs max_rate, and takes no name."),
+        ("high = 2\n", "high = 0\n", "FILE: command: low must be below high."),
+        ('units = "m"', 'units = ["m", "m"]', "FILE: command: units must have 1 or 1 values, not 2."),
+        ('labels = ["height"]\nunits', "labels = []\nunits", "FILE: command: labels must name at least one number."),
+        (
+            'signal = "lift_height"',
+            'signal = "lift_hight"',
+            "FILE: state[0]: Unknown signal 'lift_hight'. Did you mean 'lift_height'?",
+        ),
+        (
+            "/lift/joint_states",
+            "lift",
+            "FILE: state[0]: topic must be an absolute name such as /joint_states, not 'lift'.",
+        ),
+        (
+            "sensor_msgs/msg/JointState",
+            "JointState",
+            "FILE: state[0]: type must be such as sensor_msgs/JointState, not 'JointState'.",
+        ),
+        (
+            'field = "position"\n',
+            "",
+            "FILE: state[0]: give either field (where the list is) or fields (where each number is).",
+        ),
+        ('names = ["lift_joint"]', "partial = true", "FILE: state[0]: partial and ignore need names."),
+        ('["lift_joint"]', '["a", "b"]', "FILE: state[0]: names must name the 1 numbers of field, not 2."),
+        ('["lift_joint"]', '["a", 3]', "FILE: state[0]: names must be a list of texts, not ['a', 3]."),
+        ("scale = 0.001\n\n[[commands", "scale = 0\n\n[[commands", "FILE: state[0]: scale must not be 0."),
+        (
+            "scale = 0.001\n\n[[commands",
+            "scale = [1, 2]\n\n[[commands",
+            "FILE: state[0]: scale must have 1 or 1 values, not 2.",
+        ),
+        ("scale = 0.001\n\n[[commands", "skip = 3\n\n[[commands", "FILE: state[0]: skip must be two counts, not 3."),
+        ("scale = 0.001\n\n[[commands", "max_age = 0\n\n[[commands", "FILE: state[0]: max_age must be above 0, not 0."),
+        (
+            'fields = ["data"]',
+            "",
+            "FILE: commands.position[0]: std_msgs/Float64 needs fields; only sensor_msgs/JointState, "
+            "std_msgs/Float32MultiArray, std_msgs/Float64MultiArray, trajectory_msgs/JointTrajectory do without.",
+        ),
+        (
+            'labels = ["height"]\nfields',
+            'labels = ["hight"]\nfields',
+            "FILE: commands.position: labels must be height, not hight.",
+        ),
+        (
+            'fields = ["data"]',
+            'fields = ["data"]\nhold = "first"',
+            "FILE: commands.position[0]: hold must be one of measured, last, zero, not 'first'.",
+        ),
+        (
+            "[command]",
+            "[limits]\njoint_sped = 1\n[command]",
+            "FILE: limits: Unknown limit 'joint_sped'. Did you mean 'joint_speed'?",
+        ),
+        (
+            "[command]",
+            "[limits]\njoint_speed = 0\n[command]",
+            "FILE: limits: The limit joint_speed must be above 0, not 0.0.",
+        ),
+        (
+            "[command]",
+            '[rename]\n"/lift/state" = "/state"\n[command]',
+            "FILE: rename: Unknown topic '/lift/state'. Did you mean '/lift/joint_states'?",
+        ),
+        (
+            "[command]",
+            '[rename]\n"/lift/command" = "command"\n[command]',
+            "FILE: rename: /lift/command must become an absolute name such as /ur/state, not 'command'.",
+        ),
+        (
+            "[command]",
+            '[[cameras]]\nname = "hand"\ntopic = "/hand/image"\ntype = "sensor_msgs/CameraInfo"\n[command]',
+            "FILE: cameras[0]: type must be one of sensor_msgs/CompressedImage, sensor_msgs/Image, "
+            "not 'sensor_msgs/CameraInfo'.",
+        ),
+    ],
+)
+def test_bad_profiles(write, old, new, message):
+    assert old in OWN
+    found = refusal(write(OWN.replace(old, new, 1)))
+    if message.endswith(": "):
+        found = found[: len(message)]
+    assert found == message
+
+
+def test_every_number_is_commanded_once(write):
+    twice = OWN + OWN[OWN.index("[[commands") :].replace("/lift/command", "/lift/other")
+    assert refusal(write(twice)) == "FILE: commands.position: the label 'height' comes twice."
+
+
+def test_a_signal_has_one_source(write):
+    twice = OWN + OWN[OWN.index("[[state") : OWN.index("[[commands")]
+    assert refusal(write(twice)) == "FILE: state[1]: lift_height has a source already."
+
+
+def test_no_way_and_no_state(write):
+    no_way = OWN[: OWN.index("[[commands")]
+    assert refusal(write(no_way)) == (
+        "FILE: at least one way of sending commands is needed, such as [[commands.position]]."
+    )
+    no_state = OWN[: OWN.index("[[state")] + OWN[OWN.index("[[commands") :]
+    assert refusal(write(no_state)) == "FILE: at least one [[state]] table is needed."
+
+
+def test_files(write, tmp_path):
+    missing = tmp_path / "other.toml"
+    (tmp_path / "folder.toml").mkdir()
+    assert refusal(missing) == ("There is no robot profile FILE. Give the path of a file, or one of: mir100, ur5e.")
+    assert refusal(write("name =")).startswith("FILE is not TOML: ")
+    for text in ("a: [", "a: 2020-13-45", "a: !!int b", "[" * 3000):
+        assert refusal(write(text, "b.yaml")).startswith("FILE is not YAML: ")
+    assert refusal(write("- 1", "b.yaml")) == "FILE must be a table of named values, not [1]."
+    assert (
+        refusal(write("state: 3\nname: a\nkind: arm\nrobot: ur5e", "b.yaml"))
+        == "FILE: state must be a list of tables, not 3."
+    )
+    with pytest.raises(UnknownName, match=r"Did you mean 'ur5e'\?"):
+        load_profile(write('extends = "ur5"'))
+    assert refusal(write("extends = 3")) == "FILE: extends must be text, not 3."
+    assert refusal(write('extends = "b.toml"')) == (
+        "FILE: extends must be a shipped profile (mir100, ur5e), not 'b.toml'."
+    )
+    assert refusal(tmp_path / "folder.toml") == (
+        "The robot profile FILE cannot be read: [Errno 21] Is a directory: 'FILE'."
+    )
+
+
+def test_what_is_sent_on_a_topic_and_in_which_units():
+    profile = load_profile("ur5e")
+    (gripper, arm), (_, trajectory) = profile.commands.values()
+    assert profile.sinks_by_topic == {sink.topic: sink for sink in (gripper, arm, trajectory)}
+    assert profile.sinks_by_topic[gripper.topic] is gripper
+    assert (arm.is_si, replace(arm, scale=(2.0,)).is_si, replace(arm, offset=(0.1,)).is_si) == (True, False, False)
+    joints = profile.source("joint_position")
+    assert (joints.is_si, replace(joints, scale=(1.0,) * 5 + (-1.0,)).is_si) == (True, False)

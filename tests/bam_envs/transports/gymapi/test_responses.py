@@ -1,0 +1,87 @@
+"""Answers as bare dicts, as anybody's rack gives them."""
+
+import json
+
+import pytest
+
+from bam_envs.errors import InvalidValue, NotInCommand, ProtocolError, RemoteError
+from bam_envs.transports.gymapi.responses import read_response, write_failure, write_feedback, write_response
+
+
+def test_the_message_of_a_success():
+    feedback = write_feedback({"observation": [1.0]}, {}, (0.5, True, False), {"a": 1})
+    assert write_response([feedback], 0.25) == {
+        "header": {"duration": 0.25, "error_code": {"value": 1}, "error_msg": "", "calibrated": True},
+        "feedback": [
+            {
+                "observation": [1.0],
+                "executed": True,
+                "reward": 0.5,
+                "terminated": True,
+                "truncated": False,
+                "info": '{"a":1}',
+            }
+        ],
+    }
+
+
+@pytest.mark.parametrize("reward", [float("nan"), float("inf")])
+def test_a_reward_is_finite(reward):
+    with pytest.raises(InvalidValue, match="The reward must be finite to be sent, not "):
+        write_feedback({}, {}, (reward, False, False), {})
+
+
+@pytest.mark.parametrize("kind", [RemoteError, NotInCommand])
+def test_our_failures_come_back_as_they_were(kind):
+    message = json.loads(json.dumps(write_failure(kind("no, because"))))
+    assert message["header"]["error_code"] == {"value": 2}
+    response = read_response(message)
+    assert type(response.error) is kind
+    assert str(response.error) == "no, because"
+    assert response.ours
+
+
+@pytest.mark.parametrize(
+    ("code", "text", "expected"),
+    [
+        (2, "gripper stuck", "gripper stuck"),
+        (0, "", "The rack answered error code 0 (UNDEFINED)."),
+        (5, "", "The rack answered error code 5 (NO_SENSOR_DATA)."),
+        (77, "", "The rack answered error code 77 (not in the list)."),
+    ],
+)
+def test_failures_of_other_racks(code, text, expected):
+    response = read_response({"header": {"error_code": {"value": code}, "error_msg": text}})
+    assert type(response.error) is RemoteError
+    assert str(response.error) == expected
+    assert not response.ours
+
+
+def test_an_answer_without_a_code_is_no_success():
+    assert str(read_response({}).error) == "The rack answered error code 0 (UNDEFINED)."
+
+
+def test_a_field_of_the_wrong_kind_is_named():
+    text = r"feedback\[0\]\.observation\[1\]: expected a number, found null\.$"
+    with pytest.raises(ProtocolError, match=text):
+        read_response({"header": {"error_code": {"value": 1}}, "feedback": [{"observation": [0.0, None]}]})
+
+
+def test_newer_fields_and_lists_of_images_are_let_through():
+    image = {"format": "png", "data": "AAAA", "quality": 3}
+    response = read_response(
+        {
+            "header": {"error_code": {"value": 1, "text": "fine"}, "uptime": 3},
+            "feedback": [{"color_img": [image, image], "segments": [{}], "mood": 1}],
+        }
+    )
+    assert [one["data"] for one in response.feedback[0]["color_img"]] == [b"\0\0\0"] * 2
+
+
+def test_a_duplicate_has_the_observation_of_the_other_one_of_its_namespace():
+    one = {"ns": "left", "observation": [1.0], "reward": 1.0}
+    other = {"ns": "right", "observation": [2.0]}
+    same = {"ns": "left", "duplicate_obs_ns": True, "reward": 3.0, "info": "{}"}
+    response = read_response({"header": {"error_code": {"value": 1}}, "feedback": [other, same, one]})
+    assert [row["observation"] for row in response.feedback] == [[2.0], [1.0], [1.0]]
+    assert [row["reward"] for row in response.feedback] == [0.0, 3.0, 1.0]
