@@ -116,6 +116,37 @@ def guards() -> str:
     return table(["number", "guard", "limit", "what it does", "of"], rows)
 
 
+def topics_of(name: str) -> str:
+    """The topics of a shipped profile: what a robot publishes, and what it is told."""
+    from bam_envs.robots.profiles import load_profile
+
+    profile = load_profile(name)
+    published: dict[tuple[str, str], list[str]] = {}
+    for source in profile.state:
+        spec = profile.signal(source.signal)
+        units = ", ".join(dict.fromkeys(unit for unit in spec.units if unit != "1"))
+        text = f"{source.signal} [{units}]" if units else source.signal
+        published.setdefault((source.topic, source.type), []).append(text)
+    rows = [[f"`{topic}`", f"`{kind}`", "from the robot", ", ".join(what)] for (topic, kind), what in published.items()]
+    for way, sinks in profile.commands.items():
+        for sink in sinks:
+            unit = profile.command.units[profile.command.labels.index(sink.labels[0])]
+            what = f"{', '.join(sink.labels)} [{unit}]"
+            rows.append([f"`{sink.topic}`", f"`{sink.type}`", f"to the robot ({way})", what])
+    return table(["topic", "type", "direction", "what"], _once(rows))
+
+
+def _once(rows: list[list[str]]) -> list[list[str]]:
+    """Rows with the same topic and content joined into one."""
+    joined: dict[tuple[str, str, str], list[str]] = {}
+    for topic, kind, direction, what in rows:
+        joined.setdefault((topic, kind, what), []).append(direction)
+    return [
+        [topic, kind, directions[0] if len(directions) == 1 else "to the robot (each way)", what]
+        for (topic, kind, what), directions in joined.items()
+    ]
+
+
 def robot_signals() -> str:
     """What the arm measures and what it is sent."""
     spec = resolve(ENVIRONMENTS["bam/pick-v0"].robot)(1).spec
@@ -236,6 +267,7 @@ PARTS: dict[str, Callable[..., str]] = {
     "environment": environment,
     "robot-signals": robot_signals,
     "guards": guards,
+    "topics": topics_of,
     "fields": fields_of,
     "defaults": defaults_of,
     "flags": flags_of,
