@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -27,6 +28,8 @@ class Place:
     """Certificates that wss:// trusts instead of the system's."""
     token_file: str | None = None
     """File with the token that the server asks for."""
+    timeout: float | None = None
+    """Longest that an answer of `transport` is waited for [s]; None for its own default."""
 
     def require_sane(self) -> None:
         """Refuse addresses and options that exclude each other.
@@ -45,6 +48,25 @@ class Place:
                 raise SettingsError(
                     f"{flag} is for a link, and the robot is simulated here; give --robot or --transport"
                 )
+        self._require_sane_addresses()
+        self._require_sane_timeout()
+
+    def _require_sane_addresses(self) -> None:
+        plain = [url.rstrip("/") for url in self.transport]
+        for url in plain:
+            if plain.count(url) > 1:
+                raise SettingsError(f"--transport: {url} comes twice, and an address is one environment; give it once")
+        without = [url for url in (self.robot, *self.transport) if url is not None and not url.startswith("wss://")]
+        if self.ca_file is not None and without:
+            raise SettingsError(f"--ca-file says whom wss:// trusts, and {without[0]} is without TLS; leave it out")
+
+    def _require_sane_timeout(self) -> None:
+        if self.timeout is None:
+            return
+        if not self.transport:
+            raise SettingsError("--timeout is how long an answer of --transport is waited for; leave it out")
+        if not 0 < self.timeout < math.inf:
+            raise SettingsError(f"timeout: expected more than 0 s, found {self.timeout:g}")
 
     @property
     def is_remote(self) -> bool:
@@ -58,7 +80,11 @@ class Place:
 
     @property
     def link_options(self) -> dict[str, Any]:
-        """What opening a link takes beside the address."""
+        """What opening a transport takes beside the address."""
+        return {**self._files, "timeout": self.timeout}
+
+    @property
+    def _files(self) -> dict[str, Any]:
         return {"ca_file": self.ca_file, "token_file": self.token_file}
 
     def robot_kwargs(self, env_id: str, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
@@ -73,7 +99,7 @@ class Place:
                 f"bam-serve --env {env_id}, and give --transport"
             )
         own = {name: value for name, value in env_kwargs.items() if name not in _OF_SIMULATIONS}
-        return {**own, "robot": self.robot, "profile": self.profile, **self.link_options}
+        return {**own, "robot": self.robot, "profile": self.profile, **self._files}
 
 
 HERE = Place()

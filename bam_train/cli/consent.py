@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bam_train.cli.console import say
@@ -18,18 +18,38 @@ def guards_of(env: Any) -> dict[str, dict[str, Any]]:
 
 
 def limit_lines(guards: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """One line for each guard that has a limit, such as ``  G8 joint speed: 1.0 rad/s``."""
+    """One line for each guard that has a limit, such as ``  G8 joint speed: 1 rad/s``."""
     limited = [(name, row) for name, row in guards.items() if row["limit"] not in (None, "")]
-    return [f"  {row['number']} {name}: {row['limit']} {row['unit']}".rstrip() for name, row in limited]
+    return [f"  {row['number']} {name}: {row['limit']:.3g} {row['unit']}".rstrip() for name, row in limited]
 
 
-def require_consent(env: Any, who: str, *, yes: bool) -> None:
+def plan_lines(env: Any, env_id: str, address: str, episodes: int) -> list[str]:
+    """What a person should know of the episodes to come.
+
+    Args:
+        env: The environment, single, with a live robot or none.
+        env_id: What it is called.
+        address: Where the robot is.
+        episodes: How many.
+    """
+    from bam_envs.robots.robot import RobotSpec
+    from bam_envs.robots.safety.guard import is_base
+
+    spec = getattr(getattr(env.unwrapped, "robot", None), "spec", None)
+    count = "1 episode" if episodes == 1 else f"{episodes} episodes, one after the other without a pause"
+    arm = isinstance(spec, RobotSpec) and not is_base(spec)
+    begin = "by opening the gripper and going to the start pose" if arm else "where the base stands"
+    return [f"  address: {address}", f"  {env_id}: {count}", f"  each begins {begin}"]
+
+
+def require_consent(env: Any, who: str, *, yes: bool, plan: Sequence[str] = ()) -> None:
     """Ask once before a real robot moves; it is connected, and stands still.
 
     Args:
         env: The environment, single or vector; without a real robot nobody is asked.
         who: What will move it, as the first line begins.
         yes: Show it, and do not ask.
+        plan: Lines that say what it will do.
 
     Raises:
         SettingsError: The answer is not yes, or there is nobody to ask.
@@ -39,7 +59,8 @@ def require_consent(env: Any, who: str, *, yes: bool) -> None:
     info = getattr(getattr(env.unwrapped, "robot", None), "info", None)
     if info is None or info.simulated:
         return
-    for line in (f"{who} will move {info.text}, within", *limit_lines(guards_of(env))):
+    what = [f"{who} will move {info.text}:", *plan, "within"] if plan else [f"{who} will move {info.text}, within"]
+    for line in (*what, *limit_lines(guards_of(env))):
         say(line)
     if yes:
         return

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from bam_train.cli.consent import guards_of, require_consent
+from bam_train.cli.consent import guards_of, plan_lines, require_consent
 from bam_train.cli.console import is_terminal, make_console, say
 from bam_train.cli.program import run_program
 
@@ -49,6 +49,8 @@ class DeployConfig:
     """Certificates that wss:// trusts instead of the system's."""
     token_file: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """File with the token that the server asks for."""
+    timeout: Annotated[float | None, tyro.conf.arg(metavar="S")] = None
+    """Longest that an answer of --transport is waited for [s]; 30 by default."""
     yes: tyro.conf.FlagCreatePairsOff[bool] = False
     """Do not ask before a real robot moves."""
     rate: Annotated[float | None, tyro.conf.arg(metavar="HZ")] = None
@@ -87,7 +89,8 @@ def deploy_checkpoint(config: DeployConfig) -> int:
         journal = Journal(config.episodes, startup)
         deployment = Deployment(env, policy, pacer, journal)
         deployment.connect()
-        require_consent(env, f"bam-deploy: {config.checkpoint}", yes=config.yes)
+        plan = plan_lines(env, manifest.env, place.text, config.episodes)
+        require_consent(env, f"bam-deploy: {config.checkpoint}", yes=config.yes, plan=plan)
     except BaseException:
         env.close()  # type: ignore[no-untyped-call]
         raise
@@ -166,7 +169,7 @@ def place_of(config: DeployConfig) -> Place:
     from bam_train.place import Place, addresses
 
     files = {name: None if path is None else str(path) for name, path in _files(config)}
-    return Place(config.robot, addresses(config.transport), config.profile, **files)
+    return Place(config.robot, addresses(config.transport), config.profile, timeout=config.timeout, **files)
 
 
 def _files(config: DeployConfig) -> list[tuple[str, Path | None]]:

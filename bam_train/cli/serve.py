@@ -122,7 +122,19 @@ def make_env(config: ServeConfig) -> Env:
     if config.num_envs < 1:
         raise SettingsError(f"--num-envs: expected at least 1, found {config.num_envs}")
     env_id, kwargs = resolve_id(config.env), env_kwargs(config.set)
+    _require_known(env_id, kwargs)
     return make_env(env_id, kwargs) if config.num_envs == 1 else make_rows(env_id, kwargs, config.num_envs)
+
+
+def _require_known(env_id: str, kwargs: dict[str, Any]) -> None:
+    """Refuse a slip of the pen with the closest match; what says where it runs may be given here."""
+    from inspect import signature
+
+    from bam_envs.registry import make_env
+    from bam_train.trainers.resolve import require_env_kwargs
+
+    anywhere = signature(make_env).parameters
+    require_env_kwargs(env_id, {name: value for name, value in kwargs.items() if name not in anywhere})
 
 
 def env_kwargs(assignments: Sequence[str]) -> dict[str, Any]:

@@ -124,11 +124,12 @@ LINK_LOST, SAFETY_STOP = 4, 3
 
 def _ending_of(error: Exception) -> Ending:
     """What the operator has to look for first: the network, the robot, or the program."""
+    text = fault_text(error).replace("call resume()", "run it again")  # a program ends here, and is not resumed
     if isinstance(error, LinkLost):
-        return Ending(f"link lost: {fault_text(error)}", LINK_LOST)
+        return Ending(f"link lost: {text}", LINK_LOST)
     if isinstance(error, SafetyStop):
-        return Ending(f"safety stop: {fault_text(error)}", SAFETY_STOP)
-    return Ending(f"fault: {fault_text(error)}", 1)
+        return Ending(f"safety stop: {text}", SAFETY_STOP)
+    return Ending(f"fault: {text}", 1)
 
 
 def _unless_it_fails(ending: Ending, what: str, end: Callable[[], None]) -> Ending:

@@ -123,6 +123,7 @@ def make_env(
     profile: str | None = None,
     ca_file: str | None = None,
     token_file: str | None = None,
+    timeout: float | None = None,
     **task_options: Any,
 ) -> RobotEnv | RemoteEnv:
     """One robot and its task; what `gymnasium.make` calls.
@@ -138,6 +139,7 @@ def make_env(
         profile: What the live robot's topics are: a shipped name or a file; by default that of the simulated robot.
         ca_file: Certificates that ``wss://`` trusts instead of the system's.
         token_file: File with the token that the server asks for.
+        timeout: Longest that an answer of `transport` is waited for [s]; 30 by default.
         task_options: Arguments of the task.
 
     Raises:
@@ -145,10 +147,11 @@ def make_env(
     """
     _require_one_place(robot, transport, profile, task_options)
     _require_simulation(robot or transport, render_mode, randomize)
+    _require_answers(transport, timeout)
     if transport is not None:
         from bam_envs.remote_env import make_remote_env
 
-        return make_remote_env(env_id, transport, ca_file=ca_file, token_file=token_file)
+        return make_remote_env(env_id, transport, ca_file=ca_file, token_file=token_file, timeout=timeout)
     from bam_envs.robot_env import RobotEnv
 
     entry = ENVIRONMENTS[env_id]
@@ -167,6 +170,11 @@ def _require_simulation(elsewhere: object, render_mode: str | None, randomize: b
     asked = [name for name, given in (("render_mode", render_mode is not None), ("randomize", randomize)) if given]
     if elsewhere is not None and asked:
         raise InvalidValue(f"{', '.join(asked)}: only the simulation here has that, and not {elsewhere}; leave it out.")
+
+
+def _require_answers(transport: object, timeout: float | None) -> None:
+    if transport is None and timeout is not None:
+        raise InvalidValue(f"timeout={timeout!r} is how long an answer of transport= is waited for; leave it out.")
 
 
 def _require_one_place(
@@ -193,6 +201,7 @@ def make_vector_env(
     transport: str | Sequence[str] | None = None,
     ca_file: str | None = None,
     token_file: str | None = None,
+    timeout: float | None = None,
     **task_options: Any,
 ) -> RobotVectorEnv | RemoteVectorEnv:
     """Simulated robots and their task, stepped together; what `gymnasium.make_vec` calls.
@@ -206,12 +215,13 @@ def make_vector_env(
         raise InvalidValue(f"num_envs must be at least 1, not {num_envs}.")
     if robot is not None:
         raise InvalidValue("A live robot is one environment, which nothing may reset unasked; use gymnasium.make.")
+    _require_answers(transport, timeout)
     if transport is not None:
         from bam_envs.remote_env import make_remote_rows
 
         _require_one_place(None, str(transport), None, task_options)
         _require_simulation(transport, render_mode, randomize)
-        return make_remote_rows(env_id, transport, num_envs, ca_file=ca_file, token_file=token_file)
+        return make_remote_rows(env_id, transport, num_envs, ca_file=ca_file, token_file=token_file, timeout=timeout)
     from bam_envs.robot_env import RobotVectorEnv
 
     entry = ENVIRONMENTS[env_id]

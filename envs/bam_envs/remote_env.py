@@ -34,6 +34,7 @@ class RemoteEnv(gym.Env[Any, Any]):
         self.metadata = {"render_modes": []}
         self._there: EnvSpecMessage | None = None
         self._running = False
+        self._steps, self._told = 0, False
 
     def connect(self) -> EnvSpecMessage:
         """What is there.
@@ -85,7 +86,8 @@ class RemoteEnv(gym.Env[Any, Any]):
         """Begin an episode; seed and options are for the other end."""
         super().reset(seed=seed)
         self.connect()
-        self._running = False
+        self._tell_if_cut()
+        self._running, self._steps = False, 0
         observation, info = self.transport.reset(seed, options)
         self._running = True
         return observation, info
@@ -95,8 +97,23 @@ class RemoteEnv(gym.Env[Any, Any]):
         if not self._running:
             raise ResetNeeded("No episode is running: it ended, or never began. Call reset() first.")
         observation, reward, terminated, truncated, info = self.transport.step(action)
-        self._running = not (terminated or truncated)
+        self._running, self._steps = not (terminated or truncated), self._steps + 1
         return observation, reward, terminated, truncated, info
+
+    def _tell_if_cut(self) -> None:
+        """Warn once when the limit of the id here, which `gymnasium.make` puts around this, ended an episode early.
+
+        It is seen only then: whether there is that wrapper, and with which limit, is not known in here.
+        """
+        entry = gym.registry.get(self.spec.id) if self.spec is not None else None
+        if entry is None or self._told or not self._running or self._steps != entry.max_episode_steps:
+            return
+        if self._steps < (self.max_episode_steps or 0):
+            self._told = True
+            gym.logger.warn(
+                f"Episodes of {entry.id} are cut after {self._steps} steps here, and last {self.max_episode_steps} "
+                f"there; for those: gymnasium.make(..., max_episode_steps=-1)."
+            )
 
     def render(self) -> None:
         """Pictures are not carried; observations that are images are."""

@@ -29,8 +29,9 @@ class RemoteVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     """The rows of one or several transports, stepped at the same time.
 
     n rows of one transport are one request. A row whose episode ends starts the next one in the same step
-    (`AutoresetMode.SAME_STEP`), as in `RobotVectorEnv`. It connects when something of the other end is first needed.
-    Faults go through, once every transport has answered; a `reset` is needed then.
+    (`AutoresetMode.SAME_STEP`), as in `RobotVectorEnv`. The arms of a rack that is not ours have one reset: when an
+    episode of one ends, those of its others are truncated. It connects when something of the other end is first
+    needed. Faults go through, once every transport has answered; a `reset` is needed then.
 
     Args:
         transports: One, or several with the same spaces.
@@ -125,7 +126,8 @@ class RemoteVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         """Begin an episode on every row, or on those of ``options["reset_mask"]`` (n,) bool.
 
         Args:
-            seed: Row i is seeded with ``seed + i``, or with ``seed[i]``.
+            seed: Row i is seeded with ``seed + i``, or with ``seed[i]``; a rack that is not ours is told that of its
+                first arm.
             options: ``reset_mask``, and what the other ends take.
         """
         seeds = self._row_seeds(seed)

@@ -4,7 +4,7 @@ import gymnasium as gym
 import pytest
 
 from bam_envs.errors import InvalidValue, UnknownName
-from bam_envs.registry import ENVIRONMENTS, register, resolve, resolve_id
+from bam_envs.registry import ENVIRONMENTS, make_vector_env, register, resolve, resolve_id
 from bam_envs.robot_env import RobotEnv, RobotVectorEnv
 
 
@@ -123,12 +123,26 @@ def test_an_option_that_does_not_exist_is_an_error(make):
             "tolerance: the task runs at ws://b:2; give its options to bam-serve there.",
         ),
         ({"profile": "ur5e"}, "profile='ur5e' describes a live robot; give its address with robot= too."),
+        ({"timeout": 5.0}, "timeout=5.0 is how long an answer of transport= is waited for; leave it out."),
+        (
+            {"robot": "ws://a:1", "timeout": 5.0},
+            "timeout=5.0 is how long an answer of transport= is waited for; leave it out.",
+        ),
     ],
 )
 def test_options_of_different_places_exclude_each_other(options, message):
     with pytest.raises(InvalidValue) as caught:
         gym.make("bam/reach-v0", **options)
     assert str(caught.value) == message
+
+
+def test_how_long_an_environment_elsewhere_is_waited_for():
+    env = gym.make("bam/reach-v0", transport="tcp://a:1", timeout=2.5, disable_env_checker=True)
+    assert env.unwrapped.transport.timeout == 2.5
+    rows = make_vector_env("bam/reach-v0", 2, transport=["tcp://a:1", "ws://b:2"], timeout=2.5)
+    assert [transport.timeout for transport in rows.transports] == [2.5, 2.5]
+    with pytest.raises(InvalidValue, match=r"^timeout=2.5 is how long an answer of transport= is waited for"):
+        make_vector_env("bam/reach-v0", 2, timeout=2.5)
 
 
 @pytest.mark.parametrize("place", [{"robot": "ws://a:1"}, {"transport": "ws://a:1"}])

@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 from bam_envs.errors import InvalidValue, LinkLost, ResetNeeded
@@ -114,6 +115,48 @@ def test_gymnasiums_wrappers_work():
     assert [env.step(np.ones(2, np.float32))[3] for _ in range(3)] == [False, False, True]
     assert env.render() is None
     env.close()
+
+
+@pytest.fixture
+def made_here(monkeypatch):
+    """An environment registered with a limit of 3 steps here; CartPole with its 500 is what runs there."""
+    entry = EnvSpec("Short-v0", lambda: RemoteEnv(LocalTransport(gym.make("CartPole-v1"))), max_episode_steps=3)
+    monkeypatch.setitem(gym.registry, "Short-v0", entry)
+
+    def start(**options):
+        made.append(gym.make("Short-v0", disable_env_checker=True, **options))
+        return made[-1]
+
+    made = []
+    yield start
+    for env in made:
+        env.close()
+
+
+def episode(env):
+    """The steps of one."""
+    env.reset(seed=0)
+    for number in range(1, 10):
+        *_, terminated, truncated, _ = env.step(number % 2)
+        if terminated or truncated:
+            return number
+    return None
+
+
+def test_an_episode_that_the_limit_here_cuts_is_told_once(made_here, recwarn):
+    env = made_here()
+    assert [episode(env), len(recwarn)] == [3, 0]
+    assert [episode(env), episode(env), len(recwarn)] == [3, 3, 1]
+    assert (
+        "Episodes of Short-v0 are cut after 3 steps here, and last 500 there; "
+        "for those: gymnasium.make(..., max_episode_steps=-1)."
+    ) in str(recwarn[0].message)
+
+
+@pytest.mark.parametrize(("limit", "steps"), [(2, 2), (-1, None), (500, None)])
+def test_a_limit_that_was_asked_for_is_not_told(made_here, recwarn, limit, steps):
+    env = made_here(max_episode_steps=limit)
+    assert [episode(env), episode(env), len(recwarn)] == [steps, steps, 0]
 
 
 def test_making_it_of_a_url(make):

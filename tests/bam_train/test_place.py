@@ -41,12 +41,36 @@ def test_addresses(text, found):
             Place(token_file="token"),
             "--token-file is for a link, and the robot is simulated here; give --robot or --transport",
         ),
+        (
+            Place(robot="ws://a:1", ca_file="ca.pem"),
+            "--ca-file says whom wss:// trusts, and ws://a:1 is without TLS; leave it out",
+        ),
+        (
+            Place(transport=("wss://a:1", "tcp://b:2"), ca_file="ca.pem"),
+            "--ca-file says whom wss:// trusts, and tcp://b:2 is without TLS; leave it out",
+        ),
+        (
+            Place(transport=("tcp://a:1", "tcp://b:2", "tcp://a:1/")),
+            "--transport: tcp://a:1 comes twice, and an address is one environment; give it once",
+        ),
+        (
+            Place(robot="ws://a:1", timeout=5.0),
+            "--timeout is how long an answer of --transport is waited for; leave it out",
+        ),
+        (Place(timeout=5.0), "--timeout is how long an answer of --transport is waited for; leave it out"),
+        (Place(transport=("tcp://a:1",), timeout=0.0), "timeout: expected more than 0 s, found 0"),
     ],
 )
 def test_what_excludes_each_other_is_refused(place, message):
     with pytest.raises(SettingsError) as caught:
         place.require_sane()
     assert str(caught.value) == message
+
+
+def test_what_a_transport_is_opened_with():
+    place = Place(transport=("wss://a:1", "wss://b:2"), ca_file="ca.pem", timeout=2.5)
+    place.require_sane()
+    assert place.link_options == {"ca_file": "ca.pem", "token_file": None, "timeout": 2.5}
 
 
 def test_a_live_robot_is_as_it_is():

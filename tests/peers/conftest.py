@@ -101,11 +101,14 @@ def ros2(
 
 
 class Peer:
-    """A process of the test: its output as lines, questions to its standard input, an end by its id."""
+    """A process of the test: its output as lines, questions to its standard input, an end by its id.
+
+    It ends with the thread that started it too, so that nothing is left of a test run that is killed.
+    """
 
     def __init__(self, command: list[str | Path], env: dict[str, str], cwd: Path | None = None) -> None:
         self.process = subprocess.Popen(
-            [str(part) for part in command],
+            ["setpriv", "--pdeathsig", "TERM", "--", *map(str, command)],
             env=env,
             cwd=cwd,
             text=True,

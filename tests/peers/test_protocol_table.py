@@ -14,7 +14,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 BIG = 12_000_000
-BEYOND = 70_000_000
+BEYOND = 17_000_000
 LIMIT = 5.0
 
 

@@ -160,18 +160,35 @@ def _require_unicode(value: str) -> None:
 def number_array_check(kind: str, one: Check, size: int | None) -> Check:
     """Check of a list of numbers of the type `kind`; `one` checks an item, `size` is the length if it is fixed."""
     low, high = INTEGERS.get(kind) or (-FLOATS[kind], FLOATS[kind])
-    number = int if kind in INTEGERS else float
+    any_fits = kind == "float64"
+    usual = _integers if kind in INTEGERS else _floats
 
     def check(value: Any, depth: int) -> list[Any]:
         values = zeros(value, size)
-        usual = isinstance(values, list) and bool(values) and set(map(type, values)) == {number}
-        # A finite sum has finite terms: a few passes in C instead of one in Python.
-        if usual and (size is None or len(values) == size) and (number is int or math.isfinite(sum(values))):
-            first, last = min(values), max(values)
-            return list(values) if low <= first and last <= high else array_check(values, depth, one, size)
+        # A few passes in C instead of one in Python, which would hold up everybody for the time of a large list.
+        numbers = usual(values) if isinstance(values, list) and size in (None, len(values)) else None
+        if numbers and (any_fits or (low <= min(numbers) and max(numbers) <= high)):
+            return numbers
         return array_check(values, depth, one, size)
 
     return check
+
+
+def _integers(values: list[Any]) -> list[int] | None:
+    """A copy of `values` if all of them are integers."""
+    return values[:] if set(map(type, values)) == {int} else None
+
+
+def _floats(values: list[Any]) -> list[float] | None:
+    """`values` as floats if all of them are finite floats or integers."""
+    kinds = set(map(type, values))
+    if not kinds <= {float, int}:
+        return None
+    try:
+        floats = values[:] if int not in kinds else list(map(float, values))
+    except OverflowError:
+        return None
+    return floats if math.isfinite(sum(floats)) else None  # a finite sum has finite terms
 
 
 def string_array_check(size: int | None) -> Check:
@@ -215,7 +232,7 @@ def _bytes(value: Any) -> bytes:
     try:
         if isinstance(value, str):
             return base64.b64decode(value, validate=True)
-        if isinstance(value, (list, tuple)) and all(type(item) is int for item in value):
+        if isinstance(value, (list, tuple)) and set(map(type, value)) <= {int}:
             return bytes(value)
     except (binascii.Error, ValueError):
         pass
@@ -268,7 +285,10 @@ def _plain_item(step: str, item: Any, depth: int, *, null: bool) -> None:
 
 
 def _plain_list(values: Any, depth: int, *, null: bool) -> None:
-    if set(map(type, values)) <= {float} and math.isfinite(sum(values)):
+    kinds = set(map(type, values))
+    if kinds <= {float} and math.isfinite(sum(values)):
+        return
+    if kinds == {int} and min(values) >= -(2**63) and max(values) < 2**64:
         return
     for place, item in enumerate(values):
         _plain_item(f"[{place}]", item, depth, null=null)

@@ -20,6 +20,10 @@ from bam_envs.errors import InvalidValue, ProtocolError
 
 COMPRESSIONS = ("none", "png", "cbor")
 """How a message may be packed for a subscriber."""
+LONGEST_ID = 256
+"""Most characters of an id: it is kept, and said again, for as long as what it names is unfinished."""
+LARGEST_ID = 2**53
+"""Largest id that is a number: what every JSON reader holds exactly."""
 _MOST_FRAGMENTS = 10_000
 """Of one outgoing message: a smaller fragment size would cost more than it carries."""
 
@@ -120,9 +124,7 @@ class Fragments:
         Raises:
             ProtocolError: It does not fit; what there was of its message is given up.
         """
-        name = message.get("id")
-        if isinstance(name, bool) or not isinstance(name, (str, int)):
-            raise ProtocolError(f"fragment.id: expected a text, found {describe(name)}.")
+        name = _fragment_id(message.get("id"))
         try:
             return self._add(name, message, now)
         except ProtocolError:
@@ -163,6 +165,16 @@ class Fragments:
         used = sum(parts.size + 100 * len(parts.texts) for parts in self._unfinished.values())
         if used > self.max_size:
             raise ProtocolError(f"Fragments: expected at most {self.max_size} characters, found {used}.")
+
+
+def _fragment_id(name: object) -> str | int:
+    if isinstance(name, bool) or not isinstance(name, (str, int)):
+        raise ProtocolError(f"fragment.id: expected a text, found {describe(name)}.")
+    if isinstance(name, str) and len(name) > LONGEST_ID:
+        raise ProtocolError(f"fragment.id: expected at most {LONGEST_ID} characters, found {len(name)}.")
+    if isinstance(name, int) and abs(name) > LARGEST_ID:
+        raise ProtocolError(f"fragment.id: expected an integer of 53 bits, found {describe(name)}.")
+    return name
 
 
 def _count(message: Mapping[str, Any], name: str) -> int:

@@ -39,6 +39,7 @@ from bam_envs.errors import InvalidValue
 __all__ = [
     "Field",
     "complete",
+    "complete_known",
     "default",
     "describe",
     "is_known",
@@ -117,6 +118,29 @@ def complete(kind: str, message: object) -> dict[str, Any]:
         place = f"{name}.{misfit.path.removeprefix('.')}" if misfit.path else name
         raise InvalidValue(f"{place}: expected {misfit.expected}, found {misfit.found}.") from None
     return checked
+
+
+def complete_known(kind: str, message: object) -> dict[str, Any]:
+    """The same, and fields that the type does not have are ignored: they may be of a newer version of it.
+
+    Raises:
+        InvalidValue: A field that the type has does not fit.
+    """
+    try:
+        return complete(kind, message)
+    except InvalidValue:  # perhaps only because of a field too many
+        return complete(kind, _known_fields(kind, message))
+
+
+def _known_fields(kind: str, value: Any) -> Any:
+    """A message, or a list of them, without the fields that `kind` does not have."""
+    if isinstance(value, (list, tuple)):
+        return [_known_fields(kind, one) for one in value]
+    spellings = variants(kind)
+    if not spellings or not isinstance(value, Mapping):
+        return value
+    fields = max(spellings, key=lambda one: len({field.name for field in one} & value.keys()))
+    return {field.name: _known_fields(field.type, value[field.name]) for field in fields if field.name in value}
 
 
 def default(kind: str) -> dict[str, Any]:

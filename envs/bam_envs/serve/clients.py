@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import hashlib
 import threading
 from collections import Counter
 
 from bam_envs.bridge.bus import Caller
 from bam_envs.errors import RemoteError
 
+_NAMELESS = "a sender without a name"
 _MOST_SESSIONS = 64
 """Of one connection: each is remembered until that ends."""
+
+
+def shown(caller: Caller, session: str | None) -> str:
+    """What the others are told of who sends for `session` through `caller`: never the session, which is a key to it."""
+    if caller.address or caller.name or session is None:
+        return caller.address or caller.name or _NAMELESS
+    return f"{_NAMELESS} (#{hashlib.sha256(session.encode()).hexdigest()[:6]})"
 
 
 class Clients:
@@ -26,8 +35,7 @@ class Clients:
         Raises:
             RemoteError: It said too many sessions.
         """
-        nameless = caller.address or caller.name or "a sender without a name"
-        name = nameless if session is None else f"session {session}"
+        name = shown(caller, None) if session is None else f"session {session}"
         if caller.name:  # else nobody says when it leaves
             with self._lock:
                 self._remember(name, caller.name)

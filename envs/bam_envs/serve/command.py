@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from bam_envs.errors import NotInCommand
 
 Change = Callable[[str | None, str | None], None]
-"""Called with who was in command and who is; None is nobody."""
+"""Called with who was in command and who is, as others are told; None is nobody."""
 
 
 class CommandLease:
@@ -28,6 +28,7 @@ class CommandLease:
         self.seconds = seconds
         self._clock, self._lock = clock, threading.Lock()
         self._holder: str | None = None
+        self._shown: str | None = None  # what the holder is called where others read it
         self._heard = 0.0
         self._running = 0
         self._listeners: list[Change] = []
@@ -41,23 +42,26 @@ class CommandLease:
         """Call `listener` whenever command changes, in the thread that changes it, which holds no lock of this."""
         self._listeners.append(listener)
 
-    def take(self, client: str, *, force: bool = False) -> bool:
+    def take(self, client: str, *, force: bool = False, shown: str | None = None) -> bool:
         """Put `client` in command; whether it was not before.
 
         Args:
-            client: Its name, which the others are told.
+            client: Its name.
             force: Take it from whoever has it.
+            shown: What the others are told instead of its name, where that is a secret.
 
         Raises:
             NotInCommand: Another client has it, and was heard of within `seconds`.
         """
         with self._lock:
-            before = self._holder
-            if before not in (None, client) and not force and not self._lapsed():
-                raise NotInCommand(self._refusal(client))
-            self._holder, self._heard = client, self._clock()
-            self._running = self._running if before == client else 0
-        return self._told(before, client)
+            if self._holder not in (None, client) and not force and not self._lapsed():
+                raise NotInCommand(self._refusal(shown or client))
+            self._heard = self._clock()
+            if self._holder == client:
+                return False
+            before, self._shown = self._shown, shown or client
+            self._holder, self._running = client, 0
+        return self._told(before, shown or client)
 
     def require(self, client: str) -> None:
         """Take note that `client` was heard of.
@@ -91,8 +95,9 @@ class CommandLease:
         with self._lock:
             if self._holder != client:
                 return False
+            before, self._shown = self._shown, None
             self._holder, self._running = None, 0
-        return self._told(client, None)
+        return self._told(before, None)
 
     def _lapsed(self) -> bool:
         return not self._running and self._clock() - self._heard > self.seconds
@@ -101,13 +106,11 @@ class CommandLease:
         if self._holder is None:
             return f"Nobody is in command, {client} neither; reset() takes command."
         return (
-            f"{self._holder} is in command, not {client}; it passes on when {self._holder} leaves or is silent for "
+            f"{self._shown} is in command, not {client}; it passes on when {self._shown} leaves or is silent for "
             f"{self.seconds:g} s."
         )
 
     def _told(self, before: str | None, after: str | None) -> bool:
-        if before == after:
-            return False
         for listener in self._listeners:
             listener(before, after)
         return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import re
 from dataclasses import dataclass
 
@@ -53,6 +54,10 @@ class ServeOptions:
         for one, other in pairs:
             if getattr(self, one) and getattr(self, other):
                 raise InvalidValue(f"--{one} and --{other} exclude each other; give one of the two.")
+        if self.cert and self.tcp is not None:
+            raise InvalidValue(
+                "--tcp carries everything in the clear, and --cert does not change that; leave one of the two out."
+            )
         for flag, value, needed in (("key", self.key, "cert"), ("ca-file", self.ca_file, "via")):
             if value and not getattr(self, needed):
                 raise InvalidValue(f"--{flag} means something only with --{needed}.")
@@ -67,7 +72,23 @@ class ServeOptions:
             raise InvalidValue(f"--namespace must be letters, digits and _, such as bam_001, not {self.namespace!r}.")
 
     @property
+    def warning(self) -> str | None:
+        """What people should know of where it listens, in one line; None if there is nothing."""
+        listens = self.tcp is not None or not (self.via or self.rclpy)
+        if not listens or self.token_file is not None or _is_loopback(self.bind):
+            return None
+        where = self.bind or "every address of this computer"
+        return f"Anybody who reaches {where} may command what is served here: give --token-file, or --bind 127.0.0.1."
+
+    @property
     def prefix(self) -> str:
         """What stands before every name: ``/bam_001``, or nothing."""
         stripped = self.namespace.strip("/")
         return f"/{stripped}" if stripped else ""
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:  # a name: only this one is sure to stay on this computer
+        return host == "localhost"

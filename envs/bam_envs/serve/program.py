@@ -14,6 +14,7 @@ from bam_envs.errors import InvalidValue, LinkLost, RemoteError
 from bam_envs.robots.profiles.profile import profile_for
 from bam_envs.robots.profiles.tables import RobotProfile
 from bam_envs.robots.safety.safe import SafeRobot
+from bam_envs.robots.wire.codec import INFO_SERVICE
 from bam_envs.serve.command import CommandLease
 from bam_envs.serve.describe import Env
 from bam_envs.serve.env_server import EnvServer
@@ -25,6 +26,9 @@ from bam_envs.serve.served_robot import ServedRobot
 from bam_envs.serve.tcp_server import TcpServer
 from bam_envs.tokens import read_token
 from bam_envs.transports.gymapi.requests import service_name
+
+_LOOK = 3.0
+"""How long a robot that may be there already may take to answer [s]."""
 
 
 class ServedEnvironment:
@@ -86,8 +90,11 @@ class ServedEnvironment:
         server = EnvServer(self.env, lease=self.lease, realtime=realtime and robot is None)
         started.callback(server.close)
         self.lease.on_change(self._say_command)
+        if self.options.warning is not None:
+            self._tell(self.options.warning)
         self.bus = bus = self._open_bus(started)
         if robot is not None and profile is not None:
+            self._require_own_names(bus)
             self._robot_service = RobotService(robot, profile, bus, self.lease, namespace=self.prefix)
             started.callback(self._robot_service.close)
             self._robot_service.start()
@@ -125,6 +132,20 @@ class ServedEnvironment:
         server = BridgeServer(options.bind, options.port, cert=options.cert, key=options.key, token=self._token)
         started.callback(server.close)
         return server.start()
+
+    def _require_own_names(self, bus: Bus) -> None:
+        """Two robots under the same names would both do what a client tells one of them."""
+        if not isinstance(bus, RosbridgeLink):
+            return
+        service = self.prefix + INFO_SERVICE
+        try:
+            bus.call(service, "", {}, _LOOK)
+        except RemoteError:  # there is none
+            return
+        raise InvalidValue(
+            f"{self.options.via}: {service} answers there already, so another robot has these names. "
+            "Give this one names of its own: --namespace NAME."
+        )
 
     def _where(self, bus: Bus) -> str:
         if isinstance(bus, RclpyBus):

@@ -3,6 +3,9 @@
 Commands are checked where they arrive, in the thread of the network, and what is refused is told to who sent it. What
 passes goes into one slot; the clock's thread takes it from there, moves the robot and publishes. In lockstep a robot
 that is quick enough is moved where its command arrives: the way to another thread and back costs more than its step.
+
+The file is long because everything that moves the robot, or keeps it from moving, is in it: that a halt wins over each
+of them is to be seen here.
 """
 
 from __future__ import annotations
@@ -29,7 +32,7 @@ from bam_envs.robots.wire.codec import (
     encode_state,
 )
 from bam_envs.robots.wire.messages import numbers, write_stamp
-from bam_envs.serve.clients import Clients
+from bam_envs.serve.clients import Clients, shown
 from bam_envs.serve.clock import Clock
 from bam_envs.serve.command import CommandLease
 from bam_envs.serve.command_slot import CommandSlot, Order
@@ -80,6 +83,7 @@ class RobotService:
         self._low, self._high = np.array(robot.spec.command.low), np.array(robot.spec.command.high)
         self._answered = ""  # text of the tag of the last command that was executed
         self._connected = True
+        self._moving = threading.Lock()  # an order that was taken is begun before a halt, or not at all
         self._ticking, self._took = threading.Lock(), math.inf  # how long the last period took to compute [s]
         self._unsubscribe: list[Callable[[], None]] = []
         self._scene = StringRpcService(bus, namespace + SCENE_TOPIC, self._set_scene) if simulated else None
@@ -123,14 +127,18 @@ class RobotService:
             self._require_sound()
             if tag is not None:
                 self._fresh.require(tag, topic)
-            client = self._clients.name(caller, None if tag is None else tag.session)
-            self._lease.take(client)
+            client = self._take_command(caller, None if tag is None else tag.session)
             text, complete = "" if tag is None else tag.to_text(), topic in self._completing
             self._slot.put(client, places, told, complete=complete, tag=text)
             if complete and self.info.lockstep:
                 self._go_on()
 
         return listen
+
+    def _take_command(self, caller: Caller, session: str | None) -> str:
+        client = self._clients.name(caller, session)
+        self._lease.take(client, shown=shown(caller, session))
+        return client
 
     def _require_within(self, topic: str, places: list[int], values: list[float]) -> None:
         """Every number is one that the robot can be told at all; how fast it goes there is its own affair."""
@@ -147,8 +155,12 @@ class RobotService:
 
     def _on_halt(self, message: Message, caller: Caller) -> None:
         """Anybody may halt; it waits for nothing but the part of a period that is being computed."""
-        self._slot.clear()
-        self._robot.halt()
+        self._rest()
+
+    def _rest(self) -> None:
+        with self._moving:
+            self._slot.clear()
+            self._robot.halt()
 
     def _on_leave(self, caller: Caller) -> None:
         for client in self._clients.left(caller):
@@ -156,9 +168,8 @@ class RobotService:
 
     def _on_change(self, before: str | None, after: str | None) -> None:
         if before is not None:  # what it sent is not to go on under another one
-            self._slot.clear()
+            self._rest()
             self._answered = ""
-            self._robot.halt()
 
     def _say_who(self, request: Message, caller: Caller) -> Message:
         return {"success": True, "message": self.info.to_json()}
@@ -168,16 +179,17 @@ class RobotService:
         if session is not None and not isinstance(session, str):
             raise ProtocolError(f"session must be text, not {session!r}.")
         pose, seeds = _pose(request.get("object_pose")), _seeds(request.get("seeds"))
-        self._lease.take(self._clients.name(caller, session))
+        self._take_command(caller, session)
         self._robot.place_object(pose, seeds)
         return {}
 
     def _tick(self) -> None:
         """Real time: one part of a period."""
-        order = self._slot.take()
-        if order is not None and order.client == self._lease.holder:  # it may have changed since
-            self._robot.follow(self._merged(order), at_once=order.complete)
-            self._answered = order.tag
+        with self._moving:
+            order = self._slot.take()
+            if order is not None and order.client == self._lease.holder:  # it may have changed since
+                self._robot.follow(self._merged(order), at_once=order.complete)
+                self._answered = order.tag
         self._robot.tick()
         self._publish()
 
@@ -197,16 +209,20 @@ class RobotService:
 
     def _pass_period(self) -> None:
         """A whole period, if a command is there; else the state that has not changed."""
-        order = self._slot.take_complete()
-        if order is not None and order.client == self._lease.holder:
-            began = time.perf_counter()
-            try:
-                self._robot.step(self._merged(order))
-                self._answered = order.tag
-            except RobotFault as fault:
-                _log.warning("%s: %s", self._profile.name, fault)
-            self._took = time.perf_counter() - began
+        with self._moving:
+            order = self._slot.take_complete()
+            if order is not None and order.client == self._lease.holder:
+                self._execute(order)
         self._publish()
+
+    def _execute(self, order: Order) -> None:
+        began = time.perf_counter()
+        try:
+            self._robot.step(self._merged(order))
+            self._answered = order.tag
+        except RobotFault as fault:
+            _log.warning("%s: %s", self._profile.name, fault)
+        self._took = time.perf_counter() - began
 
     def _merged(self, order: Order) -> Any:
         command = self._robot.target()

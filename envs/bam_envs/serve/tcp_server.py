@@ -148,7 +148,8 @@ class TcpServer:
         """
         shown = hello.token.encode(errors="surrogatepass")  # a stranger may send anything
         if self.token is not None and not hmac.compare_digest(shown, self.token.encode()):
-            raise RemoteError("The token is wrong; give the one that the server was started with.")
+            what = "wrong" if hello.token else "missing"
+            raise RemoteError(f"The token is {what}; give the one that the server was started with (--token-file).")
         self.server.require_name(hello.env_id)
         with self._lock:
             older = [one for one in self._connections if one is not connection and one.session == hello.session]

@@ -24,7 +24,7 @@ class ForeignRack:
     action_space: Space[Any] | None = None
     """Of one row."""
     num_envs: int = 1
-    """Rows (arms)."""
+    """Rows (arms); they begin their episodes together."""
     period: float | None = None
     """Time between two actions [s]; None if nobody knows."""
     action_type: int = DEFAULT
@@ -49,8 +49,9 @@ class ForeignRack:
         if observation_space is None or action_space is None:
             observation_space, action_space = _registered_spaces(env_id)
         vector = self.num_envs > 1
+        name = env_id or "rack"
         spec = EnvSpecMessage(
-            env_id or "rack", observation_space, action_space, self.num_envs, vector=vector, period=self.period
+            name, observation_space, action_space, self.num_envs, vector=vector, autoreset=False, period=self.period
         )
         return EnvCodec(spec, foreign=True, action_type=self.action_type)
 

@@ -7,6 +7,7 @@ import inspect
 from collections.abc import Mapping
 from typing import Any
 
+from bam_envs.bridge.link.addresses import require_tls
 from bam_envs.errors import InvalidValue, UnknownName
 from bam_envs.tokens import read_token
 from bam_envs.transports.transport import Transport
@@ -21,7 +22,13 @@ _CLASSES = {
 
 
 def open_transport(
-    url: str, *, env_id: str = "", ca_file: str | None = None, token_file: str | None = None, **options: Any
+    url: str,
+    *,
+    env_id: str = "",
+    ca_file: str | None = None,
+    token_file: str | None = None,
+    timeout: float | None = None,
+    **options: Any,
 ) -> Transport:
     """The transport of `url`, not connected yet.
 
@@ -39,7 +46,8 @@ def open_transport(
         env_id: Which environment is wanted; "" for the one that is there.
         ca_file: Certificates that the server's is checked against, with wss://.
         token_file: A file that holds the server's secret.
-        options: Other keywords of the transport's class, such as ``timeout``.
+        timeout: Longest that an answer is waited for [s]; None for the default of the transport's class.
+        options: Other keywords of that class, such as ``connect_timeout``.
 
     Raises:
         InvalidValue: The URL has another scheme, the transport has no such option, or the file cannot be read.
@@ -49,8 +57,10 @@ def open_transport(
         raise InvalidValue(f"A transport is a URL such as tcp://10.0.0.5:5555 or ws://10.0.0.5:9090, not {url!r}.")
     if scheme not in _CLASSES:
         raise InvalidValue(f"{url}: {UnknownName('transport', scheme, _CLASSES)} It must be one of {_schemes()}.")
-    if ca_file is not None:
-        options = {**options, "ca_file": ca_file}
+    require_tls(url, ca_file)
+    for name, value in (("ca_file", ca_file), ("timeout", timeout)):
+        if value is not None:
+            options = {**options, name: value}
     if token_file is not None:
         options = {**options, "token": read_token(token_file)}
     module, _, name = _CLASSES[scheme].partition(":")
@@ -62,7 +72,10 @@ def open_transport(
 
 def _require_options(url: str, make: type[Transport], options: Mapping[str, Any]) -> None:
     """Each option is one of the transport's."""
-    known = [name for name in inspect.signature(make).parameters if name not in ("url", "env_id")]
+    # A class that hands options on to its parent takes those of the parent.
+    signatures = [inspect.signature(kind) for kind in make.__mro__ if "__init__" in vars(kind) and kind is not object]
+    names = dict.fromkeys(name for signature in signatures for name in signature.parameters)
+    known = [name for name in names if name not in ("url", "env_id", "options")]
     for name in options:
         if name not in known:
             raise InvalidValue(f"{url} takes no {name}; its options are {', '.join(known)}.")

@@ -24,7 +24,9 @@ class EnvSpecMessage:
     num_envs: int = 1
     """Rows stepped together."""
     vector: bool = False
-    """Whether it is a vector environment there: rows that end begin anew in the same step (SAME_STEP)."""
+    """Whether values have one row for each environment."""
+    autoreset: bool = True
+    """With `vector`, whether rows that end begin anew in the same step (SAME_STEP); always so on our own servers."""
     period: float | None = None
     """Time between two actions [s]; None if it does not say."""
     max_episode_steps: int | None = None
@@ -39,7 +41,7 @@ class Transport(Protocol):
 
     With ``spec.vector`` every value has one row for each environment: observations and actions are lists of rows,
     reward, terminated and truncated lists of numbers, and info is a list of dicts, in which a row that began anew has
-    ``final_obs`` and ``final_info``.
+    ``final_obs`` and ``final_info``. Without ``spec.autoreset`` none does: then `reset` begins all rows together.
     """
 
     def connect(self) -> EnvSpecMessage:

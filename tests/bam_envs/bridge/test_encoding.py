@@ -133,6 +133,8 @@ GOOD = {"id": "a", "data": "x", "num": 0, "total": 2}
     ("change", "text"),
     [
         ({"id": None}, "fragment.id: expected a text, found null."),
+        ({"id": "x" * 257}, "fragment.id: expected at most 256 characters, found 257."),
+        ({"id": 2**53 + 1}, "fragment.id: expected an integer of 53 bits, found 9007199254740993."),
         ({"data": 3}, "fragment.data: expected a text, found 3."),
         ({"num": -1}, "fragment.num: expected a number >= 0, found -1."),
         ({"num": "1"}, "fragment.num: expected a number >= 0, found '1'."),

@@ -6,6 +6,7 @@ import pytest
 from bam_envs.bridge.definitions import DEFINITIONS
 from bam_envs.bridge.interfaces import (
     complete,
+    complete_known,
     default,
     describe,
     is_known,
@@ -98,7 +99,29 @@ def test_the_message_that_came_is_not_changed():
     assert all(type(value) is float for value in checked["data"])
 
 
+@pytest.mark.parametrize("data", [[1, 2], [1, 2.5], [2.5, 1], [2**64, 0.5], [-0.0]])
+def test_integers_where_floats_are_expected_become_floats(data):
+    checked = complete("std_msgs/Float64MultiArray", {"data": data})["data"]
+    assert checked == data
+    assert {type(value) for value in checked} == {float}
+
+
+def test_fields_that_a_type_does_not_have_can_be_ignored():
+    kind = "bam_msgs/GymAPIRequest"
+    message = {"seed": 3, "newer": None, "header": {"newer": 1}, "action": [{"continuous_action": [1], "newer": []}]}
+    plain = {"seed": 3, "header": {}, "action": [{"continuous_action": [1]}]}
+    assert complete_known(kind, message) == complete(kind, plain)
+    with pytest.raises(InvalidValue) as caught:
+        complete_known(kind, {"seed": "3", "newer": 1})
+    assert str(caught.value) == "bam_msgs/GymAPIRequest.seed: expected an integer (int64), found '3'."
+
+
+def test_bytes_as_a_list_of_integers():
+    assert complete("std_msgs/UInt8MultiArray", {"data": [0, 255]})["data"] == b"\x00\xff"
+
+
 ARRAY, TWIST = "std_msgs/Float64MultiArray", "geometry_msgs/Twist"
+BASE64 = ".data: expected bytes as base64 or a list of integers in [0, 255], found a list of 1."
 EXPECTED = [
     (ARRAY, {"data": [1, math.nan]}, ".data[1]: expected a finite number, found NaN."),
     (ARRAY, {"data": [1.0, math.nan]}, ".data[1]: expected a finite number, found NaN."),
@@ -112,6 +135,17 @@ EXPECTED = [
     (ARRAY, {"data": np.zeros(2)}, ".data: expected a list, found a ndarray."),
     (ARRAY, {"data": [np.int64(1)]}, ".data[0]: expected a number, found a int64."),
     (ARRAY, {"data": [10**400]}, ".data[0]: expected a finite number, found a huge integer."),
+    (ARRAY, {"data": [0.5, 10**400]}, ".data[1]: expected a finite number, found a huge integer."),
+    (ARRAY, {"data": [1, -(10**400), 10**400]}, ".data[1]: expected a finite number, found a huge integer."),
+    (ARRAY, {"data": [1, 2.5, True]}, ".data[2]: expected a number, found true."),
+    (ARRAY, {"data": [math.inf, 1, -math.inf]}, ".data[0]: expected a finite number, found Infinity."),
+    (
+        "std_msgs/Float32MultiArray",
+        {"data": [0, 2**128]},
+        ".data[1]: expected a finite number of 32 bits, found a huge integer.",
+    ),
+    ("std_msgs/UInt8MultiArray", {"data": [True]}, BASE64),
+    ("std_msgs/UInt8MultiArray", {"data": [256]}, BASE64),
     (ARRAY, {"datas": []}, ": expected only the fields layout, data, found 'datas'."),
     (ARRAY, [], ": expected an object, found a list of 0."),
     (ARRAY, None, ": expected an object, found null."),
@@ -149,6 +183,8 @@ EXPECTED = [
     ("my_msgs/Thing", {"a": [{"b": None}]}, ".a[0].b: expected a plain value, found null."),
     ("my_msgs/Thing", {"a": math.nan}, ".a: expected a finite number, found NaN."),
     ("my_msgs/Thing", {"a": 2**64}, ".a: expected a number of 64 bits, found 18446744073709551616."),
+    ("my_msgs/Thing", {"a": [1, 2**64]}, ".a[1]: expected a number of 64 bits, found 18446744073709551616."),
+    ("my_msgs/Thing", {"a": [-(2**63) - 1]}, ".a[0]: expected a number of 64 bits, found -9223372036854775809."),
     ("my_msgs/Thing", {"a": object()}, ".a: expected a plain value, found a object."),
     ("my_msgs/Thing", {1: 2}, ": expected texts as names, found 1."),
 ]

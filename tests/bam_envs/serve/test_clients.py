@@ -2,7 +2,7 @@ import pytest
 
 from bam_envs.bridge.bus import UNKNOWN_CALLER, Caller
 from bam_envs.errors import RemoteError
-from bam_envs.serve.clients import Clients
+from bam_envs.serve.clients import Clients, shown
 
 A, B = Caller("client1", "127.0.0.1:1"), Caller("client2")
 
@@ -14,6 +14,14 @@ def test_names():
     assert clients.name(A, "4f1c") == "session 4f1c"
     assert clients.name(UNKNOWN_CALLER, "4f1c") == "session 4f1c"
     assert clients.name(UNKNOWN_CALLER, None) == "a sender without a name"
+
+
+def test_what_others_are_told_is_no_session():
+    assert shown(A, "4f1c") == shown(A, None) == "127.0.0.1:1"
+    assert shown(B, "4f1c") == "client2"
+    assert shown(UNKNOWN_CALLER, None) == "a sender without a name"
+    assert shown(UNKNOWN_CALLER, "4f1c") == "a sender without a name (#cfb7ec)"
+    assert shown(UNKNOWN_CALLER, "4f1d") != shown(UNKNOWN_CALLER, "4f1c")
 
 
 def test_a_client_has_left_with_its_last_connection():

@@ -85,6 +85,22 @@ def test_it_can_be_taken_by_force_even_from_a_busy_client(lease, now):
     assert lease.take("ann") is True
 
 
+def test_the_others_are_told_what_a_client_is_called_and_not_its_secret(lease):
+    told = []
+    lease.on_change(lambda before, after: told.append((before, after)))
+    lease.take("session 4f1c", shown="10.0.0.2:51444")
+    for refused in (lambda: lease.take("session 77aa", shown="10.0.0.3:1"), lambda: lease.require("10.0.0.3:1")):
+        with pytest.raises(NotInCommand) as caught:
+            refused()
+        assert str(caught.value) == (
+            "10.0.0.2:51444 is in command, not 10.0.0.3:1; it passes on when 10.0.0.2:51444 leaves or is silent for "
+            "5 s."
+        )
+    assert lease.holder == "session 4f1c"
+    lease.release("session 4f1c")
+    assert told == [(None, "10.0.0.2:51444"), ("10.0.0.2:51444", None)]
+
+
 def test_changes_are_told(lease, now):
     told = []
     lease.on_change(lambda before, after: told.append((before, after)))

@@ -83,6 +83,13 @@ def test_a_plain_client_on_the_wire(rack):
     assert env.given == [(3, None)]
 
 
+def test_fields_of_a_newer_version_are_ignored(rack):
+    with plain_client(rack[0]) as call:
+        assert call(RESET, env_name="Pick", seed=3, newer=[{"a": None}])["header"]["error_code"] == {"value": 1}
+        action = [{"continuous_action": [0.25, 0.5], "newer": 1}]
+        assert call(STEP, env_name="Pick", action=action)["feedback"][0]["observation"] == [0.25, 0.5]
+
+
 def test_two_plain_clients_with_one_name(rack):
     url, _ = rack
     with plain_client(url) as one, plain_client(url) as two:

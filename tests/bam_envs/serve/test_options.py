@@ -19,6 +19,10 @@ def test_a_token_of_the_tcp_port_beside_a_ros_2_node():
         ({"via": "ws://a", "rclpy": True}, "--via and --rclpy exclude each other; give one of the two."),
         ({"via": "ws://a", "cert": "c"}, "--via and --cert exclude each other; give one of the two."),
         ({"rclpy": True, "cert": "c"}, "--rclpy and --cert exclude each other; give one of the two."),
+        (
+            {"cert": "c", "tcp": 0},
+            "--tcp carries everything in the clear, and --cert does not change that; leave one of the two out.",
+        ),
         ({"key": "k"}, "--key means something only with --cert."),
         ({"ca_file": "k"}, "--ca-file means something only with --via."),
         (
@@ -37,6 +41,30 @@ def test_what_cannot_be(options, text):
     with pytest.raises(InvalidValue) as error:
         ServeOptions(**options).require_sane()
     assert str(error.value) == text
+
+
+OPEN = "Anybody who reaches {} may command what is served here: give --token-file, or --bind 127.0.0.1."
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({}, None),
+        ({"bind": "127.0.0.5"}, None),
+        ({"bind": "::1"}, None),
+        ({"bind": "localhost", "tcp": 0}, None),
+        ({"bind": "0.0.0.0"}, OPEN.format("0.0.0.0")),
+        ({"bind": "::"}, OPEN.format("::")),
+        ({"bind": ""}, OPEN.format("every address of this computer")),
+        ({"bind": "robot.lab"}, OPEN.format("robot.lab")),
+        ({"bind": "0.0.0.0", "token_file": "t"}, None),
+        ({"bind": "0.0.0.0", "via": "ws://a"}, None),
+        ({"bind": "0.0.0.0", "rclpy": True}, None),
+        ({"bind": "0.0.0.0", "rclpy": True, "tcp": 0}, OPEN.format("0.0.0.0")),
+    ],
+)
+def test_what_stands_open_is_said(options, text):
+    assert ServeOptions(**options).warning == text
 
 
 @pytest.mark.parametrize(("name", "prefix"), [("", ""), ("/", ""), ("a", "/a"), ("/a/b_1/", "/a/b_1")])

@@ -234,6 +234,26 @@ def test_through_somebody_elses_server(serve, link, transport):
     assert any("It is tried again until it is back; the robot rests meanwhile." in line for line in served.lines)
 
 
+def test_a_robot_that_is_there_already_is_not_doubled(serve):
+    with BridgeServer(port=0) as theirs:
+        serve(fast=True, via=theirs.url)
+        env = gym.make("bam/pick-v0", disable_env_checker=True)
+        with pytest.raises(InvalidValue) as caught:
+            serve(env=env, fast=True, via=theirs.url)
+        assert str(caught.value) == (
+            f"{theirs.url}: /bam/robot answers there already, so another robot has these names. "
+            "Give this one names of its own: --namespace NAME."
+        )
+        serve(fast=True, via=theirs.url, namespace="cell_2")
+        with pytest.raises(InvalidValue, match="/cell_2/bam/robot answers there already"):
+            serve(fast=True, via=theirs.url, namespace="cell_2")
+
+
+def test_what_stands_open_is_told(serve, monkeypatch):
+    monkeypatch.setattr(ServeOptions, "warning", "it stands open")
+    assert serve("CartPole-v1").lines == ["it stands open"]
+
+
 def test_nobody_at_the_address_of_the_other_server(serve):
     env = Timeless()
     with pytest.raises(NoServer, match=r"^ws://127\.0\.0\.1:1: refused"):

@@ -249,6 +249,15 @@ def test_a_session_is_one_client_on_both_of_its_connections(serve, bus, tagger):
     assert service.lease.holder is None
 
 
+def test_a_refusal_does_not_tell_the_session_of_who_is_in_command(serve, bus, tagger):
+    service = serve()
+    assert service.send(command(0.01), tagger.next(1, 0.1), "a") is None
+    assert service.send(command(0.02), caller="b") == (
+        "NotInCommand: a:1 is in command, not b:1; it passes on when a:1 leaves or is silent for 5 s."
+    )
+    assert tagger.session not in scene(bus, {}, "b")["error"]
+
+
 def test_what_a_client_sent_does_not_go_on_under_the_next_one(serve, bus):
     service = serve(SimulatedArm(1), realtime=True)
     service.send(command(0.5), caller="a")
@@ -275,6 +284,29 @@ def test_anybody_may_halt(serve, bus):
     assert bus.say("/bam/halt", {}, "somebody") is None
     assert service.robot._resting
     assert service.lease.holder == "a:1"
+
+
+@pytest.mark.parametrize("realtime", [True, False])
+def test_a_halt_wins_over_a_command_that_is_just_being_taken(serve, bus, realtime):
+    service = serve(SimulatedArm(1), realtime=realtime)
+    service.service.clock.stop()
+    slot, halting = service.service._slot, threading.Thread(target=bus.say, args=("/bam/halt", {}, "somebody"))
+    slot.put("a:1", range(7), command(0.5), complete=True, tag="")
+    service.lease.take("a:1")
+    name = "take" if realtime else "take_complete"
+    take = getattr(slot, name)
+
+    def take_slowly():
+        order = take()
+        halting.start()
+        halting.join(0.2)  # it must not get through before the command it has to stop
+        return order
+
+    setattr(slot, name, take_slowly)
+    (service.service._tick if realtime else service.service._tick_lockstep)()
+    halting.join(10.0)
+    assert service.robot._resting
+    assert (service.robot.target()[0, :6] < HOME[0] + 0.4).all()
 
 
 def scene(bus, payload, caller="a", identity="1"):

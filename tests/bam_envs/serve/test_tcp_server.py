@@ -160,11 +160,11 @@ def test_a_client_that_vanishes_gives_command_back(server, stranger, client):
 
 def test_the_token(env):
     with TcpServer(EnvServer(env), token="geheim") as server:
-        for token in (None, "", "falsch"):
+        for token, what in ((None, "missing"), ("", "missing"), ("falsch", "wrong")):
             with pytest.raises(NoServer) as caught:
                 TcpTransport(server.url, token=token).connect()
             assert str(caught.value) == (
-                f"{server.url}: The token is wrong; give the one that the server was started with."
+                f"{server.url}: The token is {what}; give the one that the server was started with (--token-file)."
             )
         right = TcpTransport(server.url, token="geheim")
         right.connect()
@@ -176,7 +176,7 @@ def test_a_token_that_is_no_text_is_refused(env):
         one = Stranger(server)
         assert one.hello(token="\ud800")[1:] == [
             "RemoteError",
-            "The token is wrong; give the one that the server was started with.",
+            "The token is wrong; give the one that the server was started with (--token-file).",
         ]
         one.frames.close()
 

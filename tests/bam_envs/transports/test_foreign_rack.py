@@ -14,7 +14,7 @@ def test_spaces_that_are_given():
     assert rack.is_described
     spec = rack.codec("Pick").spec
     assert (spec.env_id, spec.observation_space, spec.action_space) == ("Pick", SPACE, SPACE)
-    assert (spec.num_envs, spec.vector, spec.period) == (2, True, 0.5)
+    assert (spec.num_envs, spec.vector, spec.autoreset, spec.period) == (2, True, False, 0.5)
     assert rack.codec("").spec.env_id == "rack"
 
 

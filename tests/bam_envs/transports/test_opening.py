@@ -45,10 +45,26 @@ def test_what_is_no_address(url, text):
 
 def test_options_that_a_transport_does_not_have():
     with pytest.raises(InvalidValue) as caught:
-        open_transport("tcp://x:1", ca_file="ca.pem")
+        open_transport("tcp://x:1", channel="topics")
     assert str(caught.value) == (
-        "tcp://x:1 takes no ca_file; its options are timeout, connect_timeout, token, name, take."
+        "tcp://x:1 takes no channel; its options are timeout, connect_timeout, token, name, take."
     )
+
+
+@pytest.mark.parametrize("url", ["tcp://x:1", "ws://x:1"])
+def test_certificates_without_tls(url):
+    with pytest.raises(InvalidValue) as caught:
+        open_transport(url, ca_file="ca.pem")
+    assert str(caught.value) == (
+        f"{url}: ca_file says whom wss:// trusts, and this address is without TLS; leave it out."
+    )
+    open_transport("wss://x:1", ca_file="ca.pem")
+
+
+@pytest.mark.parametrize("url", ["tcp://x:1", "ws://x:1", "ros2://x"])
+def test_how_long_an_answer_is_waited_for(url):
+    assert open_transport(url, timeout=None).timeout == 30.0
+    assert open_transport(url, timeout=2.5).timeout == 2.5
 
 
 def test_a_token_file(tmp_path):

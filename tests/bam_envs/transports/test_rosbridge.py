@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+from bam_envs.bridge.link.link import RosbridgeLink
 from bam_envs.bridge.server.server import BridgeServer
 from bam_envs.errors import InvalidValue, LinkLost, NoServer, NotInCommand, ProtocolError
 from bam_envs.serve.env_server import EnvServer
@@ -106,6 +107,21 @@ def test_one_client_is_in_command(served, open_to):
     eve.close()
     bob.reset()
     bob.step(1)
+
+
+@pytest.mark.parametrize("channel", ["service", "topics"])
+def test_who_leaves_behind_another_server_gives_command_up_at_once(served, open_to, server, channel):
+    env = MirrorEnv(spaces.Discrete(3))
+    with closing(RosbridgeLink(server.url)) as link:
+        link.connect()
+        served(env, on=link)
+        ann, bob = open_to(name="ann", channel=channel), open_to(name="bob", channel=channel)
+        ann.reset()
+        with pytest.raises(NotInCommand):
+            bob.reset()
+        ann.close()
+        bob.reset()
+        bob.close()
 
 
 def test_seeds_of_rows_and_options_reach_our_servers(served, open_to):

@@ -5,6 +5,7 @@ import pytest
 from gymnasium import spaces
 
 from bam_envs.errors import InvalidValue, NoServer, ProtocolError, RemoteError
+from bam_envs.remote_vector_env import RemoteVectorEnv
 from bam_envs.transports.images import encode_image
 
 CAMERA = spaces.Box(0, 255, (8, 12, 3), np.uint8)
@@ -38,7 +39,8 @@ class Rack:
     def stepped(self, action):
         assert (action["action_type"], action["pose_names"], action["prefix"]) == (2, ["pick"], "")
         height = action["pose_action"][0]["pose"]["position"]["z"]
-        return {**self.feedback(height), "reward": 1.0, "terminated": True, "executed": True, "info": '{"grasp": "ok"}'}
+        done = {"reward": 1.0, "terminated": height < 0.5, "executed": True, "info": '{"grasp": "ok"}'}
+        return {**self.feedback(height), **done}
 
     def feedback(self, height):
         image = {"format": "jpeg" if self.images > 1 else "png", "data": encode_image(self.picture)}
@@ -100,6 +102,63 @@ def test_two_arms_of_a_rack_are_one_request(rack, open_to):
     assert [row["state"][0] for row in observation] == [0.25, 0.25]
     assert reward == [1.0, 1.0]
     assert [len(one["action"]) for one in there.requests] == [0, 2]
+
+
+def heights(*numbers):
+    """The actions of as many arms."""
+    rows = [{**UPRIGHT, "position": np.float32([0.5, 0, z]), "gripper_width": np.float32(0)} for z in numbers]
+    return {"pick": {key: np.stack([row[key] for row in rows]) for key in rows[0]}}
+
+
+@pytest.fixture
+def arms(rack, open_to):
+    """Two arms of a rack as rows, and the rack."""
+    there = rack(arms=2)
+    return RemoteVectorEnv(open_to(**PICKING, num_envs=2)), there
+
+
+def test_the_episode_of_one_arm_ends_those_of_the_others(arms):
+    envs, there = arms
+    envs.reset()
+    observation, reward, terminated, truncated, infos = envs.step(heights(0.75, 1.0))
+    assert (terminated.tolist(), truncated.tolist()) == ([False, False], [False, False])
+    assert observation["state"][:, 0].tolist() == [0.75, 1.0]
+    assert "final_obs" not in infos
+    observation, reward, terminated, truncated, infos = envs.step(heights(0.25, 0.75))
+    assert reward.tolist() == [1.0, 1.0]
+    assert (terminated.tolist(), truncated.tolist()) == ([True, False], [False, True])
+    assert observation["state"][:, 0].tolist() == [0.0, 0.0]
+    assert [row["state"][0] for row in infos["final_obs"]] == [0.25, 0.75]
+    assert infos["final_info"]["grasp"].tolist() == ["ok", "ok"]
+    assert infos["executed"].tolist() == [False, False]
+    assert [one["header"]["request_type"] for one in there.requests] == [2, 1, 1, 2]
+
+
+@pytest.mark.parametrize(("seed", "sent"), [(5, 5), ([5, 6], 5), (None, 0)])
+def test_the_arms_of_a_rack_have_one_seed(arms, seed, sent):
+    envs, there = arms
+    envs.reset(seed=seed)
+    assert [one["seed"] for one in there.requests] == [sent]
+
+
+@pytest.mark.parametrize("seed", [[5, 5], [5, None], [None, 6]])
+def test_other_seeds_of_its_arms_are_refused(arms, seed):
+    envs, there = arms
+    with pytest.raises(InvalidValue) as caught:
+        envs.reset(seed=seed)
+    assert str(caught.value) == (
+        f"The 2 rows of Pick begin together, from one seed s that stands for s, s + 1, …; not from {seed}."
+    )
+    assert there.requests == []
+
+
+def test_the_arms_of_a_rack_begin_together(arms):
+    envs, there = arms
+    envs.reset()
+    with pytest.raises(InvalidValue) as caught:
+        envs.reset(options={"reset_mask": np.array([True, False])})
+    assert str(caught.value) == "The 2 rows of Pick begin together; reset_mask must hold all of them or none."
+    assert len(there.requests) == 1
 
 
 def test_what_a_rack_does_not_understand_is_not_sent(rack, open_to):

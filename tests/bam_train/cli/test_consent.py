@@ -6,11 +6,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from bam_train.cli.consent import require_consent
+from bam_envs.robots.mir100 import base_spec
+from bam_envs.robots.ur5e import arm_spec
+from bam_train.cli.consent import plan_lines, require_consent
 from bam_train.errors import SettingsError
 
 GUARDS = {
-    "joint speed": {"number": "G8", "limit": 1.0, "unit": "rad/s", "altered": 3, "stopped": 0},
+    "joint speed": {"number": "G8", "limit": 3.141592653589793, "unit": "rad/s", "altered": 3, "stopped": 0},
     "finite": {"number": "G2", "limit": "", "unit": "", "altered": 0, "stopped": 0},
 }
 
@@ -24,20 +26,44 @@ class RealArm:
         return GUARDS
 
 
-def consent(monkeypatch, robot, answer=None, yes=False):
+def consent(monkeypatch, robot, answer=None, yes=False, plan=()):
     """Ask, with somebody who types `answer` or with nobody there."""
     monkeypatch.setattr(sys, "stdin", io.StringIO(answer or ""))
     monkeypatch.setattr(sys.stdin, "isatty", lambda: answer is not None, raising=False)
     env = SimpleNamespace(unwrapped=SimpleNamespace(robot=robot))
-    require_consent(env, "bam-deploy: pick.zip", yes=yes)
+    require_consent(env, "bam-deploy: pick.zip", yes=yes, plan=plan)
 
 
 def test_before_a_real_robot_moves_its_limits_are_shown_and_somebody_asked(monkeypatch, capsys):
     consent(monkeypatch, RealArm(), "yes\n")
     assert capsys.readouterr().err == (
         "bam-deploy: pick.zip will move ur5e at ws://10.0.0.5:9090, within\n"
-        "  G8 joint speed: 1.0 rad/s\n"
+        "  G8 joint speed: 3.14 rad/s\n"
         "Is the robot clear of people, and a hand on its emergency stop? Type yes to go on: "
+    )
+
+
+@pytest.mark.parametrize(
+    ("spec", "episodes", "expected"),
+    [
+        (
+            arm_spec("ur5e", with_object=True),
+            5,
+            "  bam/pick-v0: 5 episodes, one after the other without a pause\n"
+            "  each begins by opening the gripper and going to the start pose\n",
+        ),
+        (base_spec("mir100"), 1, "  bam/pick-v0: 1 episode\n  each begins where the base stands\n"),
+    ],
+)
+def test_what_it_will_do_is_shown(monkeypatch, capsys, spec, episodes, expected):
+    robot = RealArm()
+    robot.spec = spec
+    env = SimpleNamespace(unwrapped=SimpleNamespace(robot=robot))
+    plan = plan_lines(env, "bam/pick-v0", "ws://10.0.0.5:9090", episodes)
+    consent(monkeypatch, robot, yes=True, plan=plan)
+    assert capsys.readouterr().err == (
+        "bam-deploy: pick.zip will move ur5e at ws://10.0.0.5:9090:\n"
+        f"  address: ws://10.0.0.5:9090\n{expected}within\n  G8 joint speed: 3.14 rad/s\n"
     )
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import socket
+import threading
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -11,6 +13,8 @@ import numpy as np
 import pytest
 
 from bam_envs.errors import LinkLost
+from bam_envs.robots.live import bringup
+from bam_envs.robots.wire.codec import read_info
 from bam_envs.serve.env_server import EnvServer
 from bam_envs.serve.options import ServeOptions
 from bam_envs.serve.program import ServedEnvironment
@@ -144,6 +148,38 @@ def test_a_lost_link_ends_with_a_reason_and_status_4(corridor, corridor_checkpoi
     assert report["stop_reason"].startswith(f"link lost: {url}")
     assert err == f"bam-deploy: {report['stop_reason']}\n"
     assert [record["end"] for record in report["per_episode"]] == ["stopped"]
+
+
+def test_a_server_that_hangs_is_waited_for_as_long_as_one_wants(corridor, corridor_checkpoint, over_tcp, run):
+    env, released = Cut(), threading.Event()
+    url = over_tcp(env, corridor)
+    env.cut = lambda: released.wait(30.0)
+    try:
+        status, out, err = run(deploy, corridor_checkpoint(), "--fast", "--transport", url, "--timeout", 0.25)
+    finally:
+        released.set()
+    assert status == 4
+    assert err.endswith(f"bam-deploy: link lost: {url}: no answer to step within 0.25 s.\n")
+    assert out.startswith(f"link lost: {url}: no answer to step within 0.25 s: 0 of 5 episodes")
+
+
+def test_a_real_robot_is_shown_and_does_not_move_unasked(serve, run, monkeypatch):
+    monkeypatch.setattr(bringup, "read_info", lambda *said: replace(read_info(*said), simulated=False))
+    served = serve(gym.make("bam/pick-v0", disable_env_checker=True), fast=True)
+    status, out, err = run(deploy, PICK, "--episodes", 2, "--robot", served.bus.url)
+    assert (status, out) == (1, "")
+    lines = err.splitlines()
+    assert lines[0].startswith(f"bam-deploy: {PICK} will move ur5e")
+    assert lines[1:5] == [
+        f"  address: {served.bus.url}",
+        "  bam/pick-v0: 2 episodes, one after the other without a pause",
+        "  each begins by opening the gripper and going to the start pose",
+        "within",
+    ]
+    assert "  G10 tool speed: 0.25 m/s" in lines
+    assert lines[-1] == (
+        "bam-deploy: a real robot would move, and there is nobody to ask; give --yes to go on without asking"
+    )
 
 
 @pytest.mark.parametrize(("flag", "scheme"), [("--robot", "ws"), ("--transport", "tcp"), ("--transport", "ws")])

@@ -69,6 +69,12 @@ def test_wrong_flags_are_one_line(run):
     [
         (["--env", "bam/pik"], "Unknown environment 'bam/pik'. Did you mean 'bam/pick-v0'?"),
         (["--env", "CartPole-v1", "--set", "nope=1"], "CartPole-v1 cannot be made with these arguments: "),
+        (
+            ["--set", "randomise=true"],
+            "env_kwargs: unknown setting 'randomise' of bam/pick-v0. Did you mean 'randomize'?",
+        ),
+        (["--set", "robot=ws://127.0.0.1:1", "--set", "randomise=1"], "env_kwargs: unknown setting 'randomise'"),
+        (["--set", "robot=ws://127.0.0.1:1"], "ws://127.0.0.1:1: refused: nothing listens there."),
         (["--num-envs", "0"], "--num-envs: expected at least 1, found 0"),
         (["--env", "CartPole-v1", "--token-file", "/no/such"], "The token file /no/such cannot be read: No such file"),
         (

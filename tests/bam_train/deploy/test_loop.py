@@ -245,6 +245,10 @@ def test_the_same_loop_drives_any_robot():
         (LinkLost("ws://127.0.0.1:9: the link dropped."), Ending("link lost: ws://127.0.0.1:9: the link dropped.", 4)),
         (StaleState("no state for 0.3 s", 0.3, 0.1), Ending("link lost: no state for 0.3 s", 4)),
         (SafetyStop("joint speed", "joint 2 at 4 rad/s"), Ending("safety stop: joint 2 at 4 rad/s", 3)),
+        (
+            SafetyStop("joint speed", "When it is safe, call resume()."),
+            Ending("safety stop: When it is safe, run it again.", 3),
+        ),
         (RobotFault("no power"), Ending("fault: no power", 1)),
     ],
 )

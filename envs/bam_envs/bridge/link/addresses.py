@@ -49,6 +49,16 @@ def parse_address(url: str) -> Address:
     return Address(parts.hostname, _port(url, parts), parts.scheme == "wss", _namespace(url, parts.path))
 
 
+def require_tls(url: str, ca_file: object) -> None:
+    """A file of authorities is given only where there is TLS to use it.
+
+    Raises:
+        InvalidValue: `url` has none.
+    """
+    if ca_file is not None and not url.startswith("wss://"):
+        raise InvalidValue(f"{url}: ca_file says whom wss:// trusts, and this address is without TLS; leave it out.")
+
+
 def _split(url: str) -> SplitResult:
     try:
         parts = urlsplit(url)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from bam_envs.bridge.encoding import Fragments
 from bam_envs.bridge.json_frames import decode_frame, encode_frame
 from bam_envs.bridge.link.handover import Parcel
+from bam_envs.bridge.link.refusals import echoes
 from bam_envs.errors import BamEnvsError, InvalidValue, LinkLost, ProtocolError, RemoteError
 
 if TYPE_CHECKING:
@@ -23,6 +24,11 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 _CLOSE_WITHIN = 1.0
+
+
+def bare_reason(url: str, error: BamEnvsError) -> str:
+    """What `error` says, without the address and the full stop: for a text that begins with the address."""
+    return str(error).removeprefix(f"{url}: ").rstrip(".")
 
 
 class Connection:
@@ -76,7 +82,8 @@ class Connection:
             InvalidValue: A frame is larger than allowed.
         """
         if self._protocol is None or self.error is not None:
-            raise LinkLost(f"{self.url}: the link is down ({self.error or 'not open'}). Nothing was sent.")
+            why = "not open" if self.error is None else bare_reason(self.url, self.error)
+            raise LinkLost(f"{self.url}: the link is down ({why}). Nothing was sent.")
         if self._held_up:
             raise LinkLost(f"{self.url}: the server does not read what it is sent. Nothing more was sent.")
         largest = max(map(len, frames), default=0)
@@ -203,9 +210,18 @@ class Connection:
             whole = self._fragments.add(message, self.answered_at)
             if whole is not None:
                 self._dispatch(decode_frame(whole))
-        else:
+        elif not self._is_echo(message):
             self._refuse_request(message)
             self._on_message(self, message)
+
+    def _is_echo(self, message: dict[str, Any]) -> bool:
+        # Looked at before the server is known to be one: later on, a request of its own may have an id like ours.
+        if self.ready or message.get("op") != "call_service":
+            return False
+        answer = self._pending.pop(str(message.get("id")), None)
+        if answer is not None and not answer.done():
+            answer.set_exception(echoes(self.url))
+        return answer is not None
 
     def _resolve(self, message: dict[str, Any]) -> None:
         answer = self._pending.pop(str(message.get("id")), None)

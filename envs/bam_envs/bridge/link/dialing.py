@@ -146,6 +146,8 @@ async def _ask_time(connection: Connection, probe: int, deadline: float) -> Mapp
         answer = await asyncio.wait_for(connection.ask(identity, request), deadline - time.monotonic())
     except RemoteError:
         return None
+    except NoServer:
+        raise
     except LinkLost as error:
         text = f"closed the connection before it answered a request: {connection.reason}."
         raise NoServer(connection.url, text) from error

@@ -16,7 +16,7 @@ from typing import Any
 
 from bam_envs.bridge.json_frames import encode_frame
 from bam_envs.bridge.link.callbacks import tell_all
-from bam_envs.bridge.link.connection import Connection
+from bam_envs.bridge.link.connection import Connection, bare_reason
 from bam_envs.bridge.link.declarations import Declarations
 from bam_envs.bridge.link.dialing import Dial, ServerClock, dial_server
 from bam_envs.bridge.link.heartbeat import Heartbeat, watch
@@ -185,7 +185,7 @@ class Keeper:
                 try:
                     connection = await self._open(self._timeout)
                 except BamEnvsError as error:
-                    self.why = str(error)
+                    self.why = bare_reason(self._dial.address.url, error)
                 except Exception as error:  # whatever it was: a link that gives up is worse than one that tries again
                     _LOG.exception("%s: connecting failed", self._dial.address.url)
                     self.why = f"{type(error).__name__}: {error}"
@@ -228,8 +228,9 @@ class Keeper:
     def _on_end(self, connection: Connection) -> None:
         if connection is not self.up:
             return
-        self.up, self.why = None, str(connection.error)
-        tell_all(self.down_callbacks, LinkLost(self.why))
+        error = connection.error or LinkLost(f"{connection.url}: the link dropped.")
+        self.up, self.why = None, bare_reason(connection.url, error)
+        tell_all(self.down_callbacks, LinkLost(str(error)))
 
     def _start_watch(self) -> None:
         if self._beat is not None and self.up is not None:

@@ -6,6 +6,7 @@ Import this module only when a link connects: it binds Autobahn to asyncio for t
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import ssl
 import threading
@@ -17,6 +18,9 @@ from bam_envs.bridge.link.addresses import Address
 from bam_envs.bridge.text_frames import split_texts, text_frame
 from bam_envs.errors import LinkLost
 
+_AUTOBAHN = logging.getLogger("autobahn")
+if _AUTOBAHN.level == logging.NOTSET:
+    _AUTOBAHN.setLevel(logging.CRITICAL)  # a link says itself, and in one line, why it ended or did not open
 _UNSENT_HIGH = 1024 * 1024
 _inherited: list[object] = []
 _starting = threading.Lock()

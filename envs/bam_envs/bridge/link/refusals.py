@@ -63,6 +63,11 @@ def silent_bridge(url: str, timeout: float) -> NoServer:
     )
 
 
+def echoes(url: str) -> NoServer:
+    """It sends back what it is sent, which looks like a request of its own, and would get an answer from us."""
+    return NoServer(url, "an echo server: it sends back what it is sent. Is it the right port?")
+
+
 def _unreachable(address: Address, timeout: float) -> str:
     tls = "does it speak TLS (wss://), " if address.secure else ""
     return f"no connection within {timeout:.1f} s. Is the address right, is the machine on, {tls}is a firewall between?"

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import errno
 import hmac
+import logging
 import ssl
 from collections.abc import Callable
 from http import HTTPStatus
+from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 from websockets.asyncio.server import ServerConnection
@@ -17,6 +19,12 @@ from bam_envs.errors import InvalidValue
 _NO_TOKEN = (
     "This server needs its token: send the header 'Authorization: Bearer TOKEN', or open the URL with ?token=TOKEN."
 )
+_NO_PAGES = "A web page comes in only with the token of this server, and it was started without one."
+_PAGE_REFUSED = (
+    "The web page %r was refused: a browser comes in only with a token. "
+    "To let it in, start the server with one, and open its URL with ?token=TOKEN."
+)
+_logger = logging.getLogger(__name__)
 
 
 class Door:
@@ -40,6 +48,10 @@ class Door:
             response = connection.respond(HTTPStatus.UNAUTHORIZED, _NO_TOKEN + "\n")
             response.headers["WWW-Authenticate"] = "Bearer"
             return response
+        if self._token is None and "Origin" in request.headers:
+            # Any page open in a browser on this computer reaches loopback; programs send no Origin.
+            _logger.warning(_PAGE_REFUSED, ", ".join(request.headers.get_all("Origin"))[:100])
+            return connection.respond(HTTPStatus.FORBIDDEN, _NO_PAGES + "\n")
         if self._present() >= self._most:
             text = f"There are {self._most} clients, and no room for more.\n"
             return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, text)
@@ -64,15 +76,23 @@ def tls_context(cert: str, key: str | None) -> ssl.SSLContext:
         InvalidValue: They cannot be read, or do not fit each other.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    files = cert if key is None else f"{cert} and {key}"
+    files = f"{cert} is" if key is None else f"{cert} and {key} are"
     try:
         context.load_cert_chain(cert, key)
     except ssl.SSLError as error:
+        if key is None and _is_only_a_certificate(cert):
+            raise InvalidValue(f"Certificate: {cert} holds no key; give the file with its key too (--key).") from error
         reason = error.reason or "not PEM"
-        raise InvalidValue(f"Certificate: {files} are not a certificate with its key in PEM: {reason}.") from error
+        raise InvalidValue(f"Certificate: {files} not a certificate with its key in PEM: {reason}.") from error
     except OSError as error:
-        raise InvalidValue(f"Certificate: {files} cannot be read: {error.strerror}.") from error
+        read = cert if key is None else f"{cert} and {key}"
+        raise InvalidValue(f"Certificate: {read} cannot be read: {error.strerror}.") from error
     return context
+
+
+def _is_only_a_certificate(path: str) -> bool:
+    content = Path(path).read_bytes()
+    return b"BEGIN CERTIFICATE" in content and b"PRIVATE KEY" not in content
 
 
 def listening_error(host: str, port: int, error: OSError | UnicodeError) -> InvalidValue:

@@ -54,7 +54,8 @@ class BridgeServer:
         port: 0 takes a free one, `port` says which.
         cert: File with the certificate chain in PEM, for ``wss://``.
         key: File with its key, if it is not the same one.
-        token: Clients must show it: ``Authorization: Bearer TOKEN``, or ``?token=TOKEN`` in the URL.
+        token: Clients must show it: ``Authorization: Bearer TOKEN``, or ``?token=TOKEN`` in the URL. Without one no web
+            page comes in.
         options: The rest.
     """
 
@@ -181,7 +182,7 @@ class BridgeServer:
             ping_interval=options.ping_interval,
             ping_timeout=options.ping_timeout,
             close_timeout=options.close_timeout,
-            max_size=options.limits.max_message,
+            max_size=options.limits.max_incoming,
             logger=_quiet,
             create_connection=self._connection_type(),
             **extra,

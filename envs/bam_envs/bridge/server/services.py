@@ -13,11 +13,21 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bam_envs.bridge.bus import Handler
-from bam_envs.bridge.interfaces import complete, describe, normal_name, request_type, response_type, variants
+from bam_envs.bridge.interfaces import (
+    complete,
+    complete_known,
+    describe,
+    normal_name,
+    request_type,
+    response_type,
+    variants,
+)
 from bam_envs.bridge.server.packets import Packet, Wire, pack
 from bam_envs.bridge.server.session import Event, Id, Invoke, Send, Session
 from bam_envs.errors import BamEnvsError, ProtocolError
 
+_LENIENT = ("bam_msgs/GymAPI",)
+"""Types that are still growing: what a newer client says beside is ignored, as on every other way to an environment."""
 _logger = logging.getLogger(__name__)
 
 
@@ -145,7 +155,8 @@ class Services:
             BamEnvsError: The request does not fit, or there are too many.
         """
         session, limits = request.session, request.session.limits
-        values = complete(request_type(service.kind), _named(service.kind, request.args))
+        check = complete_known if service.kind in _LENIENT else complete
+        values = check(request_type(service.kind), _named(service.kind, request.args))
         if max(len(session.calls), len(session.waiting)) >= limits.calls:
             raise ProtocolError(f"At most {limits.calls} calls may be unanswered; wait for an answer first.")
         usual = limits.service_timeout if service.provider is not None else limits.handler_timeout

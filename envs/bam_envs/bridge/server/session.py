@@ -10,7 +10,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from bam_envs.bridge.bus import Caller, Handler, Message
-from bam_envs.bridge.encoding import COMPRESSIONS, Fragments
+from bam_envs.bridge.encoding import COMPRESSIONS, LARGEST_ID, LONGEST_ID, Fragments
 from bam_envs.bridge.interfaces import describe
 from bam_envs.bridge.server.packets import NEVER_SPLIT, Packet, Wire, pack
 from bam_envs.errors import ProtocolError
@@ -37,7 +37,10 @@ class Limits:
     handler_timeout: float = 300.0
     """The same for services offered inside this process [s]: a robot's motion may take its time."""
     max_message: int = 64 * 2**20
-    """Largest message either way [bytes]."""
+    """Largest answer to a client [bytes]."""
+    max_incoming: int = 16 * 2**20
+    """Largest message from a client [bytes], and most that its unfinished fragments may hold together: reading one
+    holds up everybody, and each client may have one under way."""
     topics: int = 1024
     """Most subscriptions, and most advertisements."""
     services: int = 256
@@ -96,7 +99,7 @@ class Session:
     """Its calls that wait for their turn."""
 
     def __post_init__(self) -> None:
-        self.fragments = Fragments(self.limits.max_message, self.limits.fragment_lifetime)
+        self.fragments = Fragments(self.limits.max_incoming, self.limits.fragment_lifetime)
 
     def status(self, level: str, text: str, name: Id = None) -> list[Send]:
         """What tells it `text`: nothing if it does not want to hear of that level."""
@@ -136,9 +139,9 @@ def read_id(message: Mapping[str, Any]) -> Id:
     value = message.get("id")
     if isinstance(value, bool) or not (value is None or isinstance(value, (str, int))):
         raise ProtocolError(f"id: expected a text or an integer, found {describe(value)}.")
-    if isinstance(value, str) and len(value) > _LONGEST:
-        raise ProtocolError(f"id: expected at most {_LONGEST} characters, found {len(value)}.")
-    if isinstance(value, int) and abs(value) > _LARGEST:
+    if isinstance(value, str) and len(value) > LONGEST_ID:
+        raise ProtocolError(f"id: expected at most {LONGEST_ID} characters, found {len(value)}.")
+    if isinstance(value, int) and abs(value) > LARGEST_ID:
         raise ProtocolError(f"id: expected an integer of 53 bits, found {describe(value)}.")
     return value
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from bam_envs.bridge.link.addresses import require_tls
 from bam_envs.errors import InvalidValue
 from bam_envs.robots.live.rosbridge import RosbridgeRobot
 from bam_envs.robots.profiles.profile import load_profile, profile_for
@@ -47,6 +48,7 @@ def live_robot(
         UnknownName: There is no such profile, or no such way of sending commands.
     """
     _require_robot_address(url)
+    require_tls(url, ca_file)
     chosen = _profile(profile, spec)
     robot = RosbridgeRobot(
         url, chosen, spec=spec, ca_file=ca_file, token=read_token(token_file) if token_file else None, command=command
@@ -74,6 +76,10 @@ def _require_robot_address(url: str) -> None:
         return
     expected = "A live robot's address is ws://host:port or wss://host:port"
     if scheme in ("tcp", "ros2"):
-        raise InvalidValue(f"{expected}; {url!r} is that of a whole environment. Give it as transport={url!r}.")
+        raise InvalidValue(
+            f"{expected}; {url!r} is that of a whole environment. Give it as transport={url!r} (--transport)."
+        )
     address = url.partition("://")[2] if separator else url
+    if not address:
+        raise InvalidValue(f"{expected}, such as ws://10.0.0.5:9090, not {url!r}.")
     raise InvalidValue(f"{expected}, not {url!r}. Did you mean {f'ws://{address}'!r}?")

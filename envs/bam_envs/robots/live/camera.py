@@ -19,6 +19,7 @@ from bam_envs.bridge.link.cbor_stream import CborStream
 from bam_envs.bridge.link.link import RosbridgeLink
 from bam_envs.errors import ProtocolError, ResetNeeded, StaleState
 from bam_envs.robots.live.mailbox import Letter, Mailbox
+from bam_envs.robots.live.state import SourceAge
 from bam_envs.robots.profiles.tables import CameraSource
 from bam_envs.robots.wire.messages import read_stamp, require_message
 from bam_envs.transports.images import message_bytes, read_color_message, read_depth_message
@@ -128,6 +129,7 @@ class LiveCamera:
         self._ca_file, self._token, self._clock = ca_file, token, clock
         self._feed: _Feed | None = None
         self._decoded: CameraImage | None = None
+        self._age, self._judged = SourceAge(0.0), 0  # and the number of the image that was judged last
 
     def connect(self) -> None:
         """Open a connection for this camera, and wait for its first image. Doing it twice is once.
@@ -139,6 +141,7 @@ class LiveCamera:
         if self._feed is not None:
             return
         feed, self._decoded = self._new_feed(), None
+        self._age, self._judged = SourceAge(0.0), 0
         try:
             feed.open()
             self._await_first(feed)
@@ -176,13 +179,21 @@ class LiveCamera:
         letter = None if self._feed is None else self._feed.newest()
         if letter is None:
             raise ResetNeeded(f"The camera {self.source.name} at {self.url} is not connected. Call connect() first.")
-        age, limit = self._clock() - letter.arrived, self.source.max_age
+        self._judge(letter)
+        age, limit = self._age.at(self._clock()), self.source.max_age
         if age > limit:
             what = f"{self._topic}: the newest image is {age:.3f} s old, and at most {limit:g} s are allowed."
             raise StaleState(what, age, limit)
         if self._decoded is None or self._decoded.number != letter.number:
             self._decoded = self._decode(letter)
         return self._decoded
+
+    def _judge(self, letter: Letter) -> None:
+        """An image is as old as its stamp says, beside the quickest one: a link that hung delivers old ones anew."""
+        if letter.number != self._judged:
+            stamp = read_stamp(require_message(letter.message, self._topic), self._topic)
+            self._age.look(letter.arrived, stamp, None)
+            self._judged = letter.number
 
     def _decode(self, letter: Letter) -> CameraImage:
         message = require_message(letter.message, self._topic)

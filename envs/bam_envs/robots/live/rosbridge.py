@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from bam_envs.bridge.freshness import Tag, Tagger
 from bam_envs.bridge.link.addresses import parse_address
+from bam_envs.bridge.link.connection import bare_reason
 from bam_envs.bridge.link.link import RosbridgeLink
 from bam_envs.errors import BamEnvsError, InvalidValue, LinkLost, NotInCommand, RemoteError, ResetNeeded, StaleState
 from bam_envs.robots.live.bringup import TopicTypes, ask_info, await_first, require_period, tagged_sinks
@@ -42,6 +43,10 @@ _RESET_TIMEOUT = 3.0
 """Longest that a fresh state, or a scene, is waited for [s]."""
 _HALT_WAITS = 0.05
 """Longest that a halt waits for a command that is being sent, so as to come after it [s]."""
+_HALT_NOT_SENT = (
+    "%s: the halt could not be sent, %s: stop it by hand if it moves; a robot with a dead-man stops by itself."
+)
+_AS_SAID = ". Nothing was sent, and nothing is kept"
 _LATE = ("expired", "old message", "old connection")
 """How the robot's side says that a command came too late: it holds, and the next one counts."""
 
@@ -254,8 +259,9 @@ class RosbridgeRobot:
         halts, messages = self._halts, self._messages(control, command, tag)
         with self._sending:
             if self._halts == halts:
+                self._commanded = True
                 control.publish_all(messages)
-        self._sent, self._commanded = command.copy(), True
+                self._sent = command.copy()
 
     def _ask(self, control: RosbridgeLink, command: Array, tag: Tag) -> None:
         """Send as `_send`, and wait for the answer; that they were sent need not be waited for before."""
@@ -264,8 +270,9 @@ class RosbridgeRobot:
         try:
             with self._sending:
                 if self._halts == halts:
+                    self._commanded = True
                     take_back = control.begin_publishing(messages, self._on_refusal)
-            self._sent, self._commanded = command.copy(), True
+                    self._sent = command.copy()
             self._await_answer()
         finally:
             take_back()
@@ -315,9 +322,9 @@ class RosbridgeRobot:
         try:
             self._publish_halt(halting)
             self._halt_failed = False
-        except BamEnvsError as error:  # nobody can be told; the robot's dead-man holds it
+        except BamEnvsError as error:  # told once: several threads and `close` try it too
             if not self._halt_failed:
-                _LOG.warning("%s: the halt could not be sent: %s", self.url, error)
+                _LOG.warning(_HALT_NOT_SENT, self.url, bare_reason(halting.url, error).removesuffix(_AS_SAID))
             self._halt_failed = True
         finally:
             if first:

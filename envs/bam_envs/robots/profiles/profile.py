@@ -21,7 +21,7 @@ from bam_envs.robots.profiles.files import read_profile, shipped_profiles
 from bam_envs.robots.profiles.tables import IMAGE_TYPES, CameraSource, RobotProfile, Sink, Source
 from bam_envs.robots.profiles.typed_table import read_table, require_known, require_table, require_tables
 from bam_envs.robots.robot import RobotSpec, SignalSpec
-from bam_envs.robots.safety.guards import Limits
+from bam_envs.robots.safety.guard import PROFILE_TOPS, Limits
 from bam_envs.robots.ur5e import arm_spec
 from bam_envs.robots.wire.command_messages import LISTED_TYPES
 
@@ -96,7 +96,8 @@ def _profile(where: str, table: Table) -> RobotProfile:
     """The profile in `table`, which the file `where` holds."""
     require_known(table, [*_Head.__dataclass_fields__, *_TABLES, "extends"], where)
     head = read_table(_Head, {key: value for key, value in table.items() if key not in _TABLES}, where)
-    _require_positive(where, {"period": head.period, "max_age": head.max_age, "dead_man": head.dead_man})
+    _require_positive(where, {"period": head.period, "dead_man": head.dead_man})
+    _require_age(where, head.max_age)
     _require_limits(where, head.limits)
     spec = _robot(where, head, table)
     state = tuple(_ignoring(source, head.ignore) for source in _state(where, table, spec))
@@ -122,6 +123,13 @@ def _require_positive(where: str, numbers: Mapping[str, float | None]) -> None:
     for key, number in numbers.items():
         if number is not None and number <= 0:
             raise InvalidValue(f"{where}: {key} must be above 0, not {number:g}.")
+
+
+def _require_age(where: str, max_age: float | None) -> None:
+    top, unit = PROFILE_TOPS["max_age"]
+    _require_positive(where, {"max_age": max_age})
+    if max_age is not None and max_age > top:
+        raise InvalidValue(f"{where}: max_age may be {top:g} {unit} at most, not {max_age:g}.")
 
 
 def _require_limits(where: str, limits: Mapping[str, float]) -> None:
@@ -217,7 +225,7 @@ def _checked_source(where: str, source: Source, size: int) -> Source:
     if (source.partial or source.ignore) and not source.names:
         raise InvalidValue(f"{where}: partial and ignore need names.")
     _require_once(where, "name", [*source.names, *source.ignore])
-    _require_positive(where, {"max_age": source.max_age})
+    _require_age(where, source.max_age)
     return replace(source, **_conversion(where, source, size))
 
 

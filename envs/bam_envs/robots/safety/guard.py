@@ -18,6 +18,20 @@ Array = NDArray[np.float64]
 
 _FINITE = ("position_margin", "reset_speed", "ramp_time", "reset_tolerance", "reset_timeout")
 _FROM_SPEC = ("max_age",)
+PROFILE_TOPS = {
+    "joint_speed": (math.pi, "rad/s"),
+    "joint_acceleration": (20.0, "rad/s^2"),
+    "tool_speed": (1.0, "m/s"),
+    "base_speed": (1.5, "m/s"),
+    "turn_speed": (2.0, "rad/s"),
+    "base_acceleration": (5.0, "m/s^2"),
+    "turn_acceleration": (5.0, "rad/s^2"),
+    "max_age": (1.0, "s"),
+    "bad_ticks": (10.0, "ticks"),
+    "reset_speed": (1.0, "rad/s"),
+    "reset_timeout": (300.0, "s"),
+}
+"""Widest limits that a profile may give, with their units: a slip in a file must not open a guard."""
 
 
 @dataclass(frozen=True)
@@ -65,16 +79,24 @@ class Limits:
 
     @classmethod
     def of(cls, values: Mapping[str, float]) -> Limits:
-        """The defaults with `values` in their place.
+        """The defaults with `values` of a profile in their place.
 
         Raises:
             UnknownName: There is no such limit.
+            InvalidValue: One is not above 0, or beyond what a profile may give.
         """
         names = [field.name for field in fields(cls)]
         for name in values:
             if name not in names:
                 raise UnknownName("limit", name, names)
-        return cls(**values)
+        limits = cls(**values)
+        for name, (top, unit) in PROFILE_TOPS.items():
+            if name in values and values[name] > top:
+                raise InvalidValue(
+                    f"The limit {name} of a profile may be {top:g} {unit} at most, not {values[name]:g}. "
+                    "Give a wider one in a program: live_robot(..., limits=Limits(...))."
+                )
+        return limits
 
 
 @dataclass

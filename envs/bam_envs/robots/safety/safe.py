@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, NoReturn, Protocol, final
+from typing import Any, NoReturn, Protocol, cast, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,8 @@ __all__ = ["ClearedCommand", "Limits", "LiveRobot", "SafeRobot"]
 Array = NDArray[np.float64]
 GRIPPER_TIME = 1.0
 """Longest that the gripper is waited for before an arm goes to its start pose [s]."""
+FRESH_LOOKS, FRESH_PAUSE = 50, 0.005
+"""How often a fresh state is looked for before a motion begins, and the time between two looks [s]."""
 LATE = 2.0
 """A live robot that was sent nothing for so many periods need not be where it was going to: its dead-man may have
 stopped it."""
@@ -247,8 +249,7 @@ class SafeRobot:
     def _measured_anew(self) -> Array:
         """What is measured now, as a command; a gripper goes on holding, or is open if nobody knows. Shape: (m,)."""
         if self._live is not None and self._state is not None:
-            self._state = self._live.measure()
-            self._require_fresh()
+            self._state = self._fresh_state()
         measured = self._measured()
         if self._is_base:
             return np.zeros_like(measured)
@@ -270,6 +271,25 @@ class SafeRobot:
             measured[place] = self._state.signals[name][0, column]
         return measured
 
+    def _fresh_state(self) -> RobotState:
+        """The newest state. An old one is waited out for a little: after a pause of this process newer ones lie unread.
+
+        Raises:
+            StaleState: None came.
+        """
+        for _ in range(FRESH_LOOKS):
+            fresh = self._is_fresh()  # asked first: what is measured afterwards can only be newer
+            state: RobotState = self._live.measure()
+            if fresh:
+                return state
+            time.sleep(FRESH_PAUSE)
+        self._require_fresh()
+        return cast(RobotState, self._live.measure())
+
+    def _is_fresh(self) -> bool:
+        age = self.age()
+        return all(age <= guard.limit_value for guard in self.guards if isinstance(guard, Freshness))
+
     def _require_fresh(self) -> None:
         """An old state is no place to begin at: even to hold there would be a motion."""
         age = self.age()
@@ -277,7 +297,8 @@ class SafeRobot:
             if isinstance(guard, Freshness) and not age <= guard.limit_value:
                 raise StaleState(
                     f"The newest state is {age:.3f} s old, and a motion begins at a state of at most "
-                    f"{guard.limit_value:g} s. Nothing was sent; look at the link and at what publishes the state.",
+                    f"{guard.limit_value:g} s. Nothing was sent; look at the link, at what publishes the state, and at "
+                    "whether this computer is busy.",
                     age,
                     guard.limit_value,
                 )

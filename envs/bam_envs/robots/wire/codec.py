@@ -80,8 +80,23 @@ def read_info(text: object, where: str) -> RobotInfo:
         raise ProtocolError(f"{where}: it must say what robot it is, and says {shown(text)}.")
     known = {key: data[key] for key in RobotInfo.__dataclass_fields__ if key in data}
     if known.get("period") is not None:
-        known["period"] = number(known["period"], f"{where}: period")
+        known["period"] = _period(known["period"], f"{where}: period")
+    # Any text is true in Python, and what is simulated may be moved unasked.
+    for key, kind, expected in (
+        ("simulated", bool, "true or false"),
+        ("lockstep", bool, "true or false"),
+        ("text", str, "a text"),
+    ):
+        if not isinstance(known.get(key, kind()), kind):
+            raise ProtocolError(f"{where}: {key} must be {expected}, not {shown(known[key])}.")
     return RobotInfo(**known)
+
+
+def _period(value: object, where: str) -> float:
+    period = number(value, where)
+    if not period > 0:
+        raise ProtocolError(f"{where} must be above 0 s, not {period:g}.")
+    return period
 
 
 def decode_state(profile: RobotProfile, messages: Mapping[str, object]) -> dict[str, Array]:

@@ -112,10 +112,13 @@ def shown(value: object) -> str:
 
 
 def usual_numbers(value: object) -> Array | None:
-    """The list `value` if all of it is finite floats, as it nearly always is; None for anything else. Shape: (k,)."""
-    if type(value) is list and set(map(type, value)) == {float} and math.isfinite(sum(value)):
-        return np.array(value)  # a finite sum has finite terms
-    return None
+    """The list `value` if all of it is finite plain numbers, as it nearly always is; else None. Shape: (k,)."""
+    if type(value) is not list or not value or not set(map(type, value)) <= {float, int}:
+        return None
+    try:
+        return np.array(value, dtype=np.float64) if math.isfinite(sum(value)) else None  # finite terms, too
+    except OverflowError:
+        return None
 
 
 def numbers(value: object, where: str, *, missing: float | None = None) -> Array:

@@ -60,8 +60,10 @@ class Leaf:
 def leaves_of(space: Space[Any], name: str, *, gripper: bool = False) -> tuple[Leaf, ...]:
     """The leaves of `space`, which is called `name`; with `gripper`, a pose may have a gripper width."""
     leaves = tuple(_walk(space, (), name, gripper))
+    names = [leaf.name for leaf in leaves]
     taken = [label for leaf in leaves for label in (leaf.labels or (leaf.name,))]
-    return leaves if len(set(taken)) == len(taken) else (Leaf(EXACT, name, (), space),)
+    unique = len({*names}) == len(names) and len({*taken}) == len(taken)
+    return leaves if unique else (Leaf(EXACT, name, (), space),)
 
 
 def _walk(space: Space[Any], path: Path, name: str, gripper: bool) -> list[Leaf]:

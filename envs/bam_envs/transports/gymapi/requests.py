@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from bam_envs.bridge.freshness import Tag, read_tag
-from bam_envs.bridge.interfaces import complete, request_type, variants
+from bam_envs.bridge.interfaces import complete_known, request_type
 from bam_envs.errors import InvalidValue, ProtocolError
 from bam_envs.transports.gymapi.actions import PREFIX
 from bam_envs.transports.strict_json import dump_json, load_json
@@ -124,10 +124,13 @@ def refuse_foreign(seed: Seed, options: Info | None) -> None:
     """
     if options:
         raise InvalidValue(f"GymAPI has no field for options of reset, and this rack is not of bam-train: {options}.")
-    if seed is not None and (not isinstance(seed, int) or not 0 < seed <= MAX_SEED):
-        raise InvalidValue(
-            f"The seed must be a whole number from 1 to {MAX_SEED} or None, not {seed}: 0 means no seed to this rack."
-        )
+    if isinstance(seed, list):
+        reason = "a rack has one for all its rows"
+    elif seed is None or 0 < seed <= MAX_SEED:
+        return
+    else:
+        reason = "GymAPI has no room for more" if seed else "0 means no seed to this rack"
+    raise InvalidValue(f"The seed must be a whole number from 1 to {MAX_SEED} or None, not {seed}: {reason}.")
 
 
 def read_request(message: object) -> GymRequest:
@@ -137,7 +140,7 @@ def read_request(message: object) -> GymRequest:
         InvalidValue: A field is of the wrong kind: its name, what was expected, what was found.
         ProtocolError: The words beside the fields cannot be read.
     """
-    whole = completed(request_type(KIND), message)
+    whole = complete_known(request_type(KIND), message)
     header = whole["header"]
     if header["request_type"] not in list(RequestType):
         known = ", ".join(f"{one.value} {one.name}" for one in RequestType)
@@ -167,26 +170,3 @@ def _seed_and_options(whole: Message) -> tuple[Seed, Info | None]:
     if not (options is None or isinstance(options, dict)):
         raise ProtocolError(f"The options of a reset must be an object, not {options!r}.")
     return (in_field if beside is None else beside), options
-
-
-def completed(kind: str, message: object) -> dict[str, Any]:
-    """`message` checked and with all fields of `kind`; those that it does not have are ignored.
-
-    Raises:
-        InvalidValue: A field is of the wrong kind.
-    """
-    try:
-        return complete(kind, message)
-    except InvalidValue:  # perhaps only because there are fields of a newer version
-        return complete(kind, _known_fields(kind, message))
-
-
-def _known_fields(kind: str, value: Any) -> Any:
-    """A message, or a list of them, without the fields that `kind` does not have."""
-    if isinstance(value, (list, tuple)):
-        return [_known_fields(kind, one) for one in value]
-    spellings = variants(kind)
-    if not spellings or not isinstance(value, Mapping):
-        return value
-    fields = max(spellings, key=lambda one: len({field.name for field in one} & value.keys()))
-    return {field.name: _known_fields(field.type, value[field.name]) for field in fields if field.name in value}

@@ -8,12 +8,16 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
-from bam_envs.bridge.interfaces import response_type
+from bam_envs.bridge.interfaces import complete_known, response_type
 from bam_envs.errors import BamEnvsError, InvalidValue, NotInCommand, ProtocolError, RemoteError
 from bam_envs.transports.gymapi.info import read_info, write_info
-from bam_envs.transports.gymapi.requests import KIND, Message, completed
+from bam_envs.transports.gymapi.requests import KIND, Message
 from bam_envs.transports.strict_json import dump_json
 from bam_envs.transports.transport import Info
+
+_UNREAD = ("camera_info", "detections", "masks", "segments")
+"""Fields that no space asks for."""
+_NOWHERE = {"pose": {"position": dict.fromkeys("xyz", math.nan), "orientation": dict.fromkeys("xyzw", math.nan)}}
 
 
 class ErrorCode(IntEnum):
@@ -87,13 +91,62 @@ def read_response(message: object) -> GymResponse:
         ProtocolError: A field is of the wrong kind.
     """
     try:
-        whole = completed(response_type(KIND), message)
+        whole = complete_known(response_type(KIND), _without_gaps(message))
     except InvalidValue as error:
         raise ProtocolError(str(error)) from error
-    read = [read_info(one["info"]) for one in whole["feedback"]]
+    feedback = [_with_gaps(*pair) for pair in zip(whole["feedback"], _rows(message), strict=True)]
+    read = [read_info(one["info"]) for one in feedback]
     infos, exact = tuple(info for info, _ in read), tuple(bam for _, bam in read)
     failure = _error(whole["header"]["error_code"]["value"], whole["header"]["error_msg"], exact[0] if exact else {})
-    return GymResponse(failure, tuple(_filled(whole["feedback"])), infos, exact)
+    return GymResponse(failure, tuple(_filled(feedback)), infos, exact)
+
+
+def _without_gaps(message: Any) -> Any:
+    """A response as it came, with zeros for numbers and poses that are null.
+
+    Every rosbridge writes NaN as null: the joint without a sensor, the cup that was not found, the camera without a
+    calibration. Whether that is a fault depends on what the space needs.
+    """
+    rows = _rows(message)
+    return {**message, "feedback": [_readable(row) for row in rows]} if rows else message
+
+
+def _readable(row: Any) -> Any:
+    if not isinstance(row, Mapping):
+        return row
+    kept = {name: value for name, value in row.items() if name not in _UNREAD}
+    for field, zero in (("observation", 0.0), ("pose", {})):
+        if gaps := _gaps(row, field):
+            kept[field] = [zero if gap else value for value, gap in zip(row[field], gaps, strict=True)]
+    return kept
+
+
+def _with_gaps(checked: Message, told: Message) -> Message:
+    """A checked row with NaN where null was told; no space takes that."""
+    filled = {}
+    for field, unknown in (("observation", math.nan), ("pose", _NOWHERE)):
+        if gaps := _gaps(told, field):
+            filled[field] = [unknown if gap else value for value, gap in zip(checked[field], gaps, strict=True)]
+    return {**checked, **filled} if filled else checked
+
+
+def _rows(message: Any) -> Sequence[Any]:
+    rows = message.get("feedback") if isinstance(message, Mapping) else None
+    return rows if isinstance(rows, (list, tuple)) else ()
+
+
+def _gaps(row: Message, field: str) -> list[bool]:
+    """Which entries of a list are null, or hold one; nothing if none is."""
+    values = row.get(field)
+    gaps = [_has_null(value) for value in values] if isinstance(values, list) else []
+    return gaps if any(gaps) else []
+
+
+def _has_null(value: Any, depth: int = 3) -> bool:
+    """Whether it is null, or a pose with one."""
+    if depth and isinstance(value, Mapping):
+        return any(_has_null(one, depth - 1) for one in value.values())
+    return value is None
 
 
 def _error(code: int, text: str, bam: Info) -> RemoteError | None:

@@ -1,5 +1,6 @@
 """Every way in which connecting fails has its own text; addresses; certificates."""
 
+import json
 import socket
 import ssl
 import threading
@@ -116,6 +117,18 @@ def test_a_websocket_server_that_is_not_rosbridge(scripted):
     scripted.wait_connected(0)
 
 
+def test_an_echo_server(scripted, monkeypatch):
+    async def send_back(connection, frame):
+        await connection.send(json.dumps(frame))
+
+    monkeypatch.setattr(scripted, "_answer", send_back)
+    assert _failure(scripted.url) == (
+        f"{scripted.url}: an echo server: it sends back what it is sent. Is it the right port?"
+    )
+    scripted.wait_connected(0)
+    assert scripted.of("service_response") == []
+
+
 def test_a_bridge_whose_node_has_ended(scripted):
     text = "Failed to create client: rcl node's context is invalid"
     scripted.responses["/rosapi/get_time"] = lambda args: text
@@ -131,10 +144,11 @@ def test_a_websocket_server_that_hangs_up_on_a_request(scripted):
 
 
 @pytest.mark.parametrize("status", [401, 403])
-def test_a_token_that_is_refused(new_scripted, status):
+def test_a_token_that_is_refused(new_scripted, status, caplog):
     url = new_scripted(status=status).url
     expected = f"{url}: the token was refused (HTTP {status}). Give the server's token (--token-file)."
     assert _failure(url, token="wrong") == expected
+    assert caplog.records == []  # Autobahn would say it too, in its own words
 
 
 def test_what_will_not_change_is_not_tried_twice(new_scripted):

@@ -88,6 +88,7 @@ def test_a_call_while_the_link_is_down_is_never_made(scripted, link, lost):
         link.call("/step", "std_srvs/Trigger", {}, 5.0)
     assert str(raised.value).startswith(f"{scripted.url}: the link is down (")
     assert str(raised.value).endswith("). Nothing was sent, and nothing is kept.")
+    assert str(raised.value).count(scripted.url) == 1
     scripted.start()
     link.wait_up(10.0)
     link.advertise("/last", STRING)

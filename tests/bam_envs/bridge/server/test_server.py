@@ -268,6 +268,25 @@ def test_the_token(new_server, new_client):
     new_client(url + "/?token=secret").sync()
 
 
+def test_a_web_page_comes_in_only_with_the_token(new_server, new_client, caplog):
+    page = {"additional_headers": {"Origin": "https://evil.example"}}
+    with pytest.raises(InvalidStatus) as caught:
+        new_client(new_server().url, **page)
+    assert caught.value.response.status_code == 403
+    assert caught.value.response.body == (
+        b"A web page comes in only with the token of this server, and it was started without one.\n"
+    )
+    assert [record.getMessage() for record in caplog.records] == [
+        "The web page 'https://evil.example' was refused: a browser comes in only with a token. "
+        "To let it in, start the server with one, and open its URL with ?token=TOKEN."
+    ]
+    url = new_server(token="secret").url
+    with pytest.raises(InvalidStatus) as caught:
+        new_client(url, **page)
+    assert caught.value.response.status_code == 401
+    new_client(url + "/?token=secret", **page).sync()
+
+
 def test_tls(new_server, new_client, certificates):
     cert, _ = certificates("127.0.0.1")
     url = new_server(cert=cert, key=cert.replace("cert.pem", "key.pem")).url
@@ -283,6 +302,14 @@ def test_certificates_that_are_none(certificates, tmp_path):
         BridgeServer(port=0, cert=str(tmp_path / "nowhere.pem")).start()
     with pytest.raises(InvalidValue, match=r"^Certificate: .* are not a certificate with its key in PEM: "):
         BridgeServer(port=0, cert=cert, key=cert).start()
+    with pytest.raises(InvalidValue) as caught:
+        BridgeServer(port=0, cert=cert).start()
+    assert str(caught.value) == f"Certificate: {cert} holds no key; give the file with its key too (--key)."
+    other = tmp_path / "other.pem"
+    other.write_text("no PEM at all")
+    with pytest.raises(InvalidValue) as caught:
+        BridgeServer(port=0, cert=str(other)).start()
+    assert str(caught.value) == f"Certificate: {other} is not a certificate with its key in PEM: not PEM."
     assert threads() == set()
 
 
@@ -300,11 +327,12 @@ def test_there_is_room_for_so_many(new_server, new_client):
 # Bad company.
 
 
-def test_a_message_that_is_too_large_ends_only_its_connection(server, new_client):
+@pytest.mark.parametrize("size", [16 * 2**20 + 1, 100_000_000])
+def test_a_message_that_is_too_large_ends_only_its_connection(server, new_client, size):
     big, other = new_client(), new_client()
     # The server closes while the message is still on its way.
     with contextlib.suppress(ConnectionClosed):
-        big.socket.send(b" " * 100_000_000)
+        big.socket.send(b" " * size)
     with pytest.raises(ConnectionClosed) as end:
         big.receive()
     assert end.value.rcvd is None or end.value.rcvd.code == 1009
@@ -312,9 +340,22 @@ def test_a_message_that_is_too_large_ends_only_its_connection(server, new_client
 
 
 def test_a_message_of_a_usual_size_is_done(server, client):
-    answer = client.call("/rosapi/topic_type", args={"topic": "/t" + "x" * 20_000_000})
+    answer = client.call("/rosapi/topic_type", args={"topic": "/t" + "x" * 16_000_000})
     assert answer["result"] is False
     assert answer["values"].startswith("Name: expected one such as '/joint_states', found '/txxx")
+
+
+def test_an_answer_may_be_larger_than_what_a_client_may_send(new_server, new_client):
+    server = new_server(options=ServerOptions(limits=Limits(max_incoming=1000)))
+    server.serve("/big", TRIGGER, lambda request, caller: {"message": "x" * 5000})
+    assert new_client(server.url).call("/big")["values"]["message"] == "x" * 5000
+
+
+def test_fragments_may_not_be_larger_together_than_one_message(new_server, new_client):
+    client = new_client(new_server(options=ServerOptions(limits=Limits(max_incoming=1000))).url)
+    client.send(op="fragment", id="a", num=0, total=3, data="x" * 700)
+    answer = client.ask(op="fragment", id="a", num=1, total=3, data="x" * 700)
+    assert answer["msg"] == "fragment: Fragments: expected at most 1000 characters, found 1600."
 
 
 def test_sockets_that_say_nothing_are_closed(new_server, new_client):

@@ -105,8 +105,22 @@ def test_an_address_of_something_else():
         live_robot("tcp://10.0.0.5:5555")
     assert str(caught.value) == (
         "A live robot's address is ws://host:port or wss://host:port; 'tcp://10.0.0.5:5555' is that of a whole "
-        "environment. Give it as transport='tcp://10.0.0.5:5555'."
+        "environment. Give it as transport='tcp://10.0.0.5:5555' (--transport)."
     )
+    with pytest.raises(InvalidValue) as caught:
+        live_robot("")
+    assert str(caught.value) == (
+        "A live robot's address is ws://host:port or wss://host:port, such as ws://10.0.0.5:9090, not ''."
+    )
+
+
+def test_certificates_without_tls():
+    with pytest.raises(InvalidValue) as caught:
+        live_robot("ws://robot", ca_file="ca.pem")
+    assert str(caught.value) == (
+        "ws://robot: ca_file says whom wss:// trusts, and this address is without TLS; leave it out."
+    )
+    live_robot("wss://robot", ca_file="ca.pem")
 
 
 def test_its_profile():

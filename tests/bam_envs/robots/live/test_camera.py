@@ -120,6 +120,30 @@ def test_no_image(server, monkeypatch):
     )
 
 
+def test_an_image_that_a_link_held_back(server):
+    def image(seconds):
+        return color_message(PIXELS, "png", "hand", {"sec": 1_700_000_000 + seconds, "nanosec": 0})
+
+    clock = [100.0]
+    server.advertise("/hand/compressed", "sensor_msgs/CompressedImage", latch=True)
+    server.publish("/hand/compressed", image(0))
+    one = LiveCamera(server.url, JPEG, clock=lambda: clock[0])
+    one.connect()
+    try:
+        assert one.latest().stamp == 1_700_000_000.0
+        clock[0] += 3.0
+        server.publish("/hand/compressed", image(1))
+        for _ in range(1000):
+            if one._feed.newest().number == 2:
+                break
+            threading.Event().wait(0.01)
+        with pytest.raises(StaleState) as caught:
+            one.latest()
+        assert str(caught.value).startswith("/hand/compressed: the newest image is 2.000 s old, ")
+    finally:
+        one.close()
+
+
 def test_an_old_image(server, connect):
     clock = [100.0]
     server.advertise("/hand/compressed", "sensor_msgs/CompressedImage", latch=True)

@@ -256,6 +256,39 @@ def test_a_cut_link_delivers_nothing_afterwards(server, robot_on, connect, start
         robot.close()
 
 
+def test_a_halt_that_cannot_be_sent_is_told_once(server, robot_on, connect, caplog):
+    robot_on(server)
+    robot, gate = connect(server.url)
+    gate.step(gate.state.command)
+    server.close()
+    raised(LinkLost, lambda: [gate.step(gate.state.command) for _ in range(100)])
+    assert robot._cut.wait(DEADLINE)
+    robot._state.mailbox.wait_for(lambda slots: not robot._halting.is_up, DEADLINE)
+    for _ in range(3):
+        robot.halt()
+    robot.close()
+    (line,) = [record.getMessage() for record in caplog.records if "halt" in record.getMessage()]
+    assert line.startswith(f"{server.url}: the halt could not be sent, the link is down (")
+    assert line.endswith("): stop it by hand if it moves; a robot with a dead-man stops by itself.")
+    assert line.count(server.url) == 1
+
+
+def test_a_command_that_a_halt_overtook_is_not_noted_as_sent(server, robot_on, connect, monkeypatch):
+    scripted = robot_on(server)
+    robot, gate = connect(server.url)
+    gate.step(gate.state.command)
+    scripted.wait_for(lambda: len(scripted.on(JOINT_COMMANDS)) == 1)
+    encoded = robot._messages
+
+    def halt_meanwhile(*args):
+        robot._halts += 1
+        return encoded(*args)
+
+    monkeypatch.setattr(robot, "_messages", halt_meanwhile)
+    np.testing.assert_array_equal(gate.step(gate.state.command + 0.01).command, gate.state.command)
+    assert len(scripted.on(JOINT_COMMANDS)) == 1
+
+
 def test_a_halt_overtakes_a_call_that_runs(lax, robot_on, connect):
     server = lax()
     scripted = robot_on(server)

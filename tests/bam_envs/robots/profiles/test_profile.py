@@ -210,6 +210,11 @@ ignore: [finger_joint, elbow_joint]
         ("scale = 0.001\n\n[[commands", "skip = 3\n\n[[commands", "FILE: state[0]: skip must be two counts, not 3."),
         ("scale = 0.001\n\n[[commands", "max_age = 0\n\n[[commands", "FILE: state[0]: max_age must be above 0, not 0."),
         (
+            "scale = 0.001\n\n[[commands",
+            "max_age = 9\n\n[[commands",
+            "FILE: state[0]: max_age may be 1 s at most, not 9.",
+        ),
+        (
             'fields = ["data"]',
             "",
             "FILE: commands.position[0]: std_msgs/Float64 needs fields; only sensor_msgs/JointState, "
@@ -234,6 +239,17 @@ ignore: [finger_joint, elbow_joint]
             "[command]",
             "[limits]\njoint_speed = 0\n[command]",
             "FILE: limits: The limit joint_speed must be above 0, not 0.0.",
+        ),
+        (
+            "[command]",
+            "[limits]\ntool_speed = 25\n[command]",
+            "FILE: limits: The limit tool_speed of a profile may be 1 m/s at most, not 25. "
+            "Give a wider one in a program: live_robot(..., limits=Limits(...)).",
+        ),
+        (
+            "[command]",
+            "max_age = 1.5\n[command]",
+            "FILE: max_age may be 1 s at most, not 1.5.",
         ),
         (
             "[command]",

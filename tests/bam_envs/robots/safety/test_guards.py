@@ -98,9 +98,36 @@ def test_a_margin_leaves_room():
 
 def test_limits_by_name():
     assert Limits.of({"joint_speed": 0.5}) == Limits(joint_speed=0.5)
+    assert Limits.of({"joint_speed": math.pi, "position_margin": 1e-6}).joint_speed == math.pi
     with pytest.raises(UnknownName) as caught:
         Limits.of({"joint_sped": 0.5})
     assert str(caught.value) == "Unknown limit 'joint_sped'. Did you mean 'joint_speed'?"
+
+
+@pytest.mark.parametrize(
+    ("name", "top"),
+    [
+        ("joint_speed", "3.14159 rad/s"),
+        ("joint_acceleration", "20 rad/s^2"),
+        ("tool_speed", "1 m/s"),
+        ("base_speed", "1.5 m/s"),
+        ("turn_speed", "2 rad/s"),
+        ("base_acceleration", "5 m/s^2"),
+        ("turn_acceleration", "5 rad/s^2"),
+        ("max_age", "1 s"),
+        ("bad_ticks", "10 ticks"),
+        ("reset_speed", "1 rad/s"),
+        ("reset_timeout", "300 s"),
+    ],
+)
+def test_a_profile_cannot_open_a_guard(name, top):
+    with pytest.raises(InvalidValue) as caught:
+        Limits.of({name: 1000.5})
+    assert str(caught.value) == (
+        f"The limit {name} of a profile may be {top} at most, not 1000.5. "
+        "Give a wider one in a program: live_robot(..., limits=Limits(...))."
+    )
+    assert getattr(Limits(**{name: 1000.5}), name) == 1000.5
 
 
 def other_arm():

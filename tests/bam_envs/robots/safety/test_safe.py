@@ -461,9 +461,20 @@ def test_no_motion_begins_at_a_stale_state():
         robot.step(away(state, 0.02))
     assert str(caught.value) == (
         "The newest state is 0.300 s old, and a motion begins at a state of at most 0.1 s. Nothing was sent; "
-        "look at the link and at what publishes the state."
+        "look at the link, at what publishes the state, and at whether this computer is busy."
     )
     assert len(arm.sent) == sent
+
+
+def test_after_a_pause_of_this_process_a_motion_begins_at_the_state_that_lay_unread():
+    arm, robot, state = live()
+    robot.halt()
+    ages = [0.3] * 20
+    arm.age = lambda: ages.pop() if ages else 0.01
+    robot.step(away(state, 0.02))
+    assert ages == []
+    assert robot.status == 0
+    assert robot.report()["state age"]["stopped"] == 0
 
 
 @pytest.mark.parametrize("fault", [ProtocolError("no stamp"), LinkLost("gone")])

@@ -339,3 +339,21 @@ def test_info():
         with pytest.raises(ProtocolError) as caught:
             read_info(text, "/bam/robot")
         assert str(caught.value).startswith("/bam/robot: it must say what robot it is, and says ")
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "text"),
+    [
+        ("simulated", '"false"', "simulated must be true or false, not 'false'."),
+        ("simulated", "1", "simulated must be true or false, not 1."),
+        ("simulated", "null", "simulated must be true or false, not null."),
+        ("lockstep", '"no"', "lockstep must be true or false, not 'no'."),
+        ("period", '"0.05"', "period must be a finite number, not '0.05'."),
+        ("period", "0", "period must be above 0 s, not 0."),
+        ("text", "[1]", "text must be a text, not [1]."),
+    ],
+)
+def test_info_of_the_wrong_kind_is_not_believed(field, value, text):
+    with pytest.raises(ProtocolError) as caught:
+        read_info(f'{{"name": "x", "{field}": {value}}}', "/bam/robot")
+    assert str(caught.value) == f"/bam/robot: {text}"

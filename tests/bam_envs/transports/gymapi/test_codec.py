@@ -150,3 +150,41 @@ def test_a_foreign_rack_says_whether_it_did_it():
     observation, reward, terminated, truncated, info = codec.read_result(read_response(message))
     assert (observation.tolist(), reward, terminated, truncated) == ([0.5], 0.0, False, False)
     assert info == {"text": "slipped", "executed": False}
+
+
+PARTS = spaces.Dict(
+    state=spaces.Box(-1, 1, (2,), np.float64),
+    cup=spaces.Dict(position=spaces.Box(-2, 2, (3,)), orientation=spaces.Box(-1, 1, (4,))),
+)
+
+
+def seen(numbers, x):
+    """What a rack with a torque sensor and two cups sees, through a rosbridge that writes NaN as null."""
+    poses = [{"pose": {"position": {"x": place}, "orientation": {"w": 1.0}}} for place in (x, None)]
+    fields = {"observation_names": ["state[0]", "torque", "state[1]"], "observation": numbers, "pose": poses}
+    row = {**fields, "pose_names": ["cup", "other"], "camera_info": {"K": [None] * 9}}
+    foreign = EnvCodec(EnvSpecMessage("Pick", PARTS, PARTS), foreign=True)
+    return foreign.read_result(read_response({"header": {"error_code": {"value": 1}}, "feedback": [row]}))[0]
+
+
+def test_what_a_rack_does_not_know_is_no_fault_where_nobody_asks():
+    observation = seen([0.25, None, 0.5], 0.125)
+    assert observation["state"].tolist() == [0.25, 0.5]
+    assert observation["cup"]["position"].tolist() == [0.125, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("numbers", "x", "text"),
+    [
+        ([0.25, 1.0, None], 0.125, "state[1] must be a number that float64 can hold, not nan."),
+        (
+            [0.25, 1.0, 0.5],
+            None,
+            "The observation does not fit its space: observation['cup']['position'][0] is NaN; only numbers are sent.",
+        ),
+    ],
+)
+def test_what_the_space_asks_for_must_be_known(numbers, x, text):
+    with pytest.raises(ProtocolError) as caught:
+        seen(numbers, x)
+    assert str(caught.value) == text

@@ -62,6 +62,12 @@ def test_labels():
     assert [leaf.labels for leaf in leaves_of(space, "it")] == [("m[0, 0]", "m[0, 1]", "m[1, 0]", "m[1, 1]"), ("x",)]
 
 
+@pytest.mark.parametrize("other", [spaces.Text(3), spaces.Box(0, 1, (0,)), spaces.Discrete(3)])
+def test_where_two_parts_have_one_name_all_is_one_exact_leaf(other):
+    space = spaces.Dict(OrderedDict({"0": spaces.Tuple([spaces.MultiBinary(1)]), "0/0": other}))
+    assert kinds(space) == [("exact", "it")]
+
+
 def test_taken_apart_and_put_together():
     space = spaces.Dict(OrderedDict(b=spaces.Tuple([WIDTH, spaces.Discrete(2)]), a=spaces.Text(3)))
     value = {"b": (np.float32(1), 1), "a": "x"}

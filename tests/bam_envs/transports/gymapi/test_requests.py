@@ -133,10 +133,18 @@ def test_what_is_no_seed(seed):
         gymapi.plain_seed(seed)
 
 
-@pytest.mark.parametrize("seed", [0, 2**31, [1, 2]])
-def test_seeds_that_a_foreign_rack_does_not_understand(seed):
-    with pytest.raises(InvalidValue, match="The seed must be a whole number from 1 to 2147483647 or None"):
+@pytest.mark.parametrize(
+    ("seed", "reason"),
+    [
+        (0, "0 means no seed to this rack."),
+        (2**31, "GymAPI has no room for more."),
+        ([1, 2], "a rack has one for all its rows."),
+    ],
+)
+def test_seeds_that_a_foreign_rack_does_not_understand(seed, reason):
+    with pytest.raises(InvalidValue) as error:
         gymapi.refuse_foreign(seed, None)
+    assert str(error.value) == f"The seed must be a whole number from 1 to 2147483647 or None, not {seed}: {reason}"
 
 
 def test_options_that_a_foreign_rack_does_not_understand():

@@ -1,6 +1,7 @@
 """Answers as bare dicts, as anybody's rack gives them."""
 
 import json
+import math
 
 import pytest
 
@@ -62,9 +63,41 @@ def test_an_answer_without_a_code_is_no_success():
 
 
 def test_a_field_of_the_wrong_kind_is_named():
-    text = r"feedback\[0\]\.observation\[1\]: expected a number, found null\.$"
+    text = r"feedback\[0\]\.observation\[1\]: expected a number, found 'a'\.$"
     with pytest.raises(ProtocolError, match=text):
-        read_response({"header": {"error_code": {"value": 1}}, "feedback": [{"observation": [0.0, None]}]})
+        read_response({"header": {"error_code": {"value": 1}}, "feedback": [{"observation": [0.0, "a"]}]})
+
+
+@pytest.mark.parametrize("field", ["reward", "terminated", "info", "executed"])
+def test_a_null_that_is_needed_is_named(field):
+    with pytest.raises(ProtocolError, match=rf"feedback\[0\]\.{field}: expected .*, found null\.$"):
+        read_response({"header": {"error_code": {"value": 1}}, "feedback": [{field: None}]})
+
+
+@pytest.mark.parametrize("message", [None, {"feedback": None}, {"feedback": [None]}, {"feedback": 3}])
+def test_what_is_no_response_is_refused(message):
+    with pytest.raises(ProtocolError, match=r"^bam_msgs/GymAPIResponse.*: expected .*, found "):
+        read_response(message)
+
+
+def one_row(**fields):
+    (row,) = read_response({"header": {"error_code": {"value": 1}}, "feedback": [fields]}).feedback
+    return row
+
+
+def test_a_null_in_what_nobody_reads_is_no_fault():
+    row = one_row(camera_info={"K": [None] * 9}, detections=None, masks=[None], segments={"a": None}, reward=2.0)
+    assert row["reward"] == 2.0
+    assert row == one_row(reward=2.0)
+
+
+def test_nulls_of_numbers_and_poses_are_kept_as_nan():
+    seen = {"pose": {"position": {"x": 1.5}}}
+    row = one_row(observation=[0.5, None], pose=[{"pose": {"position": {"z": None}}}, seen, None])
+    assert row["observation"][0] == 0.5
+    assert math.isnan(row["observation"][1])
+    assert [math.isnan(one["pose"]["orientation"]["w"]) for one in row["pose"]] == [True, False, True]
+    assert row["pose"][1]["pose"]["position"]["x"] == 1.5
 
 
 def test_newer_fields_and_lists_of_images_are_let_through():
