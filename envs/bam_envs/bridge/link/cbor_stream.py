@@ -53,6 +53,7 @@ class CborStream:
         throttle_ms: Least time between two messages [ms]; the server drops the others.
         connect_timeout: For one connection [s].
         max_message: Largest message [bytes].
+        clock: Monotonic clock [s], for `Arrival.at`.
 
     Raises:
         InvalidValue: The address or the type is none.
@@ -70,7 +71,9 @@ class CborStream:
         throttle_ms: int = 0,
         connect_timeout: float = 3.0,
         max_message: int = 64 * 1024 * 1024,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        self._clock = clock
         self._dial = Dial(parse_address(url), ca_file, token, max_message)
         self.url, self.topic = self._dial.address.url, topic
         self._request: dict[str, Any] = {
@@ -202,7 +205,7 @@ class CborStream:
             _LOG.warning("%s: %s: the server says %s", self.url, self.topic, frame[:500])
             return
         with self._changed:
-            self._frame = (frame, time.monotonic())
+            self._frame = (frame, self._clock())
             self._changed.notify_all()
 
     def _tell_all(self, listener: Callable[[Arrival], None]) -> None:

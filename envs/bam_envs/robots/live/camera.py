@@ -1,7 +1,7 @@
 """A live robot's camera: the newest image, decoded when it is asked for, on a connection of its own.
 
-JPEG and PNG come as CompressedImage over rosbridge. Raw images come as CBOR, on a connection that does nothing else: as
-JSON, one costs more time than a control period.
+Images, compressed or raw, come as CBOR, on a connection and in a thread of their own: as JSON a raw one costs more time
+than a control period, and a compressed one holds up the commands and states behind it.
 """
 
 from __future__ import annotations
@@ -9,16 +9,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.bridge.link.addresses import parse_address
 from bam_envs.bridge.link.cbor_stream import CborStream
-from bam_envs.bridge.link.link import RosbridgeLink
 from bam_envs.errors import ProtocolError, ResetNeeded, StaleState
-from bam_envs.robots.live.mailbox import Letter, Mailbox
+from bam_envs.robots.live.mailbox import Letter
 from bam_envs.robots.live.state import SourceAge
 from bam_envs.robots.profiles.tables import CameraSource
 from bam_envs.robots.wire.messages import read_stamp, require_message
@@ -53,39 +52,8 @@ class CameraImage:
     """Counts the images that came."""
 
 
-class _Feed(Protocol):
-    """What carries the images of one topic."""
-
-    def open(self) -> None:
-        """Connect and subscribe."""
-
-    def newest(self) -> Letter | None:
-        """The newest message, or None before the first."""
-
-    def close(self) -> None:
-        """Drop the connection."""
-
-
-class _CompressedFeed:
-    """CompressedImage over rosbridge."""
-
-    def __init__(self, link: RosbridgeLink, topic: str, kind: str, clock: Callable[[], float]) -> None:
-        self._link, self._mailbox = link, Mailbox(clock)
-        self._topic, self._kind = topic, kind
-
-    def open(self) -> None:
-        self._link.connect()
-        self._link.subscribe(self._topic, self._kind, lambda message, _: self._mailbox.put(("",), message))
-
-    def newest(self) -> Letter | None:
-        return self._mailbox.newest().get("")
-
-    def close(self) -> None:
-        self._link.close()
-
-
-class _RawFeed:
-    """Raw images as CBOR, decoded only when they are asked for."""
+class _Feed:
+    """The images of one topic, decoded only when they are asked for."""
 
     def __init__(self, stream: CborStream) -> None:
         self._stream = stream
@@ -151,11 +119,8 @@ class LiveCamera:
         self._feed = feed
 
     def _new_feed(self) -> _Feed:
-        kind = self.source.type
-        if kind == "sensor_msgs/Image":
-            return _RawFeed(CborStream(self.url, self._topic, kind, ca_file=self._ca_file, token=self._token))
-        link = RosbridgeLink(self.url, name=self.source.name, ca_file=self._ca_file, token=self._token)
-        return _CompressedFeed(link, self._topic, kind, self._clock)
+        options: dict[str, Any] = {"ca_file": self._ca_file, "token": self._token, "clock": self._clock}
+        return _Feed(CborStream(self.url, self._topic, self.source.type, **options))
 
     def _await_first(self, feed: _Feed) -> None:
         deadline = time.monotonic() + FIRST_IMAGE
