@@ -1,5 +1,6 @@
 """What importing costs, and who may import whom."""
 
+import importlib
 import pkgutil
 from pathlib import Path
 
@@ -66,3 +67,13 @@ def test_packages_are_typed(package):
 
 def test_public_names():
     assert bam_envs.__all__ == ["ENVIRONMENTS"]
+
+
+@pytest.mark.parametrize("package", ["robots", "serve", "transports"])
+def test_names_of_packages_are_there_when_they_are_used(package):
+    module = importlib.import_module(f"bam_envs.{package}")
+    for name in module.__all__:
+        assert getattr(module, name).__name__ == name
+    assert dir(module) == sorted(module.__all__)
+    with pytest.raises(AttributeError, match=f"^module 'bam_envs.{package}' has no attribute 'Robbot'$"):
+        module.Robbot  # noqa: B018

@@ -1,1 +1,54 @@
 """Robots: they take commands and give states, in SI units."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from bam_envs.robots.fake import FakeRobot
+    from bam_envs.robots.fake_base import FakeBase
+    from bam_envs.robots.live.building import live_robot
+    from bam_envs.robots.live.rosbridge import RosbridgeRobot
+    from bam_envs.robots.profiles.profile import load_profile
+    from bam_envs.robots.robot import Initial, Robot, RobotSpec, RobotState, SignalSpec
+    from bam_envs.robots.safety.safe import SafeRobot
+
+_MODULES = {
+    "FakeBase": "bam_envs.robots.fake_base",
+    "FakeRobot": "bam_envs.robots.fake",
+    "Initial": "bam_envs.robots.robot",
+    "Robot": "bam_envs.robots.robot",
+    "RobotSpec": "bam_envs.robots.robot",
+    "RobotState": "bam_envs.robots.robot",
+    "RosbridgeRobot": "bam_envs.robots.live.rosbridge",
+    "SafeRobot": "bam_envs.robots.safety.safe",
+    "SignalSpec": "bam_envs.robots.robot",
+    "live_robot": "bam_envs.robots.live.building",
+    "load_profile": "bam_envs.robots.profiles.profile",
+}
+"""Name to the module that has it; imported when it is used, so that nobody pays for the others."""
+
+__all__ = [
+    "FakeBase",
+    "FakeRobot",
+    "Initial",
+    "Robot",
+    "RobotSpec",
+    "RobotState",
+    "RosbridgeRobot",
+    "SafeRobot",
+    "SignalSpec",
+    "live_robot",
+    "load_profile",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_MODULES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
