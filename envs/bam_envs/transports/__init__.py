@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from bam_envs.on_use import imported_on_use
 
 if TYPE_CHECKING:
     from bam_envs.transports.fake import FakeTransport
@@ -24,7 +25,7 @@ _MODULES = {
     "Transport": "bam_envs.transports.transport",
     "open_transport": "bam_envs.transports.opening",
 }
-"""Name to the module that has it; imported when it is used, so that nobody pays for the others."""
+"""Name to the module that has it."""
 
 __all__ = [
     "EnvSpecMessage",
@@ -37,12 +38,4 @@ __all__ = [
     "open_transport",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_MODULES[name]), name)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__ = imported_on_use(__name__, _MODULES)

@@ -114,7 +114,7 @@ class Tick:
     measured: Array
     """What is measured of each number of the command; NaN where nothing is."""
     age: float
-    """Of the state that the command answers [s]."""
+    """Of the newest state [s]."""
     approach: bool = False
     """Whether it is on the way to a start pose."""
 

@@ -79,7 +79,7 @@ class Finite(Guard):
 
 
 class Freshness(Guard):
-    """A command that answers an old state answers something that is no longer there."""
+    """While the newest state is old, nobody knows where the robot is: nothing new is commanded."""
 
     number, name, unit = "G3", "state age", "s"
 
