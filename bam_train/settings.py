@@ -57,6 +57,16 @@ class TrainSettings:
     """Certificates that wss:// trusts instead of the system's."""
     token_file: str | None = None
     """File with the token that the servers at `transport` ask for."""
+    num_env_runners: int = 0
+    """RLlib's processes that collect samples, each with num_envs environments; 0 collects in the trainer's own."""
+    num_learners: int = 0
+    """RLlib's processes that update the weights; 0 updates in the trainer's own."""
+    num_gpus: int | None = None
+    """GPUs that RLlib's learners use in all; None is RLLIB_NUM_GPUS, else 0."""
+    address: str | None = None
+    """Ray cluster to train on, such as auto or 10.0.0.5:6379; None starts one here for the run."""
+    data: str | None = None
+    """Recorded episodes that bc, marwil and cql learn from: a folder of Parquet files, or its fsspec address."""
     normalize: bool | dict[str, Any] = False
     """Normalise observations and rewards by running statistics; a table gives VecNormalize's arguments."""
     hyperparameters: dict[str, Any] = field(default_factory=dict)
@@ -109,6 +119,7 @@ def check_names(values: Mapping[str, Any], source: str) -> None:
 def check_ranges(settings: TrainSettings) -> None:
     """Refuse numbers that cannot be."""
     least = {"steps": 1, "seed": 0, "num_envs": 1, "threads": 1, "eval_every": 1, "eval_episodes": 1}
+    least |= {"num_env_runners": 0, "num_learners": 0, "num_gpus": 0}
     for name, lowest in least.items():
         value = getattr(settings, name)
         if value is not None and value < lowest:

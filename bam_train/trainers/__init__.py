@@ -11,10 +11,16 @@ from bam_train.values import closest
 if TYPE_CHECKING:
     from bam_train.trainers.trainer import Trainer
 
-TRAINERS: dict[str, str] = {"sb3": "bam_train.trainers.sb3.trainer:SB3Trainer"}
+TRAINERS: dict[str, str] = {
+    "rllib": "bam_train.trainers.rllib.trainer:RLlibTrainer",
+    "sb3": "bam_train.trainers.sb3.trainer:SB3Trainer",
+}
 """Name of a trainer to its ``"module:Class"``."""
 
-ALGORITHMS: dict[str, str] = {"sb3": "bam_train.trainers.sb3.algorithms:ALGORITHMS"}
+ALGORITHMS: dict[str, str] = {
+    "rllib": "bam_train.trainers.rllib.algorithms:ALGORITHMS",
+    "sb3": "bam_train.trainers.sb3.algorithms:ALGORITHMS",
+}
 """Name of a trainer to the table of its algorithms; reading it imports no learning library."""
 
 

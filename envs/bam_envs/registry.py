@@ -16,7 +16,7 @@ import gymnasium as gym
 from bam_envs.errors import InvalidValue, UnknownName
 
 if TYPE_CHECKING:
-    from bam_envs.remote_env import RemoteEnv, RemoteVectorEnv
+    from bam_envs.remote_env import RemoteVectorEnv
     from bam_envs.robot_env import RobotEnv, RobotVectorEnv
     from bam_envs.robots.robot import Robot
 
@@ -37,6 +37,17 @@ class EnvEntry:
     """Steps after which an episode is truncated."""
     period: float = 0.05
     """Time between two actions [s]."""
+    parity: bool = False
+    """Whether ``parity=True`` gives robo-gym's arithmetic, which ends by itself: so the time limit is put around the
+    environment here, and not by Gymnasium, which would do it in any case."""
+    robot_options: tuple[str, ...] = ()
+    """Arguments of the task that its robot takes too."""
+
+    def make_robot(self, num_robots: int, randomize: bool, task_options: Mapping[str, Any]) -> Robot:
+        """The simulated robot, or n of them."""
+        shared = {name: task_options[name] for name in self.robot_options if name in task_options}
+        robot: Robot = resolve(self.robot)(num_robots, randomize=randomize, **shared)
+        return robot
 
 
 _ENTRIES = (
@@ -61,6 +72,71 @@ _ENTRIES = (
         "bam_envs.robots.simulated.arm:cube_scene",
         max_episode_steps=200,
     ),
+    EnvEntry(
+        "bam/mir100-navigation-v0",
+        "drive a MiR100 to within 20 cm of a place, nothing in the way",
+        "bam_envs.tasks.mir100_navigation:Mir100NavigationTask",
+        "bam_envs.robots.simulated.mir100:open_floor",
+        max_episode_steps=500,
+        period=0.1,
+        parity=True,
+    ),
+    EnvEntry(
+        "bam/mir100-avoidance-v0",
+        "drive a MiR100 to a place on the other side of three boxes that only its lasers see",
+        "bam_envs.tasks.mir100_avoidance:Mir100AvoidanceTask",
+        "bam_envs.robots.simulated.mir100:lab",
+        max_episode_steps=500,
+        period=0.1,
+        parity=True,
+    ),
+    EnvEntry(
+        "bam/ur-reach-v0",
+        "bring the flange of a UR arm of any size within 10 cm of a point",
+        "bam_envs.tasks.ur_reach:UrReachTask",
+        "bam_envs.robots.simulated.ur:reach_arm",
+        max_episode_steps=300,
+        period=0.1,
+        parity=True,
+        robot_options=("ur_model",),
+    ),
+    EnvEntry(
+        "bam/ur-empty-v0",
+        "a UR arm and nothing to do: for trying out actions",
+        "bam_envs.tasks.ur_empty:UrEmptyTask",
+        "bam_envs.robots.simulated.ur:empty_arm",
+        max_episode_steps=300,
+        parity=True,
+        robot_options=("ur_model",),
+    ),
+    EnvEntry(
+        "bam/ur-avoidance-v0",
+        "stay at a pose and out of the way of an obstacle that moves up and down",
+        "bam_envs.tasks.ur_avoidance:UrAvoidanceTask",
+        "bam_envs.robots.simulated.ur:obstacle_arm",
+        max_episode_steps=1000,
+        parity=True,
+        robot_options=("ur_model",),
+    ),
+    EnvEntry(
+        "bam/ur-track-v0",
+        "follow a recorded joint trajectory and make way for an obstacle that flies about",
+        "bam_envs.tasks.ur_track:UrTrackTask",
+        "bam_envs.robots.simulated.ur:obstacle_arm",
+        max_episode_steps=1000,
+        parity=True,
+        robot_options=("ur_model",),
+    ),
+    EnvEntry(
+        "bam/isaac-reach-v0",
+        "bring the flange of a UR10 to a pose, position and orientation, as in Isaac Lab's reach task",
+        "bam_envs.tasks.isaac_reach:IsaacReachTask",
+        "bam_envs.robots.simulated.ur:isaac_arm",
+        max_episode_steps=600,
+        period=1 / 30,
+        parity=True,
+        robot_options=("ur_model",),
+    ),
 )
 ENVIRONMENTS: dict[str, EnvEntry] = {entry.id: entry for entry in _ENTRIES}
 
@@ -73,7 +149,7 @@ def register() -> None:
                 entry.id,
                 entry_point="bam_envs.registry:make_env",
                 vector_entry_point="bam_envs.registry:make_vector_env",
-                max_episode_steps=entry.max_episode_steps,
+                max_episode_steps=None if entry.parity else entry.max_episode_steps,
                 kwargs={"env_id": entry.id},
             )
 
@@ -125,7 +201,7 @@ def make_env(
     token_file: str | None = None,
     timeout: float | None = None,
     **task_options: Any,
-) -> RobotEnv | RemoteEnv:
+) -> gym.Env[Any, Any]:
     """One robot and its task; what `gymnasium.make` calls.
 
     Args:
@@ -156,13 +232,23 @@ def make_env(
 
     entry = ENVIRONMENTS[env_id]
     task = resolve(entry.task)(1, **task_options)
-    simulated: Robot = resolve(entry.robot)(1, randomize=randomize)
+    simulated = entry.make_robot(1, randomize, task_options)
     if robot is None:
-        return RobotEnv(simulated, task, render_mode=render_mode)
+        return _limited(RobotEnv(simulated, task, render_mode=render_mode), entry)
     from bam_envs.robots.live.building import live_robot
 
-    live = live_robot(robot, simulated.spec, profile=profile, ca_file=ca_file, token_file=token_file)
-    return RobotEnv(live, task, render_mode=render_mode)
+    tool = getattr(simulated, "tool_position", None)  # forward kinematics of an arm that is no UR5e
+    live = live_robot(
+        robot, simulated.spec, profile=profile, tool_position=tool, ca_file=ca_file, token_file=token_file
+    )
+    return _limited(RobotEnv(live, task, render_mode=render_mode), entry)
+
+
+def _limited(env: RobotEnv, entry: EnvEntry) -> gym.Env[Any, Any]:
+    """`env` with the time limit that Gymnasium does not put around it."""
+    if not entry.parity or getattr(env.task, "ends_by_itself", False):
+        return env
+    return gym.wrappers.TimeLimit(env, entry.max_episode_steps)
 
 
 def _require_simulation(elsewhere: object, render_mode: str | None, randomize: bool) -> None:
@@ -225,9 +311,12 @@ def make_vector_env(
     from bam_envs.robot_env import RobotVectorEnv
 
     entry = ENVIRONMENTS[env_id]
+    if max_episode_steps is None and entry.parity:
+        max_episode_steps = entry.max_episode_steps
+    task = resolve(entry.task)(num_envs, **task_options)
     return RobotVectorEnv(
-        resolve(entry.robot)(num_envs, randomize=randomize),
-        resolve(entry.task)(num_envs, **task_options),
-        max_episode_steps=max_episode_steps,
+        entry.make_robot(num_envs, randomize, task_options),
+        task,
+        max_episode_steps=None if getattr(task, "ends_by_itself", False) else max_episode_steps,
         render_mode=render_mode,
     )

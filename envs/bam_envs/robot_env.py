@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -19,7 +19,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from bam_envs.errors import InvalidValue, ResetNeeded
+from bam_envs.errors import InvalidValue, ResetNeeded, UnknownName
 from bam_envs.robots.robot import Robot, RobotState, Rows
 from bam_envs.tasks.task import Score, Task
 
@@ -32,12 +32,33 @@ def render_modes() -> list[str]:
     return ["rgb_array"] if headless else list(RENDER_MODES)
 
 
-def start_rows(robot: Robot, task: Task, rows: Rows, rngs: Sequence[np.random.Generator]) -> RobotState:
+def start_rows(
+    robot: Robot,
+    task: Task,
+    rows: Rows,
+    rngs: Sequence[np.random.Generator],
+    options: Mapping[str, Any] | None = None,
+) -> RobotState:
     """Begin a new episode on `rows`; the state of all rows."""
+    begin: Any = task.begin
+    initial = begin(rows, rngs, options) if options else begin(rows, rngs)
     robot.connect()
-    state = robot.reset(rows, task.begin(rows, rngs))
+    state = robot.reset(rows, initial)
     task.start(rows, state)
     return state
+
+
+def task_options(task: Task, options: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What `reset` was given for the task.
+
+    Raises:
+        UnknownName: The task has no such option; it carries the closest match.
+    """
+    known: Sequence[str] = getattr(task, "reset_options", ())
+    for name in options or {}:
+        if name not in known:
+            raise UnknownName("reset option", name, known)
+    return dict(options or {})
 
 
 def describe(robot: Robot, task: Task) -> dict[str, list[dict[str, Any]]]:
@@ -99,7 +120,8 @@ class RobotEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Begin an episode; a live robot goes to its start pose slowly."""
         super().reset(seed=seed)
-        self.state = start_rows(self.robot, self.task, self._first, [self.np_random])
+        given = task_options(self.task, options)
+        self.state = start_rows(self.robot, self.task, self._first, [self.np_random], given)
         if self.render_mode == "human":
             self.render()
         return self.task.observe(self.state)[0], {"is_success": False}
@@ -138,7 +160,17 @@ class RobotEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
 def plain_info(score: Score) -> dict[str, Any]:
     """The info of row 0 in plain Python values."""
-    return {"is_success": bool(score.success[0]), **{key: float(value[0]) for key, value in score.info.items()}}
+    said = {key: _plain(value[0]) for key, value in score.info.items()}
+    return {"is_success": bool(score.success[0]), **{key: value for key, value in said.items() if value != ""}}
+
+
+def _plain(value: Any) -> Any:
+    """Text as str, one number as float, several as an array of their own, objects as they are."""
+    if isinstance(value, str):
+        return str(value)
+    if isinstance(value, np.ndarray):
+        return value.tolist() if value.dtype.kind in "US" else value.copy()
+    return float(value) if isinstance(value, np.generic) else value
 
 
 class RobotVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
@@ -192,16 +224,18 @@ class RobotVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.float3
 
         Args:
             seed: Row i is seeded with ``seed + i``, or with ``seed[i]``.
-            options: ``reset_mask`` or nothing.
+            options: ``reset_mask``, and what the task's ``reset_options`` names, for every row alike.
         """
-        mask = self._all if options is None else np.asarray(options.get("reset_mask", self._all), dtype=bool)
+        given = dict(options or {})
+        mask = np.asarray(given.pop("reset_mask", self._all), dtype=bool)
+        given = task_options(self.task, given)
         if mask.shape != self._all.shape:
             raise InvalidValue(f"reset_mask must have shape {self._all.shape}, not {mask.shape}.")
         rows = np.flatnonzero(mask)
         for row, one in self._row_seeds(seed):
             if one is not None and mask[row]:
                 self._rngs[row] = seeding.np_random(one)[0]
-        self._begin(rows)
+        self._begin(rows, given)
         return self._observe(), {"is_success": np.zeros(self.num_envs, dtype=bool), "_is_success": self._all.copy()}
 
     def _row_seeds(self, seed: int | list[int | None] | None) -> list[tuple[int, int | None]]:
@@ -212,8 +246,8 @@ class RobotVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.float3
             raise InvalidValue(f"seed must be one number or {self.num_envs} of them, not {len(seeds)}.")
         return list(enumerate(seeds))
 
-    def _begin(self, rows: Rows) -> None:
-        self.state = start_rows(self.robot, self.task, rows, [self._rngs[row] for row in rows])
+    def _begin(self, rows: Rows, options: Mapping[str, Any] | None = None) -> None:
+        self.state = start_rows(self.robot, self.task, rows, [self._rngs[row] for row in rows], options)
         self.elapsed[rows] = 0
 
     def _observe(self) -> NDArray[np.float32]:

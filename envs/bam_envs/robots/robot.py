@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -67,6 +67,8 @@ class RobotState:
     """When it was measured [s]: the robot's monotonic clock, or simulated time. Shape: (n,)."""
     command: Array
     """The command that was really sent before this was measured. Shape: (n, m)."""
+    truth: dict[str, Array] = field(default_factory=dict)
+    """What only a simulation knows, such as contacts; {} of a live robot. Shape: (n, ...) each."""
 
 
 @dataclass(frozen=True)

@@ -41,13 +41,18 @@ class Score:
     """The task ended, well or badly. Shape: (n,)."""
     success: Flags
     """The task is done. Shape: (n,)."""
-    info: dict[str, Array] = field(default_factory=dict)
-    """Named distances and the like. Shape: (n,) each."""
+    info: dict[str, NDArray[Any]] = field(default_factory=dict)
+    """Named distances and the like, numbers, text ("" for nothing to say) or objects. Shape: (n, ...) each."""
 
 
 @runtime_checkable
 class Task(Protocol):
-    """Observation, command, reward and end for `num_rows` rows; the same code for one live robot and many simulated."""
+    """Observation, command, reward and end for `num_rows` rows; the same code for one live robot and many simulated.
+
+    A task may have two more attributes. ``reset_options`` names the options that an environment's `reset` takes; such a
+    task's `begin` has a third argument, ``options``, a mapping of those that were given. ``ends_by_itself`` is True for
+    one that counts its own steps and terminates at its time limit; no time limit is put around it.
+    """
 
     num_rows: int
     observation_space: spaces.Box
