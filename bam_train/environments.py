@@ -11,7 +11,7 @@ import gymnasium as gym
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 import bam_envs  # noqa: F401 - registers our environments with Gymnasium
-from bam_envs.registry import ENVIRONMENTS
+from bam_envs.registry import entry_of
 from bam_envs.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint
 from bam_train.errors import CheckpointMismatch, SettingsError
@@ -23,7 +23,7 @@ AnyEnv = gym.Env[Any, Any] | VectorEnv[Any, Any, Any]
 
 def is_batched(env_id: str) -> bool:
     """Whether `env_id` is one of ours, whose rows share one batched simulation."""
-    return env_id.rpartition(":")[2] in ENVIRONMENTS
+    return entry_of(env_id) is not None
 
 
 def make_env(

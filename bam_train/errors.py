@@ -20,6 +20,7 @@
     │   ├── RemoteAgentError       an agent in another process failed, or its process ended
     │   └── AgentInUse             an agent is called by two threads at once
     ├── TrainingFailed             training cannot go on (a NaN loss); the last good checkpoint is kept
+    │   └── ProcessesLost          other processes that it needs are gone; what was learnt so far is good
     └── OutputError                no space, no permission, or a file that is in the way
 
 Third-party errors are mapped to these at the border, with the cause kept by ``from``.
@@ -144,6 +145,10 @@ class AgentInUse(LoopError):  # noqa: N818
 
 class TrainingFailed(BamTrainError):  # noqa: N818
     """Training cannot go on; the text names the last good checkpoint."""
+
+
+class ProcessesLost(TrainingFailed):
+    """Processes that training needs are gone, and do not come back; what was learnt so far is good."""
 
 
 class OutputError(BamTrainError, OSError):

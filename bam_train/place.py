@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bam_envs.registry import ENVIRONMENTS
+from bam_envs.registry import entry_of
 from bam_train.errors import SettingsError
 
 _OF_SIMULATIONS = frozenset({"randomize"})
@@ -93,7 +93,7 @@ class Place:
         Raises:
             SettingsError: The environment is none of ours, so that it has no robot to exchange.
         """
-        if env_id.rpartition(":")[2] not in ENVIRONMENTS:
+        if entry_of(env_id) is None:
             raise SettingsError(
                 f"{env_id} has no robot that --robot could exchange; serve it next to the robot with "
                 f"bam-serve --env {env_id}, and give --transport"

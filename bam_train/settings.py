@@ -215,8 +215,11 @@ def differences(wanted: Mapping[str, Any], found: Mapping[str, Any], prefix: str
     return rows
 
 
-def file_stem(env: str, algo: str) -> str:
-    """A run's name in file names: ``bam/pick-v0`` and ppo make ``pick-ppo``; a foreign id keeps its version."""
+def file_stem(env: str, algo: str, trainer: str = "sb3") -> str:
+    """A run's name in file names: ``bam/pick-v0`` and ppo make ``pick-ppo``; a foreign id keeps its version.
+
+    Another trainer than sb3 is named: ``pick-rllib-ppo``.
+    """
     own = re.fullmatch(r"bam/(.+)-v\d+", env)
     name = own[1] if own else env
-    return re.sub(r"[^\w.-]+", "-", f"{name}-{algo}").strip("-.")
+    return re.sub(r"[^\w.-]+", "-", f"{name}-{algo if trainer == 'sb3' else f'{trainer}-{algo}'}").strip("-.")

@@ -1,4 +1,4 @@
-"""How fast the environments step, against the bare physics of the same model, in one run.
+"""How fast the environments step, with random actions; those of MuJoCo against the bare physics of the same model.
 
 Measured in turns, so that a busy machine slows all of them alike; the figures are medians.
 """
@@ -23,6 +23,13 @@ from bam_envs.errors import BamEnvsError
 from bam_envs.registry import ENVIRONMENTS, resolve_id
 
 VECTOR_TARGET, SHARE_TARGET, SINGLE_TARGET = 15_000.0, 0.80, 2_500.0
+PHYSICS, PHYSICS_ROWS = "bam/pick-v0", 64
+IN_NUMPY = {
+    "bam/mir100-navigation-v0": (4096, 300_000.0),
+    "bam/mir100-avoidance-v0": (256, 20_000.0),
+    "bam/ur-reach-v0": (256, 30_000.0),
+}
+"""Environments without MuJoCo: rows, and the target of the rows together [steps/s]."""
 Array = NDArray[Any]
 
 
@@ -97,7 +104,7 @@ def seconds(work: Callable[[], None]) -> float:
 
 
 def measure(env_id: str, rows: int, rounds: int, steps: int) -> dict[str, list[float]]:
-    """Steps/s of each candidate in each round."""
+    """Steps/s of each candidate in each round; of the bare physics, where there is one."""
     envs: Any = gym.make_vec(env_id, num_envs=rows)
     envs.reset(seed=0)
     for _ in range(20):
@@ -106,9 +113,10 @@ def measure(env_id: str, rows: int, rounds: int, steps: int) -> dict[str, list[f
     env.reset(seed=0)
     work = {
         "vector": (vector_steps(envs, steps), rows * steps),
-        "bare": (Tape(envs, steps).replayer(), rows * steps),
         "single": (single_steps(env, 10 * steps), 10 * steps),
     }
+    if hasattr(envs.unwrapped.robot, "physics"):
+        work["bare"] = (Tape(envs, steps).replayer(), rows * steps)
     rates: dict[str, list[float]] = {name: [] for name in work}
     for run, _ in work.values():
         run()  # warm
@@ -125,9 +133,20 @@ def line(what: str, value: str, target: str, met: bool) -> str:
 
 
 def report(env_id: str, rows: int, rates: dict[str, list[float]]) -> None:
-    vector, bare, single = (median(rates[name]) for name in ("vector", "bare", "single"))
+    title = f"{env_id}, medians of {len(rates['vector'])} rounds"
+    print(f"{title:52}{'steps/s':>12}{'target':>12}")
+    vector, single = median(rates["vector"]), median(rates["single"])
+    if "bare" in rates:
+        report_physics(rows, vector, single, rates)
+    else:
+        target = IN_NUMPY.get(env_id, (rows, 0.0))[1]
+        print(line(f"gym.make_vec, {rows} rows", f"{vector:,.0f}", f"{target:,.0f}", vector >= target))
+        print(f"{'gym.make, one':52}{single:12,.0f}")
+
+
+def report_physics(rows: int, vector: float, single: float, rates: dict[str, list[float]]) -> None:
+    bare = median(rates["bare"])
     share = median(one / other for one, other in zip(rates["vector"], rates["bare"], strict=True))
-    print(f"{env_id}, medians of {len(rates['vector'])} rounds{'':17}{'steps/s':>12}{'target':>12}")
     print(line(f"gym.make_vec, {rows} rows", f"{vector:,.0f}", f"{VECTOR_TARGET:,.0f}", vector >= VECTOR_TARGET))
     print(f"{'bare mujoco.rollout, same model, states, controls':52}{bare:12,.0f}")
     print(line("share of the bare physics", f"{share:.1%}", f"{SHARE_TARGET:.0%}", share >= SHARE_TARGET))
@@ -136,21 +155,25 @@ def report(env_id: str, rows: int, rates: dict[str, list[float]]) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", default="bam/pick", help="environment (default bam/pick)")
-    parser.add_argument("--rows", type=int, default=64, help="rows of the vector environment (default 64)")
+    parser.add_argument("--env", help=f"one environment (default {PHYSICS} and those in NumPy with a target)")
+    parser.add_argument(
+        "--rows", type=int, help=f"rows of a vector environment (default {PHYSICS_ROWS}; others in NumPy)"
+    )
     parser.add_argument("--rounds", type=int, default=9, help="how often each is measured (default 9)")
     parser.add_argument("--steps", type=int, default=100, help="vector steps a round (default 100)")
     arguments = parser.parse_args()
     try:
-        env_id = resolve_id(arguments.env)
+        env_ids = [resolve_id(arguments.env)] if arguments.env else [PHYSICS, *IN_NUMPY]
     except BamEnvsError as error:
         parser.error(str(error))
-    if env_id not in ENVIRONMENTS:
-        parser.error(f"--env must be one of {', '.join(ENVIRONMENTS)}, not {env_id}")
+    if env_ids[0] not in ENVIRONMENTS:
+        parser.error(f"--env must be one of {', '.join(ENVIRONMENTS)}, not {env_ids[0]}")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
     print(f"{cores} cores, load {load:.1f}, mujoco {mujoco.__version__}, numpy {np.__version__}")
-    report(env_id, arguments.rows, measure(env_id, arguments.rows, arguments.rounds, arguments.steps))
+    for env_id in env_ids:
+        rows = arguments.rows or IN_NUMPY.get(env_id, (PHYSICS_ROWS,))[0]
+        report(env_id, rows, measure(env_id, rows, arguments.rounds, arguments.steps))
     return 0
 
 

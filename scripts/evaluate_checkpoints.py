@@ -21,12 +21,15 @@ from bam_train.cli.console import duration
 from bam_train.errors import BamTrainError
 from bam_train.evaluation import FIRST_SEED, EvaluationReport, evaluate
 from bam_train.policy import FrozenPolicy
-from bam_train.settings import differences
+from bam_train.settings import differences, file_stem
 from bam_train.trainers.resolve import resolve
 
 FOLDER = Path(__file__).resolve().parents[1] / "checkpoints"
 HEADER = ("checkpoint", "command", "seed", "steps", "wall time", "success", "size")
-FLAGS = ("steps", "seed", "num_envs", "device", "threads", "until_success", "eval_every", "eval_episodes")
+FLAGS = (
+    *("steps", "seed", "num_envs", "device", "threads", "until_success", "eval_every", "eval_episodes"),
+    *("num_env_runners", "num_learners", "num_gpus", "address", "data"),
+)
 """Settings that have a flag of their own."""
 _TABLE = re.compile(r"(<!-- generated -->\n).*?(<!-- /generated -->)", re.DOTALL)
 
@@ -36,9 +39,12 @@ def command(manifest: Manifest, name: str) -> str:
     own = manifest.settings
     env = manifest.env.rpartition("-v")[0] if manifest.env.startswith("bam/") else manifest.env
     words = ["bam-train", "--env", env, "--algo", manifest.algorithm]
-    for setting, value, _ in differences(own, resolve({"env": manifest.env, "algo": manifest.algorithm}).to_mapping()):
+    if manifest.trainer != "sb3":
+        words += ["--trainer", manifest.trainer]
+    asked = {"env": manifest.env, "algo": manifest.algorithm, "trainer": manifest.trainer}
+    for setting, value, _ in differences(own, resolve(asked).to_mapping()):
         words += _words(setting, value)
-    if name != f"{env.removeprefix('bam/')}-{manifest.algorithm}.zip":
+    if name != f"{file_stem(manifest.env, manifest.algorithm, manifest.trainer)}.zip":
         words += ["--out", f"checkpoints/{name}"]
     return shlex.join(words)
 

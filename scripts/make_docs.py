@@ -25,7 +25,9 @@ from bam_envs.robots.robot import SignalSpec
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 _PART = re.compile(r"(<!-- generated: (?P<name>\S+)(?: (?P<argument>\S+))? -->\n)(.*?)(<!-- /generated -->)", re.DOTALL)
 SECTIONS = ("Start", "Reward", "Success", "End", "Info")
-"""Parts of a task's docstring that its page shows."""
+"""Parts of a task's docstring that its page shows; every task has them."""
+OPTIONAL = ("Action",)
+"""Parts that a task may have."""
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -81,13 +83,18 @@ def anchor(heading: str) -> str:
 def environment(env_id: str) -> str:
     """Everything about one environment."""
     entry = ENVIRONMENTS[env_id]
-    docs = sections(resolve(entry.task).__doc__ or "")
+    task = resolve(entry.task)
+    docs = sections(task.__doc__ or "")
     signals = describe(resolve(entry.robot)(1), resolve(entry.task)(1))
     parts = [f"{entry.summary[0].upper()}{entry.summary[1:]}. One step is {entry.period:g} s of robot time."]
-    parts += [f"**{name}.** {docs[name]}" for name in SECTIONS]
-    end = f"Truncated after {entry.max_episode_steps} steps ({entry.max_episode_steps * entry.period:g} s)."
-    parts[1 + SECTIONS.index("End")] += f" {end}"
-    parts[1 + SECTIONS.index("Info")] += " `is_success`, as everywhere."
+    docs["End"] += f" Truncated after {entry.max_episode_steps} steps ({entry.max_episode_steps * entry.period:g} s)."
+    docs["Info"] += " `is_success`, as everywhere."
+    names = [name for name in docs if name in (*SECTIONS, *OPTIONAL)]
+    parts += [f"**{name}.** {docs[name]}" for name in names]
+    parts += [f"**Parity.** {text}" for text in _paragraphs(task, "With ``parity=True``")]
+    if options := arguments(task):
+        named = [[f"`{name}`", default, meaning] for name, default, meaning in options]
+        parts.append(f"**Options**: arguments of `gym.make`\n\n{table(['name', 'default', 'meaning'], named)}")
     for kind in ("observation", "action"):
         rows = signals[kind]
         numbers = [
@@ -97,6 +104,25 @@ def environment(env_id: str) -> str:
         parts.append(f"**{kind.capitalize()}**: float32, shape ({len(rows)},)")
         parts.append(table(["index", "name", "meaning", "unit", "scale", "min", "max"], numbers))
     return "\n\n".join(parts)
+
+
+def _paragraphs(kind: type, beginning: str) -> list[str]:
+    """The paragraphs of a docstring that begin so."""
+    found = inspect.cleandoc(kind.__doc__ or "").split("\n\n")
+    return [code(text) for text in found if text.startswith(beginning)]
+
+
+def arguments(task: type) -> list[tuple[str, str, str]]:
+    """Name, default and meaning of a task's options, out of its docstring and signature; ``num_rows`` is none."""
+    body = re.search(r"^Args:\n((?:[ ]{4}.*\n?|\n)+)", inspect.cleandoc(task.__doc__ or ""), re.MULTILINE)
+    found = re.findall(r"^(\w+): ((?:.*\n?)(?:^ +.*\n?)*)", textwrap.dedent(body[1]) if body else "", re.MULTILINE)
+    known = inspect.signature(task).parameters
+    values = {name: known[name].default for name, _ in found if name in known and name != "num_rows"}
+    return [(name, _default(values[name]), code(text)) for name, text in found if name in values]
+
+
+def _default(value: object) -> str:
+    return "" if value is None else f"`{value}`"
 
 
 def guards() -> str:
@@ -223,8 +249,10 @@ def flag(field: dataclasses.Field[Any]) -> str:
     return f"`--{field.name.replace('_', '-')}`"
 
 
-def algorithms() -> str:
-    """The table of algorithms."""
+def algorithms(trainer: str = "sb3") -> str:
+    """The table of a trainer's algorithms."""
+    if trainer == "rllib":
+        return rllib_algorithms()
     from bam_train.trainers.sb3.algorithms import ALGORITHMS
 
     rows = []
@@ -233,6 +261,37 @@ def algorithms() -> str:
         policy = f"{memory}, recurrent policy" if row.recurrent else memory
         rows.append([f"`{row.name}`", f"`{row.reference.replace(':', '.')}`", ", ".join(row.actions), policy])
     return table(["--algo", "class", "action spaces", "learns from"], rows)
+
+
+def rllib_algorithms() -> str:
+    """The table of RLlib's algorithms."""
+    from bam_train.trainers.rllib.algorithms import ALGORITHMS
+
+    rows = []
+    for row in ALGORITHMS.values():
+        memory = "recorded episodes" if row.offline else "fresh rollouts" if row.on_policy else "replay buffer"
+        rows.append([f"`{row.name}`", f"`{row.reference.replace(':', '.')}`", ", ".join(row.actions), memory])
+    return table(["--algo", "configuration", "action spaces", "learns from"], rows)
+
+
+def robo_gym() -> str:
+    """The table of robo-gym's ids; its two ids of one environment are one row."""
+    from bam_envs.robo_gym.table import ROBO_GYM
+
+    rows = []
+    for entry in (entry for entry in ROBO_GYM.values() if not entry.is_live):
+        ours = ENVIRONMENTS[entry.env_id]
+        options = {} if entry.no_parity else {"parity": True}
+        task = resolve(ours.task)(1, **options)
+        numbers = [len(task.observation_labels), len(task.action_labels)]
+        told = ", ".join(f"`{name}={value!r}`" for name, value in entry.defaults.items() if value is not False)
+        link = f"[`{ours.id}`](environments.md#{anchor(ours.id)})"
+        parity = "no" if entry.no_parity else "yes"
+        rate = f"{1 / ours.period:g} Hz"
+        rows.append([f"`{entry.stem}`", link, told, *numbers, ours.max_episode_steps, rate, parity])
+    names = ["id, before `Sim-v0` or `Rob-v0`", "is", "with"]
+    header = [*names, "observation", "action", "steps", "rate", "`parity=True`"]
+    return table(header, rows)
 
 
 def presets() -> str:
@@ -273,6 +332,7 @@ PARTS: dict[str, Callable[..., str]] = {
     "flags": flags_of,
     "algorithms": algorithms,
     "presets": presets,
+    "robo-gym": robo_gym,
     "run-folder": run_folder,
     "members": members,
 }

@@ -9,10 +9,9 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-import bam_envs
 from bam_envs.errors import BamEnvsError
 from bam_envs.registry import ENVIRONMENTS, resolve_id
-from bam_envs.scripted import scripted_policy
+from bam_envs.scripted import SCRIPTED, scripted_policy
 
 ROWS = 64
 
@@ -40,13 +39,14 @@ def run_episodes(env_id: str, episodes: int, seed: int, *, randomize: bool) -> t
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--env", action="append", help="environment, e.g. bam/pick; may be repeated; default: all")
+    known = ", ".join(SCRIPTED)
+    parser.add_argument("--env", action="append", help=f"one of {known}; may be repeated; default: all of these")
     parser.add_argument("--episodes", type=int, default=1000, help="episodes each (default 1000)")
     parser.add_argument("--seed", type=int, default=0, help="episode k is seeded seed + k (default 0)")
     parser.add_argument("--randomize", action="store_true", help="with domain randomisation")
     arguments = parser.parse_args()
     try:
-        names = [resolve_id(name) for name in arguments.env or bam_envs.ENVIRONMENTS]
+        names = [resolve_id(name) for name in arguments.env or SCRIPTED]
         for name in names:
             scripted_policy(name)
     except BamEnvsError as error:

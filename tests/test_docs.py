@@ -158,7 +158,7 @@ def test_commands_exist(page):
         elif words[0] == "python":
             assert (ROOT / words[1]).exists() or f"`{words[1]}`" in page.read_text()
         else:
-            assert words[0] in {*PROGRAMS, "pip", "pytest", "ros2"}
+            assert words[0] in {*PROGRAMS, "pip", "pytest", "ray", "ros2"}
 
 
 TRAINING = [words for page in PAGES for words in commands(page) if words[0] == "bam-train" and "--resume" not in words]

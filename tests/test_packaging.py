@@ -1,6 +1,7 @@
 """The wheel: what it holds, what it asks for, what it installs."""
 
 import email
+import importlib.metadata
 import os
 import re
 import subprocess
@@ -45,6 +46,7 @@ def test_the_wheel_holds_two_packages_and_nothing_else(wheel):
         "bam_train/py.typed",
         "bam_envs/robots/simulated/models/ur5e_gripper.xml",
         "bam_envs/robots/simulated/models/ur5e_cube.xml",
+        "bam_envs/robots/simulated/models/floor.xml",
         "bam_train/trainers/presets/pick-ppo.toml",
         "bam_train/trainers/presets/reach-ppo.toml",
         "bam_train/trainers/presets/pick-place-ppo.toml",
@@ -67,6 +69,7 @@ def test_console_scripts(wheel):
         "bam-deploy = bam_train.cli.deploy:main",
         "bam-envs = bam_train.cli.envs:main",
         "bam-eval = bam_train.cli.eval:main",
+        "bam-export = bam_train.cli.export:main",
         "bam-serve = bam_train.cli.serve:main",
         "bam-train = bam_train.cli.train:main",
     ]
@@ -90,7 +93,41 @@ def test_the_base_install_is_small(metadata):
 
 
 def test_extras(metadata):
-    assert sorted(metadata.get_all("Provides-Extra")) == ["all", "dev", "notebook", "sim", "train", "video"]
+    assert sorted(metadata.get_all("Provides-Extra")) == ["all", "dev", "notebook", "rllib", "sim", "train", "video"]
+
+
+def of_extra(metadata, extra):
+    return sorted(one.partition(";")[0].strip() for one in metadata.get_all("Requires-Dist") if f"'{extra}'" in one)
+
+
+def test_rllib_brings_ray_and_what_training_needs(metadata):
+    train, rllib = of_extra(metadata, "train"), of_extra(metadata, "rllib")
+    assert rllib == sorted([*train, "ray[rllib]<3,>=2.55"])
+    assert set(rllib) <= set(of_extra(metadata, "all"))
+    assert not [one for one in base_requirements(metadata) if one.startswith(("ray", "torch"))]
+
+
+OF_RLLIB = ("ray", "pydantic", "pyarrow", "tensorboardx", "dm-tree", "lz4", "ormsgpack", "scipy", "pandas")
+"""Ray, and what its extra rllib asks for."""
+
+
+def normal(name):
+    return re.split(r"[\[<>=; ]", name)[0].lower().replace("_", "-")
+
+
+def test_what_the_extras_bring_is_pinned_as_installed():
+    """Every package that the extra rllib brings, and what those bring, is in constraints.txt."""
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pins = {normal(one): one.partition("==")[2].partition(";")[0] for one in lines if "==" in one}
+    wanted, seen = [*OF_RLLIB], set()
+    while wanted:
+        name = wanted.pop()
+        if name in seen or name == "setuptools":
+            continue
+        seen.add(name)
+        there = importlib.metadata.distribution(name)
+        assert pins.get(name) == there.version.partition("+")[0], f"{name}=={there.version} is installed"
+        wanted += [normal(one) for one in there.requires or () if ";" not in one]
 
 
 def test_licence_and_versions(metadata):

@@ -25,7 +25,10 @@ def open_zip(path: Path) -> Iterator[zipfile.ZipFile]:
     """Open the zip; whatever damage zipfile meets in it becomes one clear line."""
     try:
         if path.is_dir():
-            raise NotACheckpoint(path, "is a folder, expected a checkpoint.zip. Give the file in it")
+            raise NotACheckpoint(
+                path,
+                "is a folder, expected a checkpoint.zip. Give the file in it; bam-export makes one of RLlib's folders",
+            )
         with zipfile.ZipFile(path) as archive:
             yield archive
     except FileNotFoundError as error:

@@ -37,8 +37,10 @@ def plan_lines(env: Any, env_id: str, address: str, episodes: int) -> list[str]:
 
     spec = getattr(getattr(env.unwrapped, "robot", None), "spec", None)
     count = "1 episode" if episodes == 1 else f"{episodes} episodes, one after the other without a pause"
-    arm = isinstance(spec, RobotSpec) and not is_base(spec)
-    begin = "by opening the gripper and going to the start pose" if arm else "where the base stands"
+    begin = "where the base stands"
+    if isinstance(spec, RobotSpec) and not is_base(spec):
+        gripper = "opening the gripper and " if "m" in spec.command.units else ""
+        begin = f"by {gripper}going to the start pose"
     return [f"  address: {address}", f"  {env_id}: {count}", f"  each begins {begin}"]
 
 

@@ -36,6 +36,7 @@ def show_environments(config: EnvsConfig) -> None:
 def overview() -> list[dict[str, Any]]:
     """One row of plain values for each of our environments; imports no simulator."""
     from bam_envs.registry import ENVIRONMENTS, resolve
+    from bam_envs.robo_gym.table import ROBO_GYM
 
     rows = []
     for entry in ENVIRONMENTS.values():
@@ -48,6 +49,7 @@ def overview() -> list[dict[str, Any]]:
                 "action": short_space(task.action_space),
                 "episode_steps": entry.max_episode_steps,
                 "rate_hz": 1 / entry.period,
+                "robo_gym": [name for name, theirs in ROBO_GYM.items() if theirs.env_id == entry.id],
             }
         )
     return rows
@@ -68,25 +70,37 @@ def overview_lines(rows: list[dict[str, Any]]) -> list[str]:
     lines = ["  ".join(str(row[key]).ljust(widths[key]) for key in header) for row in cells]
     summaries = ["what to do", *(row["summary"] for row in rows)]
     table = [f"{line}  {summary}" for line, summary in zip(lines, summaries, strict=True)]
-    return [*table, "", "Details: bam-envs ID. Training: bam-train --env ID --algo ppo; any Gymnasium id will do."]
+    more = "Details: bam-envs ID. Training: bam-train --env ID --algo ppo; any Gymnasium id will do."
+    return [*table, "", *_robo_gym_lines(rows), "", more]
+
+
+def _robo_gym_lines(rows: list[dict[str, Any]]) -> list[str]:
+    """robo-gym's names of the same environments, two ids in a line: ``EmptyEnvironmentUR{Sim,Rob}-v0``."""
+    pairs = {name.replace("Sim-v0", "{Sim,Rob}-v0"): row["id"] for row in rows for name in row["robo_gym"][::2]}
+    width = max(map(len, pairs), default=0)
+    lines = [f"{name.ljust(width)}  {env_id}" for name, env_id in pairs.items()]
+    return ["robo-gym's ids work too, with robo-gym's options; Rob is the one with a live robot:", *lines]
 
 
 def details(name: str) -> dict[str, Any]:
     """Everything about one environment, as plain values; makes it, so it needs its simulator."""
-    from bam_envs.registry import ENVIRONMENTS, resolve_id
+    from bam_envs.registry import entry_of, resolve_id
+    from bam_envs.robo_gym.table import ROBO_GYM
     from bam_envs.spaces import space_to_json
     from bam_train.environments import control_period, make_env
 
     env_id = resolve_id(name)
-    own = env_id.rpartition(":")[2]
-    env = make_env(env_id)
+    entry, theirs = entry_of(env_id), ROBO_GYM.get(env_id)
+    env = make_env(theirs.twin if theirs is not None and theirs.is_live else env_id)
     try:
         describe = getattr(env.unwrapped, "describe", None)
         period = control_period(env)
         return {
             "id": env_id,
-            "summary": ENVIRONMENTS[own].summary if own in ENVIRONMENTS else None,
-            "episode_steps": None if env.spec is None else env.spec.max_episode_steps,
+            "summary": None if entry is None else entry.summary,
+            "same_as": None if theirs is None else theirs.env_id,
+            "is_live": theirs is not None and theirs.is_live,
+            "episode_steps": _limit(env) if entry is None else entry.max_episode_steps,
             "rate_hz": None if period is None else 1 / period,
             "observation_space": space_to_json(env.observation_space),
             "action_space": space_to_json(env.action_space),
@@ -96,9 +110,17 @@ def details(name: str) -> dict[str, Any]:
         env.close()  # type: ignore[no-untyped-call]
 
 
+def _limit(env: Any) -> int | None:
+    steps: int | None = None if env.spec is None else env.spec.max_episode_steps
+    return steps
+
+
 def detail_lines(facts: dict[str, Any]) -> list[str]:
     """The same for people."""
     lines = [facts["id"] if facts["summary"] is None else f"{facts['id']}: {facts['summary']}"]
+    if facts["same_as"] is not None:
+        live = ", with a live robot: rs_address='IP:PORT' or robot='ws://IP:PORT'" if facts["is_live"] else ""
+        lines.append(f"robo-gym's name of {facts['same_as']}{live}")
     steps = "no time limit" if facts["episode_steps"] is None else f"{facts['episode_steps']} steps an episode"
     lines.append(f"{steps}, {'no rate given' if facts['rate_hz'] is None else format(facts['rate_hz'], 'g') + ' Hz'}")
     if not facts["signals"]:

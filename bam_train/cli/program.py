@@ -23,6 +23,7 @@ EXTRAS = {
     "torch": "train",
     "stable_baselines3": "train",
     "sb3_contrib": "train",
+    "ray": "rllib",
     "onnx": "train",
     "tensorboard": "train",
     "matplotlib": "train",

@@ -16,6 +16,7 @@ from bam_train.cli.program import run_program
 if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
     from bam_train.settings import TrainSettings
+    from bam_train.trainers.copies import Copies
     from bam_train.trainers.output import Output
     from bam_train.trainers.run_folder import RunFolder
     from bam_train.trainers.trainer import Trainer
@@ -41,13 +42,26 @@ class TrainConfig:
     env: Text = None
     """Environment: any Gymnasium id, such as bam/pick, CartPole-v1 or some_module:Env-v0."""
     algo: Text = None
-    """Algorithm: ppo, a2c, sac, td3, ddpg, dqn, tqc, trpo, qrdqn, crossq or recurrent-ppo."""
+    """Algorithm: ppo, a2c, sac, td3, ddpg, dqn, tqc, trpo, qrdqn, crossq or recurrent-ppo.
+    With --trainer rllib: ppo, appo, impala, sac, dqn, bc, marwil or cql."""
+    trainer: Text = None
+    """Library that trains: sb3 (default) or rllib."""
     steps: Whole = None
     """Environment steps of the whole run, also after --resume."""
     seed: Whole = None
     """Seed of weights, exploration and environments."""
     num_envs: Whole = None
-    """Environments stepped side by side."""
+    """Environments stepped side by side; of rllib: in each runner."""
+    num_env_runners: Whole = None
+    """Processes of rllib that collect samples (default 0: the trainer's own does)."""
+    num_learners: Whole = None
+    """Processes of rllib that update the weights (default 0: the trainer's own does)."""
+    num_gpus: Whole = None
+    """GPUs that learners of rllib use in all (default RLLIB_NUM_GPUS, else 0)."""
+    address: Annotated[str | None, _flag("auto|HOST:PORT")] = None
+    """Ray cluster that rllib trains on; by default it starts one on this computer, for this run."""
+    data: Annotated[str | None, _flag("FOLDER")] = None
+    """Recorded episodes that bc, marwil and cql of rllib learn from: Parquet files, also at an fsspec address."""
     device: Text = None
     """Where to compute: auto, cpu, cuda, cuda:1."""
     threads: Whole = None
@@ -61,6 +75,8 @@ class TrainConfig:
     """Print all settings of the run as JSON, and do not train."""
     out: File = None
     """Where the best checkpoint goes (default checkpoints/<env>-<algo>.zip)."""
+    copy_to: Annotated[str | None, _flag("URL")] = None
+    """Copy every checkpoint that goes to --out to an fsspec address too, such as s3://bucket/runs/."""
     resume: File = None
     """Checkpoint to go on from, with its settings and up to --steps in all."""
     until_success: Share = None
@@ -81,7 +97,7 @@ class TrainConfig:
     """Folder in which the run's own folder is made."""
 
 
-_NOT_SETTINGS = frozenset({"config", "set", "print_config", "out", "resume", "force", "runs"})
+_NOT_SETTINGS = frozenset({"config", "set", "print_config", "out", "copy_to", "resume", "force", "runs"})
 
 
 def main() -> None:
@@ -123,20 +139,35 @@ def _settings(config: TrainConfig, checkpoint: Checkpoint | None) -> TrainSettin
 def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint | None) -> int:
     """Train with complete settings; returns the exit status."""
     from bam_train.cli.train_display import nobody_need_read
-    from bam_train.settings import file_stem
     from bam_train.trainers import load_trainer
+    from bam_train.trainers.copies import Copies
     from bam_train.trainers.output import choose_output
-    from bam_train.trainers.run_folder import RunFolder, require_room
+    from bam_train.trainers.run_folder import require_room
 
     require_room(config.runs.expanduser())
     output = choose_output(settings, config.out, config.force, checkpoint)
     kind = load_trainer(settings.trainer)
+    copies = None if config.copy_to is None else Copies(config.copy_to)
     made = kind.create(settings) if checkpoint is None else kind.load(checkpoint, settings)
-    folder = RunFolder(config.runs.expanduser(), file_stem(settings.env, settings.algo))
-    folder.write_config(settings.to_mapping())
-    made.log_to(folder.tensorboard)
+    try:
+        folder = _folder(config.runs.expanduser(), made)
+    except BaseException:
+        made.close()
+        raise
     with nobody_need_read():
-        return _run(made, folder, output, _title(settings, checkpoint))
+        return _run(made, folder, output, copies, _title(settings, checkpoint))
+
+
+def _folder(runs: Path, trainer: Trainer) -> RunFolder:
+    """The run's own folder, with its settings and log files."""
+    from bam_train.settings import file_stem
+    from bam_train.trainers.run_folder import RunFolder
+
+    settings = trainer.settings
+    folder = RunFolder(runs, file_stem(settings.env, settings.algo, settings.trainer))
+    folder.write_config(settings.to_mapping())
+    trainer.log_to(folder.tensorboard)
+    return folder
 
 
 def _title(settings: TrainSettings, checkpoint: Checkpoint | None) -> str:
@@ -147,7 +178,7 @@ def _title(settings: TrainSettings, checkpoint: Checkpoint | None) -> str:
     return f"{title}, going on from {checkpoint.path} at {count(checkpoint.manifest.steps)} steps"
 
 
-def _run(trainer: Trainer, folder: RunFolder, output: Output, title: str) -> int:
+def _run(trainer: Trainer, folder: RunFolder, output: Output, copies: Copies | None, title: str) -> int:
     """Train to the end and say how it went; returns the exit status."""
     from bam_train.cli.stop_signals import StopSignals
     from bam_train.cli.train_display import make_display
@@ -155,7 +186,7 @@ def _run(trainer: Trainer, folder: RunFolder, output: Output, title: str) -> int
     from bam_train.trainers.run import TrainingRun
 
     display = make_display(title)
-    run = TrainingRun(trainer, folder, output.path, display, output.best)
+    run = TrainingRun(trainer, folder, output.path, display, output.best, copies=copies)
     with StopSignals(run) as signals:
         try:
             with display:

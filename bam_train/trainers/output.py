@@ -41,7 +41,8 @@ def choose_output(settings: TrainSettings, out: Path | None, force: bool, resume
         OutputError: It cannot be written there.
     """
     own = None if resumed is None else _own_best(resumed, settings)
-    wanted = (out or (own.path if own else FOLDER / f"{file_stem(settings.env, settings.algo)}.zip")).expanduser()
+    usual = FOLDER / f"{file_stem(settings.env, settings.algo, settings.trainer)}.zip"
+    wanted = (out or (own.path if own else usual)).expanduser()
     if wanted.suffix != ".zip" and not wanted.is_dir():
         raise OutputError(f"{wanted}: expected a file name that ends in .zip. Choose another one with --out")
     require_writable(wanted)

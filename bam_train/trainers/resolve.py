@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any
 
 from bam_train.checkpoint import Checkpoint
@@ -15,9 +16,13 @@ from bam_train.values import closest
 
 CHANGEABLE = frozenset(
     {"steps", "until_success", "eval_every", "eval_episodes", "device", "threads", "transport", "ca_file", "token_file"}
+    | {"num_env_runners", "num_learners", "num_gpus", "address"}
 )
 """Settings that a resumed run may have otherwise: when to stop, how to measure, where to compute and where the
 environment runs; not what to learn."""
+
+OF_RLLIB = ("num_env_runners", "num_learners", "num_gpus", "address", "data")
+"""Settings that the rllib trainer alone has a use for."""
 
 _NOT_OF_THE_ENVIRONMENT = frozenset({"env_id", "render_mode", "task_options"}) | {
     "robot",
@@ -41,8 +46,11 @@ def resolve(given: Mapping[str, Any]) -> TrainSettings:
         if given.get(name) is None:
             raise SettingsError(f"{name}: expected a name, found nothing. Give --{name} NAME")
     env = resolve_env(given["env"], elsewhere=bool(given.get("transport")))
-    require_algorithm(given.get("trainer", "sb3"), given["algo"])
-    settings = TrainSettings.from_mapping(merge(read_preset(env, given["algo"]), given, {"env": env}))
+    trainer = given.get("trainer") or "sb3"
+    require_algorithm(trainer, given["algo"])
+    preset = read_preset(_tuned_as(env), given["algo"], trainer)
+    settings = TrainSettings.from_mapping(merge(preset, given, {"env": env}))
+    _require_of_trainer(settings)
     require_env_kwargs(env, settings.env_kwargs)
     _require_own(given, settings)
     completed = load_trainer(settings.trainer).complete(settings)
@@ -50,6 +58,14 @@ def resolve(given: Mapping[str, Any]) -> TrainSettings:
         there = f"there are {completed.num_envs} at {settings.place.text}"
         raise SettingsError(f"num_envs: {settings.num_envs} were asked for, and {there}; leave it out")
     return completed
+
+
+def _require_of_trainer(settings: TrainSettings) -> None:
+    """Refuse settings that belong to the other trainer."""
+    defaults = {field.name: field.default for field in fields(TrainSettings)}
+    for name in OF_RLLIB if settings.trainer == "sb3" else ():
+        if getattr(settings, name) != defaults[name]:
+            raise SettingsError(f"{name}: the sb3 trainer has no use for it; leave it out, or add --trainer rllib")
 
 
 def _require_own(given: Mapping[str, Any], settings: TrainSettings) -> None:
@@ -70,6 +86,9 @@ def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSe
     """
     check_names(given, "settings")
     own = dict(checkpoint.manifest.settings)
+    if "exported" in own:
+        text = "was exported from a directory of RLlib and holds the policy alone: training cannot go on from it"
+        raise CheckpointMismatch(checkpoint.path, f"{text}. Train anew, or go on with RLlib from its own directory")
     if given.get("transport") == []:  # from there to here, where there is no link
         own |= {"ca_file": None, "token_file": None}
     asked = dict(given)
@@ -82,6 +101,7 @@ def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSe
     for name, wanted, found in differences(asked, own):
         if name not in CHANGEABLE and found is not None:
             raise _mismatch(checkpoint, name, wanted, found)
+    _require_of_trainer(settings)
     completed = load_trainer(settings.trainer).complete(settings)
     _require_same(asked, own, checkpoint)
     _require_steps_left(checkpoint, completed)
@@ -111,19 +131,31 @@ def resolve_env(name: str, *, elsewhere: bool = False) -> str:
         raise
 
 
+def _tuned_as(env: str) -> str:
+    """Under which id the presets of `env` are: robo-gym's ids are names of ours."""
+    from bam_envs.registry import entry_of
+
+    entry = entry_of(env)
+    return env if entry is None else entry.id
+
+
 def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
     """Refuse an argument that one of our environments does not have; others are asked when they are made.
 
     Raises:
         SettingsError: Carries the closest match.
     """
-    from bam_envs.registry import ENVIRONMENTS, make_env
+    from bam_envs.registry import entry_of, make_env
     from bam_envs.registry import resolve as resolve_reference
+    from bam_envs.robo_gym.options import CONSTRUCTOR_OPTIONS
+    from bam_envs.robo_gym.table import ROBO_GYM
 
-    entry = ENVIRONMENTS.get(env.rpartition(":")[2])
+    entry = entry_of(env)
     if entry is None or not given:
         return
     own = set(inspect.signature(make_env).parameters) - _NOT_OF_THE_ENVIRONMENT
+    if env.rpartition(":")[2] in ROBO_GYM:
+        own |= CONSTRUCTOR_OPTIONS
     of_task = set(inspect.signature(resolve_reference(entry.task)).parameters) - {"num_rows"}
     for name in given:
         if name not in own | of_task | {"max_episode_steps"}:

@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from bam_envs.errors import RobotFault
-from bam_train.errors import OutputError, TrainingFailed
+from bam_train.errors import OutputError, ProcessesLost, TrainingFailed
 from bam_train.evaluation import EvaluationReport
 from bam_train.settings import TrainSettings
+from bam_train.trainers.copies import Copies
 from bam_train.trainers.judge import judge
 from bam_train.trainers.run_folder import RunFolder, unwritable
 from bam_train.trainers.trainer import Progress, Statistics, Trainer
@@ -97,6 +98,7 @@ class TrainingRun:
         watcher: Who is told.
         best: The best evaluation of the part of this run that was trained before, whose checkpoint is at `out`.
         clock: Monotonic time [s].
+        copies: Where every checkpoint that goes to `out` is copied to.
 
     Attributes:
         done: Whether everything is saved.
@@ -110,10 +112,11 @@ class TrainingRun:
         watcher: Watcher,
         best: Best | None = None,
         clock: Callable[[], float] = time.monotonic,
+        copies: Copies | None = None,
     ) -> None:
         self.trainer, self.folder, self.out, self.watcher, self.best = trainer, folder, out, watcher, best
         self.settings: TrainSettings = trainer.settings
-        self._clock = clock
+        self._clock, self._copies = clock, copies
         self._start = self._recorded = self._saved = clock()
         self._first_step = trainer.steps
         self._save_pause = FIRST_SAVE
@@ -125,6 +128,7 @@ class TrainingRun:
         self._kept: Path | None = out if best else None
         self._last_steps = 0
         self._failures: dict[str, OutputError] = {}
+        self._noted = len(trainer.notices)
 
     def stop(self) -> None:
         """Ask for an end after the update in progress; may be called from a signal handler."""
@@ -146,18 +150,29 @@ class TrainingRun:
             self.trainer.train(self.settings.steps, self._between)
             if not self._stop and self._evaluated_at < self.trainer.steps:
                 self._evaluate()
+        except ProcessesLost as error:
+            self._save_last()
+            raise TrainingFailed(f"at step {self.trainer.steps}: {error}. {self._learnt}") from error
         except TrainingFailed as error:
             kept = f"the last good checkpoint is {self.last}" if self.last else "no checkpoint had been saved yet"
             raise TrainingFailed(f"{error}; {kept}") from error
         except RobotFault as error:  # what was learnt so far is not lost with the link
             self._save_last()
-            kept = f"go on with --resume {self.folder.last}" if self._last_steps else "nothing had been learnt yet"
-            raise TrainingFailed(f"at step {self.trainer.steps}: {error} What was learnt is kept: {kept}") from error
+            raise TrainingFailed(f"at step {self.trainer.steps}: {error} {self._learnt}") from error
         self._save_last()
         if self._stop and self._kept is None and not self.out.exists():
             self._kept = self.out if self._write(self.out, None, "--out") else None  # the newest: none was evaluated
+            self._copy()
+        if "copy" in self._failures:
+            self._copy()  # what was in the way may be gone
         self.done = True
         return self._outcome()
+
+    @property
+    def _learnt(self) -> str:
+        """What is left of a run that something outside it ended."""
+        kept = f"go on with --resume {self.folder.last}" if self._last_steps else "nothing had been learnt yet"
+        return f"What was learnt is kept: {kept}"
 
     def _outcome(self) -> Outcome:
         reason = "stopped" if self._stop else "success" if self._reached else "steps"
@@ -169,6 +184,7 @@ class TrainingRun:
 
     def _between(self, progress: Progress) -> bool:
         """What happens between two updates; False ends training."""
+        self._note()
         if self._stop:
             return False
         self._record(progress)
@@ -178,6 +194,13 @@ class TrainingRun:
         elif self._clock() - self._saved > self._save_pause:
             self._save_last()
         return not (self._stop or self._reached)
+
+    def _note(self) -> None:
+        """Pass on what the trainer wants known since the last time."""
+        notices = self.trainer.notices
+        for notice in notices[self._noted :]:
+            self.watcher.note(notice)
+        self._noted = len(notices)
 
     def _due(self, progress: Progress) -> bool:
         """Whether to evaluate: every so many steps, and early once training itself succeeds as often as wanted."""
@@ -234,6 +257,7 @@ class TrainingRun:
         if self._write(self.out, self.out, "--out"):
             self._kept = self.out
             self._failures.pop("best.zip", None)
+            self._copy()
             return
         rescue = self.folder.path / "best.zip"
         if self._write(rescue, rescue, "--runs"):
@@ -243,6 +267,19 @@ class TrainingRun:
         self.best, self._best_scores = before  # the next evaluation tries again
         kept = f"the best one that is saved is {self._kept}" if self._kept else "no best policy is saved yet"
         self.watcher.note(f"the best policy could not be saved; {kept}")
+
+    def _copy(self) -> None:
+        """Copy what is at `out`; training does not depend on it."""
+        if self._copies is None or self._kept != self.out:
+            return
+        try:
+            self._copies.copy(self.out)
+        except OutputError as error:
+            if "copy" not in self._failures:
+                self.watcher.note(f"{error}. It is tried again{' at the next best policy' if self._goes_on else ''}")
+            self._failures["copy"] = error
+        else:
+            self._failures.pop("copy", None)
 
     def _save_last(self) -> None:
         """Save the newest state; the next save is put off while saving is slow."""

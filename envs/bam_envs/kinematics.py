@@ -4,6 +4,9 @@ Six joints with the Denavit-Hartenberg structure alpha = (90, 0, 0, 90, -90, 0) 
 parallel axes, so a tool that points straight down has an exact inverse. Positions are in the ROS ``base_link`` frame
 (x forward, z up; the DH frame turned by 180 degrees about z), in metres; angles in radians.
 
+Link frames are those of ROS-Industrial's ur_description (kinematics since its version 1.3): each link's frame is at its
+joint, which turns it about its z axis; ``tool0`` is at the flange, its z axis pointing out of it.
+
 Source of the constants: Universal Robots, "DH parameters for calculations of kinematics and dynamics", article 45257.
 """
 
@@ -16,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+LINKS = ("shoulder_link", "upper_arm_link", "forearm_link", "wrist_1_link", "wrist_2_link", "tool0")
+"""Frames of `ArmGeometry.link_poses`, in its order. ``tool0`` is also the frame of ``wrist_3_link``."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +76,54 @@ class ArmGeometry:
         """Position of the tool [m]. Shape: (n, 6) -> (n, 3)."""
         return self.tool_pose(q)[0]
 
+    def flange_pose(self, q: Array) -> tuple[Array, Array]:
+        """Pose of ``tool0`` in ``base_link``; the tool's length does not count.
+
+        Args:
+            q: Joint positions [rad]. Shape: (n, 6).
+
+        Returns:
+            position [m], shape (n, 3), and rotation matrix, whose columns are the axes of ``tool0``, shape (n, 3, 3).
+        """
+        positions, rotations = self.link_poses(q)
+        return positions[:, -1], rotations[:, -1]
+
+    def link_poses(self, q: Array) -> tuple[Array, Array]:
+        """Poses of the frames `LINKS` in ``base_link``.
+
+        Args:
+            q: Joint positions [rad]. Shape: (n, 6).
+
+        Returns:
+            positions [m], shape (n, 6, 3), and rotation matrices, whose columns are the axes, shape (n, 6, 3, 3).
+        """
+        c, s = np.cos(q), np.sin(q)
+        level = np.empty((len(q), 4))  # angles of x axes in the arm's vertical plane
+        level[:, 0], level[:, 1] = 0.0, q[:, 1]
+        level[:, 2] = q[:, 1] + q[:, 2]
+        level[:, 3] = level[:, 2] + q[:, 3]
+        along = np.stack([np.cos(level), np.zeros_like(level), np.sin(level)], axis=2)
+        across = np.stack([-along[:, :, 2], np.zeros_like(level), along[:, :, 0]], axis=2)
+        # In the plane's own coordinates: radial along x1, sideways along the shoulder axis, height along z.
+        axes = np.zeros((len(q), 6, 3, 3))
+        axes[:, :4, :, 0], axes[:, :4, :, 1], axes[:, 1:4, 1, 2] = along, across, 1.0
+        axes[:, 0, :, 1], axes[:, 0, :, 2] = (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)
+        x, y = along[:, 3], np.array([0.0, 1.0, 0.0])
+        axes[:, 4, :, 0] = c[:, 4:5] * x + s[:, 4:5] * y
+        axes[:, 4, :, 1] = c[:, 4:5] * y - s[:, 4:5] * x
+        axes[:, 4, :, 2] = -across[:, 3]
+        axes[:, 5, :, 0] = c[:, 5:6] * axes[:, 4, :, 0] + s[:, 5:6] * across[:, 3]
+        axes[:, 5, :, 1] = c[:, 5:6] * across[:, 3] - s[:, 5:6] * axes[:, 4, :, 0]
+        axes[:, 5, :, 2] = axes[:, 4, :, 1]
+        places = np.zeros((len(q), 6, 3))
+        places[:, :, 2] = self.d1
+        places[:, 2:] += self.a2 * along[:, 1, None]
+        places[:, 3:] += self.a3 * along[:, 2, None]
+        places[:, 3:, 1] += self.d4
+        places[:, 4:] -= self.d5 * across[:, 3, None]
+        places[:, 5] += self.d6 * axes[:, 5, :, 2]
+        return _turned(places, c[:, 0], s[:, 0]), _turned(axes.swapaxes(2, 3), c[:, 0], s[:, 0]).swapaxes(2, 3)
+
     def reach_down(self, position: Array, yaw: Array) -> Array:
         """Joint positions that put the tool at `position`, pointing straight down, its x axis at `yaw` from world x.
 
@@ -107,7 +160,48 @@ class ArmGeometry:
         return q
 
 
+UR3 = ArmGeometry(d1=0.1519, a2=-0.24365, a3=-0.21325, d4=0.11235, d5=0.08535, d6=0.0819)
+UR3E = ArmGeometry(d1=0.15185, a2=-0.24355, a3=-0.2132, d4=0.13105, d5=0.08535, d6=0.0921)
+UR5 = ArmGeometry(d1=0.089159, a2=-0.425, a3=-0.39225, d4=0.10915, d5=0.09465, d6=0.0823)
 UR5E = ArmGeometry(d1=0.1625, a2=-0.425, a3=-0.3922, d4=0.1333, d5=0.0997, d6=0.0996)
+UR10 = ArmGeometry(d1=0.1273, a2=-0.612, a3=-0.5723, d4=0.163941, d5=0.1157, d6=0.0922)
+UR10E = ArmGeometry(d1=0.1807, a2=-0.6127, a3=-0.57155, d4=0.17415, d5=0.11985, d6=0.11655)
+UR16E = ArmGeometry(d1=0.1807, a2=-0.4784, a3=-0.36, d4=0.17415, d5=0.11985, d6=0.11655)
+
+
+def _turned(vectors: Array, c1: Array, s1: Array) -> Array:
+    """Vectors (n, ..., 3) of the arm's vertical plane (radial, sideways, height) in ``base_link``."""
+    shape = (len(c1), *[1] * (vectors.ndim - 2))
+    c1, s1 = c1.reshape(shape), s1.reshape(shape)
+    turned = np.empty_like(vectors)
+    turned[..., 0] = -(vectors[..., 0] * c1 + vectors[..., 1] * s1)
+    turned[..., 1] = vectors[..., 1] * c1 - vectors[..., 0] * s1
+    turned[..., 2] = vectors[..., 2]
+    return turned
+
+
+def quaternions(rotation: Array) -> Array:
+    """Unit quaternions x, y, z, w of rotation matrices, w not negative. Shape: (n, 3, 3) -> (n, 4).
+
+    Each component is computed from the one that is largest, so that nothing is divided by a small number.
+    """
+    m = rotation
+    trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
+    # The symmetric matrix 4 q q^T: its column with the largest diagonal element is a multiple of q.
+    square = np.empty((len(m), 4, 4))
+    for i in range(3):
+        square[:, i, i] = 1 + 2 * m[:, i, i] - trace
+        for j in range(i):
+            square[:, i, j] = square[:, j, i] = m[:, i, j] + m[:, j, i]
+    square[:, 3, 3] = 1 + trace
+    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
+        square[:, i, 3] = square[:, 3, i] = m[:, k, j] - m[:, j, k]
+    largest = np.einsum("nii->ni", square).argmax(axis=1)
+    column: Array = square[np.arange(len(m)), :, largest]
+    x, y, z, w = column.T
+    column /= np.sqrt(x * x + y * y + z * z + w * w)[:, None]
+    column[column[:, 3] < 0] *= -1.0
+    return column
 
 
 def cube_yaw_phase(quaternion: Array) -> NDArray[np.complex128]:

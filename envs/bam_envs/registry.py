@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 
 from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.robo_gym.table import ROBO_GYM
 
 if TYPE_CHECKING:
     from bam_envs.remote_env import RemoteVectorEnv
@@ -142,16 +143,29 @@ ENVIRONMENTS: dict[str, EnvEntry] = {entry.id: entry for entry in _ENTRIES}
 
 
 def register() -> None:
-    """Register every row with Gymnasium; doing it twice is once."""
+    """Register every row with Gymnasium, and robo-gym's ids of them; doing it twice is once."""
     for entry in ENVIRONMENTS.values():
-        if entry.id not in gym.registry:
-            gym.register(
-                entry.id,
-                entry_point="bam_envs.registry:make_env",
-                vector_entry_point="bam_envs.registry:make_vector_env",
-                max_episode_steps=None if entry.parity else entry.max_episode_steps,
-                kwargs={"env_id": entry.id},
-            )
+        _register(entry.id, "bam_envs.registry", None if entry.parity else entry.max_episode_steps)
+    for env_id in ROBO_GYM:
+        _register(env_id, "bam_envs.robo_gym.making", None)
+
+
+def _register(env_id: str, module: str, max_episode_steps: int | None) -> None:
+    """`module` has the two functions that make it."""
+    if env_id not in gym.registry:
+        gym.register(
+            env_id,
+            entry_point=f"{module}:make_env",
+            vector_entry_point=f"{module}:make_vector_env",
+            max_episode_steps=max_episode_steps,
+            kwargs={"env_id": env_id},
+        )
+
+
+def entry_of(env_id: str) -> EnvEntry | None:
+    """The row that `env_id` names, ours or robo-gym's, with or without ``module:``; None of anything else."""
+    own = env_id.rpartition(":")[2]
+    return ENVIRONMENTS.get(ROBO_GYM[own].env_id if own in ROBO_GYM else own)
 
 
 def resolve_id(name: str) -> str:
@@ -234,17 +248,17 @@ def make_env(
     task = resolve(entry.task)(1, **task_options)
     simulated = entry.make_robot(1, randomize, task_options)
     if robot is None:
-        return _limited(RobotEnv(simulated, task, render_mode=render_mode), entry)
+        return limited(RobotEnv(simulated, task, render_mode=render_mode), entry)
     from bam_envs.robots.live.building import live_robot
 
     tool = getattr(simulated, "tool_position", None)  # forward kinematics of an arm that is no UR5e
     live = live_robot(
         robot, simulated.spec, profile=profile, tool_position=tool, ca_file=ca_file, token_file=token_file
     )
-    return _limited(RobotEnv(live, task, render_mode=render_mode), entry)
+    return limited(RobotEnv(live, task, render_mode=render_mode), entry)
 
 
-def _limited(env: RobotEnv, entry: EnvEntry) -> gym.Env[Any, Any]:
+def limited(env: RobotEnv, entry: EnvEntry) -> gym.Env[Any, Any]:
     """`env` with the time limit that Gymnasium does not put around it."""
     if not entry.parity or getattr(env.task, "ends_by_itself", False):
         return env

@@ -6,6 +6,7 @@ Longer than most files here: the two stand side by side because they must agree 
 from __future__ import annotations
 
 import copy
+import math
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from bam_envs.errors import InvalidValue, ResetNeeded, UnknownName
 from bam_envs.robots.robot import Robot, RobotState, Rows
-from bam_envs.tasks.task import Score, Task
+from bam_envs.tasks.task import Label, Score, Task
 
 RENDER_MODES = ["rgb_array", "human"]
 
@@ -62,10 +63,18 @@ def task_options(task: Task, options: Mapping[str, Any] | None) -> dict[str, Any
 
 
 def describe(robot: Robot, task: Task) -> dict[str, list[dict[str, Any]]]:
-    """What every number of observation, action, state and command means: name, unit, limits; plain values."""
+    """What every number of observation, action, state and command means: name, unit, limits; plain values.
+
+    No limit is ``"inf"`` or ``"-inf"``, as in `bam_envs.spaces`: JSON has no infinities.
+    """
     labels = {"observation": task.observation_labels, "action": task.action_labels}
-    rows = {kind: [asdict(label) for label in group] for kind, group in labels.items()}
+    rows = {kind: [_described(label) for label in group] for kind, group in labels.items()}
     return {**rows, **robot.spec.describe()}
+
+
+def _described(label: Label) -> dict[str, Any]:
+    row = asdict(label)
+    return row | {side: str(row[side]) for side in ("low", "high") if math.isinf(row[side])}
 
 
 def render(robot: Robot, task: Task, mode: str | None) -> NDArray[np.uint8] | None:
@@ -104,6 +113,8 @@ class RobotEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.metadata = {"render_modes": render_modes(), "render_fps": round(1 / robot.spec.period)}
         self.state: RobotState | None = None
         """The last state, or None when no episode runs."""
+        self.last_state: RobotState | None = None
+        """The newest state there was, also when the episode that it ended is over."""
         self._first = np.zeros(1, dtype=np.int64)
 
     @property
@@ -121,7 +132,7 @@ class RobotEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Begin an episode; a live robot goes to its start pose slowly."""
         super().reset(seed=seed)
         given = task_options(self.task, options)
-        self.state = start_rows(self.robot, self.task, self._first, [self.np_random], given)
+        self.state = self.last_state = start_rows(self.robot, self.task, self._first, [self.np_random], given)
         if self.render_mode == "human":
             self.render()
         return self.task.observe(self.state)[0], {"is_success": False}
@@ -135,7 +146,7 @@ class RobotEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         score = self.task.score(state, batch)
         observation = self.task.observe(state)[0]
         terminated = bool(score.terminated[0])
-        self.state = None if terminated else state
+        self.state, self.last_state = None if terminated else state, state
         if self.render_mode == "human":
             self.render()
         return observation, float(score.reward[0]), terminated, False, plain_info(score)
@@ -161,7 +172,19 @@ class RobotEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 def plain_info(score: Score) -> dict[str, Any]:
     """The info of row 0 in plain Python values."""
     said = {key: _plain(value[0]) for key, value in score.info.items()}
-    return {"is_success": bool(score.success[0]), **{key: value for key, value in said.items() if value != ""}}
+    return {"is_success": bool(score.success[0]), **{key: value for key, value in said.items() if not _is_empty(value)}}
+
+
+def _is_empty(value: Any) -> bool:
+    return isinstance(value, str) and value == ""
+
+
+def _said(value: NDArray[Any]) -> NDArray[np.bool_]:
+    """Of which rows an info says something: an empty text says nothing. Shape: (n,)."""
+    if value.dtype.kind in "US":
+        said: NDArray[np.bool_] = value != ""
+        return said
+    return np.array([not _is_empty(one) for one in value]) if value.dtype.kind == "O" else np.ones(len(value), bool)
 
 
 def _plain(value: Any) -> Any:
@@ -269,7 +292,7 @@ class RobotVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.float3
         truncated = self._truncated(score)
         infos = {"is_success": score.success, "_is_success": self._all.copy()}
         for key, value in score.info.items():
-            infos[key], infos["_" + key] = value, infos["_is_success"]
+            infos[key], infos["_" + key] = value, _said(value)
         ended = score.terminated | truncated
         if ended.any():
             observation = self._next_episodes(ended, observation, infos)
@@ -286,9 +309,10 @@ class RobotVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.float3
     ) -> NDArray[np.float32]:
         """Move the last observation and info of ended rows aside and begin their next episodes."""
         values = {key: value for key, value in infos.items() if not key.startswith("_")}
-        infos |= {"_" + key: ~ended for key in values}  # what `reset` says nothing of
+        masks = {"_" + key: infos["_" + key] for key in values}
+        infos |= {name: mask & ~ended for name, mask in masks.items()}  # what `reset` says nothing of
         infos |= {"is_success": values["is_success"] & ~ended, "_is_success": self._all.copy()}
-        infos["final_info"] = {**values, **{"_" + key: ended for key in values}}
+        infos["final_info"] = {**values, **{name: mask & ended for name, mask in masks.items()}}
         infos["final_obs"], infos["_final_obs"], infos["_final_info"] = observation, ended, ended
         self._begin(np.flatnonzero(ended))
         return self._observe()

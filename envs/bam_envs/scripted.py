@@ -1,4 +1,4 @@
-"""Hand-written policies that solve the tasks from their observations alone: a task can be done, and here is how.
+"""Hand-written policies that solve MuJoCo's tasks from their observations alone: they can be done, and here is how.
 
 They keep no memory, so they act on rows of any length in any order, like a frozen policy.
 """
@@ -11,7 +11,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.errors import UnknownName
+from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.registry import ENVIRONMENTS
 from bam_envs.robots.ur5e import GEOMETRY, JOINTS
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.pick_place import CARRY, PickPlaceTask
@@ -179,15 +180,18 @@ SCRIPTED: dict[str, Any] = {
     "bam/pick-v0": ScriptedPick,
     "bam/pick-place-v0": ScriptedPickPlace,
 }
-"""The scripted policy of each environment."""
+"""The scripted policy of each environment that has one."""
 
 
 def scripted_policy(env_id: str) -> ScriptedPolicy:
     """The scripted policy for `env_id`.
 
     Raises:
-        UnknownName: There is none.
+        InvalidValue: The environment has none.
+        UnknownName: There is no such environment.
     """
+    if env_id in ENVIRONMENTS and env_id not in SCRIPTED:
+        raise InvalidValue(f"{env_id} has no scripted policy. These have one: {', '.join(SCRIPTED)}.")
     if env_id not in SCRIPTED:
         raise UnknownName("scripted policy", env_id, SCRIPTED)
     policy: ScriptedPolicy = SCRIPTED[env_id]()

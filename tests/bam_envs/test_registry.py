@@ -13,6 +13,13 @@ def test_the_table():
         "bam/reach-v0": (100, 0.05),
         "bam/pick-v0": (100, 0.05),
         "bam/pick-place-v0": (200, 0.05),
+        "bam/mir100-navigation-v0": (500, 0.1),
+        "bam/mir100-avoidance-v0": (500, 0.1),
+        "bam/ur-reach-v0": (300, 0.1),
+        "bam/ur-empty-v0": (300, 0.05),
+        "bam/ur-avoidance-v0": (1000, 0.05),
+        "bam/ur-track-v0": (1000, 0.05),
+        "bam/isaac-reach-v0": (600, 1 / 30),
     }
     for key, entry in ENVIRONMENTS.items():
         assert entry.id == key
@@ -55,8 +62,8 @@ def test_names_that_mean_something(name, env_id):
         ("bam/pik", "Unknown environment 'bam/pik'. Did you mean 'bam/pick-v0'?"),
         ("bam/pick-v7", "Unknown environment 'bam/pick-v7'. Did you mean 'bam/pick-v0'?"),
         ("CartPol-v1", "Unknown environment 'CartPol-v1'. Did you mean 'CartPole-v1'?"),
-        ("", "Unknown environment ''. Choose from: bam/reach-v0, bam/pick-v0, bam/pick-place-v0."),
-        ("Qwxyz", "Unknown environment 'Qwxyz'. Choose from: bam/reach-v0, bam/pick-v0, bam/pick-place-v0."),
+        ("", f"Unknown environment ''. Choose from: {', '.join(ENVIRONMENTS)}."),
+        ("Qwxyz", f"Unknown environment 'Qwxyz'. Choose from: {', '.join(ENVIRONMENTS)}."),
     ],
 )
 def test_names_that_mean_nothing(name, text):

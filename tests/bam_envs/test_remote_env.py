@@ -10,9 +10,11 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 from bam_envs.errors import InvalidValue, LinkLost, ResetNeeded
+from bam_envs.registry import ENVIRONMENTS
 from bam_envs.remote_env import RemoteEnv, RemoteVectorEnv, make_remote_env, make_remote_rows
 from bam_envs.serve.env_server import EnvServer
 from bam_envs.serve.tcp_server import TcpServer
+from bam_envs.testing.transports import assert_same_value
 from bam_envs.transports.fake import FakeEnv, FakeTransport
 from bam_envs.transports.local import LocalTransport
 from bam_envs.transports.tcp import TcpTransport
@@ -33,7 +35,7 @@ THROUGH = pytest.mark.parametrize("through", [local, tcp])
 
 
 @THROUGH
-@pytest.mark.parametrize("env_id", ["bam/reach-v0", "CartPole-v1"])
+@pytest.mark.parametrize("env_id", ["bam/reach-v0", "bam/mir100-avoidance-v0", "CartPole-v1"])
 @pytest.mark.filterwarnings("ignore:.*Not able to test alternative render modes.*")
 @pytest.mark.filterwarnings("ignore:.*Box observation space m(in|ax)imum value is (-)?infinity.*")
 def test_gymnasiums_checker_passes(make, through, env_id):
@@ -44,27 +46,29 @@ def test_gymnasiums_checker_passes(make, through, env_id):
 
 
 @THROUGH
-def test_same_seed_and_actions_give_the_same_bit_for_bit(make, actions_of, through):
-    alone = make("bam/reach-v0")
-    with through(make("bam/reach-v0")) as transport:
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_same_seed_and_actions_give_the_same_bit_for_bit(make, actions_of, through, env_id):
+    options = {"rs_state_to_info": True} if ENVIRONMENTS[env_id].parity else {}
+    alone, there = (make(env_id, max_episode_steps=20, **options) for _ in range(2))
+    with through(there) as transport:
         env = RemoteEnv(transport)
-        first, info = env.reset(seed=11)
-        theirs, their_info = alone.reset(seed=11)
-        assert first.tobytes() == theirs.tobytes()
-        assert info == their_info
-        for action in actions_of(0, 100, 6):
+        assert_same_value(env.reset(seed=11), alone.reset(seed=11), "reset")
+        for action in actions_of(0, 20, alone.action_space.shape[0]):
             one, two = env.step(action), alone.step(action)
-            assert (one[0].dtype, one[0].tobytes()) == (two[0].dtype, two[0].tobytes())
-            assert one[1:] == two[1:]
-        assert one[3]
+            assert [type(part) for part in one] == [type(part) for part in two]
+            assert_same_value(one, two, "step")
+            if one[2] or one[3]:
+                assert_same_value(env.reset(), alone.reset(), "reset")
+        assert one[2] or one[3]
         env.close()
 
 
-def test_what_the_other_end_says(make):
-    there = make("bam/reach-v0")
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_what_the_other_end_says(make, env_id):
+    there, entry = make(env_id), ENVIRONMENTS[env_id]
     env = RemoteEnv(LocalTransport(there))
     assert (env.observation_space, env.action_space) == (there.observation_space, there.action_space)
-    assert (env.env_id, env.period, env.max_episode_steps) == ("bam/reach-v0", 0.05, 100)
+    assert (env.env_id, env.period, env.max_episode_steps) == (env_id, entry.period, entry.max_episode_steps)
     assert env.describe() == there.unwrapped.describe()
     env.close()
 

@@ -9,15 +9,18 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import FlattenObservation, NormalizeObservation, RecordEpisodeStatistics, RescaleAction
 
-import bam_envs
 from bam_envs.errors import InvalidValue, ResetNeeded
 from bam_envs.registry import ENVIRONMENTS, make_env
 from bam_envs.robot_env import RobotEnv
 from bam_envs.robots.fake import FakeRobot
-from bam_envs.scripted import scripted_policy
+from bam_envs.scripted import SCRIPTED, scripted_policy
 from bam_envs.tasks.pick import PickTask
+from bam_envs.testing.assertions import assert_same_tree
 
-IDS = tuple(bam_envs.ENVIRONMENTS)
+SAME_START = "bam/ur-empty-v0"
+"""Where every episode begins in the same way, unless the arms differ."""
+SURVIVED = {"bam/ur-avoidance-v0", "bam/ur-track-v0"}
+"""Where the task is to reach the time limit unhurt."""
 
 
 def played(env, actions, seed):
@@ -34,10 +37,11 @@ def assert_same(one, two):
     assert len(one) == len(two)
     for left, right in zip(one, two, strict=True):
         np.testing.assert_array_equal(left[0], right[0])
-        assert left[1:] == right[1:]
+        assert left[1:-1] == right[1:-1]
+        assert_same_tree(left[-1], right[-1], "info")
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
 @pytest.mark.parametrize("randomize", [False, True])
 def test_gymnasiums_checker_has_nothing_to_say(env_id, randomize):
     env = gym.make(env_id, randomize=randomize, render_mode="rgb_array")
@@ -49,12 +53,12 @@ def test_gymnasiums_checker_accepts_a_robot_without_physics():
     check_env(RobotEnv(FakeRobot(), PickTask()), skip_render_check=True)
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_wrappers_work_without_a_warning(env_id):
-    env = RescaleAction(gym.make(env_id), np.float32(-2.0), np.float32(2.0))
+    env = RescaleAction(gym.make(env_id, max_episode_steps=30), np.float32(-2.0), np.float32(2.0))
     env = RecordEpisodeStatistics(NormalizeObservation(FlattenObservation(env)))
     env.reset(seed=0)
-    for _ in range(ENVIRONMENTS[env_id].max_episode_steps):
+    for _ in range(30):
         *_, terminated, truncated, info = env.step(env.action_space.sample())
         if terminated or truncated:
             break
@@ -62,40 +66,54 @@ def test_wrappers_work_without_a_warning(env_id):
     env.close()
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
 @pytest.mark.parametrize("randomize", [False, True])
 def test_the_same_seed_is_the_same_trajectory(make, actions_of, env_id, randomize):
-    size = make(env_id).action_space.shape[0]
-    actions = actions_of(0, 150, size)
-    one = played(make(env_id, randomize=randomize), actions, seed=7)
-    assert_same(one, played(make(env_id, randomize=randomize), actions, seed=7))
-    other = played(make(env_id, randomize=randomize), actions, seed=8)
-    assert (one[0][0] != other[0][0]).any()
+    def run(seed):
+        return played(make(env_id, randomize=randomize, max_episode_steps=60), actions, seed)
+
+    actions = actions_of(0, 100, make(env_id).action_space.shape[0])
+    one = run(seed=7)
+    assert len(one) > 101  # also of the episodes after the first
+    assert_same(one, run(seed=7))
+    differs = (one[5][0] != run(seed=8)[5][0]).any()
+    assert differs == (env_id != SAME_START or randomize)
 
 
-def test_the_same_environment_repeats_itself(make, actions_of):
-    env = make("bam/pick-v0", randomize=True)
-    actions = actions_of(3, 120, 5)
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_the_same_environment_repeats_itself(make, actions_of, env_id):
+    env = make(env_id, randomize=True, max_episode_steps=30)
+    actions = actions_of(3, 50, env.action_space.shape[0])
     assert_same(played(env, actions, seed=1), played(env, actions, seed=1))
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_episodes_differ(make, env_id):
     env = make(env_id)
     starts = [env.reset(seed=0)[0], *(env.reset()[0] for _ in range(3))]
-    assert len({start.tobytes() for start in starts}) == 4
+    assert len({start.tobytes() for start in starts}) == (1 if env_id == SAME_START else 4)
 
 
-@pytest.mark.parametrize("env_id", IDS)
-def test_infos_are_plain_and_can_be_pickled(make, env_id):
-    env = make(env_id)
+PLACES = {"target_coord": (3,), "target_rot": (4,)}
+"""Infos that are no numbers, texts or objects, and their shapes."""
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("wire", [False, True])
+def test_infos_are_plain_and_can_be_pickled(make, env_id, wire):
+    env = make(env_id, rs_state_to_info=True) if wire and ENVIRONMENTS[env_id].parity else make(env_id)
     _, info = env.reset(seed=0)
     assert info == {"is_success": False}
     *_, info = env.step(env.action_space.sample())
     assert info["is_success"] is False
-    assert type(info["distance"]) is float
-    assert json.loads(json.dumps(info)) == info
-    assert pickle.loads(pickle.dumps(info)) == info
+    assert type(info.get("distance", 0.0)) is float
+    for name, shape in PLACES.items():
+        place = info.get(name, np.zeros(shape))
+        assert (type(place), place.shape, place.dtype) == (np.ndarray, shape, np.float64)
+    assert_same_tree(pickle.loads(pickle.dumps(info)), info, "info")
+    plain = {name: value for name, value in info.items() if name not in PLACES}
+    assert json.loads(json.dumps(plain)) == plain
+    assert ("rs_state" in plain) == (wire and ENVIRONMENTS[env_id].parity)
 
 
 def finished(env, policy, seed):
@@ -108,7 +126,7 @@ def finished(env, policy, seed):
             return step
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", SCRIPTED)
 def test_success_terminates(make, env_id):
     env = make(env_id)
     _, reward, terminated, truncated, info = finished(env, scripted_policy(env_id), seed=0)
@@ -116,16 +134,23 @@ def test_success_terminates(make, env_id):
     assert reward > 9.0
 
 
-@pytest.mark.parametrize("env_id", IDS)
+def still(env_id, env):
+    """The action that does nothing. Where the obstacle comes to an arm that does, it makes way."""
+    action = np.zeros(env.action_space.shape, np.float32)
+    action[:1] = env_id == "bam/ur-avoidance-v0"
+    return action
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_the_time_limit_truncates(make, env_id):
-    env = make(env_id)
+    env, limit = make(env_id), ENVIRONMENTS[env_id].max_episode_steps
     env.reset(seed=0)
-    still = np.zeros(env.action_space.shape, np.float32)
-    for step in range(1, ENVIRONMENTS[env_id].max_episode_steps + 1):
-        *_, terminated, truncated, info = env.step(still)
+    action = still(env_id, env)
+    for step in range(1, limit + 1):
+        *_, terminated, truncated, info = env.step(action)
         assert not terminated
-        assert not info["is_success"]
-        assert truncated == (step == ENVIRONMENTS[env_id].max_episode_steps)
+        assert truncated == (step == limit)
+        assert info["is_success"] == (truncated and env_id in SURVIVED)
 
 
 @pytest.mark.parametrize("env_id", ["bam/pick-v0", "bam/pick-place-v0"])
@@ -142,56 +167,94 @@ def test_a_cube_off_the_table_terminates_without_success(make, env_id):
     assert reward < -1.0
 
 
-@pytest.mark.parametrize("env_id", IDS)
+ENDED = {
+    "bam/mir100-navigation-v0": ("out of boundary", [-1, 0]),
+    "bam/mir100-avoidance-v0": ("collision", [1, 1]),
+    "bam/ur-reach-v0": ("collision", [0, -1, 0, 0, 0]),
+    "bam/ur-empty-v0": ("collision", [0, -1, 0, 0, 0]),
+    "bam/ur-avoidance-v0": ("collision", [0, -1, 0, 0, 0]),
+    "bam/ur-track-v0": ("collision", [-1, -1, -1, -1, -1]),
+    "bam/isaac-reach-v0": ("collision", [0, 0, 1, 0, 0, 0]),
+}
+"""How an episode ends without success, and the action that is kept until it does."""
+
+
+class Kept:
+    """A policy that gives the same action again and again."""
+
+    def __init__(self, action):
+        self.action = np.array([action], np.float32)
+
+    def act_batch(self, observations):
+        return self.action
+
+
+@pytest.mark.parametrize("env_id", ENDED)
+def test_failure_terminates(make, env_id):
+    status, action = ENDED[env_id]
+    *_, terminated, truncated, info = finished(make(env_id), Kept(action), seed=0)
+    assert (terminated, truncated, info["is_success"], info["final_status"]) == (True, False, False, status)
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_no_step_without_an_episode(env_id):
     env = make_env(env_id)
-    for prepare in (lambda: None, lambda: finished(env, scripted_policy(env_id), seed=0)):
+    policy = scripted_policy(env_id) if env_id in SCRIPTED else Kept(ENDED[env_id][1])
+    action = np.zeros(env.action_space.shape, np.float32)
+    for prepare in (lambda: None, lambda: finished(env, policy, seed=0), env.close):
         prepare()
         with pytest.raises(ResetNeeded) as caught:
-            env.step(np.zeros(env.action_space.shape, np.float32))
+            env.step(action)
         assert str(caught.value) == "No episode is running: it ended, or never began. Call reset() first."
     env.reset()
-    env.step(np.zeros(env.action_space.shape, np.float32))
+    env.step(action)
     env.close()
 
 
-def test_bad_actions_are_refused_and_nothing_moves(make):
-    env = make("bam/pick-v0")
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_bad_actions_are_refused_and_nothing_moves(make, env_id):
+    env = make(env_id)
     env.reset(seed=0)
-    before = env.unwrapped.state
+    before, size = env.unwrapped.state, env.action_space.shape[0]
+    bad = [0.0, float("nan"), *[0.0] * (size - 2)]
     with pytest.raises(InvalidValue) as caught:
-        env.step(np.array([0, 0, np.nan, 0, 0], np.float32))
-    assert str(caught.value) == "The action must be finite numbers, not [0.0, 0.0, nan, 0.0, 0.0]."
+        env.step(np.array(bad, np.float32))
+    assert str(caught.value) == f"The action must be finite numbers, not {bad}."
     with pytest.raises(InvalidValue) as caught:
-        env.step(np.zeros(4, np.float32))
-    assert str(caught.value) == "The action must have shape (5,), not (4,)."
+        env.step(np.zeros(size - 1, np.float32))
+    assert str(caught.value) == f"The action must have shape ({size},), not ({size - 1},)."
     assert env.unwrapped.state is before
 
 
-def test_actions_may_be_lists(make):
-    one, two = make("bam/pick-v0"), make("bam/pick-v0")
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_actions_may_be_lists(make, env_id):
+    one, two = make(env_id), make(env_id)
     one.reset(seed=0)
     two.reset(seed=0)
-    action = [0.5, -0.5, 0.25, 0.0, 1.0]
+    action = [0.5, -0.5, 0.25, 0.0, 1.0, -1.0][: one.action_space.shape[0]]
     np.testing.assert_array_equal(one.step(action)[0], two.step(np.array(action, np.float32))[0])
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_describe_names_every_number(make, env_id):
     env = make(env_id).unwrapped
     said = json.loads(json.dumps(env.describe()))
     assert list(said) == ["observation", "action", "state", "command"]
+    env.reset(seed=0)
     assert len(said["observation"]) == env.observation_space.shape[0]
     assert len(said["action"]) == env.action_space.shape[0]
-    assert len(said["command"]) == 7
+    assert len(said["command"]) == env.state.command.shape[1]
+    assert len(said["state"]) == sum(signal.shape[1] for signal in env.state.signals.values())
     for rows in said.values():
         assert all({"name", "unit", "low", "high"} <= set(row) for row in rows)
-    assert env.period == 0.05
-    assert env.metadata["render_fps"] == 20
+        assert len({(row["name"], row["unit"]) for row in rows}) == len(rows)
+    assert env.period == ENVIRONMENTS[env_id].period
+    assert env.metadata["render_fps"] == round(1 / env.period)
 
 
-def test_closing_twice_and_starting_again(make):
-    env = make("bam/pick-v0")
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_closing_twice_and_starting_again(make, env_id):
+    env = make(env_id)
     first, _ = env.reset(seed=0)
     env.close()
     env.close()

@@ -4,14 +4,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import bam_envs
-from bam_envs.errors import UnknownName
+from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.registry import ENVIRONMENTS
 from bam_envs.robots.ur5e import GEOMETRY
-from bam_envs.scripted import Columns, Sight, numeric_jacobian, scripted_policy
+from bam_envs.scripted import SCRIPTED, Columns, Sight, numeric_jacobian, scripted_policy
 from bam_envs.tasks.pick import PickTask
 from bam_envs.testing import ARM_HOME
 
-IDS = tuple(bam_envs.ENVIRONMENTS)
+IDS = tuple(SCRIPTED)
 
 
 @pytest.mark.parametrize("env_id", IDS)
@@ -33,6 +33,15 @@ def test_no_policy_for_other_environments():
     with pytest.raises(UnknownName) as caught:
         scripted_policy("bam/pik-v0")
     assert str(caught.value) == "Unknown scripted policy 'bam/pik-v0'. Did you mean 'bam/pick-v0'?"
+
+
+@pytest.mark.parametrize("env_id", sorted(set(ENVIRONMENTS) - set(SCRIPTED)))
+def test_environments_without_one_say_which_have_one(env_id):
+    with pytest.raises(InvalidValue) as caught:
+        scripted_policy(env_id)
+    assert str(caught.value) == (
+        f"{env_id} has no scripted policy. These have one: bam/reach-v0, bam/pick-v0, bam/pick-place-v0."
+    )
 
 
 def test_columns_are_read_by_name():

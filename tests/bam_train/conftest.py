@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from pathlib import Path
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -108,3 +112,13 @@ def always_right(numbers: int) -> bytes:
         ],
     )
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8).SerializeToString()
+
+
+@pytest.fixture(scope="session")
+def rllib_directories(tmp_path_factory):
+    """Checkpoint directories as RLlib writes them, and its own actions beside them; see ``make_directories.py``."""
+    root = tmp_path_factory.mktemp("rllib")
+    maker = Path(__file__).parent / "trainers" / "rllib" / "make_directories.py"
+    done = subprocess.run([sys.executable, maker, root], capture_output=True, text=True, timeout=400, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return root

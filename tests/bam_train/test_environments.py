@@ -25,6 +25,7 @@ def test_arguments_reach_the_environment(corridor):
 
 def test_only_ours_are_batched(corridor):
     assert is_batched("bam/pick-v0")
+    assert is_batched("EndEffectorPositioningURSim-v0")
     assert not is_batched(corridor)
 
 

@@ -16,7 +16,7 @@ def bench(*arguments):
 
 
 def test_it_measures_all_four():
-    result = bench("--rows", "8", "--rounds", "2", "--steps", "5")
+    result = bench("--env", "bam/pick", "--rows", "8", "--rounds", "2", "--steps", "5")
     assert result.returncode == 0, result.stderr
     lines = result.stdout.splitlines()
     assert lines[1].startswith("bam/pick-v0, medians of 2 rounds")
@@ -29,7 +29,23 @@ def test_it_measures_all_four():
     assert all(line.endswith(("met", "missed")) for line in (lines[2], lines[4], lines[5]))
 
 
+def test_all_in_one_go_with_their_own_rows():
+    result = bench("--rounds", "1", "--steps", "2")
+    assert result.returncode == 0, result.stderr
+    lines = [line for line in result.stdout.splitlines() if line.startswith(("bam/", "gym.make_vec"))]
+    assert [line.partition(",")[0] for line in lines[::2]] == [
+        "bam/pick-v0",
+        "bam/mir100-navigation-v0",
+        "bam/mir100-avoidance-v0",
+        "bam/ur-reach-v0",
+    ]
+    targets = [line.split()[-2] for line in lines[1::2]]
+    assert targets == ["15,000", "300,000", "20,000", "30,000"]
+    assert [line.split()[1] for line in lines[1::2]][:3] == ["64", "4096", "256"]
+
+
 def test_only_ours():
     result = bench("--env", "CartPole")
     assert result.returncode == 2
-    assert "--env must be one of bam/reach-v0, bam/pick-v0, bam/pick-place-v0, not CartPole-v1" in result.stderr
+    assert "--env must be one of bam/reach-v0, bam/pick-v0, bam/pick-place-v0, " in result.stderr
+    assert "not CartPole-v1" in result.stderr

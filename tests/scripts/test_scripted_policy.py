@@ -43,11 +43,19 @@ def test_the_table(script, capsys, monkeypatch):
     assert lines[1].split()[:3] == ["bam/reach-v0", "100.00%", "3"]
 
 
+def test_without_a_name_those_that_have_a_policy(script, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["scripted_policy.py", "--episodes", "1"])
+    assert script.main() == 0
+    rows = capsys.readouterr().out.splitlines()[1:]
+    assert [row.split()[0] for row in rows] == ["bam/reach-v0", "bam/pick-v0", "bam/pick-place-v0"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
         (["--env", "bam/pik"], "Unknown environment 'bam/pik'. Did you mean 'bam/pick-v0'?"),
         (["--env", "CartPole"], "Unknown scripted policy 'CartPole-v1'."),
+        (["--env", "bam/ur-reach"], "bam/ur-reach-v0 has no scripted policy. These have one: bam/reach-v0, bam/pick"),
         (["--episodes", "0"], "--episodes must be at least 1, not 0"),
     ],
 )

@@ -1,4 +1,7 @@
-"""Tuned settings as data: ``<environment>-<algorithm>.toml``, laid out like a ``--config`` file."""
+"""Tuned settings as data, laid out like a ``--config`` file.
+
+``<environment>-<algorithm>.toml`` is for sb3, ``<environment>-<trainer>-<algorithm>.toml`` for any other trainer.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +11,9 @@ from typing import Any
 from bam_train.settings import file_stem, parse_config
 
 
-def preset_name(env: str, algo: str) -> str:
-    """File name of a preset: ``bam/pick-v0`` and ppo make ``pick-ppo.toml``."""
-    return f"{file_stem(env, algo)}.toml"
+def preset_name(env: str, algo: str, trainer: str = "sb3") -> str:
+    """File name of a preset: ``bam/pick-v0`` and ppo make ``pick-ppo.toml``, and for rllib ``pick-rllib-ppo.toml``."""
+    return f"{file_stem(env, algo, trainer)}.toml"
 
 
 def list_presets() -> list[str]:
@@ -19,13 +22,13 @@ def list_presets() -> list[str]:
     return sorted(name for name in names if name.endswith(".toml"))
 
 
-def read_preset(env: str, algo: str) -> dict[str, Any]:
-    """The tuned settings of an environment and an algorithm; {} if there are none.
+def read_preset(env: str, algo: str, trainer: str = "sb3") -> dict[str, Any]:
+    """The tuned settings of an environment and an algorithm of a trainer; {} if there are none.
 
     Raises:
         SettingsError: The file is not as it should be.
     """
-    name = preset_name(env, algo)
+    name = preset_name(env, algo, trainer)
     if name not in list_presets():
         return {}
     return parse_config(name, resources.files(__name__).joinpath(name).read_text(encoding="utf-8"))

@@ -8,15 +8,14 @@ from bam_envs.on_use import imported_on_use
 
 if TYPE_CHECKING:
     from bam_envs.robots.fake import FakeRobot
-    from bam_envs.robots.fake_base import FakeBase
     from bam_envs.robots.live.building import live_robot
     from bam_envs.robots.live.rosbridge import RosbridgeRobot
     from bam_envs.robots.profiles.profile import load_profile
     from bam_envs.robots.robot import Initial, Robot, RobotSpec, RobotState, SignalSpec
     from bam_envs.robots.safety.safe import SafeRobot
+    from bam_envs.robots.simulated.mir100 import SimulatedBase
 
 _MODULES = {
-    "FakeBase": "bam_envs.robots.fake_base",
     "FakeRobot": "bam_envs.robots.fake",
     "Initial": "bam_envs.robots.robot",
     "Robot": "bam_envs.robots.robot",
@@ -25,13 +24,13 @@ _MODULES = {
     "RosbridgeRobot": "bam_envs.robots.live.rosbridge",
     "SafeRobot": "bam_envs.robots.safety.safe",
     "SignalSpec": "bam_envs.robots.robot",
+    "SimulatedBase": "bam_envs.robots.simulated.mir100",
     "live_robot": "bam_envs.robots.live.building",
     "load_profile": "bam_envs.robots.profiles.profile",
 }
 """Name to the module that has it."""
 
 __all__ = [
-    "FakeBase",
     "FakeRobot",
     "Initial",
     "Robot",
@@ -40,6 +39,7 @@ __all__ = [
     "RosbridgeRobot",
     "SafeRobot",
     "SignalSpec",
+    "SimulatedBase",
     "live_robot",
     "load_profile",
 ]

@@ -18,6 +18,8 @@ MAX_ACCELERATION = (2.0, 2.5)
 """Fastest the drive changes its speed: forwards [m/s^2], turning [rad/s^2]."""
 FOOTPRINT = (0.90, 0.58)
 """Length and width [m]."""
+FOOTPRINT_AHEAD = 0.0376
+"""How far the middle of the footprint is ahead of the base's frame [m]."""
 SCAN_RAYS = 541
 """Rays of one scanner, half a degree apart."""
 SCAN_SPAN = (math.radians(-135.0), math.radians(135.0))

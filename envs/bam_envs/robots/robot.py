@@ -32,6 +32,13 @@ class SignalSpec:
     max_rate: tuple[float, ...] | None = None
     """Fastest change of each number [unit/s]; None for what is only measured."""
 
+    def part(self, labels: tuple[str, ...]) -> SignalSpec:
+        """The numbers called `labels`, each of which it has, in their order."""
+        places = [self.labels.index(label) for label in labels]
+        low, high = tuple(self.low[one] for one in places), tuple(self.high[one] for one in places)
+        rate = None if self.max_rate is None else tuple(self.max_rate[one] for one in places)
+        return SignalSpec(self.name, labels, tuple(self.units[one] for one in places), low, high, rate)
+
 
 @dataclass(frozen=True)
 class RobotSpec:

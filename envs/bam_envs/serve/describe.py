@@ -41,9 +41,15 @@ def describe_env(env: Env, env_id: str | None = None) -> EnvSpecMessage:
         num_envs=env.num_envs if isinstance(env, VectorEnv) else 1,
         vector=vector,
         period=_period(env),
-        max_episode_steps=env.spec.max_episode_steps if env.spec is not None else None,
+        max_episode_steps=_limit(env),
         signals=describe() if describe is not None else {},
     )
+
+
+def _limit(env: Env) -> int | None:
+    """Steps after which episodes are cut: what rows say that cut them themselves, else what Gymnasium says."""
+    said: int | None = env.spec.max_episode_steps if env.spec is not None else None
+    return getattr(env.unwrapped, "max_episode_steps", said) if isinstance(env, VectorEnv) else said
 
 
 def _period(env: Env) -> float | None:

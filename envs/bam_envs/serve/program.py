@@ -174,7 +174,8 @@ def _take_robot(env: Env, profile: RobotProfile, realtime: bool) -> ServedRobot:
     """Put a `ServedRobot` between the environment and its robot, at the start of an episode."""
     inner: Any = env.unwrapped
     resting = any(sink.hold == "zero" for way in profile.commands.values() for sink in way)
-    robot = ServedRobot(inner.robot, dead_man=profile.dead_man, zero_rests=resting, realtime=realtime)
+    life = profile.command_life(inner.robot.spec.period)
+    robot = ServedRobot(inner.robot, dead_man=life, zero_rests=resting, realtime=realtime)
     inner.robot = robot
     env.reset()
     return robot

@@ -54,7 +54,7 @@ class RobotService:
 
     Args:
         robot: The robot; whoever else moves it does so through this object, too.
-        profile: Its topics.
+        profile: Its topics; those of commands that `robot` does not take are not offered.
         bus: Carries them.
         lease: Who is in command; shared with whoever else moves the robot.
         namespace: Before every topic, such as ``/cell_1``; or nothing.
@@ -73,6 +73,7 @@ class RobotService:
         simulated: bool = True,
         clock: Callable[[], float] = time.time,
     ) -> None:
+        profile = profile.narrowed(robot.spec.command.labels)
         self._robot, self._profile, self._bus, self._lease = robot, profile, bus, lease
         self._namespace, self._clock = namespace, clock
         lockstep = not robot.realtime

@@ -97,18 +97,20 @@ class TaskContract:
     def test_commands_keep_the_robots_limits(self) -> None:
         """Inside the command's limits; no joint and no tool faster than allowed, from the first command on."""
         with self.running(3) as (task, robot, state):
-            last = state.signals["joint_position"]
+            last = self.first_command(state)
             for action in self.actions(task):
                 command = task.command(action, state)
-                self._check_command(robot, last, command)
-                state, last = robot.step(command), command[:, :6]
+                _check_command(robot, command)
+                self.check_pace(last, command)
+                state, last = robot.step(command), command
 
-    def _check_command(self, robot: Robot, last: Array, command: Array) -> None:
-        spec = robot.spec.command
-        assert command.shape == (robot.num_robots, len(spec.labels))
-        assert command.dtype == np.float64
-        assert (command >= np.array(spec.low)).all()
-        assert (command <= np.array(spec.high)).all()
+    def first_command(self, state: RobotState) -> Array:
+        """Hook: what `check_pace` compares the first command with. Shape: (n, m), or of its first numbers."""
+        return state.signals["joint_position"]
+
+    def check_pace(self, last: Array, command: Array) -> None:
+        """Hook: from the command `last` to `command`, both (n, m), is no farther than allowed in a period."""
+        last = last[:, :6]
         turn = np.abs(command[:, :6] - last).max()
         assert turn <= self.joint_step * (1 + 1e-9), f"a joint turned {turn} rad in a period"
         tool = np.linalg.norm(self.tool_position(command[:, :6]) - self.tool_position(last), axis=1).max()
@@ -121,7 +123,7 @@ class TaskContract:
             np.testing.assert_array_equal(task.command(100 * action, state), other.command(action, same))
 
     def test_scores_are_one_a_row(self) -> None:
-        """Finite float64 rewards, boolean ends, success ends the episode, infos of shape (n,)."""
+        """Finite float64 rewards, boolean ends, success ends the episode, infos of shape (n, ...)."""
         with self.running(3) as (task, robot, state):
             for action in self.actions(task):
                 state = robot.step(task.command(action, state))
@@ -203,6 +205,17 @@ class TaskContract:
             _start(task, robot, np.array([1]), seed=9)
             assert_same_tree(saved, kept)
 
+    def test_given_away_is_given_away(self) -> None:
+        """Beginning another episode does not reach into observations and scores of the one before."""
+        with self.running(2) as (task, robot, state):
+            for action in self.actions(task):
+                state = robot.step(task.command(action, state))
+                score, observation = task.score(state, action), task.observe(state)
+            kept, seen = copy.deepcopy(score), observation.copy()
+            _start(task, robot, np.array([0, 1]), seed=9)
+            _assert_same_score(score, kept)
+            np.testing.assert_array_equal(observation, seen)
+
     def test_marks_are_places_and_colours(self) -> None:
         """For pictures."""
         with self.running() as (task, _, _):
@@ -216,6 +229,14 @@ def _start(task: Task, robot: Robot, rows: Rows, seed: int) -> RobotState:
     state = robot.reset(rows, task.begin(rows, [np.random.default_rng(seed + k) for k in range(len(rows))]))
     task.start(rows, state)
     return state
+
+
+def _check_command(robot: Robot, command: Array) -> None:
+    spec = robot.spec.command
+    assert command.shape == (robot.num_robots, len(spec.labels))
+    assert command.dtype == np.float64
+    assert (command >= np.array(spec.low)).all()
+    assert (command <= np.array(spec.high)).all()
 
 
 def _check_observation(task: Task, observation: NDArray[np.float32]) -> None:
@@ -233,7 +254,7 @@ def _check_score(task: Task, score: Score) -> None:
     assert score.terminated.dtype == score.success.dtype == np.bool_
     assert not (score.success & ~score.terminated).any(), "a success did not end the episode"
     for name, values in score.info.items():
-        assert values.shape == (n,), f"info {name} has shape {values.shape}"
+        assert values.shape[:1] == (n,), f"info {name} has shape {values.shape}"
         assert not name.startswith("_"), f"info {name} looks like a mask"
 
 

@@ -128,11 +128,13 @@ class ScriptedRobot:
         profile: Which robot.
         namespace: Before its topics.
         info: What it says of itself; None: nothing, as a real robot.
+        spec: What it has only; None: all of the profile.
     """
 
-    def __init__(self, bus, profile="ur5e", namespace="", info=None):
+    def __init__(self, bus, profile="ur5e", namespace="", info=None, spec=None):
         self.profile = load_profile(profile)
-        self.spec = self.profile.spec()
+        self.spec = self.profile.spec(spec)
+        self.profile = self.profile.narrowed(self.spec.command.labels)
         self.commands = []
         """(topic, caller, message), in order."""
         self.halts = 0
@@ -147,8 +149,9 @@ class ScriptedRobot:
 
     def start(self):
         if "joint_position" in self.signals:
-            self.signals["joint_position"][:], self.signals["gripper_width"][:] = HOME, 0.085
-            self.signals["object_quaternion"][0] = 1.0
+            known = {"joint_position": HOME, "gripper_width": 0.085, "object_quaternion": [1.0, 0.0, 0.0, 0.0]}
+            for name in known.keys() & self.signals.keys():
+                self.signals[name][:] = known[name]
         for source in self.profile.state:
             if source.signal in self.signals:
                 self._bus.advertise(self._namespace + source.topic, source.type)
@@ -201,7 +204,7 @@ class ScriptedRobot:
             self._changed.notify_all()
 
     def _move(self):
-        names = ("base_velocity",) if "base_velocity" in self.signals else ("joint_position", "gripper_width")
+        names = [one for one in ("base_velocity", "joint_position", "gripper_width") if one in self.signals]
         now = np.concatenate([self.signals[name] for name in names])
         now[list(self._told)] = list(self._told.values())
         ends = np.cumsum([len(self.signals[name]) for name in names])

@@ -4,26 +4,35 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-import bam_envs  # noqa: F401 - registers the environments
 from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.registry import ENVIRONMENTS
 from bam_envs.serve.describe import describe_env, same_name
 from bam_envs.transports.fake import FakeEnv
 
 
-def test_one_of_ours_says_everything(make):
-    env = make("bam/reach-v0")
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_one_of_ours_says_everything(make, env_id):
+    env, entry = make(env_id), ENVIRONMENTS[env_id]
     spec = describe_env(env)
-    assert (spec.env_id, spec.num_envs, spec.vector) == ("bam/reach-v0", 1, False)
-    assert (spec.period, spec.max_episode_steps) == (0.05, 100)
+    assert (spec.env_id, spec.num_envs, spec.vector) == (env_id, 1, False)
+    assert (spec.period, spec.max_episode_steps) == (entry.period, entry.max_episode_steps)
     assert (spec.observation_space, spec.action_space) == (env.observation_space, env.action_space)
     assert spec.signals == env.unwrapped.describe()
 
 
-def test_rows_of_ours(make_rows):
-    envs = make_rows("bam/reach-v0", 3)
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_rows_of_ours(make_rows, env_id):
+    envs, entry = make_rows(env_id, 3), ENVIRONMENTS[env_id]
     spec = describe_env(envs)
-    assert (spec.env_id, spec.num_envs, spec.vector) == ("bam/reach-v0", 3, True)
+    assert (spec.env_id, spec.num_envs, spec.vector) == (env_id, 3, True)
+    assert (spec.period, spec.max_episode_steps) == (entry.period, entry.max_episode_steps)
     assert spec.observation_space == envs.single_observation_space
+    assert describe_env(make_rows(env_id, 2, max_episode_steps=7)).max_episode_steps == 7
+
+
+def test_episodes_that_end_by_themselves_have_no_limit(make, make_rows):
+    for env in (make("bam/ur-reach-v0", parity=True), make_rows("bam/ur-reach-v0", 2, parity=True)):
+        assert describe_env(env).max_episode_steps is None
 
 
 def test_another_one_says_less():

@@ -7,12 +7,14 @@ import pytest
 from bam_envs.bridge.link.link import RosbridgeLink
 from bam_envs.bridge.server.server import BridgeServer
 from bam_envs.errors import InvalidValue, NoServer, NotInCommand, RemoteError, RobotFault
+from bam_envs.registry import ENVIRONMENTS
 from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.robots.ur5e import arm_spec
 from bam_envs.robots.wire.codec import encode_command, read_info
 from bam_envs.serve.options import ServeOptions
 from bam_envs.serve.program import ServedEnvironment
 from bam_envs.serve.served_robot import ServedRobot
+from bam_envs.testing.transports import assert_same_value
 from bam_envs.transports.rosbridge import RosbridgeTransport
 from bam_envs.transports.tcp import TcpTransport
 
@@ -115,16 +117,18 @@ def test_several_rows_have_no_topics(serve, transport):
 
 
 @pytest.mark.parametrize("kind", [RosbridgeTransport, TcpTransport])
-def test_the_environment_is_the_one_in_process_bit_for_bit(serve, transport, kind):
-    served = serve(fast=True, tcp=0)
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_the_environment_is_the_one_in_process_bit_for_bit(serve, transport, make, actions_of, env_id, kind):
+    options = {"rs_state_to_info": True} if ENVIRONMENTS[env_id].parity else {}
+    local = make(env_id, **options)
+    served = serve(env=gym.make(env_id, disable_env_checker=True, **options), fast=True, tcp=0)
     remote = transport(kind, served.bus.url if kind is RosbridgeTransport else served.tcp.url)
-    local = gym.make("bam/pick-v0", disable_env_checker=True)
-    np.testing.assert_array_equal(remote.reset(5)[0], local.reset(seed=5)[0])
-    for _ in range(20):
-        ours, theirs = local.step(RISE), remote.step(RISE)
-        np.testing.assert_array_equal(theirs[0], ours[0])
-        assert theirs[1:] == ours[1:]
-    local.close()
+    assert_same_value(remote.reset(5), local.reset(seed=5), "reset")
+    for action in actions_of(0, 20, local.action_space.shape[0]):
+        ours, theirs = local.step(action), remote.step(action)
+        assert_same_value(tuple(theirs), ours, "step")
+        if ours[2]:
+            break
 
 
 def test_in_real_time_a_step_is_a_period(serve, transport):

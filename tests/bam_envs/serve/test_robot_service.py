@@ -9,10 +9,11 @@ import pytest
 from bam_envs.bridge.freshness import read_tag
 from bam_envs.errors import LinkLost, PhysicsDiverged
 from bam_envs.robots.fake import FakeRobot
-from bam_envs.robots.fake_base import FakeBase
 from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.robots.robot import Initial
 from bam_envs.robots.simulated.arm import SimulatedArm
+from bam_envs.robots.simulated.mir100 import SimulatedBase
+from bam_envs.robots.simulated.ur import reach_arm
 from bam_envs.robots.wire.codec import RobotInfo, encode_command, read_info
 from bam_envs.serve.command import CommandLease
 from bam_envs.serve.robot_service import RobotService
@@ -85,6 +86,20 @@ def test_what_it_offers(serve, bus):
         "/cell/bam/scene/request": "std_msgs/String",
     }
     assert {name: kind for name, (kind, _) in bus.services.items()} == {"/cell/bam/robot": "std_srvs/Trigger"}
+
+
+def test_an_arm_without_gripper_offers_no_topics_of_one(serve, bus):
+    service = serve(reach_arm(1, ur_model="ur5e"))
+    assert set(bus.advertised) == {"/joint_states", "/bam/scene/reply"}
+    assert set(bus.listeners) == {
+        ARM,
+        "/scaled_joint_trajectory_controller/joint_trajectory",
+        "/bam/halt",
+        "/bam/scene/request",
+    }
+    assert bus.say(ARM, {"data": (HOME[0] + 0.01).tolist()}, "a") is None
+    state = service.joints(lambda message: message["position"] != HOME[0].tolist())
+    np.testing.assert_allclose(state["position"], HOME[0] + 0.01)
 
 
 @pytest.mark.parametrize(
@@ -421,7 +436,7 @@ def test_nothing_is_published_where_nobody_listens(serve, bus):
 def base(bus):
     """A base in real time whose clocks are set by hand: ``tick()`` is one part of a period."""
     profile, now = load_profile("mir100"), [0.0]
-    robot = ServedRobot(FakeBase(1), dead_man=profile.dead_man, zero_rests=True, realtime=True, now=lambda: now[0])
+    robot = ServedRobot(SimulatedBase(1), dead_man=profile.dead_man, zero_rests=True, realtime=True, now=lambda: now[0])
     robot.connect()
     robot.reset(np.zeros(1, dtype=np.int64), Initial({}, np.zeros(1, dtype=np.int64)))
     service = RobotService(robot, profile, bus, CommandLease(5.0))

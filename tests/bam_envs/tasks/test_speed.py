@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-import bam_envs
+from bam_envs.registry import ENVIRONMENTS
 from bam_envs.robots.ur5e import GEOMETRY
-from bam_envs.scripted import scripted_policy
+from bam_envs.scripted import SCRIPTED, scripted_policy
 
 TOOL_SPEED, JOINT_SPEED = 0.25, 1.0
 """Limits [m/s] and [rad/s]."""
@@ -13,7 +13,42 @@ SLACK = 1.005
 """Position control follows its set point to within this factor."""
 
 
-@pytest.mark.parametrize("env_id", bam_envs.ENVIRONMENTS)
+DRIVEN = (0.5, 0.7)
+"""Speeds forward [m/s] and of turning [rad/s] that the tasks of a base ask for; where bases differ, 5 % more."""
+SHARES = {
+    "bam/ur-reach-v0": 0.1,
+    "bam/ur-empty-v0": 0.2,
+    "bam/ur-avoidance-v0": 0.2,
+    "bam/ur-track-v0": 0.2,
+    "bam/isaac-reach-v0": 0.2,
+}
+"""Of the fastest speed of an arm's joints, that robo-gym's trajectory controllers let them have."""
+
+
+def limits(env_id, envs):
+    """The signal with the robot's speeds, and how fast each may be."""
+    if env_id in SHARES:
+        return "joint_velocity", SHARES[env_id] * envs.unwrapped.task.model.max_velocity
+    return ("base_velocity", np.array(DRIVEN)) if "mir100" in env_id else ("joint_velocity", JOINT_SPEED)
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("randomize", [False, True])
+def test_no_robot_is_faster_than_its_task_lets_it_be(make_rows, env_id, randomize):
+    envs = make_rows(env_id, 16, randomize=randomize)
+    envs.reset(seed=0)
+    signal, fastest = limits(env_id, envs)
+    slack, rng = 1.05 if "mir100" in env_id and randomize else SLACK, np.random.default_rng(0)
+    seen = 0.0
+    for step in range(60):
+        if step % 10 == 0:
+            action = rng.uniform(-2, 2, envs.action_space.shape).clip(-1, 1).astype(np.float32)
+        envs.step(action)
+        seen = max(seen, (np.abs(envs.unwrapped.state.signals[signal]) / fastest).max())
+    assert 0.5 < seen <= slack
+
+
+@pytest.mark.parametrize("env_id", SCRIPTED)
 @pytest.mark.parametrize("randomize", [False, True])
 @pytest.mark.parametrize("actions", ["random", "scripted"])
 def test_measured_speeds(make_rows, env_id, randomize, actions):
@@ -35,7 +70,7 @@ def test_measured_speeds(make_rows, env_id, randomize, actions):
     assert 0.1 < joint_speed <= JOINT_SPEED * SLACK
 
 
-@pytest.mark.parametrize("env_id", bam_envs.ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", SCRIPTED)
 def test_commanded_speeds_whatever_the_actions(make_rows, env_id):
     """To the limit for half a second each way, into the table and into the cube."""
     envs = make_rows(env_id, 32)

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from bam_envs.robots.mir100 import base_spec
+from bam_envs.robots.ur import ur_model, ur_spec
 from bam_envs.robots.ur5e import arm_spec
 from bam_train.cli.consent import plan_lines, require_consent
 from bam_train.errors import SettingsError
@@ -51,6 +52,11 @@ def test_before_a_real_robot_moves_its_limits_are_shown_and_somebody_asked(monke
             5,
             "  bam/pick-v0: 5 episodes, one after the other without a pause\n"
             "  each begins by opening the gripper and going to the start pose\n",
+        ),
+        (
+            ur_spec(ur_model("ur5"), 0.1, with_object=False),
+            1,
+            "  bam/pick-v0: 1 episode\n  each begins by going to the start pose\n",
         ),
         (base_spec("mir100"), 1, "  bam/pick-v0: 1 episode\n  each begins where the base stands\n"),
     ],

@@ -2,6 +2,9 @@ import json
 import subprocess
 import sys
 
+import pytest
+
+from bam_envs.registry import ENVIRONMENTS
 from bam_train.cli.envs import main
 
 
@@ -15,9 +18,33 @@ def test_table(run):
     assert lines[-1] == "Details: bam-envs ID. Training: bam-train --env ID --algo ppo; any Gymnasium id will do."
 
 
+def test_names_of_robo_gym(run):
+    lines = run(main)[1].splitlines()
+    start = lines.index("robo-gym's ids work too, with robo-gym's options; Rob is the one with a live robot:")
+    assert lines[start + 1].split() == ["NoObstacleNavigationMir100{Sim,Rob}-v0", "bam/mir100-navigation-v0"]
+    assert lines[start + 11] == ""
+
+
+@pytest.mark.parametrize(
+    ("kind", "live"), [("Sim", ""), ("Rob", ", with a live robot: rs_address='IP:PORT' or robot='ws://IP:PORT'")]
+)
+def test_details_of_a_name_of_robo_gym(run, kind, live):
+    status, out, err = run(main, f"EmptyEnvironmentUR{kind}")
+    assert (status, err) == (0, "")
+    assert out.splitlines()[:3] == [
+        f"EmptyEnvironmentUR{kind}-v0: a UR arm and nothing to do: for trying out actions",
+        f"robo-gym's name of bam/ur-empty-v0{live}",
+        "300 steps an episode, 20 Hz",
+    ]
+
+
 def test_json(run):
     rows = json.loads(run(main, "--json")[1])
-    assert [row["id"] for row in rows] == ["bam/reach-v0", "bam/pick-v0", "bam/pick-place-v0"]
+    assert [row["id"] for row in rows] == list(ENVIRONMENTS)
+    assert rows[1]["robo_gym"] == []
+    assert [row["robo_gym"] for row in rows if row["id"] == "bam/mir100-navigation-v0"] == [
+        ["NoObstacleNavigationMir100Sim-v0", "NoObstacleNavigationMir100Rob-v0"]
+    ]
     assert rows[1]["episode_steps"] == 100
     assert rows[1]["rate_hz"] == 20
     assert rows[1]["action"] == "float32 (5,)"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import gymnasium as gym
 import pytest
@@ -27,7 +28,7 @@ def preset(monkeypatch):
     values = {"steps": 7000, "num_envs": 4, "hyperparameters": {"gamma": 0.9, "policy_kwargs": {"net_arch": [8]}}}
     monkeypatch.setattr(
         "bam_train.trainers.resolve.read_preset",
-        lambda env, algo: values if (env, algo) == ("CartPole-v1", "ppo") else {},
+        lambda env, algo, trainer: values if (env, algo, trainer) == ("CartPole-v1", "ppo", "sb3") else {},
     )
 
 
@@ -100,7 +101,7 @@ def test_names_are_completed_and_unknown_ones_refused():
 
 
 def test_the_tables_agree():
-    with pytest.raises(SettingsError, match=r"^Unknown trainer 'x'\. Choose from: sb3\.$"):
+    with pytest.raises(SettingsError, match=r"^Unknown trainer 'x'\. Choose from: rllib, sb3\.$"):
         load_trainer("x")
     require_algorithm("sb3", "recurrent-ppo")
     assert load_trainer("sb3").__name__ == "SB3Trainer"
@@ -109,14 +110,16 @@ def test_the_tables_agree():
 @pytest.mark.parametrize("name", list_presets())
 def test_every_preset_is_complete_and_of_an_environment_of_ours(name):
     from bam_envs.registry import ENVIRONMENTS
-    from bam_train.settings import file_stem
-    from bam_train.trainers.sb3.algorithms import ALGORITHMS
+    from bam_train.trainers.presets import preset_name
+    from bam_train.trainers.rllib.algorithms import ALGORITHMS as OF_RLLIB
+    from bam_train.trainers.sb3.algorithms import ALGORITHMS as OF_SB3
 
-    pairs = [(env, algo) for env in ENVIRONMENTS for algo in ALGORITHMS if f"{file_stem(env, algo)}.toml" == name]
-    assert len(pairs) == 1
-    env, algo = pairs[0]
-    assert read_preset(env, algo)
-    resolve({"env": env, "algo": algo})
+    runs = [("sb3", algo) for algo in OF_SB3] + [("rllib", algo) for algo in OF_RLLIB]
+    found = [(env, *run) for env in ENVIRONMENTS for run in runs if preset_name(env, run[1], run[0]) == name]
+    assert len(found) == 1
+    env, trainer, algo = found[0]
+    assert read_preset(env, algo, trainer)
+    resolve({"env": env, "algo": algo, "trainer": trainer})
 
 
 def test_there_is_no_preset_of_a_foreign_environment():
@@ -295,3 +298,19 @@ def test_settings_of_another_time_to_stop_are_the_same_run(saved, here):
     longer = TrainSettings.from_mapping({**saved.settings.to_mapping(), "steps": 9000})
     assert choose_output(longer, None, False, saved(here / "last.zip", best=best)).path == here / "best.zip"
     assert isinstance(saved.checkpoint, Checkpoint)
+
+
+def test_a_name_of_robo_gym_is_tuned_as_the_environment():
+    ours = resolve({"env": "bam/mir100-navigation", "algo": "ppo"})
+    theirs = resolve({"env": "NoObstacleNavigationMir100Sim", "algo": "ppo", "env_kwargs": {"ip": "127.0.0.1"}})
+    assert (theirs.env, theirs.env_kwargs) == ("NoObstacleNavigationMir100Sim-v0", {"ip": "127.0.0.1"})
+    assert replace(theirs, env=ours.env, env_kwargs=ours.env_kwargs) == ours
+
+
+def test_an_argument_that_neither_robo_gym_nor_we_have():
+    given = {"env": "EndEffectorPositioningURSim", "algo": "ppo", "env_kwargs": {"ur_modle": "ur5"}}
+    with pytest.raises(SettingsError) as caught:
+        resolve(given)
+    assert str(caught.value) == (
+        "env_kwargs: unknown setting 'ur_modle' of EndEffectorPositioningURSim-v0. Did you mean 'ur_model'?"
+    )

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from bam_envs.errors import LinkLost
-from bam_train.errors import OutputError, TrainingFailed
+from bam_train.errors import OutputError, ProcessesLost, TrainingFailed
 from bam_train.evaluation import EvaluationReport
 from bam_train.settings import TrainSettings
 from bam_train.trainers import judge as judge_module
@@ -43,9 +43,10 @@ class Counter:
 
     def __init__(self, settings, clock=None):
         self.settings, self.steps, self.clock = settings, 0, clock
-        self.saved, self.refuse, self.fails_at, self.logged = [], [], None, []
+        self.saved, self.refuse, self.fails_at, self.logged, self.notices = [], [], None, [], []
         self.statistics = STATISTICS
         self.rows = self.link = None
+        self.news = []
 
     def train(self, steps, on_progress):
         while self.steps < steps:
@@ -54,6 +55,8 @@ class Counter:
                 self.clock.now += 1.0
             if self.link is not None and self.steps >= 60:
                 raise self.link
+            if self.steps == 20:
+                self.notices += self.news
             if self.fails_at is not None and self.steps >= self.fails_at:
                 raise TrainingFailed("train/loss is nan at step 60; expected finite numbers")
             if not on_progress(Progress(self.steps, steps, lambda: self.statistics)):
@@ -107,7 +110,7 @@ class Watcher:
 def start(tmp_path, monkeypatch):
     """Makes a run whose evaluations are looked up by step; asks for seeds are in ``start.seeds``."""
 
-    def start(results, clock=None, best=None, **extra):
+    def start(results, clock=None, best=None, copies=None, **extra):
         given = {"env": "test/Count-v0", "algo": "ppo", "steps": 100, "eval_every": 30, "eval_episodes": 10, "seed": 7}
         settings = TrainSettings.from_mapping({**given, **extra})
         start.seeds = []
@@ -121,7 +124,7 @@ def start(tmp_path, monkeypatch):
         monkeypatch.setattr(judge_module, "evaluate", evaluate)
         trainer, watcher = Counter(settings, clock), Watcher()
         folder = RunFolder(tmp_path / "runs", "count-ppo")
-        run = TrainingRun(trainer, folder, tmp_path / "out.zip", watcher, best, clock or Clock())
+        run = TrainingRun(trainer, folder, tmp_path / "out.zip", watcher, best, clock or Clock(), copies)
         return run, trainer, watcher
 
     return start
@@ -366,3 +369,72 @@ def test_a_lost_link_loses_nothing_that_was_learnt(start, tmp_path):
         f"at step 60: tcp://127.0.0.1:9: the link dropped. What was learnt is kept: go on with --resume {last}"
     )
     assert last.read_text() == "60"
+
+
+def test_lost_processes_lose_nothing_that_was_learnt(start):
+    run, trainer, _ = start({30: report(0.5)})
+    trainer.link = ProcessesLost("env runner 2 died 6 times within 20 updates")
+    last = run.folder.last
+    with pytest.raises(TrainingFailed) as caught:
+        run.run()
+    assert str(caught.value) == (
+        f"at step 60: env runner 2 died 6 times within 20 updates. What was learnt is kept: go on with --resume {last}"
+    )
+    assert last.read_text() == "60"
+
+
+def test_what_the_trainer_says_in_mid_run_is_passed_on_once(start):
+    run, trainer, watcher = start({100: report(0.5)}, eval_every=100)
+    trainer.news = ["env runner 1 died", "env runner 1 is back"]
+    run.run()
+    assert watcher.notes == ["env runner 1 died", "env runner 1 is back"]
+
+
+class Copying:
+    """Notes what it is to copy; fails as often as it is told to."""
+
+    def __init__(self, failures=0):
+        self.failures, self.copied = failures, []
+
+    def copy(self, checkpoint):
+        if self.failures:
+            self.failures -= 1
+            raise OutputError("s3://bucket/: out.zip could not be copied there: OSError: slow down")
+        self.copied.append(checkpoint.read_text())
+
+
+RISING = {30: report(0.1), 60: report(0.5), 90: report(0.4), 100: report(0.4)}
+
+
+def test_every_best_checkpoint_is_copied(start):
+    copies = Copying()
+    run, _, watcher = start(RISING, copies=copies)
+    assert run.run().failure is None
+    assert (copies.copied, watcher.notes) == (["30", "60"], [])
+
+
+def test_a_stopped_run_copies_its_newest_state_if_it_has_no_best(start):
+    copies = Copying()
+    run, trainer, _ = start({}, copies=copies)
+    trainer.news = ["stop"]
+    run.watcher.note = lambda text: run.stop()
+    assert run.run().reason == "stopped"
+    assert copies.copied == ["20"]
+
+
+def test_a_copy_that_failed_is_made_up_for(start):
+    copies = Copying(failures=2)
+    run, _, watcher = start(RISING, copies=copies)
+    assert run.run().failure is None
+    assert copies.copied == ["60"]
+    assert watcher.notes == [
+        "s3://bucket/: out.zip could not be copied there: OSError: slow down. It is tried again at the next best policy"
+    ]
+
+
+def test_a_last_copy_that_failed_fails_the_run(start):
+    run, _, watcher = start(RISING, copies=Copying(failures=9))
+    outcome = run.run()
+    assert (outcome.reason, outcome.steps) == ("steps", 100)
+    assert str(outcome.failure) == "s3://bucket/: out.zip could not be copied there: OSError: slow down"
+    assert len(watcher.notes) == 1

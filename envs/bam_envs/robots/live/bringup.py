@@ -104,18 +104,19 @@ class TopicTypes:
             f"Correct the topic or its type in the profile of {self._profile.name}."
         )
 
-    def check_listened(self, topic: str, expected: str) -> str:
-        """As `check`, for a topic of commands, which somebody must listen to; stamped or not must be as expected.
+    def check_listened(self, topic: str, sink: Sink) -> str:
+        """As `check`, for the `topic` of `sink`, which somebody must listen to; stamped or not must be as expected.
 
         Raises:
             ProtocolError: `topic` has another type there, or nobody knows it.
         """
-        deadline = time.monotonic() + TIMEOUT
+        deadline, expected = time.monotonic() + TIMEOUT, sink.type
         while not self._found(topic) and self._answers:
             if time.monotonic() > deadline:
                 raise ProtocolError(
-                    f"Nobody listens to {topic} ({expected}). Is the controller active, and is the topic called so? "
-                    f"Topics are in the profile of {self._profile.name}."
+                    f"Nobody listens to {topic} ({expected}), which takes {', '.join(sink.labels)}. Is the controller "
+                    f"active, and is the topic called so? Topics are in the profile of {self._profile.name}. A robot "
+                    "that has none of this runs environments that do not command it."
                 )
             time.sleep(_ASK_AGAIN)  # nodes of a ROS graph find each other after a while
         found = self._found(topic) or expected

@@ -35,7 +35,8 @@ def live_robot(
     Args:
         url: ``ws://host:port`` or ``wss://host:port``, with a namespace behind it if its topics have one.
         spec: What the task needs of it, such as the spec of its simulated robot; None: everything it measures.
-        profile: Its topics; a shipped name or a file. None: the shipped one that takes the commands of `spec`.
+        profile: Its topics; a shipped name or a file. None: the shipped one that takes the commands of `spec`. What
+            takes others only is left alone.
         limits: How far the guards let it go; None: those of the profile.
         tool_position: Forward kinematics of an arm that is no UR5e, (n, k) [rad] to (n, 3) [m].
         command: Way of sending commands, such as ``"trajectory"``; None: the profile's default.
@@ -43,8 +44,8 @@ def live_robot(
         token_file: File with the server's shared secret.
 
     Raises:
-        InvalidValue: The address is none of a robot, a file cannot be read, or the robot does not measure what `spec`
-            names.
+        InvalidValue: The address is none of a robot, a file cannot be read, or the robot does not measure, or take,
+            what `spec` names.
         UnknownName: There is no such profile, or no such way of sending commands.
     """
     _require_robot_address(url)

@@ -57,14 +57,15 @@ class RosbridgeRobot:
     Args:
         url: ``ws://host:port`` or ``wss://host:port``, with a namespace behind it if its topics have one.
         profile: Its topics.
-        spec: What the task needs; only these signals are subscribed. None: everything that is not optional.
+        spec: What the task needs; only these signals are subscribed, only these commands sent. None: everything that
+            is not optional.
         ca_file: PEM file of the authorities to trust instead of the system's.
         token: Shared secret of the server.
         command: Way of sending commands, such as ``"trajectory"``; None: the profile's default.
         clock: Monotonic clock [s].
 
     Raises:
-        InvalidValue: The address is none, or the robot does not measure what `spec` names.
+        InvalidValue: The address is none, or the robot does not measure, or take, what `spec` names.
         UnknownName: The profile has no such way of sending commands.
     """
 
@@ -82,10 +83,10 @@ class RosbridgeRobot:
         command: str | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.profile = profile
+        self.spec = profile.spec(spec, command)
+        self.profile = profile.narrowed(self.spec.command.labels, command)
         self.url = url
         self.namespace = parse_address(url).namespace
-        self.spec = self.profile.spec(spec)
         self.info = RobotInfo(self.profile.name)
         """What it says of itself; known after `connect`."""
         self._hears_halts = False
@@ -93,6 +94,7 @@ class RosbridgeRobot:
         self._ca_file, self._token = ca_file, token
         self._clock, self._state = clock, LiveState(self.profile, self.spec, clock)
         self._grid, self._tagger = Grid(self.spec.period), Tagger()
+        self._command_life = profile.command_life(self.spec.period)
         self._control: RosbridgeLink | None = None
         self._halting: RosbridgeLink | None = None
         self._epoch = 0  # of the connection that was verified; another one needs a reset
@@ -149,7 +151,7 @@ class RosbridgeRobot:
             control.subscribe(name, types.check(name, kind), self._state.listener(topic))
         for sink in self._sinks:
             name = self.namespace + sink.topic
-            kind = types.check_listened(name, sink.type)
+            kind = types.check_listened(name, sink)
             control.advertise(name, kind)
             halting.advertise(name, kind)
         halting.advertise(self.namespace + HALT_TOPIC, "std_msgs/Empty")
@@ -244,7 +246,7 @@ class RosbridgeRobot:
         self._require_accepted()
         end = self._grid.next(self._clock())
         # Where no time passes between commands, a late one does no harm before it is given up.
-        tag = self._tagger.next(self._epoch, ANSWER_TIMEOUT if self.info.lockstep else self.profile.dead_man)
+        tag = self._tagger.next(self._epoch, ANSWER_TIMEOUT if self.info.lockstep else self._command_life)
         if self.info.lockstep:
             self._ask(control, command.command[0], tag)
         else:
@@ -335,7 +337,7 @@ class RosbridgeRobot:
         if self._hears_halts:
             return
         hold = self._hold()
-        tag = self._tagger.next(self._epoch, self.profile.dead_man)
+        tag = self._tagger.next(self._epoch, self._command_life)
         for sink in self._sinks:
             if np.isfinite(hold[places_of(self.spec, sink)]).all():  # what is not known is not commanded
                 topic, _, message = encode_sink(sink, self.spec, hold, tag, ros1=halting.ros == "ros1")

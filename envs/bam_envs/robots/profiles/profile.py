@@ -50,15 +50,18 @@ def load_profile(name_or_path: str | Path) -> RobotProfile:
 
 
 def profile_for(spec: RobotSpec) -> RobotProfile:
-    """The shipped profile that takes the commands of `spec`.
+    """The shipped profile that takes the commands of `spec`; else the first that takes more, narrowed to them.
 
     Raises:
-        InvalidValue: There is none.
+        InvalidValue: There is none, or it would be sent a part of a message.
     """
-    for name in shipped_profiles():
-        profile = load_profile(name)
-        if profile.command.labels == spec.command.labels:
+    labels, shipped = spec.command.labels, [load_profile(name) for name in shipped_profiles()]
+    for profile in shipped:
+        if profile.command.labels == labels:
             return profile
+    for profile in shipped:
+        if labels and set(labels) <= set(profile.command.labels):
+            return profile.narrowed(labels)
     raise InvalidValue(f"No shipped profile takes the commands of {spec.name}. Give its file: profile='my_robot.toml'.")
 
 

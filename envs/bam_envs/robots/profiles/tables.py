@@ -125,7 +125,7 @@ class RobotProfile:
     max_age: float
     """Oldest state that is acted on [s]."""
     dead_man: float
-    """For how long a command means something [s]."""
+    """For how long a command means something [s]; see `command_life`."""
     limits: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Limits of the guards that differ from their defaults, by their names in `bam_envs.robots.safety.guards`."""
     cameras: tuple[CameraSource, ...] = ()
@@ -135,6 +135,13 @@ class RobotProfile:
     def sinks_by_topic(self) -> Mapping[str, Sink]:
         """What is sent on each topic, in the first way that uses it."""
         return {sink.topic: sink for way in reversed([*self.commands.values()]) for sink in reversed(way)}
+
+    def command_life(self, period: float) -> float:
+        """For how long a command means something to who sends one every `period` [s]: two periods at least.
+
+        The robot would else rest in the middle of a slow task whenever the next command is a little late.
+        """
+        return max(self.dead_man, 2.0 * period)
 
     def source(self, signal: str) -> Source:
         """Where `signal` comes from."""
@@ -171,20 +178,58 @@ class RobotProfile:
             raise UnknownName(f"way of sending commands to {self.name}", mode, self.commands)
         return self.commands[mode]
 
-    def spec(self, wanted: RobotSpec | None = None) -> RobotSpec:
-        """What this robot measures and is sent; only the signals of `wanted`, and its period, if it is given.
+    def narrowed(self, labels: tuple[str, ...], mode: str | None = None) -> RobotProfile:
+        """The same robot, for a task that commands only the numbers `labels`, in their order.
+
+        Sinks that take none of them are not in it: nothing is ever sent there. Nor are ways that would cut a message,
+        and that is an error of the way `mode` (None: the default one).
 
         Raises:
-            InvalidValue: It does not measure a signal of `wanted`, or takes other commands.
+            InvalidValue: It does not take one of them, or a sink of `mode` takes some of its numbers only.
+            UnknownName: There is no such way.
+        """
+        if labels == self.command.labels:
+            return self
+        if not labels or not set(labels) <= set(self.command.labels):
+            expected, found = ", ".join(labels) or "nothing", ", ".join(self.command.labels)
+            raise InvalidValue(f"Commands are {expected}, and {self.name} takes {found}. Choose another profile.")
+        wanted = self.sinks(mode)
+        for sink in wanted:
+            self._require_whole(sink, labels)
+        commands = {
+            way: tuple(sink for sink in sinks if set(sink.labels) <= set(labels))
+            for way, sinks in self.commands.items()
+            if sinks is wanted or not any(_missing(sink, labels) for sink in sinks)
+        }
+        return dataclasses.replace(self, command=self.command.part(labels), commands=commands)
+
+    def _require_whole(self, sink: Sink, labels: tuple[str, ...]) -> None:
+        missing = _missing(sink, labels)
+        if missing:
+            taken, absent, alone = (", ".join(one) for one in (sink.labels, missing, labels))
+            raise InvalidValue(
+                f"{sink.topic} takes {taken} in one message, and {absent} is not commanded. "
+                f"Give the profile of {self.name} a way of sending commands with a topic for {alone} alone."
+            )
+
+    def spec(self, wanted: RobotSpec | None = None, mode: str | None = None) -> RobotSpec:
+        """What this robot measures and is sent; only the signals and commands of `wanted`, at its period, if given.
+
+        Args:
+            wanted: What a task needs.
+            mode: As of `narrowed`, and so are its errors.
+
+        Raises:
+            InvalidValue: It does not measure a signal of `wanted`, or does not take its commands.
         """
         if wanted is None:
             signals = tuple(signal for signal in self.signals if not self.source(signal.name).optional)
             return RobotSpec(self.name, signals, self.command, self.period)
-        self._require_what_is(wanted)
-        names = [signal.name for signal in wanted.signals]
-        return RobotSpec(self.name, tuple(self.signal(name) for name in names), self.command, wanted.period)
+        self._require_measured(wanted)
+        signals = tuple(self.signal(signal.name) for signal in wanted.signals)
+        return RobotSpec(self.name, signals, self.narrowed(wanted.command.labels, mode).command, wanted.period)
 
-    def _require_what_is(self, wanted: RobotSpec) -> None:
+    def _require_measured(self, wanted: RobotSpec) -> None:
         known = {signal.name: signal for signal in self.signals}
         for signal in wanted.signals:
             if signal.name not in known:
@@ -195,6 +240,9 @@ class RobotProfile:
             if signal.labels != known[signal.name].labels:
                 found = ", ".join(known[signal.name].labels)
                 raise InvalidValue(f"{signal.name} must be {', '.join(signal.labels)}; that of {self.name} is {found}.")
-        if wanted.command.labels != self.command.labels:
-            expected, found = ", ".join(wanted.command.labels), ", ".join(self.command.labels)
-            raise InvalidValue(f"Commands are {expected}, and {self.name} takes {found}. Choose another profile.")
+
+
+def _missing(sink: Sink, labels: tuple[str, ...]) -> list[str]:
+    """What `sink` needs beside `labels`; nothing where it takes none of them."""
+    missing = [label for label in sink.labels if label not in labels]
+    return missing if len(missing) < len(sink.labels) else []

@@ -50,8 +50,8 @@ class StartPose:
         return command
 
     def is_open(self, measured: Array) -> bool:
-        """Whether the gripper is measured open."""
-        return bool((np.abs(self.command - measured)[self._grippers] <= GRIPPER_NEAR).all())
+        """Whether the gripper is measured open; one that is not measured (NaN) is not waited for."""
+        return not (np.abs(self.command - measured)[self._grippers] > GRIPPER_NEAR).any()
 
     def joints_off(self, measured: Array) -> dict[str, float]:
         """The joints that are not there, with how far they have to go [rad]."""

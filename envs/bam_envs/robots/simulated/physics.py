@@ -8,6 +8,7 @@ i of many equals one alone, bit for bit.
 from __future__ import annotations
 
 import copy
+import importlib
 import os
 from pathlib import Path
 from typing import Any
@@ -15,16 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.errors import InvalidValue, MissingExtra
+from bam_envs.robots.simulated.engine import load_mujoco
 
-try:
-    import mujoco
-    from mujoco import rollout
-except ImportError as error:
-    raise MissingExtra("mujoco", "sim", "A simulated robot") from error
-except RuntimeError as error:  # a MUJOCO_GL that it does not know
-    raise InvalidValue(f"MuJoCo cannot be imported: {error}. Unset MUJOCO_GL, or set it to egl or osmesa.") from error
-
+mujoco = load_mujoco("A simulated robot")
+rollout: Any = importlib.import_module("mujoco.rollout")
 Array = NDArray[np.float64]
 FULL = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 MODELS = Path(__file__).parent / "models"

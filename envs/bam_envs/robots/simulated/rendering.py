@@ -14,21 +14,30 @@ import subprocess
 import sys
 import threading
 import warnings
+from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.errors import BamEnvsError
-from bam_envs.robots.simulated.physics import Physics
+from bam_envs.robots.simulated.engine import load_mujoco
+from bam_envs.robots.simulated.shapes import Colour
+
+if TYPE_CHECKING:
+    from bam_envs.robots.simulated.physics import Physics
+
+mujoco = load_mujoco("A picture of a robot")
 
 Array = NDArray[np.float64]
-Mark = tuple[Array, tuple[float, float, float, float]]
+Mark = tuple[Array, Colour]
+Draw = Callable[[Any], None]
+"""Appends bodies that are in no model to an ``MjvScene``."""
 WIDTH, HEIGHT = 640, 480
 CAMERA = "front"
 MARK_RADIUS = 0.02
+MOST_GEOMS = 1000
 BACKENDS = ("egl", "osmesa")
 _PROBE = "import sys, importlib; importlib.import_module('mujoco.' + sys.argv[1]).GLContext(16, 16).make_current()"
 
@@ -41,39 +50,46 @@ class SceneRenderer:
     """Row 0 of a `Physics`, off screen or in a window."""
 
     def __init__(self, physics: Physics, mode: str) -> None:
-        self._physics = physics
-        self._view: OffScreen | Window = OffScreen(physics) if mode == "rgb_array" else Window(physics)
+        model = physics.model_of(0)
+        self._physics, self._view = physics, open_view(model, mode)
+        self._view.camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._view.camera.fixedcamid = model.camera(CAMERA).id
 
     def render(self, marks: list[Mark]) -> NDArray[np.uint8] | None:
         """An image (480, 640, 3), or None from a window."""
-        return self._view.show(self._physics.data_of(0), marks)
+        return self._view.show(self._physics.data_of(0), lambda scene: add_marks(scene, marks))
 
     def close(self) -> None:
         """Free the OpenGL context or close the window."""
         self._view.close()
 
 
+def open_view(model: Any, mode: str) -> OffScreen | Window:
+    """Where `model` is drawn: in memory for ``rgb_array``, else in a window."""
+    return OffScreen(model) if mode == "rgb_array" else Window(model)
+
+
 class OffScreen:
     """Draws into memory."""
 
-    def __init__(self, physics: Physics) -> None:
-        self._model = physics.model_of(0)
+    def __init__(self, model: Any) -> None:
+        self._model = model
         self._gl: Any = gl_context(find_backend())
         self._gl.make_current()
-        self._scene = mujoco.MjvScene(self._model, maxgeom=200)
-        self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
-        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._camera.fixedcamid = self._model.camera(CAMERA).id
-        self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        self._scene = mujoco.MjvScene(model, maxgeom=MOST_GEOMS)
+        self._option = mujoco.MjvOption()
+        self.camera: Any = mujoco.MjvCamera()
+        """From where it is seen; to be set."""
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         atexit.register(self.close)  # while OpenGL is still there
 
-    def show(self, data: Any, marks: list[Mark]) -> NDArray[np.uint8]:
-        """Draw and read back an image (480, 640, 3)."""
+    def show(self, data: Any, draw: Draw) -> NDArray[np.uint8]:
+        """Draw the model as `data` says and what `draw` adds; read back an image (480, 640, 3)."""
         self._gl.make_current()
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
-        mujoco.mjv_updateScene(self._model, data, self._option, None, self._camera, everything, self._scene)
-        add_marks(self._scene, marks)
+        mujoco.mjv_updateScene(self._model, data, self._option, None, self.camera, everything, self._scene)
+        draw(self._scene)
         view, image = mujoco.MjrRect(0, 0, WIDTH, HEIGHT), np.empty((HEIGHT, WIDTH, 3), dtype=np.uint8)
         mujoco.mjr_render(view, self._scene, self._context)
         mujoco.mjr_readPixels(image, None, view, self._context)
@@ -93,24 +109,23 @@ class OffScreen:
 class Window:
     """Draws into a window of MuJoCo's own viewer."""
 
-    def __init__(self, physics: Physics) -> None:
+    def __init__(self, model: Any) -> None:
         require_display()
         viewer = importlib.import_module("mujoco.viewer")
-        self._model = physics.model_of(0)
-        self._data = mujoco.MjData(self._model)
+        self._model, self._data = model, mujoco.MjData(model)
         before = set(threading.enumerate())
-        self._viewer: Any = viewer.launch_passive(self._model, self._data, show_left_ui=False, show_right_ui=False)
+        self._viewer: Any = viewer.launch_passive(model, self._data, show_left_ui=False, show_right_ui=False)
         self._threads = set(threading.enumerate()) - before
-        self._viewer.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._viewer.cam.fixedcamid = self._model.camera(CAMERA).id
+        self.camera: Any = self._viewer.cam
+        """From where it is seen; the mouse moves it too."""
 
-    def show(self, data: Any, marks: list[Mark]) -> None:
+    def show(self, data: Any, draw: Draw) -> None:
         """Bring the window up to date."""
         with self._viewer.lock():
             self._data.qpos[:], self._data.qvel[:], self._data.time = data.qpos, data.qvel, data.time
             mujoco.mj_forward(self._model, self._data)
             self._viewer.user_scn.ngeom = 0
-            add_marks(self._viewer.user_scn, marks)
+            draw(self._viewer.user_scn)
         self._viewer.sync()
 
     def close(self) -> None:
@@ -136,13 +151,49 @@ def require_display() -> None:
     glfw.terminate()
 
 
-def add_marks(scene: Any, marks: list[Mark]) -> None:
-    """Append a sphere for each mark to `scene`."""
-    size, upright = np.array([MARK_RADIUS, 0.0, 0.0]), np.eye(3).ravel()
+def add_marks(scene: Any, marks: Sequence[Mark], radius: float = MARK_RADIUS) -> None:
+    """Append a sphere of `radius` [m] for each mark to `scene`."""
     for position, colour in marks:
-        geom = scene.geoms[scene.ngeom]
-        mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_SPHERE, size, position, upright, np.array(colour, np.float32))
-        scene.ngeom += 1
+        add_geom(scene, "sphere", position, (radius, 0.0, 0.0), colour)
+
+
+_UPRIGHT = np.eye(3).ravel()
+
+
+def add_geom(
+    scene: Any,
+    kind: str,
+    position: Array,
+    size: Sequence[float],
+    colour: Colour,
+    rotation: Array = _UPRIGHT,
+) -> Any:
+    """Append a body to `scene`; it is left out where there is no room for more.
+
+    Args:
+        scene: An ``MjvScene``.
+        kind: "box" or "sphere" or another of MuJoCo's ``mjtGeom``.
+        position: Its middle [m]. Shape: (3,).
+        size: MuJoCo's sizes of the kind [m]: half edges of a box, radius of a sphere. Length 3.
+        colour: Its colour.
+        rotation: From its frame to the world's, row by row. Shape: (9,).
+
+    Returns:
+        The ``MjvGeom``, or None without room.
+    """
+    if scene.ngeom >= scene.maxgeom:
+        return None
+    geom, type_ = scene.geoms[scene.ngeom], getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
+    mujoco.mjv_initGeom(
+        geom,
+        type_,
+        np.asarray(size, np.float64),
+        np.asarray(position, np.float64),
+        rotation,
+        np.array(colour, np.float32),
+    )
+    scene.ngeom += 1
+    return geom
 
 
 def gl_context(backend: str) -> Any:

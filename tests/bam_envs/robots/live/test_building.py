@@ -9,7 +9,6 @@ import pytest
 from bam_envs.bridge.server.server import BridgeServer
 from bam_envs.errors import InvalidValue, LinkLost, ProtocolError, UnknownName
 from bam_envs.robots.fake import FakeRobot
-from bam_envs.robots.fake_base import FakeBase
 from bam_envs.robots.live.building import live_robot, profile_limits
 from bam_envs.robots.live.rosbridge import RosbridgeRobot
 from bam_envs.robots.mir100 import base_spec
@@ -17,6 +16,7 @@ from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.robots.robot import Initial, Robot, RobotState, Rows
 from bam_envs.robots.safety.guards import Limits
 from bam_envs.robots.safety.safe import SafeRobot
+from bam_envs.robots.simulated.mir100 import SimulatedBase
 from bam_envs.robots.ur5e import JOINTS, arm_spec
 from bam_envs.serve.command import CommandLease
 from bam_envs.serve.robot_service import RobotService
@@ -30,7 +30,7 @@ class Box:
     """A robot in a box: a fake one, served on a port of its own."""
 
     def __init__(self, robot, initial, realtime):
-        profile = load_profile("mir100" if isinstance(robot, FakeBase) else "ur5e")
+        profile = load_profile("mir100" if isinstance(robot, SimulatedBase) else "ur5e")
         self.server = BridgeServer(port=0).start()
         self.robot = ServedRobot(robot, dead_man=profile.dead_man, zero_rests=profile.kind == "base", realtime=realtime)
         self.robot.connect()
@@ -81,7 +81,7 @@ class TestLiveArmInRealTime(TestLiveArm):
 
 class TestLiveBase(LiveContract):
     def served(self):
-        return FakeBase(1)
+        return SimulatedBase(1)
 
     def initial(self, robot: Robot, rows: Rows) -> Initial:
         return Initial({}, np.zeros(1, np.int64))

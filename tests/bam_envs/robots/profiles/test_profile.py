@@ -9,6 +9,7 @@ from bam_envs.errors import InvalidValue, UnknownName
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.profiles.profile import load_profile, profile_for, shipped_profiles
+from bam_envs.robots.ur import ur_model, ur_spec
 from bam_envs.robots.ur5e import JOINTS, arm_spec
 
 OWN = """
@@ -118,6 +119,73 @@ def test_what_is_needed_and_not_measured():
 def test_the_profile_for_a_robot():
     assert profile_for(FakeRobot().spec).name == "ur5e"
     assert profile_for(base_spec("base")).name == "mir100"
+
+
+def test_a_task_may_take_a_part_of_the_commands():
+    profile, wanted = load_profile("ur5e"), ur_spec(ur_model("ur10"), 0.1, with_object=False)
+    spec, narrow = profile.spec(wanted), profile.narrowed(JOINTS)
+    assert spec.command == narrow.command == profile.command.part(JOINTS)
+    assert spec.command.labels == JOINTS
+    assert spec.command.max_rate == (np.pi,) * 6
+    assert spec.period == 0.1
+    (_, arm), (_, trajectory) = profile.commands.values()
+    assert dict(narrow.commands) == {"position": (arm,), "trajectory": (trajectory,)}
+    assert narrow.sinks() == (arm,)
+    assert list(narrow.sinks_by_topic) == [trajectory.topic, arm.topic]
+    assert replace(narrow, command=profile.command, commands=profile.commands) == profile
+    assert profile.narrowed(profile.command.labels) is profile
+    assert profile_for(wanted) == narrow
+
+
+def test_commands_may_come_in_another_order():
+    turned = JOINTS[::-1]
+    profile = load_profile("ur5e").narrowed(turned)
+    assert profile.command.labels == turned
+    assert profile.command.high == profile.narrowed(JOINTS).command.high[::-1]
+    assert profile.sinks()[0].labels == JOINTS
+
+
+def test_commands_that_it_does_not_take():
+    profile = load_profile("mir100")
+    for labels, told in (((*JOINTS[:2],), "shoulder_pan_joint, shoulder_lift_joint"), ((), "nothing")):
+        with pytest.raises(InvalidValue) as caught:
+            profile.narrowed(labels)
+        assert str(caught.value) == (
+            f"Commands are {told}, and mir100 takes linear_velocity, angular_velocity. Choose another profile."
+        )
+    nothing = replace(base_spec("base"), command=profile.command.part(()))
+    other = replace(base_spec("base"), command=replace(profile.command, labels=("linear_velocity", "lift")))
+    for spec in (nothing, other):
+        with pytest.raises(InvalidValue) as caught:
+            profile_for(spec)
+        assert str(caught.value) == (
+            "No shipped profile takes the commands of base. Give its file: profile='my_robot.toml'."
+        )
+
+
+def test_no_message_is_cut_in_two():
+    spec = replace(base_spec("base"), command=base_spec().command.part(("linear_velocity",)))
+    with pytest.raises(InvalidValue) as caught:
+        profile_for(spec)
+    assert str(caught.value) == (
+        "/cmd_vel takes linear_velocity, angular_velocity in one message, and angular_velocity is not commanded. "
+        "Give the profile of mir100 a way of sending commands with a topic for linear_velocity alone."
+    )
+
+
+def test_a_way_that_would_be_cut_is_left_out_unless_it_is_wanted():
+    profile = load_profile("ur5e")
+    gripper, arm = profile.sinks()
+    whole = replace(arm, topic="/all", labels=profile.command.labels)
+    two = replace(profile, commands={"whole": (whole,), "parts": (gripper, arm)})
+    assert dict(two.narrowed(JOINTS, "parts").commands) == {"parts": (arm,)}
+    for mode in (None, "whole"):
+        with pytest.raises(InvalidValue, match=r"^/all takes "):
+            two.narrowed(JOINTS, mode)
+    wanted = ur_spec(ur_model("ur5"), 0.1, with_object=False)
+    assert two.spec(wanted, "parts").command.labels == JOINTS
+    with pytest.raises(InvalidValue, match=r"^/all takes "):
+        two.spec(wanted)
 
 
 def test_unknown_names():

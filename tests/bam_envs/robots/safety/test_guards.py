@@ -1,6 +1,7 @@
 """The guards one by one: what they let through, what they make of the rest, and what they say."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from bam_envs.robots.safety import arm_guards, guards
 from bam_envs.robots.safety.arm_guards import longest_step
 from bam_envs.robots.safety.guard import Guard, Limits, Tick
 from bam_envs.robots.safety.guards import default_guards
-from bam_envs.robots.ur5e import GEOMETRY, arm_spec
+from bam_envs.robots.ur5e import GEOMETRY, JOINTS, arm_spec
 from bam_envs.testing import ARM_HOME
 
 ARM, BASE = arm_spec("ur5e", with_object=False), base_spec(with_scans=False)
@@ -53,6 +54,12 @@ def test_the_list_of_an_arm():
         ("G10", "tool speed", 0.25, "m/s"),
         ("G7", "measured limits", 0.0, "beyond the data sheet"),
     ]
+
+
+def test_an_arm_that_is_told_its_joints_alone_has_no_guard_of_a_gripper():
+    spec = replace(ARM, command=ARM.command.part(JOINTS))
+    whole, joints_only = ([(one.name, one.limit_value) for one in default_guards(one)] for one in (ARM, spec))
+    assert joints_only == [("shape", 6), *(one for one in whole[1:] if one[0] != "gripper speed")]
 
 
 def test_the_list_of_a_base():

@@ -20,10 +20,10 @@ from bam_envs.errors import (
     StartNotReached,
 )
 from bam_envs.robots.fake import FakeRobot
-from bam_envs.robots.fake_base import FakeBase
 from bam_envs.robots.robot import Initial, Robot, RobotState
 from bam_envs.robots.safety.guards import Guard, Limits, default_guards
 from bam_envs.robots.safety.safe import ClearedCommand, SafeRobot
+from bam_envs.robots.simulated.mir100 import SimulatedBase
 from bam_envs.robots.ur5e import GEOMETRY
 from bam_envs.testing import ARM_HOME, RobotContract
 
@@ -131,7 +131,7 @@ class TestSafeLiveArm(Guarded):
 
 class TestSafeBase(Guarded):
     def make(self, num_robots: int) -> Robot:
-        return SafeRobot(FakeBase(num_robots, with_scans=False))
+        return SafeRobot(SimulatedBase(num_robots, with_scans=False))
 
     def measured(self, state: RobotState):
         return state.signals["base_velocity"]
@@ -252,7 +252,7 @@ SPEEDS = st.one_of(st.floats(-3, 3), st.sampled_from([math.nan, math.inf, 1e300]
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(SPEEDS, SPEEDS), max_size=40))
 def test_whatever_a_base_is_told_it_keeps_its_limits(commands):
-    robot = SafeRobot(FakeBase(with_scans=False))
+    robot = SafeRobot(SimulatedBase(with_scans=False))
     robot.connect()
     last = robot.reset(np.arange(1), Initial({}, FIRST)).command[0]
     np.testing.assert_array_equal(last, [0.0, 0.0])
@@ -427,7 +427,7 @@ def test_after_a_hold_it_starts_from_rest():
 
 
 def test_a_base_holds_at_zero():
-    robot = SafeRobot(FakeBase(with_scans=False))
+    robot = SafeRobot(SimulatedBase(with_scans=False))
     robot.connect()
     robot.reset(np.arange(1), Initial({}, FIRST))
     robot.step(np.array([[0.2, 0.1]]))
@@ -743,6 +743,7 @@ def test_a_gripper_that_is_not_measured():
     robot.connect()
     arm.place(ARM_HOME)
     state = robot.reset(np.arange(1), start_at())
+    assert arm.sent == []  # it is there, and nobody waits for what nobody sees
     assert state.command[0, 6] == 0.085
     assert robot.step(away(state, 0.01)).command[0, 6] == 0.085
 

@@ -1,0 +1,228 @@
+"""Ray for one training run: a quiet one of its own on this computer, or a cluster that is there already.
+
+The own one listens on the loopback device only, asks for a token that nobody else has, keeps its files in a folder of
+its own, and is gone when the run ends, however it ends. A cluster is joined and left as it was.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import logging
+import os
+import secrets
+import shutil
+import signal
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import ray
+import ray.rllib  # sets up its loggers
+
+from bam_train.errors import TrainingFailed
+from bam_train.settings import TrainSettings
+from bam_train.trainers.rllib.address import find, reach
+from bam_train.trainers.rllib.descendants import Descendants
+from bam_train.trainers.rllib.fault_tolerance import fault_tolerance
+from bam_train.trainers.rllib.resources import cores, gpus, learners, require_resources
+
+__all__ = ["cluster", "fault_tolerance", "gpus", "learners", "require_resources"]
+
+OBJECT_STORE = 200 * 2**20
+"""Memory that the own Ray shares samples and weights through [bytes]; they are a few megabytes."""
+
+_TOKEN = secrets.token_hex(32)
+_LOGGERS = ("ray", "ray.rllib", "ray.tune", "ray.train", "ray.data")
+_MODE = "RAY_AUTH_MODE"
+_TOKENS = ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
+
+
+@contextlib.contextmanager
+def cluster(settings: TrainSettings) -> Iterator[None]:
+    """Ray for a run, within; one that runs in this process already is used, and left running.
+
+    Args:
+        settings: `address` is None for a Ray of the run's own, else ``auto`` or ``host:port`` of the cluster to join;
+            runners, learners and GPUs say how much of it is asked for.
+
+    Raises:
+        SettingsError: More is asked for than there is, or the address cannot be one.
+        TrainingFailed: Ray does not start, or the cluster does not answer or let us in; within 20 s.
+    """
+    with _quiet():
+        if ray.is_initialized():
+            require_resources(settings)
+            yield
+        elif settings.address is None:
+            require_resources(settings)
+            with _own(settings):
+                yield
+        else:
+            with _joined(settings.address):
+                require_resources(settings)
+                yield
+
+
+@contextlib.contextmanager
+def _own(settings: TrainSettings) -> Iterator[None]:
+    """A Ray of the run's own, on this computer alone."""
+    root = "/tmp" if os.path.isdir("/tmp") else None  # the names of its sockets must be short
+    folder = Path(tempfile.mkdtemp(prefix="bam-ray-", dir=root))
+    descendants = Descendants()
+    with _private_token():
+        try:
+            _start(folder, gpus(settings))
+            yield
+        finally:
+            descendants.watch()
+            with contextlib.suppress(Exception):  # whatever it says about its end, nothing of it must be left
+                ray.shutdown(wait_for_processes=True)
+            descendants.end()
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _start(folder: Path, num_gpus: int) -> None:
+    try:
+        with _starting(), loopback_only():
+            ray.init(
+                address="local",
+                num_cpus=cores(),
+                num_gpus=num_gpus,
+                object_store_memory=OBJECT_STORE,
+                include_dashboard=False,
+                log_to_driver=False,
+                configure_logging=False,
+                _temp_dir=str(folder),
+            )
+    except Exception as error:  # Ray has no one error for what may go wrong with its processes
+        why = str(error).strip().partition("\n")[0].rstrip(".")
+        raise TrainingFailed(f"Ray does not start on this computer: {why}. Is there enough memory and disk?") from error
+
+
+@contextlib.contextmanager
+def _private_token() -> Iterator[None]:
+    """A token of this process alone for the own Ray, instead of the one that Ray would write into the home folder."""
+    if _MODE in os.environ or any(name in os.environ for name in _TOKENS):
+        yield  # whoever set them knows
+        return
+    try:
+        with _environment(**{_MODE: "token", _TOKENS[0]: _TOKEN}):
+            _read_token_again()
+            yield
+    finally:
+        _read_token_again()
+
+
+def _read_token_again() -> None:
+    """Ray reads mode and token once, when it is imported."""
+    raylet: Any = importlib.import_module("ray._raylet")
+    raylet.Config.initialize("")
+    raylet.AuthenticationTokenLoader.instance().reset_cache()
+
+
+@contextlib.contextmanager
+def _environment(**variables: str) -> Iterator[None]:
+    """Within, these environment variables are set so, for what is started too."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@contextlib.contextmanager
+def loopback_only() -> Iterator[None]:
+    """Ray started within takes 127.0.0.1 for its computer's address, and then its servers bind to nothing else.
+
+    `ray.init(_node_ip_address="127.0.0.1")` would not do: Ray puts an address that others can reach in its place, but
+    where clusters are not enabled (the default on macOS and Windows, for the sake of their firewalls).
+    """
+    from ray._private import ray_constants
+
+    before = ray_constants.ENABLE_RAY_CLUSTER
+    ray_constants.ENABLE_RAY_CLUSTER = False
+    try:
+        with _environment(**{ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR: "0"}):
+            yield
+    finally:
+        ray_constants.ENABLE_RAY_CLUSTER = before
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Within, Ray and RLlib say nothing: `RunnerWatch` and the errors here say what the user needs to know."""
+    from ray._private import worker
+
+    loggers = [logging.getLogger(name) for name in _LOGGERS]
+    before = [(logger, logger.handlers[:], logger.propagate) for logger in loggers]
+    said = worker.print_to_stdstream
+    worker.print_to_stdstream = _say_nothing  # prints dead processes on standard output, whatever `ray.init` is given
+    _hush()
+    try:
+        yield
+    finally:
+        worker.print_to_stdstream = said
+        for logger, handlers, propagate in before:
+            logger.handlers[:], logger.propagate = handlers, propagate
+
+
+@contextlib.contextmanager
+def _starting() -> Iterator[None]:
+    """Around `ray.init`: its C++ part learns to be quiet, says so on standard error, and our signals stay ours."""
+    with _own_signals(), _environment(RAY_BACKEND_LOG_LEVEL="fatal"):
+        sys.stderr.flush()
+        kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            os.close(nowhere)
+            _hush()
+
+
+def _hush() -> None:
+    """Take their handlers from the loggers of Ray; `ray.init` does that too, and leaves none."""
+    for name in _LOGGERS:
+        logger = logging.getLogger(name)
+        logger.handlers[:], logger.propagate = [logging.NullHandler()], False
+
+
+def _say_nothing(*_: object, **__: object) -> None:
+    return
+
+
+@contextlib.contextmanager
+def _own_signals() -> Iterator[None]:
+    """Keeps the handler of SIGTERM, which `ray.init` replaces."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
+def _joined(address: str) -> Iterator[None]:
+    """A cluster that is there already."""
+    place = find(address)
+    reach(place)
+    try:
+        with _starting():
+            ray.init(address=place, log_to_driver=False, configure_logging=False)
+        yield
+    finally:
+        ray.shutdown()

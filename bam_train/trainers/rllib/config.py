@@ -1,0 +1,119 @@
+"""Complete settings as RLlib's `AlgorithmConfig`."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from gymnasium import Space, spaces
+from ray.rllib.callbacks.callbacks import RLlibCallback
+from ray.rllib.connectors.env_to_module import FlattenObservations
+
+from bam_train.environments import is_batched
+from bam_train.errors import BamTrainError, SettingsError
+from bam_train.settings import TrainSettings
+from bam_train.trainers.rllib import hyperparameters
+from bam_train.trainers.rllib.algorithms import ALGORITHMS
+from bam_train.trainers.rllib.cluster import fault_tolerance, learners
+from bam_train.trainers.rllib.env_runner import RobotEnvRunner, log_end
+from bam_train.trainers.rllib.filters import MeanStdFilter
+from bam_train.trainers.rllib.registration import register_foreign
+from bam_train.trainers.rllib.rows import End
+
+STEPS_AT_LEAST = 200
+"""Steps of an iteration of an algorithm that updates after every few: its overhead is then small."""
+
+
+def make_config(settings: TrainSettings, observation_space: Space[Any], action_space: Space[Any], seed: int) -> Any:
+    """The configuration of a run.
+
+    Args:
+        settings: Complete.
+        observation_space: The environment's own.
+        action_space: The environment's own.
+        seed: Of weights, exploration and environments.
+    """
+    algorithm, values = ALGORITHMS[settings.algo], settings.hyperparameters
+    number, gpus_each = learners(settings)
+    config = algorithm.load()()
+    config.framework("torch").rl_module(model_config=dict(values["model_config"]))
+    config.training(**hyperparameters.training_arguments(values))
+    config.learners(num_learners=number, num_gpus_per_learner=gpus_each)
+    config.debugging(seed=seed, log_level="ERROR")
+    config.reporting(min_time_s_per_iteration=0, min_sample_timesteps_per_iteration=_least_steps(settings))
+    if algorithm.offline:
+        return _offline(config, settings, observation_space, action_space)
+    name = register_foreign(settings.env)
+    config.environment(name, env_config=dict(settings.env_kwargs), disable_env_checking=True)
+    config.env_runners(
+        num_env_runners=settings.num_env_runners,
+        num_envs_per_env_runner=settings.num_envs,
+        rollout_fragment_length=values["rollout_fragment_length"],
+        env_to_module_connector=functools.partial(connectors, observation_space, settings.normalize),
+    )
+    if runs_batched(settings, observation_space):
+        config.env_runners(env_runner_cls=RobotEnvRunner)
+    else:
+        config.callbacks(NotesEnds)
+    return fault_tolerance(config)
+
+
+def runs_batched(settings: TrainSettings, observation_space: Space[Any]) -> bool:
+    """Whether our own runner does: one batched simulation, a module without a state."""
+    plain = isinstance(observation_space, spaces.Box)
+    return is_batched(settings.env) and plain and not settings.hyperparameters["model_config"]["use_lstm"]
+
+
+def connectors(
+    observation_space: Space[Any], normalize: bool | Mapping[str, Any], env: Any, spaces: Any, device: Any
+) -> list[Any]:
+    """What lies between environment and module: one vector out of several inputs, normalised if asked for."""
+    pieces: list[Any] = [] if _is_plain(observation_space) else [FlattenObservations()]
+    if normalize:
+        pieces.append(MeanStdFilter(**({} if normalize is True else normalize)))
+    return pieces
+
+
+def _is_plain(space: Space[Any]) -> bool:
+    return isinstance(space, spaces.Box)
+
+
+def _least_steps(settings: TrainSettings) -> int:
+    """How long an iteration is at least; on-policy algorithms say so themselves, offline ones take no step."""
+    algorithm = ALGORITHMS[settings.algo]
+    if algorithm.on_policy or algorithm.offline:
+        return 0
+    return min(STEPS_AT_LEAST, settings.eval_every or STEPS_AT_LEAST)
+
+
+def _offline(config: Any, settings: TrainSettings, observation_space: Space[Any], action_space: Space[Any]) -> Any:
+    from bam_train.trainers.rllib.offline import add_data
+
+    return add_data(config, settings, observation_space, action_space)
+
+
+@contextlib.contextmanager
+def refusals(settings: TrainSettings) -> Iterator[None]:
+    """What RLlib says about settings that cannot be, as our own error."""
+    try:
+        yield
+    except (AssertionError, ValueError, TypeError, KeyError, AttributeError, NotImplementedError) as error:
+        if isinstance(error, BamTrainError):
+            raise
+        text = " ".join(str(error).partition("To suppress all validation errors")[0].split())
+        raise SettingsError(f"{settings.algo} on {settings.env} cannot be set up: {text:.400}") from error
+
+
+class NotesEnds(RLlibCallback):  # type: ignore[misc]
+    """Notes how each episode of RLlib's own runner went, which keeps means alone, and knows nothing of success."""
+
+    def on_episode_end(
+        self, *, episode: Any, prev_episode_chunks: Any = (), metrics_logger: Any, **kwargs: Any
+    ) -> None:
+        """Note one."""
+        pieces = [*prev_episode_chunks, episode]
+        success = episode.get_infos(-1).get("is_success")
+        total, length = sum(piece.get_return() for piece in pieces), sum(map(len, pieces))
+        log_end(metrics_logger, End(length, float(total), None if success is None else bool(success)))

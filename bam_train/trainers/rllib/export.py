@@ -1,0 +1,278 @@
+"""From a checkpoint directory of RLlib to a checkpoint.zip that can be evaluated and deployed, and not resumed."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from bam_envs.errors import UnknownName
+from bam_envs.registry import resolve_id
+from bam_envs.spaces import space_to_json
+from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, safetensors_file, write_checkpoint
+from bam_train.environments import control_period, first_difference, make_env
+from bam_train.errors import CheckpointMismatch, PolicyError
+from bam_train.policy import FrozenPolicy
+from bam_train.policy.golden import TOLERANCE, worst_difference
+from bam_train.policy.spaces import leaf, leaves
+from bam_train.trainers.provenance import git_commit, now, versions
+from bam_train.trainers.rllib.by_hand import actions_by_hand
+from bam_train.trainers.rllib.directory import Directory, find_policy
+from bam_train.trainers.rllib.foreign import ForeignPolicy, read_policy
+from bam_train.trainers.rllib.freeze import freeze
+from bam_train.trainers.rllib.golden import clear_observations, pack
+from bam_train.trainers.rllib.parts import AnySpace, Array, PolicyParts, leaf_spaces
+
+EXPORTED = "exported"
+"""Setting of the manifest that says where an exported checkpoint comes from; a run's own has none of this name."""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A policy out of a directory, frozen and checked."""
+
+    directory: Directory
+    parts: PolicyParts
+    """Its spaces are the environment's own."""
+    env: str
+    """Versioned id."""
+    env_kwargs: dict[str, Any]
+    steps: int
+    signals: dict[str, Any]
+    period: float | None
+    graph: bytes
+    """ONNX."""
+    golden: bytes
+    """Observations and the actions that the graph was checked against."""
+    checked_by: str
+    """What computed those actions: RLlib with its version, or NumPy."""
+    difference: float
+    """The largest difference from them."""
+    policy: FrozenPolicy
+
+    def write(self, path: Path) -> Checkpoint:
+        """Write the checkpoint.zip.
+
+        Raises:
+            OutputError: It cannot be written there.
+        """
+        source = {
+            "directory": str(self.directory.folder),
+            "policy": self.directory.name,
+            "ray": self.directory.ray_version,
+            "golden": self.checked_by,
+        }
+        fields = {
+            "env": self.env,
+            "env_kwargs": self.env_kwargs,
+            "observation_space": self.policy.observation_space,
+            "action_space": self.policy.action_space,
+            "signals": self.signals,
+            "period": self.period,
+            "algorithm": self.parts.algorithm,
+            "trainer": "rllib",
+            "settings": {EXPORTED: source},
+            "steps": self.steps,
+            "seed": 0,
+            "scores": {},
+            "versions": versions(),
+            "git_commit": git_commit(),
+            "created": now(),
+        }
+        return write_checkpoint(path, fields, {POLICY: self.graph, GOLDEN: self.golden})
+
+
+def export(
+    given: Path,
+    *,
+    env: str | None = None,
+    algo: str | None = None,
+    policy: str | None = None,
+    trust: bool = False,
+    warn: Callable[[str], None] = lambda text: None,
+) -> Exported:
+    """Read, freeze and check one policy of a checkpoint directory of RLlib.
+
+    Args:
+        given: The directory, of an algorithm or of a policy.
+        env: Its environment, where the directory does not say it or means another.
+        algo: Its algorithm, where the directory does not say it.
+        policy: Its name, where there are several.
+        trust: Files that only their own code can read are unpickled, which runs it.
+        warn: Told before that is done, and what else the user should know.
+
+    Raises:
+        CheckpointError: The directory cannot be used.
+        PolicyError: Its policy cannot be frozen.
+        UnknownName: No environment is called `env`.
+        SettingsError: The environment cannot be made.
+    """
+    directory = find_policy(given, policy, trust=trust, warn=warn)
+    foreign = read_policy(directory)
+    env_id, env_kwargs = _environment(directory, foreign, env)
+    made = make_env(env_id, env_kwargs)
+    try:
+        parts = _fitted(directory, foreign, env_id, made, warn)
+        parts = replace(parts, algorithm=_algorithm(directory, foreign, algo))
+        describe = getattr(made.unwrapped, "describe", None)
+        signals, period = {} if describe is None else describe(), control_period(made)
+    finally:
+        made.close()  # type: ignore[no-untyped-call]
+    graph = freeze(parts)
+    golden, by = _golden(parts)
+    frozen = FrozenPolicy.from_graph(graph, *_spaces(parts))
+    difference = _checked(directory, frozen, golden, by)
+    return Exported(
+        directory, parts, env_id, env_kwargs, foreign.steps, signals, period, graph, golden, by, difference, frozen
+    )
+
+
+def _spaces(parts: PolicyParts) -> tuple[dict[str, Any], dict[str, Any]]:
+    return space_to_json(parts.observation_space), space_to_json(parts.action_space)
+
+
+def _algorithm(directory: Directory, foreign: ForeignPolicy, asked: str | None) -> str:
+    found = foreign.parts.algorithm
+    if asked is None and not found:
+        raise CheckpointMismatch(directory.given, "does not say which algorithm trained it; give --algo NAME")
+    if asked is not None and found and asked != found and foreign.algorithm_known:
+        raise CheckpointMismatch(directory.given, f"was trained by {found}, not by {asked}; leave --algo out")
+    return asked or found
+
+
+def _environment(directory: Directory, foreign: ForeignPolicy, asked: str | None) -> tuple[str, dict[str, Any]]:
+    """Id and keyword arguments of the environment: what was asked for, else what the directory says."""
+    own = None
+    if foreign.env is not None:
+        try:
+            own = resolve_id(foreign.env)
+        except UnknownName as error:
+            if asked is None:
+                text = f"was trained on {foreign.env!r}, which is not known here; give --env ID, or --env module:ID"
+                raise CheckpointMismatch(directory.given, text) from error
+    if asked is None and own is None:
+        raise CheckpointMismatch(directory.given, "does not say on which environment it was trained; give --env ID")
+    env = resolve_id(asked) if asked is not None else str(own)
+    return env, _plain(directory, foreign.env_kwargs, asked) if env == own else {}
+
+
+def _plain(directory: Directory, kwargs: Mapping[str, Any], asked: str | None) -> dict[str, Any]:
+    """Keyword arguments as JSON values."""
+    try:
+        return dict(json.loads(json.dumps(dict(kwargs), allow_nan=False)))
+    except (TypeError, ValueError, RecursionError) as error:
+        text = f"its env_config holds more than plain values ({', '.join(map(str, kwargs))}), which cannot be kept"
+        raise CheckpointMismatch(directory.given, f"{text}; train with plain ones") from error
+
+
+def _fitted(
+    directory: Directory, foreign: ForeignPolicy, env_id: str, env: gym.Env[Any, Any], warn: Callable[[str], None]
+) -> PolicyParts:
+    """The parts with the environment's own spaces, which must be those that the policy was trained with.
+
+    Raises:
+        CheckpointMismatch: Names the first difference.
+    """
+    parts = foreign.parts
+    pairs = [("action_space", parts.action_space, env.action_space)]
+    if foreign.whole:
+        pairs.append(("observation_space", parts.observation_space, env.observation_space))
+    else:
+        parts = _guessed(directory, parts, env_id, env.observation_space, warn)
+    for name, theirs, ours in pairs:
+        found = first_difference(_from_zero(space_to_json(theirs)), _from_zero(space_to_json(ours)), name)
+        if found is not None:
+            what, there, here = found
+            text = f"{what} is {_short(there)} in the directory and {_short(here)} in {env_id}"
+            raise CheckpointMismatch(directory.given, f"{text}; give the environment it was trained on with --env")
+    _require_from_zero(parts.action_space)
+    return replace(parts, observation_space=env.observation_space, action_space=env.action_space)
+
+
+def _guessed(
+    directory: Directory, parts: PolicyParts, env_id: str, ours: AnySpace, warn: Callable[[str], None]
+) -> PolicyParts:
+    """Parts of a policy alone, whose directory does not say what came before and after the network."""
+    theirs = parts.observation_space
+    if space_to_json(theirs) == space_to_json(ours):
+        return parts
+    shape, width = theirs.shape or (), sum(_width(leaf) for leaf in leaf_spaces(ours).values())
+    if not isinstance(theirs, spaces.Box) or (theirs.shape != ours.shape and shape != (width,)):
+        text = f"its network takes observations {_space(theirs)}, and {env_id} gives {_space(ours)}"
+        raise CheckpointMismatch(directory.given, f"{text}; give the environment it was trained on with --env")
+    if np.isfinite(theirs.low).any() or np.isfinite(theirs.high).any():
+        text = f"its network takes observations {_space(theirs)}, and {env_id} gives {_space(ours)}: what RLlib did to "
+        more = "them in between (MeanStdFilter) is not in a policy's directory. Give that of the whole algorithm"
+        raise CheckpointMismatch(directory.given, text + more)
+    warn("a policy's directory does not say how observations were flattened: taken as FlattenObservations does it")
+    return replace(parts, flatten=True)
+
+
+def _width(space: AnySpace) -> int:
+    """Numbers of a flattened array."""
+    if isinstance(space, spaces.Discrete):
+        return int(space.n)
+    if isinstance(space, spaces.MultiDiscrete):
+        return int(space.nvec.sum())
+    return math.prod(space.shape or ())
+
+
+def _from_zero(space: Any) -> Any:
+    """A space's JSON form without ``start`` of whole numbers: the trainer may have seen them counted from 0."""
+    if not isinstance(space, Mapping):
+        return space
+    if space.get("type") == "Dict":
+        return {**space, "spaces": {key: _from_zero(inner) for key, inner in sorted(dict(space["spaces"]).items())}}
+    return {key: value for key, value in space.items() if key != "start"}
+
+
+def _require_from_zero(space: AnySpace) -> None:
+    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)) and np.any(space.start):
+        raise PolicyError(
+            f"action space {space}: RLlib counts actions from 0 whatever their start; it cannot be frozen"
+        )
+
+
+def _space(space: AnySpace) -> str:
+    """A space in short."""
+    return f"{type(space).__name__}{space.shape}" if isinstance(space, spaces.Box) else _short(space_to_json(space))
+
+
+def _short(value: Any, most: int = 60) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
+def _golden(parts: PolicyParts) -> tuple[bytes, str]:
+    """Observations and actions for them, and who computed those: RLlib's own code if it is there, else NumPy."""
+    observations = clear_observations(parts)
+    actions, by = _reference_actions(parts, observations)
+    return pack(observations, actions), by
+
+
+def _reference_actions(parts: PolicyParts, observations: dict[str, Array]) -> tuple[Array, str]:
+    if parts.old_stack:
+        return actions_by_hand(parts, observations), "NumPy"
+    try:
+        from bam_train.trainers.rllib.reference import remade, rllib_actions
+    except ModuleNotFoundError:
+        return actions_by_hand(parts, observations), "NumPy"
+    return rllib_actions(parts, *remade(parts), observations), f"RLlib {metadata.version('ray')}"
+
+
+def _checked(directory: Directory, policy: FrozenPolicy, golden: bytes, by: str) -> float:
+    """Act on the golden observations; the largest difference."""
+    parts, action = leaves(policy.observation_space), leaf("action", policy.action_space)
+    worst, _ = worst_difference(policy, parts, action, safetensors_file.parse(golden))
+    if not worst <= TOLERANCE:  # NaN too
+        text = f"its frozen policy differs by {worst:.3g} from the actions of {by}"
+        raise PolicyError(f"{directory.given}: {text}, expected at most {TOLERANCE}: this network cannot be exported")
+    return worst

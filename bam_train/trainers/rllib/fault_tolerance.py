@@ -1,0 +1,145 @@
+"""What a run does when a process of RLlib's dies: it goes on with the others while a new one takes its place.
+
+Lost is what the dead runner had sampled since its last delivery, no more: an update takes the samples that were
+delivered, and only those are counted.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from ray.exceptions import RayError
+
+from bam_train.errors import ProcessesLost, TrainingFailed
+from bam_train.trainers.rllib import faults
+
+SAMPLE_TIMEOUT = 60.0
+"""How long an update waits for the samples of its slowest runner [s]."""
+
+PROBE_TIMEOUT = 0.25
+"""How long each update waits for a sign of life of the runners that are gone [s].
+
+RLlib asks them before every update, for as long as they are gone, and waits half a minute each time. They answer within
+milliseconds once they are back, and are asked again at the next update.
+"""
+
+RESTART_DELAY = 1.0
+"""Between the failure of a runner's environment and its restart [s]; RLlib's own is a minute without samples."""
+
+MOST_DEATHS = 5
+"""How often one runner may die within `WINDOW` updates."""
+
+WINDOW = 20
+"""Updates over which deaths are counted; the ones that were made while no runner was there are left out."""
+
+LONGEST_ALONE = 180.0
+"""How long a run waits while all of its runners are gone [s]; a busy computer takes half a minute to start one."""
+
+
+def fault_tolerance(config: Any) -> Any:
+    """Make an `AlgorithmConfig` go on when a runner or a computer dies in mid-training.
+
+    `env_runner_cls` must be set before, if at all.
+
+    Args:
+        config: Changed in place.
+
+    Returns:
+        The same config.
+    """
+    if config.env_runner_cls is None:
+        config.env_runners(env_runner_cls=faults.ReportingEnvRunner)
+    config.env_runners(sample_timeout_s=SAMPLE_TIMEOUT)
+    return config.fault_tolerance(
+        restart_failed_env_runners=True,
+        delay_between_env_runner_restarts_s=RESTART_DELAY,
+        env_runner_health_probe_timeout_s=PROBE_TIMEOUT,
+    )
+
+
+class RunnerWatch:
+    """Looks after the runners of an algorithm, before each of its training steps and after the last of an iteration.
+
+    Args:
+        algorithm: RLlib's, made of a config that `fault_tolerance` has seen; from now on it is trained by `train`.
+        clock: Monotonic time [s].
+    """
+
+    def __init__(self, algorithm: Any, clock: Callable[[], float] = time.monotonic) -> None:
+        self._algorithm, self._clock = algorithm, clock
+        self._group = algorithm.env_runner_group
+        self._all = set(range(1, 1 + (self._group.num_remote_env_runners() if self._group else 0)))
+        self._gone: set[int] = set()
+        self._deaths: dict[int, deque[int]] = {index: deque(maxlen=MOST_DEATHS + 1) for index in self._all}
+        self._update = 0
+        self._seen_at = clock()
+        self._cause = ""
+        self._lines: list[str] = []
+        if self._all:
+            self._restore_as_it_does = algorithm.restore_env_runners
+            algorithm.restore_env_runners = self._restore  # an algorithm without samples may never leave its loop
+
+    def train(self) -> tuple[dict[str, Any], list[str]]:
+        """One iteration of the algorithm.
+
+        Returns:
+            RLlib's result, and what the user should know about runners, one line each.
+
+        Raises:
+            ProcessesLost: A runner dies again and again, or all are gone for good; says why they died if they could.
+            TrainingFailed: A learner died, or the cluster did.
+        """
+        try:
+            result: dict[str, Any] = self._algorithm.train()
+        except RayError as error:
+            why = " ".join(str(error).split())
+            raise TrainingFailed(f"a process of the cluster that training needs is gone ({why:.300})") from error
+        self._look()
+        self._update += len(self._gone) < len(self._all)
+        lines, self._lines = self._lines, []
+        return result, lines
+
+    def _restore(self, group: Any) -> list[int]:
+        """Stands before the algorithm's own `restore_env_runners`."""
+        if group is not self._group:
+            return list(self._restore_as_it_does(group))
+        self._look()
+        back = list(self._restore_as_it_does(group))
+        self._gone -= set(back)
+        self._lines += [f"env runner {index} is back" for index in sorted(back)]
+        self._require_somebody()
+        return back
+
+    def _look(self) -> None:
+        """Note who died since the last look."""
+        died = self._all - set(self._group.healthy_env_runner_ids()) - self._gone if self._all else set()
+        if not died:
+            return
+        self._gone |= died
+        for index in sorted(died):
+            why = faults.take(index)
+            self._cause = f" ({why})" if why else ""
+            self._lines.append(f"env runner {index} died{self._cause}: what it had not delivered yet is lost")
+            self._deaths[index].append(self._update)
+            self._require_few_deaths(index)
+        left = len(self._all) - len(self._gone)
+        goes_on = f"training goes on with {left} of {len(self._all)} env runners"
+        self._lines.append(goes_on if left else "no env runner is left: waiting for one to come back")
+
+    def _require_few_deaths(self, index: int) -> None:
+        deaths = self._deaths[index]
+        updates = self._update - deaths[0] + 1
+        if len(deaths) > MOST_DEATHS and updates <= WINDOW:
+            within = f"{updates} update{'s' if updates > 1 else ''}"
+            raise ProcessesLost(f"env runner {index} died {len(deaths)} times within {within}{self._cause}")
+
+    def _require_somebody(self) -> None:
+        now = self._clock()
+        if self._gone < self._all:
+            self._seen_at = now
+        elif now - self._seen_at > LONGEST_ALONE:
+            waited = f"{now - self._seen_at:.0f} s"
+            raise ProcessesLost(f"all {len(self._all)} env runners died{self._cause}, and none came back in {waited}")

@@ -1,0 +1,77 @@
+"""RLlib's `MeanStdFilter`, for many rows at once, and right where several runners are merged.
+
+A runner sends what it saw since the last merge as "deltas" that `RunningStat.update` takes for the count, mean and sum
+of squares of those observations alone. RLlib's own `RunningStat.push` keeps something else in them (how far the overall
+mean moved), so that with remote runners its merged mean goes towards 0. Here they are what the merge expects
+(Chan, Golub and LeVeque 1979: counts n, means m, sums of squares s of two sets combine exactly).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from ray.rllib.connectors.env_to_module.mean_std_filter import MeanStdFilter as _MeanStdFilter
+from ray.rllib.utils.filter import RunningStat
+from ray.rllib.utils.numpy import SMALL_NUMBER
+
+Array = NDArray[Any]
+
+
+class MeanStdFilter(_MeanStdFilter):  # type: ignore[misc]
+    """RLlib's filter, which `rows` runs over n observations of one array at once. Same name, state and files."""
+
+    def rows(self, observations: Array, update: bool = True) -> NDArray[np.float32]:
+        """Normalise observations, and count them in first.
+
+        Args:
+            observations: (n, ...).
+            update: Whether to count them in.
+        """
+        if self._filters is None:
+            self._init_new_filters()
+        own = self._filters[None]
+        stat: RunningStat = own.running_stats
+        if update and self._update_stats and len(observations):
+            push(stat, observations)
+        value = observations - stat.mean if own.demean else observations
+        if own.destd:
+            value = value / (stat.std + SMALL_NUMBER)
+        return np.asarray(np.clip(value, -own.clip, own.clip) if own.clip else value, np.float32)
+
+    def __call__(self, *, episodes: list[Any], **kwargs: Any) -> Any:
+        """As RLlib's, one row after the other; the deltas are mended afterwards."""
+        if self._filters is None:
+            self._init_new_filters()
+        plain = isinstance(self._filters[None].running_stats, RunningStat) if None in self._filters else False
+        if not plain:
+            return super().__call__(episodes=episodes, **kwargs)
+        space = self.observation_space
+        for episode in self.single_agent_episode_iterator(episodes):
+            seen = np.asarray(episode.get_observations(indices=-1))
+            filtered = self.rows(seen[None])[0].astype(seen.dtype)
+            episode.set_observations(at_indices=-1, new_data=filtered)
+            episode.observation_space = space
+        return kwargs["batch"]
+
+
+def push(stat: RunningStat, observations: Array) -> None:
+    """Count observations (n, ...) into the statistics and into what the next merge is sent."""
+    more = observations.astype(np.float64)
+    mean = more.mean(axis=0)
+    squares = np.square(more - mean).sum(axis=0)
+    n = len(more)
+    stat.num_pushes = _combine(stat.num_pushes, stat.mean_array, stat.sum_sq_diff_array, n, mean, squares)
+    stat.num_pushes_delta = _combine(
+        stat.num_pushes_delta, stat.mean_delta_array, stat.sum_sq_diff_delta_array, n, mean, squares
+    )
+
+
+def _combine(count: int, mean: Array, squares: Array, n: int, more_mean: Array, more_squares: Array) -> int:
+    """Combine count, mean and sum of squares of two sets into the arrays of the first; the count of both."""
+    both = count + n
+    delta = more_mean - mean
+    mean += delta * (n / both)
+    squares += more_squares + np.square(delta) * (count * n / both)
+    return both

@@ -1,0 +1,229 @@
+"""Hyperparameters: checked against RLlib's own ``training()`` arguments, completed, written as JSON.
+
+Beside these there are ``model_config`` (RLlib's `DefaultModelConfig`: fcnet_hiddens, fcnet_activation, …; initialisers
+by the name they have in ``torch.nn.init``), ``rollout_fragment_length``, how many steps each row takes before a runner
+hands over what it has, and two on where actions start: ``log_std_init``, of their standard deviation if it does not
+depend on the observation (``model_config.free_log_std``), and ``action_init_scale``, what the weights of the last layer
+are multiplied by: with 0.01 the first actions are about 0 and not biased. A schedule is a list of steps and values:
+``lr=[[0, 3e-4], [1000000, 0.0]]``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import json
+import math
+import typing
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from ray.rllib.connectors.env_to_module.mean_std_filter import MeanStdFilter
+from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
+
+from bam_train.errors import SettingsError
+from bam_train.settings import HINTS
+from bam_train.trainers.rllib.algorithms import Algorithm
+from bam_train.values import closest, expected, fit, fits
+
+ELSEWHERE = {
+    "train_batch_size": "train_batch_size_per_learner",
+    "num_sgd_iter": "num_epochs",
+    "lr_schedule": "lr, which takes a schedule too",
+    "entropy_coeff_schedule": "entropy_coeff, which takes a schedule too",
+    "model": "model_config",
+    "vf_share_layers": "model_config.vf_share_layers",
+    "policy_model_config": "model_config",
+    "q_model_config": "model_config",
+    "hiddens": "model_config.head_fcnet_hiddens",
+    "optimization_config": "actor_lr, critic_lr and alpha_lr",
+    "num_envs_per_env_runner": "--num-envs",
+    "seed": "--seed",
+}
+"""Arguments of RLlib's old stack, or of other methods, and what to use instead."""
+
+_OF_THE_OLD_STACK = frozenset(
+    {
+        "optimizer",
+        "learner_class",
+        "learner_connector",
+        "add_default_connectors_to_learner_pipeline",
+        "learner_config_dict",
+        "num_aggregator_actors_per_learner",
+        "max_requests_in_flight_per_aggregator_actor",
+        "max_requests_in_flight_per_sampler_worker",
+        "max_requests_in_flight_per_aggregator_worker",
+        "num_aggregation_workers",
+        "store_buffer_in_checkpoints",
+        "before_learn_on_batch",
+        "categorical_distribution_temperature",
+        "num_gpu_loader_threads",
+        "num_multi_gpu_tower_stacks",
+        "minibatch_buffer_size",
+        "replay_proportion",
+        "replay_buffer_num_slots",
+        "learner_queue_size",
+        "learner_queue_timeout",
+        "timeout_s_sampler_manager",
+        "timeout_s_aggregator_manager",
+        "opt_type",
+        "decay",
+        "momentum",
+        "target_update_frequency",
+        "training_intensity",
+        "bc_iters",
+    }
+)
+_OLD_HERE = {"impala": {"epsilon"}, "appo": {"epsilon", "use_critic"}}
+"""Names that are old in one algorithm and current in another."""
+
+_OF_CONNECTORS = frozenset({"self", "kwargs", "multi_agent", "update_stats"})
+
+
+_OURS = ("model_config", "rollout_fragment_length", "log_std_init", "action_init_scale")
+"""Hyperparameters that ``training()`` does not take."""
+
+
+def complete(algorithm: Algorithm, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Check hyperparameters by name and type and add the defaults of those that are not given.
+
+    Raises:
+        SettingsError: An unknown name (with the closest match), a wrong type or a number out of range.
+    """
+    config = algorithm.load()()
+    defaults = _defaults(algorithm, config)
+    for name in given:
+        _require_known(name, [*defaults, "model_config"], f"{algorithm.name} hyperparameter", HINTS)
+    values = {
+        name: fit(name, given[name], _hint(hint, default)) if name in given else _plain(default)
+        for name, (hint, default) in defaults.items()
+    }
+    if isinstance(given.get("replay_buffer_config"), Mapping):
+        values["replay_buffer_config"] = {**_plain(config.replay_buffer_config), **given["replay_buffer_config"]}
+    values["model_config"] = _complete_model(config, given.get("model_config") or {})
+    if values["log_std_init"] is not None and not values["model_config"]["free_log_std"]:
+        raise SettingsError("log_std_init: only a free standard deviation has one; add model_config.free_log_std=true")
+    _check_ranges(values)
+    return values
+
+
+def complete_normalize(given: bool | Mapping[str, Any]) -> bool | dict[str, Any]:
+    """Check the arguments of `MeanStdFilter`."""
+    if isinstance(given, bool):
+        return given
+    parameters = {
+        name: row
+        for name, row in inspect.signature(MeanStdFilter.__init__).parameters.items()
+        if name not in _OF_CONNECTORS
+    }
+    for name in given:
+        _require_known(name, parameters, "normalize argument")
+    hints = {name: float if name == "clip_by_value" else bool for name in parameters}
+    return {name: fit(f"normalize.{name}", value, hints[name]) for name, value in given.items()}
+
+
+def training_arguments(values: Mapping[str, Any]) -> dict[str, Any]:
+    """What ``training()`` takes of complete hyperparameters."""
+    taken = {name: value for name, value in values.items() if name not in _OURS}
+    copied: dict[str, Any] = json.loads(json.dumps(taken))
+    if isinstance(taken.get("n_step"), list):
+        copied["n_step"] = tuple(taken["n_step"])  # a range to draw from
+    return copied
+
+
+def _defaults(algorithm: Algorithm, config: Any) -> dict[str, tuple[Any, Any]]:
+    """Name of every hyperparameter to its annotation and its default."""
+    left_out = _OF_THE_OLD_STACK | ELSEWHERE.keys() | _OLD_HERE.get(algorithm.name, set())
+    found: dict[str, tuple[Any, Any]] = {}
+    for owner in type(config).__mro__:
+        method = vars(owner).get("training")
+        for name, row in inspect.signature(method).parameters.items() if method else ():
+            if name not in left_out | {"self", "kwargs"} and not name.startswith("_") and name not in found:
+                found[name] = row.annotation, getattr(config, name, None)
+    if "actor_lr" in found:  # RLlib refuses any other, and its own CQL has one
+        found["lr"] = found["lr"][0], None
+    found["rollout_fragment_length"] = typing.Union[int, str], config.rollout_fragment_length  # noqa: UP007
+    found["log_std_init"] = typing.Optional[float], None  # noqa: UP045
+    found["action_init_scale"] = float, 1.0
+    return found
+
+
+def _hint(hint: Any, default: Any) -> Any:
+    """The annotation, unless RLlib's own default does not fit it (``grad_clip: Optional[int] = 40.0``)."""
+    if hint is inspect.Parameter.empty:
+        return Any
+    return hint if fits(_plain(default), hint) else typing.Optional[type(_plain(default))]  # noqa: UP045
+
+
+def _plain(value: Any) -> Any:
+    """As it is in JSON: tuples are lists."""
+    return json.loads(json.dumps(value, default=str))
+
+
+def _complete_model(config: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Check ``model_config`` and add RLlib's defaults."""
+    known = {row.name: row for row in dataclasses.fields(DefaultModelConfig)}
+    hints = {
+        name: typing.Optional[str] if name.endswith("_initializer") else hint  # noqa: UP045 - not a function
+        for name, hint in typing.get_type_hints(DefaultModelConfig).items()
+    }
+    own = dataclasses.asdict(DefaultModelConfig()) | config._model_config_auto_includes
+    for name in given:
+        _require_known(name, known, "model_config argument")
+    return {
+        name: fit(f"model_config.{name}", given[name], _hint(hints[name], own[name]))
+        if name in given
+        else _plain(own[name])
+        for name in known
+    }
+
+
+def _require_known(name: str, known: Iterable[str], what: str, others: Iterable[str] = ()) -> None:
+    if name in known:
+        return
+    if name in ELSEWHERE:
+        raise SettingsError(f"{name} is not a hyperparameter here: use {ELSEWHERE[name]}")
+    if name in _OF_THE_OLD_STACK:
+        raise SettingsError(f"{name} cannot be set: it belongs to RLlib's old API stack, or bam-train takes care of it")
+    raise SettingsError(f"Unknown {what} {name!r}. {closest(name, [*known, *others])}")
+
+
+_SHARES = ("gamma", "lambda_", "tau", "expectile")
+_POSITIVE = ("lr", "actor_lr", "critic_lr", "alpha_lr", "value_lr", "grad_clip", "clip_param", "vf_clip_param")
+_NOT_NEGATIVE = ("action_init_scale", "entropy_coeff", "vf_loss_coeff", "kl_coeff")
+_COUNTS = ("train_batch_size_per_learner", "minibatch_size", "num_epochs", "rollout_fragment_length", "num_atoms")
+
+
+def _check_ranges(values: Mapping[str, Any]) -> None:
+    """Refuse numbers that no algorithm can learn with; a schedule is its first value."""
+    for name, value in values.items():
+        number = _number(value)
+        if number is None:
+            if name == "rollout_fragment_length" and value != "auto":
+                raise SettingsError(f"{name}: expected {expected(int)} or 'auto', found {value!r}")
+            continue
+        if not math.isfinite(number):
+            raise SettingsError(f"{name}: expected a finite number, found {value!r}")
+        wanted = _complaint(name, number)
+        if wanted is not None:
+            raise SettingsError(f"{name}: expected {wanted}, found {value!r}")
+
+
+def _complaint(name: str, number: float) -> str | None:
+    """What was expected instead of `number`; None if it is in range."""
+    if name in _SHARES and not 0 <= number <= 1:
+        return "a number from 0 to 1"
+    if name in _POSITIVE and not number > 0:
+        return "a number above 0"
+    if name in _COUNTS and not number >= 1:
+        return "at least 1"
+    if name in _NOT_NEGATIVE and not number >= 0:
+        return "at least 0"
+    return None
+
+
+def _number(value: Any) -> float | None:
+    """The number that `value` is or, as a schedule ``[[step, value], ...]``, begins with; None if it is none."""
+    if isinstance(value, list) and value and isinstance(value[0], list) and len(value[0]) == 2:
+        return _number(value[0][1])
+    return None if isinstance(value, bool) or not isinstance(value, (int, float)) else float(value)

@@ -1,0 +1,136 @@
+"""How many CPUs and GPUs a run asks for, held against how many there are: RLlib would wait for more without a word."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping
+
+import ray
+
+from bam_train.errors import SettingsError
+from bam_train.settings import TrainSettings
+
+VARIABLE = "RLLIB_NUM_GPUS"
+
+LONGEST_BUSY = 10.0
+"""How long to wait for CPUs and GPUs that others in the cluster use [s]."""
+
+
+def gpus(settings: TrainSettings) -> int:
+    """GPUs that the learners of a run use in all: ``--num-gpus``, else RLLIB_NUM_GPUS, else none.
+
+    Raises:
+        SettingsError: RLLIB_NUM_GPUS is no whole number from 0.
+    """
+    if settings.num_gpus is not None:
+        return settings.num_gpus
+    text = os.environ.get(VARIABLE, "").strip()
+    if not text:
+        return 0
+    if not (text.isascii() and text.isdigit()):
+        raise SettingsError(f"{VARIABLE}: expected a whole number of GPUs, such as 1, found {text!r}. Mend or unset it")
+    return int(text)
+
+
+def learners(settings: TrainSettings) -> tuple[int, int]:
+    """RLlib's ``num_learners`` and ``num_gpus_per_learner``.
+
+    No learner is the trainer's own process, which can have one GPU; more GPUs make a learner each.
+
+    Raises:
+        SettingsError: The GPUs cannot be shared out evenly among the learners asked for.
+    """
+    number, wanted = settings.num_learners, gpus(settings)
+    if number == 0:
+        return (0, wanted) if wanted <= 1 else (wanted, 1)
+    if wanted not in (0, number):
+        raise SettingsError(f"num_gpus: {number} learners use 0 or {number} GPUs, one each, found {wanted}")
+    return number, int(wanted > 0)
+
+
+def cores() -> int:
+    """CPUs that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def asked(settings: TrainSettings) -> dict[str, int]:
+    """CPUs and GPUs that a run's processes ask Ray for: one CPU for each runner and each learner without a GPU.
+
+    The trainer's own process asks for none. Reading recorded episodes needs one CPU more.
+    """
+    number, gpus_each = learners(settings)
+    cpus = settings.num_env_runners + number * (gpus_each == 0) + (settings.data is not None)
+    return {"CPU": cpus, "GPU": number * gpus_each}
+
+
+def require_resources(settings: TrainSettings) -> None:
+    """Refuse a run that asks for more than there is, on the cluster that runs in this process, else on this computer.
+
+    Raises:
+        SettingsError: Says what was asked for, what there is, and what to do.
+    """
+    _require_own_gpu(settings)
+    joined = ray.is_initialized()
+    where = "in the cluster" if joined else "on this computer"
+    there = ray.cluster_resources() if joined else {"CPU": cores(), "GPU": _own_gpus()}
+    wanted = asked(settings)
+    if wanted["GPU"] > there.get("GPU", 0):
+        raise SettingsError(_gpus_missing(wanted["GPU"], int(there.get("GPU", 0)), where))
+    if wanted["CPU"] > there.get("CPU", 0):
+        raise SettingsError(_cpus_missing(settings, wanted["CPU"], there, where, joined))
+    if joined:
+        _require_free(wanted)
+
+
+def _require_free(wanted: Mapping[str, int]) -> None:
+    """Refuse what others in the cluster use; a run that has just ended may hold it for some seconds more."""
+    end = time.monotonic() + LONGEST_BUSY
+    while missing := [name for name, number in wanted.items() if number > ray.available_resources().get(name, 0)]:
+        if time.monotonic() > end:
+            name = missing[0]
+            free = int(ray.available_resources().get(name, 0))
+            raise SettingsError(
+                f"{_number(wanted[name], name)} asked for, and {free} of the cluster's "
+                f"{int(ray.cluster_resources()[name])} not in use by others. Ask for less, or wait for them"
+            )
+        time.sleep(0.2)
+
+
+def _require_own_gpu(settings: TrainSettings) -> None:
+    """The trainer's own process learns on a GPU of this computer."""
+    number, gpus_each = learners(settings)
+    if number == 0 and gpus_each > _own_gpus():
+        raise SettingsError(_gpus_missing(gpus_each, _own_gpus(), "on this computer"))
+
+
+def _own_gpus() -> int:
+    import torch
+
+    return int(torch.cuda.device_count())
+
+
+def _gpus_missing(wanted: int, there: int, where: str) -> str:
+    return (
+        f"num_gpus: {_number(wanted, 'GPU')} asked for, {there} {where}. Give --num-gpus {there}, or unset {VARIABLE}"
+    )
+
+
+def _cpus_missing(settings: TrainSettings, wanted: int, there: Mapping[str, float], where: str, joined: bool) -> str:
+    found = int(there.get("CPU", 0))
+    number, gpus_each = learners(settings)
+    for_what = [_number(settings.num_env_runners, "env runner")] * (settings.num_env_runners > 0)
+    for_what += [_number(number, "learner")] * (number > 0 and not gpus_each) + ["the data"] * (
+        settings.data is not None
+    )
+    add = "add computers with ray start" if joined else "join a cluster with --address"
+    return (
+        f"{' and '.join(for_what)} ask for {_number(wanted, 'CPU')}, {found} {where}. "
+        f"Lower --num-env-runners or --num-learners, or {add}"
+    )
+
+
+def _number(number: int, of_what: str) -> str:
+    return f"{number} {of_what}{'' if number == 1 else 's'}"

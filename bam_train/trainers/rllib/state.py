@@ -1,0 +1,150 @@
+"""A whole algorithm in a checkpoint: RLlib's own tree of files, and how a run goes on from it without unpickling them.
+
+``bam/resume/rllib/…`` is what ``Algorithm.save_to_path`` writes, so that ``Algorithm.from_checkpoint`` of the unpacked
+folder works for those who trust it. Ours builds the algorithm from its settings and sets the states in those files,
+which are read as arrays and plain values (`pickles.read_state`); how objects are made (``class_and_ctor_args.pkl``) is
+never read.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import torch
+
+from bam_train.checkpoint import Checkpoint
+from bam_train.errors import AlteredCheckpoint, CheckpointMismatch
+
+FOLDER, NOTES = "bam/resume/rllib/", "bam/resume/notes.json"
+_STATES = ("state.pkl", "algorithm_state.pkl", "module_state.pkl", "policy_state.pkl")
+
+
+def members(algorithm: Any, notes: Mapping[str, Any]) -> dict[str, bytes]:
+    """Everything that the run needs to go on.
+
+    Args:
+        algorithm: RLlib's, between two iterations.
+        notes: JSON values to keep.
+    """
+    with tempfile.TemporaryDirectory(prefix="bam-rllib-") as name:
+        root = Path(name).resolve()  # RLlib takes absolute paths alone
+        algorithm.save_to_path(str(root))
+        files = sorted(path for path in root.rglob("*") if path.is_file())
+        tree = {FOLDER + path.relative_to(root).as_posix(): path.read_bytes() for path in files}
+    return {NOTES: json.dumps(dict(notes)).encode(), **tree}
+
+
+def load(checkpoint: Checkpoint, algorithm: Any) -> None:
+    """Put a checkpoint's states into a new algorithm of the same settings.
+
+    Raises:
+        CheckpointMismatch: It was made by another version of Ray.
+        AlteredCheckpoint: A state cannot be read, or does not fit the algorithm.
+    """
+    require_version(checkpoint)
+    state = read(checkpoint)
+    try:
+        _set(algorithm, state)
+    except (RuntimeError, ValueError, KeyError, TypeError, IndexError, AttributeError, AssertionError) as error:
+        reason = " ".join(str(error).split())
+        raise AlteredCheckpoint(
+            checkpoint.path, FOLDER, f"{FOLDER} does not fit these settings: {reason:.200}"
+        ) from error
+
+
+def _set(algorithm: Any, state: dict[str, Any]) -> None:
+    """What ``Algorithm.set_state`` does, which expects runners."""
+    if algorithm.env_runner_group is not None:
+        algorithm.set_state(state)
+        return
+    algorithm.learner_group.set_state(state["learner_group"])
+    algorithm.metrics.set_state(state["metrics_logger"])
+    algorithm._iteration = state["training_iteration"]
+
+
+def read(checkpoint: Checkpoint) -> dict[str, Any]:
+    """The nested state of the whole algorithm, arrays and plain values.
+
+    Raises:
+        AlteredCheckpoint: A state holds something else; names it.
+    """
+    from bam_train.trainers.rllib.pickles import read_state
+
+    tree: dict[str, Any] = {}
+    for name in sorted(checkpoint.manifest.sha256):
+        path = PurePosixPath(name)
+        if not name.startswith(FOLDER) or path.name not in _STATES:
+            continue
+        inner = tree
+        for part in path.parent.relative_to(FOLDER).parts:
+            inner = inner.setdefault(part, {})
+        inner.update(read_state(checkpoint.read(name)))
+    if not tree:
+        raise AlteredCheckpoint(checkpoint.path, FOLDER, f"has no {FOLDER}; it was not made by RLlib")
+    return tree
+
+
+def start_actions(algorithm: Any, log_std: float | None, scale: float) -> None:
+    """Change where the actions of a new algorithm start.
+
+    Args:
+        algorithm: RLlib's.
+        log_std: Of the standard deviation, where it is a parameter of its own; None leaves it.
+        scale: What the weights and biases of the policy's last layer are multiplied by.
+    """
+    if log_std is None and scale == 1.0:
+        return
+    group = algorithm.learner_group
+    weights = group.get_weights()
+    for module in weights.values():
+        for name in [name for name in module if name.startswith("pi.")]:
+            if name.endswith("log_std") and log_std is not None:
+                module[name] = np.full_like(module[name], log_std)
+            elif name in last_layer(module):
+                module[name] = module[name] * np.float32(scale)
+    group.set_weights(weights)
+    if algorithm.env_runner_group is not None:
+        algorithm.env_runner_group.sync_weights(from_worker_or_learner_group=group, inference_only=True)
+
+
+def last_layer(module: Mapping[str, Any]) -> set[str]:
+    """Names of weight and bias of the policy head's last layer: the highest ``pi.net.mlp.<k>``."""
+    layers = [name.split(".") for name in module if name.startswith("pi.net.mlp.")]
+    highest = max((int(parts[3]) for parts in layers), default=-1)
+    return {".".join(parts) for parts in layers if int(parts[3]) == highest}
+
+
+def require_version(checkpoint: Checkpoint) -> None:
+    """Refuse to go on from the state of another Ray than this one, major or minor: its layout is Ray's own affair.
+
+    Raises:
+        CheckpointMismatch: Names both versions.
+    """
+    import ray
+
+    theirs = str(checkpoint.manifest.versions.get("ray", ""))
+    if theirs and theirs.split(".")[:2] != ray.__version__.split(".")[:2]:
+        raise CheckpointMismatch(
+            checkpoint.path,
+            f"was trained with Ray {theirs}, and this is Ray {ray.__version__}, whose states differ. "
+            f'Run: pip install "ray[rllib]=={theirs}" to go on; bam-eval and bam-deploy need no Ray',
+        )
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Do something between two iterations that leaves the random numbers of this process as they were."""
+    before = random.getstate(), np.random.get_state(), torch.get_rng_state()
+    try:
+        yield
+    finally:
+        random.setstate(before[0])
+        np.random.set_state(before[1])
+        torch.set_rng_state(before[2])

@@ -1,0 +1,325 @@
+"""`RLlibTrainer`: a run of an algorithm of RLlib that can be stopped, saved and gone on with between two iterations."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import dataclasses
+import logging
+import math
+from collections import deque
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import Space
+from gymnasium.vector import VectorEnv
+from ray.rllib.core import DEFAULT_MODULE_ID
+
+from bam_envs.spaces import space_to_json
+from bam_train.checkpoint import Checkpoint, write_checkpoint
+from bam_train.environments import control_period, make_env, require_fit
+from bam_train.errors import SettingsError, TrainingFailed
+from bam_train.policy import FrozenPolicy
+from bam_train.settings import TrainSettings
+from bam_train.trainers.provenance import git_commit, now, versions
+from bam_train.trainers.rllib import hyperparameters, state
+from bam_train.trainers.rllib.algorithms import ALGORITHMS
+from bam_train.trainers.rllib.cluster import cluster
+from bam_train.trainers.rllib.config import make_config, refusals
+from bam_train.trainers.rllib.env_runner import ENDS
+from bam_train.trainers.rllib.exploring import ExploringPolicy
+from bam_train.trainers.rllib.fault_tolerance import RunnerWatch
+from bam_train.trainers.rllib.freeze import freeze
+from bam_train.trainers.rllib.golden import golden
+from bam_train.trainers.rllib.parts import PolicyParts, parts_of
+from bam_train.trainers.rllib.tensorboard import TensorBoard
+from bam_train.trainers.trainer import OnProgress, Progress, Statistics
+
+_FINITE = "expected finite numbers: try a smaller lr"
+_EPISODES = 100
+"""Training episodes behind the means of `Statistics`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Seen:
+    """What one environment of the run says of itself."""
+
+    observation_space: Space[Any]
+    action_space: Space[Any]
+    signals: dict[str, Any]
+    period: float | None
+
+    @classmethod
+    def of(cls, settings: TrainSettings) -> Seen:
+        """Make one and look."""
+        with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
+            describe = getattr(env.unwrapped, "describe", None)
+            signals = describe() if describe else {}
+            return cls(env.observation_space, env.action_space, signals, control_period(env))
+
+
+class RLlibTrainer:
+    """A run of one algorithm of RLlib; made by `create` or `load`."""
+
+    def __init__(self, settings: TrainSettings, seen: Seen, seed: int) -> None:
+        self.settings, self._seen = settings, seen
+        self.notices: list[str] = []
+        self._ends = {name: deque[float](maxlen=_EPISODES) for name in ("return", "length", "success")}
+        self._result: dict[str, Any] = {}
+        self._steps = 0
+        self._tensorboard: TensorBoard | None = None
+        logging.getLogger("ray.rllib").setLevel(logging.ERROR)
+        torch.set_num_threads(settings.threads)
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(cluster(settings))
+            with refusals(settings):
+                self._config = make_config(settings, seen.observation_space, seen.action_space, seed)
+                self.algorithm = self._config.build_algo()
+            stack.callback(self.algorithm.stop)
+            self._watch = RunnerWatch(self.algorithm)
+            self._open = stack.pop_all()
+        _remove_empty(Path(self.algorithm.logdir))
+
+    @classmethod
+    def complete(cls, settings: TrainSettings) -> TrainSettings:
+        """Check the algorithm's own settings and fill in its defaults."""
+        algorithm = ALGORITHMS[settings.algo]
+        _require_fitting(settings)
+        seen = Seen.of(settings)
+        algorithm.require_actions(settings.env, type(seen.action_space).__name__)
+        return dataclasses.replace(
+            settings,
+            hyperparameters=hyperparameters.complete(algorithm, settings.hyperparameters),
+            normalize=hyperparameters.complete_normalize(settings.normalize),
+            eval_every=settings.eval_every or max(1000, settings.steps // 20),
+        )
+
+    @classmethod
+    def create(cls, settings: TrainSettings) -> RLlibTrainer:
+        """Set up a new run of complete settings."""
+        trainer = cls(settings, Seen.of(settings), settings.seed)
+        values = settings.hyperparameters
+        state.start_actions(trainer.algorithm, values["log_std_init"], values["action_init_scale"])
+        return trainer
+
+    @classmethod
+    def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None) -> RLlibTrainer:
+        """Set up a run that goes on from a checkpoint, with its settings or with these."""
+        settings = settings or TrainSettings.from_mapping(checkpoint.manifest.settings, str(checkpoint.path))
+        with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
+            require_fit(checkpoint, env)
+        steps = checkpoint.manifest.steps
+        trainer = cls(settings, Seen.of(settings), settings.seed + steps)  # other episodes than the first ones again
+        try:
+            state.load(checkpoint, trainer.algorithm)
+        except BaseException:
+            trainer.close()
+            raise
+        trainer._steps = steps
+        trainer.notices += _not_saved(settings)
+        return trainer
+
+    def log_to(self, folder: Path) -> None:
+        """Write TensorBoard files into a folder from now on."""
+        self._tensorboard = TensorBoard(folder)
+
+    @property
+    def steps(self) -> int:
+        """Steps trained since the first of the run; of an offline algorithm: recorded steps learnt from."""
+        return self._steps
+
+    def train(self, steps: int, on_progress: OnProgress) -> None:
+        """Train until the run has at least `steps` steps, or `on_progress` returns False."""
+        while self.steps < steps:
+            self._iterate()
+            if not on_progress(Progress(self.steps, steps, self._statistics)):
+                return
+
+    def _iterate(self) -> None:
+        self._result, news = self._watch.train()
+        self.notices += news
+        before, self._steps = self._steps, self._count()
+        if self._steps == before:  # every runner was gone
+            return
+        ends = self._result.get("env_runners", {}).get(ENDS, {})
+        for name, values in self._ends.items():
+            said = np.asarray(ends.get(name, ()), np.float64)
+            values.extend(said.tolist() if said.ndim else ())  # where no episode ended, RLlib says NaN
+        self._require_finite()
+        if self._tensorboard is not None:
+            self._tensorboard.write(self._metrics() | self._means(), self.steps)
+
+    def _count(self) -> int:
+        if ALGORITHMS[self.settings.algo].offline:
+            return int(self._learned("num_module_steps_trained_lifetime"))
+        return int(self._result.get("env_runners", {}).get("num_env_steps_sampled_lifetime", self._steps))
+
+    def _learned(self, name: str) -> float:
+        return float(self._result.get("learners", {}).get(DEFAULT_MODULE_ID, {}).get(name, self._steps))
+
+    def _metrics(self) -> dict[str, float]:
+        """The learner's own numbers, finite ones only."""
+        said = self._result.get("learners", {}).get(DEFAULT_MODULE_ID, {})
+        numbers = {f"train/{name}": _number(value) for name, value in said.items()}
+        return {name: value for name, value in numbers.items() if value is not None and math.isfinite(value)}
+
+    def _means(self) -> dict[str, float]:
+        return {f"episodes/{name}": float(np.mean(values)) for name, values in self._ends.items() if values}
+
+    def _statistics(self) -> Statistics:
+        means = {name: float(np.mean(values)) if values else None for name, values in self._ends.items()}
+        return Statistics(
+            episodes=len(self._ends["return"]),
+            return_mean=means["return"],
+            length_mean=means["length"],
+            success_rate=means["success"],
+            metrics=self._metrics(),
+        )
+
+    def _require_finite(self) -> None:
+        """No weight is NaN or infinite; a loss that is makes the weights so, and RLlib reports NaN for no update too.
+
+        Raises:
+            TrainingFailed: One is.
+        """
+        if not all(bool(torch.isfinite(one).all()) for one in self._module().parameters()):
+            raise TrainingFailed(f"the policy's weights are NaN or infinite at step {self.steps}; {_FINITE}")
+
+    def _module(self) -> Any:
+        """The module of this process that has the newest weights."""
+        group = self.algorithm.learner_group
+        if group.is_local:
+            return group._learner.module[DEFAULT_MODULE_ID].unwrapped()
+        module = self.algorithm.env_runner.module
+        weights = group.get_state(components=f"learner/rl_module/{DEFAULT_MODULE_ID}", inference_only=True)
+        module.set_state(weights["learner"]["rl_module"][DEFAULT_MODULE_ID])
+        return module
+
+    def _env_to_module(self) -> Any:
+        runner = self.algorithm.env_runner
+        return None if runner is None else runner._env_to_module
+
+    def _parts(self, module: Any) -> PolicyParts:
+        pair = self._seen.observation_space, self._seen.action_space
+        return parts_of(module, self._env_to_module(), self._config, pair)
+
+    def save(self, path: Path, scores: Mapping[str, Any], notes: Mapping[str, Any]) -> Checkpoint:
+        """Write a checkpoint that can be resumed and deployed."""
+        with state.undisturbed():
+            module = copy.deepcopy(self._module())  # of appo and impala, a thread goes on learning
+            parts = self._parts(module)
+            members = {
+                "bam/policy.onnx": freeze(parts),
+                "bam/golden.safetensors": golden(parts, module, self._env_to_module(), self._config),
+                **state.members(self.algorithm, notes),
+            }
+        return write_checkpoint(path, self._manifest(scores), members)
+
+    def _manifest(self, scores: Mapping[str, Any]) -> dict[str, Any]:
+        return {
+            "env": self.settings.env,
+            "env_kwargs": self.settings.env_kwargs,
+            "observation_space": space_to_json(self._seen.observation_space),
+            "action_space": space_to_json(self._seen.action_space),
+            "signals": self._seen.signals,
+            "period": self._seen.period,
+            "algorithm": self.settings.algo,
+            "trainer": self.settings.trainer,
+            "settings": self.settings.to_mapping(),
+            "steps": self.steps,
+            "seed": self.settings.seed,
+            "scores": dict(scores),
+            "versions": versions(),
+            "git_commit": git_commit(),
+            "created": now(),
+        }
+
+    def freeze(self) -> FrozenPolicy:
+        """The policy as it is now."""
+        with state.undisturbed():
+            graph = freeze(self._parts(self._module()))
+        spaces = space_to_json(self._seen.observation_space), space_to_json(self._seen.action_space)
+        return FrozenPolicy.from_graph(graph, *spaces)
+
+    def exploring(self) -> ExploringPolicy:
+        """The policy as it is now, drawing its actions as in training."""
+        with state.undisturbed():
+            return ExploringPolicy(self._parts(), self._module(), self._env_to_module(), self._config)
+
+    @contextlib.contextmanager
+    def undisturbed(self) -> Iterator[None]:
+        """Do something between two iterations that leaves training's random numbers as they were."""
+        with state.undisturbed():
+            yield
+
+    @contextlib.contextmanager
+    def evaluation_rows(self) -> Iterator[VectorEnv[Any, Any, Any] | None]:
+        """None: evaluation makes its own."""
+        yield None
+
+    def log(self, metrics: Mapping[str, float]) -> None:
+        """Put numbers next to the trainer's own in TensorBoard."""
+        if self._tensorboard is not None:
+            self._tensorboard.write(metrics, self.steps)
+
+    def close(self) -> None:
+        """Let go of environments, log files and Ray."""
+        if self._tensorboard is not None:
+            self._tensorboard.close()
+        self._open.close()
+
+
+def _require_fitting(settings: TrainSettings) -> None:
+    """Refuse settings that RLlib's trainer has no use for.
+
+    Raises:
+        SettingsError: Names the setting and the remedy.
+    """
+    if settings.transport:
+        raise SettingsError(
+            "transport: the rllib trainer makes its environments in its own runners. Leave --transport out and put "
+            "runners on the other computers with --address, or train there with --trainer sb3"
+        )
+    offline = ALGORITHMS[settings.algo].offline
+    if settings.data is not None and not offline:
+        names = ", ".join(sorted(row.name for row in ALGORITHMS.values() if row.offline))
+        raise SettingsError(f"data: {settings.algo} learns in the environment; leave it out, or use one of: {names}")
+    if offline:
+        _require_offline(settings)
+
+
+def _require_offline(settings: TrainSettings) -> None:
+    if settings.data is None:
+        raise SettingsError(
+            f"data: {settings.algo} learns from recorded episodes, found none. Give a folder of Parquet files with "
+            "--data, such as scripts/record_parquet.py writes"
+        )
+    if settings.num_env_runners:
+        raise SettingsError(f"num_env_runners: {settings.algo} learns from recorded episodes alone; leave it out")
+    if settings.normalize:
+        raise SettingsError(f"normalize: {settings.algo} takes recorded observations as they are; leave it out")
+
+
+def _not_saved(settings: TrainSettings) -> list[str]:
+    """What a resumed run begins anew."""
+    algorithm = ALGORITHMS[settings.algo]
+    if algorithm.offline:
+        return []
+    lost = "running episodes" if algorithm.on_policy else "running episodes and replay buffers"
+    return [f"RLlib saves no {lost}: new ones begin, so the rest differs from an unbroken run"]
+
+
+def _remove_empty(folder: Path) -> None:
+    """RLlib makes a folder below ~/ray_results for files that it then does not write."""
+    with contextlib.suppress(OSError):
+        folder.rmdir()
+        folder.parent.rmdir()
+
+
+def _number(value: Any) -> float | None:
+    """A number of RLlib's results; None if it is something else."""
+    array = np.asarray(value)
+    return float(array) if array.ndim == 0 and array.dtype.kind in "fiu" else None

@@ -1,0 +1,141 @@
+"""What robo-gym's constructor options mean here: from its arguments to those of `bam_envs.registry.make_env`."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from typing import Any
+
+from bam_envs import registry
+from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.robo_gym.notices import say_once
+from bam_envs.robo_gym.table import RoboGymId
+from bam_envs.robot_env import render_modes
+
+_MANAGER = ("ip", "lower_bound_port", "upper_bound_port", "server_manager_port")
+"""Where robo-gym finds the Server Manager that starts Gazebo."""
+_WINDOWS = ("gui", "gazebo_gui", "rviz_gui")
+_SIMULATED = (*_MANAGER, *_WINDOWS)
+_OF_ENVIRONMENT = frozenset(inspect.signature(registry.make_env).parameters) | {"max_episode_steps"}
+_NOT_HERE = {
+    "max_velocity_scale_factor": "the arm's speed belongs to the environment, which would be another one",
+    "action_rate": "the rate belongs to the environment, which would be another one",
+    "ee_rotation_matters": "bam/isaac-reach-v0 (IsaacReachURSim-v0) has targets with an orientation",
+    "ee_rotation_threshold": "bam/isaac-reach-v0 (IsaacReachURSim-v0) has targets with an orientation",
+    "ee_distance_threshold": "success is within 0.1 m, as by default",
+    "ee_target_pose": "give it to reset: options={'ee_target_pose': [x, y, z, roll, pitch, yaw]}",
+    "ee_target_volume_bounding_box": "targets are drawn from the arm's workspace",
+    "randomize_start": "give it to reset: options={'randomize_start': True}",
+    "random_joint_offset": "give reset the start itself: options={'joint_positions': [...]}",
+    "continue_on_success": "give it to reset: options={'continue_on_success': True}",
+    "continue_except_collision": "give reset the start itself: options={'joint_positions': [...]}",
+}
+"""Options of robo-gym's modular environments that are none of ours, and what to do instead."""
+CONSTRUCTOR_OPTIONS = frozenset({*_SIMULATED, "rs_address", *_NOT_HERE})
+"""What robo-gym's constructors take and ours do not; its other options are those of our tasks."""
+
+
+def translate(entry: RoboGymId, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of `bam_envs.registry.make_env` for `entry`; says once in a process what an option means here.
+
+    Raises:
+        UnknownName: Neither robo-gym nor we have such an option; it carries the closest match.
+        InvalidValue: An option that is there and cannot be had, a live robot without an address, or a simulated one
+            with one.
+    """
+    _require_known(entry, given)
+    options = {name: value for name, value in given.items() if name not in (*_SIMULATED, "rs_address")}
+    address = _live_address(entry, given)
+    if address is not None:
+        options["robot"] = address
+    else:
+        _say_where_it_runs(given)
+        options |= _window(given)
+    if options.get("parity") and entry.no_parity:
+        raise InvalidValue(f"parity=True: {entry.id} has none: {entry.no_parity}.")
+    return options if options.get("transport") is not None else {**entry.defaults, **options}
+
+
+def _require_known(entry: RoboGymId, given: Mapping[str, Any]) -> None:
+    task = registry.resolve(registry.ENVIRONMENTS[entry.env_id].task)
+    of_task = set(inspect.signature(task).parameters) - {"num_rows"}
+    known = {*of_task, *_OF_ENVIRONMENT, *_SIMULATED, "rs_address"} - {"env_id", "task_options"}
+    for name in given:
+        if name in known:
+            continue
+        if name in _NOT_HERE:
+            raise InvalidValue(f"{name}= of {entry.id}: there is none here; {_NOT_HERE[name]}.")
+        raise UnknownName(f"argument of {entry.id}", name, known)
+
+
+def _live_address(entry: RoboGymId, given: Mapping[str, Any]) -> str | None:
+    """Address of the live robot behind rosbridge; None for the simulated one.
+
+    A ``Sim-v0`` takes ``robot=`` too: a policy that was trained in it is deployed in it.
+    """
+    robot, address = given.get("robot"), given.get("rs_address")
+    if not entry.is_live:
+        if address is not None:
+            raise InvalidValue(f"rs_address={address!r} names a live robot; it belongs to {entry.twin}.")
+        return robot
+    if given.get("transport") is not None:
+        return None
+    _require_nothing_simulated(entry, given)
+    if robot is not None and address is not None:
+        raise InvalidValue(f"rs_address={address!r} and robot={robot!r} name the same thing; leave one out.")
+    if robot is not None or address is not None:
+        return robot or _rosbridge_address(address)
+    raise InvalidValue(
+        f"{entry.id} is a live robot, and it has no address: give robot='ws://IP:PORT' of the rosbridge in front of "
+        f"it (rs_address='IP:PORT' is the same), or use {entry.twin} for the simulated one."
+    )
+
+
+def _require_nothing_simulated(entry: RoboGymId, given: Mapping[str, Any]) -> None:
+    for name in _SIMULATED:
+        if given.get(name):
+            raise InvalidValue(
+                f"{name}={given[name]!r} belongs to the simulation, {entry.twin}; the robot of {entry.id} is "
+                "named by rs_address='IP:PORT' or robot='ws://IP:PORT'."
+            )
+
+
+def _rosbridge_address(address: Any) -> str:
+    """``"IP:PORT"`` as the address of a rosbridge server."""
+    text = str(address)
+    if text.startswith(("ws://", "wss://")):
+        return text
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise InvalidValue(f"rs_address must be 'IP:PORT', such as '10.0.0.5:9090', not {address!r}.")
+    url = f"ws://{text}"
+    say_once(
+        "rs_address",
+        f"rs_address={text!r} is read as robot={url!r}: the robot is reached through rosbridge (port 9090 unless it "
+        "was given another), and not through a robot server of robo-gym's.",
+    )
+    return url
+
+
+def _say_where_it_runs(given: Mapping[str, Any]) -> None:
+    """Of options for what is not there."""
+    names = [name for name in (*_MANAGER, "rviz_gui") if given.get(name)]
+    if names:
+        said = ", ".join(f"{name}={given[name]!r}" for name in names)
+        say_once(
+            " ".join(names),
+            f"{said}: accepted, and without effect. The robot is simulated in this process; there is no Server Manager "
+            "and no Gazebo, and nothing to be started first.",
+        )
+
+
+def _window(given: Mapping[str, Any]) -> dict[str, Any]:
+    """``gui=True`` is a window of the simulated robot's, where there is a display."""
+    names = [name for name in ("gui", "gazebo_gui") if given.get(name)]
+    if not names or given.get("render_mode") is not None or given.get("transport") is not None:
+        return {}
+    if "human" not in render_modes():
+        say_once("no display", f"{names[0]}=True: no window, for there is no display; render_mode='rgb_array' draws.")
+        return {}
+    say_once("gui", f"{names[0]}=True is render_mode='human': a window with the simulated robot.")
+    return {"render_mode": "human"}

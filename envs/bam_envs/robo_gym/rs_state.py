@@ -1,0 +1,138 @@
+"""Wire states of robo-gym's robot servers, read: one state of theirs to a `RobotState` of one robot.
+
+The other way is the task's: ``task.rs_state(state)`` gives one wire state for each row. What a task knows and a robot
+does not (a target) is in the wire state too; `read_mir_target` and `read_object` give it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.errors import InvalidValue
+from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS
+from bam_envs.robots.robot import RobotState
+from bam_envs.tasks.ur_wire import POSITIONS, VELOCITIES, frame_keys
+
+Array = NDArray[np.float64]
+
+_OBJECT, _FLANGE, _FOREARM = frame_keys("object_0"), frame_keys("ee"), frame_keys("forearm")
+_ONLY_ROBOT = (*POSITIONS, *VELOCITIES, *_FLANGE, "in_collision")
+UR_KEYS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "only_robot": _ONLY_ROBOT,
+        "1object": (*_OBJECT, *_ONLY_ROBOT),
+        "1moving2points": (*_OBJECT, *POSITIONS, *VELOCITIES, *_FLANGE, *_FOREARM, "in_collision"),
+    }
+)
+"""The keys of an arm's wire state by robo-gym's ``rs_mode``: 20, 27 and 34 of them."""
+
+_TARGET, _POSE, _TWIST = slice(0, 3), slice(3, 6), slice(6, 8)
+_FRONT = slice(8, 8 + FRONT_RAYS)
+_BACK = slice(_FRONT.stop, _FRONT.stop + BACK_RAYS)
+_COLLISION = _BACK.stop
+MIR_LENGTH = _COLLISION + 1 + 9
+"""Numbers of a base's wire state: 1030."""
+
+
+def read_mir(wire: Sequence[float]) -> RobotState:
+    """The state of a base: ``base_pose``, ``base_velocity``, ``f_scan``, ``b_scan``, and ``collision`` as truth.
+
+    Args:
+        wire: Target x, y, yaw; robot x, y, yaw (m, rad, map); forward and turning speed [m/s, rad/s]; 501 ranges of the
+            front scanner and 511 of the back one [m]; contact (0 or 1); three obstacles x, y, yaw.
+
+    Raises:
+        InvalidValue: It has not 1030 numbers, or one that is infinite; what is not a number is 0, as in robo-gym.
+    """
+    row = _numbers(wire)
+    signals = {"base_pose": _POSE, "base_velocity": _TWIST, "f_scan": _FRONT, "b_scan": _BACK}
+    return _state({name: row[part] for name, part in signals.items()}, row[_COLLISION], 2)
+
+
+def read_mir_target(wire: Sequence[float]) -> Array:
+    """The target's x, y [m] and yaw [rad] of a base's wire state. Shape: (3,)."""
+    target: Array = _numbers(wire)[_TARGET].copy()
+    return target
+
+
+def _numbers(wire: Sequence[float]) -> Array:
+    row = np.asarray(wire, dtype=np.float64)
+    if row.shape != (MIR_LENGTH,):
+        raise InvalidValue(f"The wire state of a MiR100 has {MIR_LENGTH} numbers in a row; this has shape {row.shape}.")
+    infinite = np.flatnonzero(np.isinf(row))
+    if infinite.size:
+        raise InvalidValue(
+            f"Number {infinite[0]} of the wire state of a MiR100 must be finite, not {row[infinite[0]]}."
+        )
+    numbers: Array = np.nan_to_num(row)
+    return numbers
+
+
+def read_ur(wire: Mapping[str, float]) -> RobotState:
+    """The state of an arm: ``joint_position``, ``joint_velocity``, the object if there is one, ``collision`` as truth.
+
+    The frames of flange and forearm are left out: they follow from the joints.
+
+    Args:
+        wire: Joint angles [rad] and speeds [rad/s], frames in ``base_link`` [m, quaternion x, y, z, w], and contact
+            (0 or 1).
+
+    Raises:
+        InvalidValue: A key is missing or is none of robo-gym's, or its value is not finite; it names the key.
+    """
+    require_ur_keys(wire)
+    signals = {"joint_position": _take(wire, POSITIONS), "joint_velocity": _take(wire, VELOCITIES)}
+    if _OBJECT[0] in wire:
+        position, quaternion = read_object(wire)
+        signals |= {"object_position": position, "object_quaternion": quaternion}
+    return _state(signals, _take(wire, ("in_collision",))[0], 6)
+
+
+def read_object(wire: Mapping[str, float]) -> tuple[Array, Array]:
+    """Target or obstacle of an arm's wire state in ``base_link``: position (3,) [m], quaternion w, x, y, z (4,)."""
+    frame = _take(wire, _OBJECT)
+    return frame[:3], frame[[6, 3, 4, 5]]
+
+
+def require_ur_keys(wire: Mapping[str, Any]) -> str:
+    """The ``rs_mode`` whose keys `wire` has, exactly.
+
+    Raises:
+        InvalidValue: Names the first key that is missing, or that no mode has.
+    """
+    given = set(wire)
+    for mode, keys in UR_KEYS.items():
+        if given == set(keys):
+            return mode
+    mode = _meant(given)
+    keys = UR_KEYS[mode]
+    missing, more = [key for key in keys if key not in given], sorted(given - set(keys))
+    what = f"lacks {missing[0]!r}" if missing else f"has {more[0]!r}, which robo-gym's has not"
+    raise InvalidValue(f"The wire state of a UR ({mode}: {len(keys)} keys) {what}; it has {len(given)} keys.")
+
+
+def _meant(given: Iterable[str]) -> str:
+    """The mode that keys are of, by the frames that are among them."""
+    names = set(given)
+    if names & set(_FOREARM):
+        return "1moving2points"
+    return "1object" if names & set(_OBJECT) else "only_robot"
+
+
+def _take(wire: Mapping[str, float], keys: Sequence[str]) -> Array:
+    values = np.array([wire[key] for key in keys], dtype=np.float64)
+    for key, value in zip(keys, values, strict=True):
+        if not np.isfinite(value):
+            raise InvalidValue(f"{key} of the wire state of a UR must be finite, not {value}.")
+    return values
+
+
+def _state(signals: Mapping[str, Array], collision: float, commands: int) -> RobotState:
+    """One row. A wire state has no time stamp and no command."""
+    rows = {name: np.array(values)[None] for name, values in signals.items()}
+    return RobotState(rows, np.zeros(1), np.zeros((1, commands)), {"collision": np.array([collision == 1])})

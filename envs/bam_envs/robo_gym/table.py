@@ -1,0 +1,65 @@
+"""The one table of robo-gym's ids: which environment of ours each is, and what robo-gym has otherwise by default.
+
+Pure data: `bam_envs.registry` reads it to register the ids.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+NOTHING: Mapping[str, Any] = MappingProxyType({})
+_UR = MappingProxyType({"ur_model": "ur5", "rs_state_to_info": True})
+_UR_MODULAR = MappingProxyType({"ur_model": "ur5", "rs_state_to_info": False})
+
+
+@dataclass(frozen=True)
+class RoboGymId:
+    """One id of robo-gym's."""
+
+    stem: str
+    """The id without ``Sim-v0`` or ``Rob-v0``."""
+    env_id: str
+    """Key of `bam_envs.ENVIRONMENTS`."""
+    is_live: bool
+    """Whether it is the ``Rob-v0`` of the two: the same environment, with a robot."""
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+    """Task options that have other defaults there than here."""
+    no_parity: str = ""
+    """Why there is no ``parity=True``; empty where there is."""
+
+    @property
+    def id(self) -> str:
+        """Gymnasium's id."""
+        return f"{self.stem}{'Rob' if self.is_live else 'Sim'}-v0"
+
+    @property
+    def twin(self) -> str:
+        """The other id of the two."""
+        return f"{self.stem}{'Sim' if self.is_live else 'Rob'}-v0"
+
+
+_EE2 = (
+    "robo-gym's own has its target at (0, 0, 0) always, and no observation of the shape that it declares; "
+    "EndEffectorPositioningUR has parity=True"
+)
+_STEMS: tuple[tuple[str, str, Mapping[str, Any], str], ...] = (
+    ("NoObstacleNavigationMir100", "bam/mir100-navigation-v0", NOTHING, ""),
+    ("ObstacleAvoidanceMir100", "bam/mir100-avoidance-v0", NOTHING, ""),
+    ("EmptyEnvironmentUR", "bam/ur-empty-v0", _UR, ""),
+    ("EndEffectorPositioningUR", "bam/ur-reach-v0", _UR, ""),
+    ("BasicAvoidanceUR", "bam/ur-avoidance-v0", _UR, ""),
+    ("AvoidanceRaad2022UR", "bam/ur-track-v0", _UR, ""),
+    ("AvoidanceRaad2022TestUR", "bam/ur-track-v0", MappingProxyType({**_UR, "fixed_paths": True}), ""),
+    ("EmptyEnvironment2UR", "bam/ur-empty-v0", _UR_MODULAR, ""),
+    ("EndEffectorPositioning2UR", "bam/ur-reach-v0", _UR_MODULAR, _EE2),
+    ("IsaacReachUR", "bam/isaac-reach-v0", MappingProxyType({"rs_state_to_info": False}), ""),
+)
+ROBO_GYM: dict[str, RoboGymId] = {
+    entry.id: entry
+    for stem, env_id, defaults, no_parity in _STEMS
+    for entry in (RoboGymId(stem, env_id, is_live, defaults, no_parity) for is_live in (False, True))
+}
+"""By id, each ``Sim-v0`` followed by its ``Rob-v0``."""

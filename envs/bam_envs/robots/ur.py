@@ -1,0 +1,138 @@
+"""Universal Robots arms of seven sizes: limits, speeds, workspaces, outlines; the signals of one, simulated or live.
+
+The command is six joints. The shipped profile ``ur5e`` has them; its gripper, if there is one, is left alone.
+
+Sources: user manuals of the UR3, UR5 and UR10 (CB3) and of the e-Series (+-360 degrees on all joints; speeds;
+recommended workspaces); ROS-Industrial's ur_description (the elbow cannot fold by more than 180 degrees; offsets and
+radii of the links, measured from models).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs import kinematics
+from bam_envs.errors import UnknownName
+from bam_envs.kinematics import ArmGeometry
+from bam_envs.robots.robot import RobotSpec, SignalSpec
+from bam_envs.robots.ur5e import COMMAND, JOINTS, arm_spec
+
+__all__ = [
+    "DEFAULT_MODEL",
+    "JOINTS",
+    "START",
+    "UR_MODELS",
+    "ArmOutline",
+    "UrModel",
+    "ur_model",
+    "ur_spec",
+]
+
+Array = NDArray[np.float64]
+DEFAULT_MODEL = "ur5"
+"""The model that is meant where none is named: robo-gym's, so that its policies fit."""
+START = (0.0, -2.5, 1.5, 0.0, -1.4, 0.0)
+"""Joint positions [rad] with every model's flange in the air before it, clear of itself and of the table."""
+
+
+@dataclass(frozen=True)
+class ArmOutline:
+    """Where the tubes of an arm are, beside its kinematics [m]."""
+
+    upper_arm_offset: float
+    """Of the upper arm's tube from the arm's middle plane, along the shoulder axis."""
+    forearm_offset: float
+    """Of the forearm's tube, likewise."""
+    base: float
+    """Radius of base and shoulder."""
+    upper_arm: float
+    """Radius of the upper arm."""
+    forearm: float
+    """Radius of the forearm."""
+    wrist: float
+    """Radius of the wrists and of the flange."""
+
+
+@dataclass(frozen=True, eq=False)
+class UrModel:
+    """One size of arm."""
+
+    name: str
+    geometry: ArmGeometry
+    joint_limits: Array
+    """Lowest and highest joint positions [rad]. Shape: (2, 6)."""
+    max_velocity: Array
+    """Fastest joints [rad/s]. Shape: (6,)."""
+    workspace_radius: float
+    """Radius of the recommended workspace, a half-ball around the base [m]."""
+    workspace_inner: float
+    """Radius of the cylinder about the base's axis that is left out of it [m]."""
+    outline: ArmOutline
+
+
+def _model(
+    name: str, geometry: ArmGeometry, degrees: tuple[int, int], workspace: tuple[float, float], outline: ArmOutline
+) -> UrModel:
+    """A model; `degrees` are the speeds of shoulder and wrists [degrees/s], an elbow does 180."""
+    turn, elbow = 2 * math.pi, math.pi
+    high = np.array([turn, turn, elbow, turn, turn, turn])
+    speeds = np.radians([degrees[0], degrees[0], 180, degrees[1], degrees[1], degrees[1]])
+    for array in (limits := np.stack([-high, high]), speeds):
+        array.setflags(write=False)
+    return UrModel(name, geometry, limits, speeds, *workspace, outline)
+
+
+UR_MODELS: dict[str, UrModel] = {
+    model.name: model
+    for model in (
+        _model("ur3", kinematics.UR3, (180, 360), (0.45, 0.2), ArmOutline(0.1198, 0.0273, 0.060, 0.048, 0.040, 0.0315)),
+        _model(
+            "ur3e", kinematics.UR3E, (180, 360), (0.45, 0.2), ArmOutline(0.1200, 0.0270, 0.060, 0.048, 0.040, 0.0315)
+        ),
+        _model(
+            "ur5", kinematics.UR5, (180, 180), (0.75, 0.2), ArmOutline(0.13585, 0.0165, 0.070, 0.054, 0.042, 0.0375)
+        ),
+        _model(
+            "ur5e", kinematics.UR5E, (180, 180), (0.75, 0.2), ArmOutline(0.1380, 0.0070, 0.070, 0.054, 0.042, 0.0375)
+        ),
+        _model(
+            "ur10", kinematics.UR10, (120, 180), (1.3, 0.3), ArmOutline(0.220941, 0.049041, 0.085, 0.075, 0.055, 0.045)
+        ),
+        _model(
+            "ur10e", kinematics.UR10E, (120, 180), (1.3, 0.3), ArmOutline(0.1762, 0.0393, 0.085, 0.075, 0.055, 0.045)
+        ),
+        _model(
+            "ur16e", kinematics.UR16E, (120, 180), (0.8, 0.3), ArmOutline(0.1760, 0.0390, 0.085, 0.075, 0.055, 0.045)
+        ),
+    )
+}
+"""Name to model."""
+
+
+def ur_model(name: str) -> UrModel:
+    """The model called `name`.
+
+    Raises:
+        UnknownName: There is none; it carries the closest match.
+    """
+    if name not in UR_MODELS:
+        raise UnknownName("ur_model", str(name), UR_MODELS, examples=UR_MODELS)
+    return UR_MODELS[name]
+
+
+def ur_spec(model: UrModel, period: float, with_object: bool) -> RobotSpec:
+    """The signals of an arm, and of a tracked object where there is one."""
+    known = {signal.name: signal for signal in arm_spec(model.name, with_object=True).signals}
+    speeds = tuple(model.max_velocity.tolist())
+    signals: list[SignalSpec] = [
+        known["joint_position"],
+        replace(known["joint_velocity"], low=tuple(-speed for speed in speeds), high=speeds),
+    ]
+    if with_object:
+        signals += [known["object_position"], known["object_quaternion"]]
+    command = replace(COMMAND.part(JOINTS), max_rate=speeds)
+    return RobotSpec(model.name, tuple(signals), command, period)

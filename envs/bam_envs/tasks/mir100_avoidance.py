@@ -1,0 +1,157 @@
+"""Drive a MiR100 to the other side of a room, round three boxes that only its lasers see."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from bam_envs.robots.mir100 import BACK_RAYS, FOOTPRINT, FRONT_RAYS
+from bam_envs.robots.robot import RobotState, Rows
+from bam_envs.tasks.mir100_drive import DriveTask
+from bam_envs.tasks.poses import spread
+from bam_envs.tasks.task import Array, Flags, Floats, Label
+
+SIDE = (2.1, 3.1)
+"""Starts are drawn so far from the middle of the room along y, targets as far on the other side [m]."""
+WIDTH = 2.0
+"""They are drawn at most this far from the middle along x [m]."""
+BOXES = np.array([[-2.4, -1.5], [-0.5, 0.5], [1.5, 2.4]])
+"""Lowest and highest x of the middle of each box [m]."""
+BOX_DEPTH = 1.0
+"""Boxes are drawn at most this far from the middle along y [m]."""
+NEAREST = 0.15
+"""A ray shorter than this is a collision [m]."""
+SAFETY_RADIUS = 0.40
+"""With ``parity=True`` a corner of the base nearer than this to the middle of a box is one, too [m]."""
+BEAMS = np.round(np.linspace(0, FRONT_RAYS + BACK_RAYS - 1, 16)).astype(np.int64)
+"""With ``parity=True``, the rays that are observed, out of those of the front and the back scanner."""
+SECTORS = 8
+"""Otherwise the shortest ray is observed of so many sectors of each scanner."""
+SIGHT = 3.0
+"""What is farther than this is observed as if it were there [m]."""
+_FRONT_STARTS = np.linspace(0, FRONT_RAYS, SECTORS + 1).astype(np.int64)[:-1]
+_BACK_STARTS = np.linspace(0, BACK_RAYS, SECTORS + 1).astype(np.int64)[:-1]
+_CORNERS = np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]]) * np.array(FOOTPRINT) / 2
+
+
+class Mir100AvoidanceTask(DriveTask):
+    """Drive to within 20 cm of a target on the other side of three boxes.
+
+    Start:
+        The base is at rest at x -2 to 2 m, 2.1 to 3.1 m from the middle of the room to either side along y, with any
+        yaw; a live one where it is. The target is as far on the other side, at x -2 to 2 m. The boxes, cubes of 0.5 m,
+        are about x -2, 0 and 2 m, y -1 to 1 m, with any yaw. The reset options ``start_pose`` and ``target_pose``
+        (x, y [m], yaw [rad]) choose the former two.
+
+    Reward:
+        Each step 0.5 for each metre nearer, less 0.005 for the time, 0.003 |forward| and 0.0003 |turn|. At success 2
+        instead, and -2 instead at a collision.
+
+    Success:
+        The base is nearer than 20 cm to the target. Its heading does not matter.
+
+    End:
+        Terminated at success and at a collision: a ray shorter than 15 cm, or, in simulation, a touch.
+
+    Info:
+        `distance` of the target [m], `target_coord` (x, y [m], yaw [rad]), at the end `final_status`: "success" or
+        "collision".
+
+    With ``parity=True`` observation, reward and end are those of robo-gym's `ObstacleAvoidanceMir100`: metres and
+    radians, 16 single rays, the way at a hundred times this reward but none for that of the first step, 100 at
+    success, -200 at a collision; it collides also when a corner comes near the middle of a box, never on a live robot,
+    and the episode is terminated after 500 steps as "max_steps_exceeded".
+
+    Args:
+        num_rows: How many robots are scored together.
+        parity: Robo-gym's arithmetic.
+        rs_state_to_info: ``info["rs_state"]`` is the state as robo-gym's robot server would send it.
+    """
+
+    parity_success, failure = 100.0, "collision"
+    draws = 15
+
+    def __init__(self, num_rows: int = 1, *, parity: bool = False, rs_state_to_info: bool = False) -> None:
+        super().__init__(num_rows, parity=parity, rs_state_to_info=rs_state_to_info)
+        self.obstacles = np.zeros((num_rows, len(BOXES), 3))
+        """Boxes of a simulated room: x, y [m] and yaw [rad]. Shape: (n, 3, 3)."""
+        self._sectors: tuple[RobotState, Array] | None = None
+
+    def labels(self) -> tuple[Label, ...]:
+        """Those of driving, and ranges."""
+        if self.parity:
+            rays = (Label(f"range_{ray}", f"ray {ray} of both scanners", "m", low=0.0, high=29.0) for ray in BEAMS)
+            return (*super().labels(), *rays)
+        sectors = [(name, sector) for name in ("front", "back") for sector in range(SECTORS)]
+        scale = f"1 - range / {SIGHT:g}, clipped"
+        meant = "shortest ray of sector {} of the {} scanner, clockwise end first"
+        return (
+            *super().labels(),
+            *(Label(f"{name}_{sector}", meant.format(sector, name), "m", scale, 0.0) for name, sector in sectors),
+        )
+
+    def starts(self, draws: Array) -> Array:
+        """On either side. Shape: (k, 3)."""
+        side = np.where(draws[:, 3] < 0.5, -1.0, 1.0)
+        x, y = spread(draws[:, 0], -WIDTH, WIDTH), side * spread(draws[:, 1], *SIDE)
+        return np.stack([x, y, spread(draws[:, 2], -math.pi, math.pi)], axis=1)
+
+    def targets(self, draws: Array, start: Array) -> Array:
+        """On the other side, which is always far enough. Shape: (k, 3)."""
+        side = np.where(start[:, 1] > 0, -1.0, 1.0)
+        x, y = spread(draws[:, 4], -WIDTH, WIDTH), side * spread(draws[:, 5], *SIDE)
+        return np.stack([x, y, np.zeros(len(start))], axis=1)
+
+    def scene(self, rows: Rows, draws: Array) -> dict[str, Array]:
+        """The boxes."""
+        x = BOXES[:, 0] + draws[:, 6:9] * (BOXES[:, 1] - BOXES[:, 0])
+        y, yaw = spread(draws[:, 9:12], -BOX_DEPTH, BOX_DEPTH), spread(draws[:, 12:15], -math.pi, math.pi)
+        self.obstacles[rows] = np.stack([x, y, yaw], axis=2)
+        return {"obstacle_pose": self.obstacles[rows]}
+
+    def sectors(self, state: RobotState) -> Array:
+        """The shortest ray of each sector [m], worked out once for each state. Shape: (n, 32)."""
+        if self._sectors is None or self._sectors[0] is not state:
+            front = np.minimum.reduceat(state.signals["f_scan"], _FRONT_STARTS, axis=1)
+            back = np.minimum.reduceat(state.signals["b_scan"], _BACK_STARTS, axis=1)
+            self._sectors = (state, np.concatenate([front, back], axis=1))
+        return self._sectors[1]
+
+    def seen(self, state: RobotState) -> list[Floats]:
+        """Single rays, or the shortest of sectors. Shapes: (n, 16) in two parts, or (n, 32)."""
+        if not self.parity:
+            return [(1.0 - self.sectors(state) / SIGHT).astype(np.float32)]
+        front, back = BEAMS[BEAMS < FRONT_RAYS], BEAMS[BEAMS >= FRONT_RAYS] - FRONT_RAYS
+        rays = (state.signals["f_scan"][:, front], state.signals["b_scan"][:, back])
+        return [one.astype(np.float32) for one in rays]
+
+    def failed(self, state: RobotState) -> Flags:
+        """Whether the base touches something, or nearly does. Shape: (n,)."""
+        if self.parity and not state.truth:
+            return np.zeros(self.num_rows, dtype=bool)
+        near: Flags = self.sectors(state).min(axis=1) < NEAREST
+        touching: Any = state.truth.get("collision", False)
+        if self.parity:
+            near = near | self._corner_near_box(state.signals["base_pose"])
+        failed: Flags = near | touching
+        return failed
+
+    def _corner_near_box(self, pose: Array) -> Flags:
+        """Whether a corner is within `SAFETY_RADIUS` of the middle of a box; as if the base's frame were its middle."""
+        cos, sin = np.cos(pose[:, 2].copy())[:, None], np.sin(pose[:, 2].copy())[:, None]
+        x = pose[:, :1] + _CORNERS[:, 0] * cos - _CORNERS[:, 1] * sin
+        y = pose[:, 1:2] + _CORNERS[:, 0] * sin + _CORNERS[:, 1] * cos
+        dx, dy = x[:, :, None] - self.obstacles[:, None, :, 0], y[:, :, None] - self.obstacles[:, None, :, 1]
+        near: Flags = (dx * dx + dy * dy <= SAFETY_RADIUS**2).any(axis=(1, 2))
+        return near
+
+    def state_dict(self) -> dict[str, Any]:
+        """The memory, as plain arrays."""
+        return {**super().state_dict(), "obstacles": self.obstacles.copy()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go to what `state_dict` returned."""
+        super().load_state_dict(state)
+        self.obstacles, self._sectors = np.array(state["obstacles"]), None

@@ -1,0 +1,96 @@
+"""Run the policy of a checkpoint on a MiR100, and say how each episode went.
+
+The checkpoint is a checkpoint.zip, or a directory that RLlib wrote: of a whole algorithm or of one policy, by its
+present API or by the old one. Only the policy is read: no Ray is started, no worker, and no environment but this one.
+
+Examples:
+  python scripts/policy_from_cp_mir.py checkpoints/mir100-navigation-rllib-ppo.zip
+  python scripts/policy_from_cp_mir.py ray_results/run/checkpoint_000024 --num-episodes 20 --seed 7
+  python scripts/policy_from_cp_mir.py checkpoint_000024/policies/default_policy --env NoObstacleNavigationMir100Sim-v0
+  python scripts/policy_from_cp_mir.py checkpoints/mir100-navigation-rllib-ppo.zip --robot ws://10.0.0.5:9090
+"""
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from bam_envs.registry import resolve_id
+from bam_train.checkpoint import Checkpoint
+from bam_train.cli.experiment import ScriptParser, open_env, whole
+from bam_train.cli.program import guarded
+from bam_train.evaluation import FIRST_SEED
+from bam_train.policy import FrozenPolicy
+
+ENV = "bam/mir100-navigation-v0"  # of a directory that does not say on which it was trained
+NAME = Path(__file__).stem
+
+
+def open_checkpoint(path: Path, env: str | None, trust: bool, folder: str) -> Checkpoint:
+    """The checkpoint at `path`; one out of a directory of RLlib is written into `folder`."""
+    if not path.is_dir():
+        checkpoint = Checkpoint.open(path)
+        if env is not None:
+            checkpoint.requires_env(resolve_id(env))
+        return checkpoint
+    from bam_train.trainers.rllib.directory import find_policy
+    from bam_train.trainers.rllib.export import export
+    from bam_train.trainers.rllib.foreign import read_policy
+
+    if env is None and read_policy(find_policy(path, trust=trust)).env is None:
+        env = ENV
+    exported = export(path, env=env, trust=trust, warn=lambda text: print(f"{NAME}: warning: {text}", file=sys.stderr))
+    return exported.write(Path(folder) / "policy.zip")
+
+
+def play(env: gym.Env[Any, Any], policy: FrozenPolicy, seed: int) -> tuple[float, bool, int, int]:
+    """One episode: its return, whether it succeeded, its clipped actions, and how many there were."""
+    space: Any = env.action_space
+    observation, _ = env.reset(seed=seed)
+    policy.reset()
+    total, clipped, steps, ended = 0.0, 0, 0, False
+    while not ended:  # on a live robot, each step waits for the end of its period
+        action = np.clip(policy.act(observation), space.low, space.high)
+        # A frozen policy clips by itself, as RLlib does: a number is then exactly at its bound.
+        clipped += bool(((action <= space.low) | (action >= space.high)).any())
+        observation, reward, terminated, truncated, info = env.step(action)
+        total, steps, ended = total + float(reward), steps + 1, terminated or truncated
+    return total, bool(info.get("is_success")), clipped, steps
+
+
+def main(args: argparse.Namespace) -> None:
+    """Run the episodes, in a simulation or on a live robot."""
+    with tempfile.TemporaryDirectory() as folder:
+        checkpoint = open_checkpoint(args.checkpoint.expanduser(), args.env, args.trust_pickle, folder)
+        policy = FrozenPolicy.from_checkpoint(checkpoint)
+        with open_env(checkpoint, args.robot, who=NAME, episodes=args.num_episodes, yes=args.yes) as env:
+            successes = 0
+            for k in range(args.num_episodes):
+                total, success, clipped, steps = play(env, policy, args.seed + k)
+                successes += success
+                how = "success" if success else "no success"
+                print(f"episode {k + 1}: return {total:.2f}, {how}, clipped {clipped} of {steps} actions", flush=True)
+            print(f"success in {successes} of {args.num_episodes} episodes on {checkpoint.manifest.env}")
+
+
+def parse() -> argparse.Namespace:
+    """Read the command line."""
+    parser = ScriptParser(__file__, __doc__)
+    add = parser.add_argument
+    add("checkpoint", type=Path, metavar="CHECKPOINT", help="checkpoint.zip, or a directory that RLlib wrote")
+    add("--env", metavar="ID", help=f"of a directory that does not say where it was trained (default {ENV})")
+    add("--num-episodes", type=whole(1), default=5, metavar="N", help="how many (default 5)")
+    add("--seed", type=whole(0), default=FIRST_SEED, metavar="N", help=f"of the first episode (default {FIRST_SEED})")
+    add("--robot", metavar="URL", help="use the policy on a live robot behind rosbridge, such as ws://10.0.0.5:9090")
+    add("--yes", action="store_true", help="do not ask before a real robot moves")
+    add("--trust-pickle", action="store_true", help="unpickle what cannot be read otherwise, which runs what is in it")
+    args: argparse.Namespace = parser.parse_args()
+    return args
+
+
+if __name__ == "__main__":
+    raise SystemExit(guarded(lambda: main(parse()), NAME))

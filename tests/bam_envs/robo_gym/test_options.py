@@ -1,0 +1,151 @@
+"""What robo-gym's constructor options become here."""
+
+import logging
+
+import pytest
+
+from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.robo_gym import notices, options
+from bam_envs.robo_gym.table import ROBO_GYM
+
+SIM, ROB = ROBO_GYM["EndEffectorPositioningURSim-v0"], ROBO_GYM["EndEffectorPositioningURRob-v0"]
+DEFAULTS = {"ur_model": "ur5", "rs_state_to_info": True}
+
+
+@pytest.fixture(autouse=True)
+def told(caplog):
+    """What is said, from a process that has said nothing."""
+    notices.forget()
+    caplog.set_level(logging.WARNING)
+    yield lambda: [record.getMessage() for record in caplog.records]
+    notices.forget()
+
+
+def test_defaults_are_robo_gyms_and_say_nothing(told):
+    assert options.translate(SIM, {}) == DEFAULTS
+    assert options.translate(SIM, {"ip": None, "gui": False, "lower_bound_port": None}) == DEFAULTS
+    assert options.translate(ROBO_GYM["NoObstacleNavigationMir100Sim-v0"], {}) == {}
+    assert told() == []
+
+
+def test_options_of_the_task_go_through(told):
+    given = {
+        "ur_model": "ur10e",
+        "fix_base": True,
+        "restrict_wrist_1": False,
+        "rs_state_to_info": False,
+        "parity": True,
+    }
+    assert options.translate(SIM, given) == given
+    assert options.translate(ROBO_GYM["AvoidanceRaad2022TestURSim-v0"], {"include_polar_to_elbow": False}) == {
+        **DEFAULTS,
+        "fixed_paths": True,
+        "include_polar_to_elbow": False,
+    }
+    assert told() == []
+
+
+def test_a_server_manager_is_said_once_not_to_be_there(told):
+    for _ in range(3):
+        assert options.translate(SIM, {"ip": "127.0.0.1", "lower_bound_port": 50100, "rviz_gui": True}) == DEFAULTS
+    assert told() == [
+        "ip='127.0.0.1', lower_bound_port=50100, rviz_gui=True: accepted, and without effect. The robot is simulated "
+        "in this process; there is no Server Manager and no Gazebo, and nothing to be started first."
+    ]
+
+
+@pytest.mark.parametrize("name", ["gui", "gazebo_gui"])
+def test_gui_is_a_window(name, told, monkeypatch):
+    monkeypatch.setattr(options, "render_modes", lambda: ["rgb_array", "human"])
+    for _ in range(2):
+        assert options.translate(SIM, {name: True}) == {**DEFAULTS, "render_mode": "human"}
+    assert told() == [f"{name}=True is render_mode='human': a window with the simulated robot."]
+    assert options.translate(SIM, {name: True, "render_mode": "rgb_array"})["render_mode"] == "rgb_array"
+
+
+def test_gui_without_a_display(told, monkeypatch):
+    monkeypatch.setattr(options, "render_modes", lambda: ["rgb_array"])
+    assert options.translate(SIM, {"gui": True}) == DEFAULTS
+    assert told() == ["gui=True: no window, for there is no display; render_mode='rgb_array' draws."]
+
+
+def test_the_address_of_a_robot(told):
+    for _ in range(2):
+        found = options.translate(ROB, {"rs_address": "10.0.0.5:9090", "ip": None})
+        assert found == {**DEFAULTS, "robot": "ws://10.0.0.5:9090"}
+    assert told() == [
+        "rs_address='10.0.0.5:9090' is read as robot='ws://10.0.0.5:9090': the robot is reached through rosbridge "
+        "(port 9090 unless it was given another), and not through a robot server of robo-gym's."
+    ]
+    for given in ({"robot": "wss://10.0.0.5:9090/arm"}, {"rs_address": "wss://10.0.0.5:9090/arm"}):
+        assert options.translate(ROB, given)["robot"] == "wss://10.0.0.5:9090/arm"
+    assert options.translate(SIM, {"robot": "ws://10.0.0.5:9090"})["robot"] == "ws://10.0.0.5:9090"
+
+
+@pytest.mark.parametrize(
+    ("entry", "given", "text"),
+    [
+        (
+            ROB,
+            {},
+            "EndEffectorPositioningURRob-v0 is a live robot, and it has no address: give robot='ws://IP:PORT' of the "
+            "rosbridge in front of it (rs_address='IP:PORT' is the same), or use EndEffectorPositioningURSim-v0 for "
+            "the simulated one.",
+        ),
+        (ROB, {"rs_address": "10.0.0.5"}, "rs_address must be 'IP:PORT', such as '10.0.0.5:9090', not '10.0.0.5'."),
+        (ROB, {"rs_address": ":9090"}, "rs_address must be 'IP:PORT', such as '10.0.0.5:9090', not ':9090'."),
+        (ROB, {"rs_address": "a:70000"}, "rs_address must be 'IP:PORT', such as '10.0.0.5:9090', not 'a:70000'."),
+        (
+            ROB,
+            {"ip": "10.0.0.5"},
+            "ip='10.0.0.5' belongs to the simulation, EndEffectorPositioningURSim-v0; the robot of "
+            "EndEffectorPositioningURRob-v0 is named by rs_address='IP:PORT' or robot='ws://IP:PORT'.",
+        ),
+        (
+            ROB,
+            {"rs_address": "10.0.0.5:9090", "robot": "ws://10.0.0.5:9090"},
+            "rs_address='10.0.0.5:9090' and robot='ws://10.0.0.5:9090' name the same thing; leave one out.",
+        ),
+        (
+            SIM,
+            {"rs_address": "10.0.0.5:9090"},
+            "rs_address='10.0.0.5:9090' names a live robot; it belongs to EndEffectorPositioningURRob-v0.",
+        ),
+        (
+            SIM,
+            {"action_rate": 5},
+            "action_rate= of EndEffectorPositioningURSim-v0: there is none here; the rate belongs to the environment, "
+            "which would be another one.",
+        ),
+        (
+            SIM,
+            {"randomize_start": True},
+            "randomize_start= of EndEffectorPositioningURSim-v0: there is none here; give it to reset: "
+            "options={'randomize_start': True}.",
+        ),
+        (
+            ROBO_GYM["EndEffectorPositioning2URSim-v0"],
+            {"parity": True},
+            "parity=True: EndEffectorPositioning2URSim-v0 has none: robo-gym's own has its target at (0, 0, 0) always, "
+            "and no observation of the shape that it declares; EndEffectorPositioningUR has parity=True.",
+        ),
+    ],
+)
+def test_what_cannot_be_had(entry, given, text):
+    with pytest.raises(InvalidValue) as caught:
+        options.translate(entry, given)
+    assert str(caught.value) == text
+
+
+@pytest.mark.parametrize(("name", "closest"), [("ur_modle", "ur_model"), ("lower_port", "lower_bound_port")])
+def test_a_typo_is_not_swallowed(name, closest):
+    with pytest.raises(UnknownName) as caught:
+        options.translate(SIM, {name: 1})
+    assert str(caught.value) == (
+        f"Unknown argument of EndEffectorPositioningURSim-v0 {name!r}. Did you mean {closest!r}?"
+    )
+
+
+def test_options_of_arms_are_none_of_bases():
+    with pytest.raises(UnknownName, match=r"Unknown argument of NoObstacleNavigationMir100Sim-v0 'ur_model'"):
+        options.translate(ROBO_GYM["NoObstacleNavigationMir100Sim-v0"], {"ur_model": "ur5"})

@@ -1,0 +1,59 @@
+import subprocess
+import sys
+
+import gymnasium as gym
+import pytest
+
+from bam_envs import ENVIRONMENTS
+from bam_envs.registry import entry_of, resolve_id
+from bam_envs.robo_gym.table import ROBO_GYM
+
+STEMS = {
+    "NoObstacleNavigationMir100": "bam/mir100-navigation-v0",
+    "ObstacleAvoidanceMir100": "bam/mir100-avoidance-v0",
+    "EmptyEnvironmentUR": "bam/ur-empty-v0",
+    "EndEffectorPositioningUR": "bam/ur-reach-v0",
+    "BasicAvoidanceUR": "bam/ur-avoidance-v0",
+    "AvoidanceRaad2022UR": "bam/ur-track-v0",
+    "AvoidanceRaad2022TestUR": "bam/ur-track-v0",
+    "EmptyEnvironment2UR": "bam/ur-empty-v0",
+    "EndEffectorPositioning2UR": "bam/ur-reach-v0",
+    "IsaacReachUR": "bam/isaac-reach-v0",
+}
+
+
+def test_the_ids():
+    assert list(ROBO_GYM) == [f"{stem}{kind}-v0" for stem in STEMS for kind in ("Sim", "Rob")]
+    for name, entry in ROBO_GYM.items():
+        assert (entry.id, entry.env_id) == (name, STEMS[entry.stem])
+        assert ROBO_GYM[entry.twin].twin == name
+        assert entry.is_live == name.endswith("Rob-v0")
+
+
+@pytest.mark.parametrize("name", ROBO_GYM)
+def test_every_id_is_registered_and_is_one_of_ours(name):
+    assert gym.spec(name).max_episode_steps is None
+    assert entry_of(name) is ENVIRONMENTS[ROBO_GYM[name].env_id]
+    assert resolve_id(name.removesuffix("-v0")) == name
+
+
+def test_rows_of_names():
+    assert entry_of("bam/pick-v0") is ENVIRONMENTS["bam/pick-v0"]
+    assert entry_of("bam_envs:EmptyEnvironmentURSim-v0") is ENVIRONMENTS["bam/ur-empty-v0"]
+    assert entry_of("CartPole-v1") is None
+
+
+def test_the_closest_id():
+    with pytest.raises(ValueError, match=r"Did you mean 'EndEffectorPositioningURSim-v0'\?"):
+        resolve_id("EndEffectorPositionURSim-v0")
+
+
+def test_the_ids_cost_nothing():
+    """Importing bam_envs registers them; their modules are imported when one is made."""
+    code = """
+import sys, bam_envs
+print(sorted(name for name in sys.modules if name.startswith("bam_envs.")))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    modules = ["bam_envs.errors", "bam_envs.registry", "bam_envs.robo_gym", "bam_envs.robo_gym.table"]
+    assert done.stdout.strip() == str(modules)

@@ -1,0 +1,294 @@
+"""Reaching a pose as Isaac Lab's policies do."""
+
+import math
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.kinematics import UR10, quaternions
+from bam_envs.robots.robot import RobotState
+from bam_envs.robots.simulated.ur import isaac_arm
+from bam_envs.robots.ur import ur_model
+from bam_envs.tasks.isaac_reach import DEFAULT, TOOL1, IsaacReachTask
+from bam_envs.testing import TaskContract
+
+ROW = np.zeros(1, np.int64)
+H = math.sqrt(0.5)
+LIMITS = np.array([2 * math.pi, 2 * math.pi, math.pi, 2 * math.pi, 2 * math.pi, 2 * math.pi])
+QUIET = np.zeros((1, 6), np.float32)
+
+
+class IsaacReach(TaskContract):
+    options = {}  # noqa: RUF012
+
+    def make(self, num_rows):
+        return IsaacReachTask(num_rows, **self.options)
+
+    def make_robot(self, num_robots):
+        return isaac_arm(num_robots)
+
+    def check_pace(self, last, command):
+        assert (np.abs(command - last) <= 0.2 * ur_model("ur10").max_velocity / 30 * (1 + 1e-9)).all()
+
+
+class TestIsaacReach(IsaacReach):
+    pass
+
+
+class TestIsaacReachParity(IsaacReach):
+    options = {"parity": True, "rs_state_to_info": True}  # noqa: RUF012
+
+    def test_spaces_have_a_label_for_each_number(self):
+        """An action is in units of half a radian from the default pose, to the limits of the joints."""
+        task = self.make(1)
+        np.testing.assert_array_equal(task.action_space.high, ((LIMITS - DEFAULT) / 0.5).astype(np.float32))
+        np.testing.assert_array_equal(task.action_space.low, ((-LIMITS - DEFAULT) / 0.5).astype(np.float32))
+        inf = math.inf
+        high = [*(1.1 * LIMITS - DEFAULT), *[inf] * 9, *[1.0] * 4, *task.action_space.high]
+        low = [*(-1.1 * LIMITS - DEFAULT), *[-inf] * 9, *[-1.0] * 4, *task.action_space.low]
+        np.testing.assert_array_equal(task.observation_space.high, np.array(high, np.float32))
+        np.testing.assert_array_equal(task.observation_space.low, np.array(low, np.float32))
+        assert len({label.name for label in task.observation_labels}) == 25
+
+    def test_actions_beyond_the_space_are_cut(self):
+        """To where a joint has its limit."""
+        with self.running() as (task, _, where), self.running() as (other, _, same):
+            high = task.action_space.high[None]
+            np.testing.assert_array_equal(task.command(100 * high, where), other.command(high, same))
+
+
+def began(options=None, **arguments):
+    task = IsaacReachTask(**arguments)
+    task.initial = task.begin(ROW, [np.random.default_rng(0)], options or {})
+    return task
+
+
+def state(joints, velocity=(0.0,) * 6, collision=False):
+    signals = {"joint_position": np.array([joints], float), "joint_velocity": np.array([velocity], float)}
+    return RobotState(signals, np.zeros(1), np.zeros((1, 6)), {"collision": np.array([collision])})
+
+
+def pose_of(joints):
+    """Position of tool1, and its axes."""
+    position, rotation = UR10.flange_pose(np.array([joints]))
+    return position[0], rotation[0] @ TOOL1
+
+
+def facing(joints, forward=0.0, turned=0.0):
+    """A target that many metres before the flange at `joints`, turned about the flange's axis [rad]."""
+    position, axes = pose_of(joints)
+    sine, cosine = math.sin(turned), math.cos(turned)
+    rotation = axes @ np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
+    return [*(position + forward * axes[:, 0]), *quaternions(rotation[None])[0]]
+
+
+def test_tool1_points_out_of_the_flange():
+    _, rotation = UR10.flange_pose(np.array([DEFAULT]))
+    _, axes = pose_of(DEFAULT)
+    np.testing.assert_array_equal(axes[:, 0], rotation[0, :, 2])
+    np.testing.assert_allclose(np.linalg.det(TOOL1), 1.0)
+    down = UR10.reach_down(np.array([[0.5, 0.1, 0.3]]), np.zeros(1))[0]
+    np.testing.assert_allclose(pose_of(down)[1][:, 0], [0, 0, -1], atol=1e-12)
+
+
+def test_targets():
+    task = IsaacReachTask(200)
+    task.begin(np.arange(200), [np.random.default_rng(seed) for seed in range(200)])
+    for axis, low, high in ((0, 0.35, 0.65), (1, -0.2, 0.2), (2, 0.15, 0.5)):
+        values = task.target[:, axis]
+        assert low <= values.min() < low + 0.02
+        assert high - 0.02 < values.max() <= high
+    x, y, z, w = task.quaternion.T
+    np.testing.assert_allclose(2 * (x * z - w * y), -1.0, atol=1e-12)  # x points down
+    yaw = 2 * np.arctan2(z, w)
+    assert yaw.min() < -3
+    assert yaw.max() > 3
+
+
+def test_targets_that_are_given():
+    task = began({"ee_target_pose": [0.4, 0.1, 0.3, 0.0, math.pi / 2, math.pi / 2]})
+    assert task.target.tolist() == [[0.4, 0.1, 0.3]]
+    np.testing.assert_allclose(task.quaternion, [[-0.5, 0.5, 0.5, 0.5]], atol=1e-15)
+    task = began({"ee_target_pose": [0.4, 0.1, 0.3, 0.0, H, 0.0, H]})
+    np.testing.assert_allclose(task.quaternion, [[0.0, H, 0.0, H]], atol=1e-15)
+
+
+@pytest.mark.parametrize("parity", [False, True])
+def test_rewards(parity):
+    for forward, turned, reward, terminated, status in (
+        (0.1, 0.2, -0.0005 - 0.01, False, ""),
+        (0.0, 1.5, -0.075, False, ""),
+        (0.021, 0.0, -0.000105, False, ""),
+        (0.0199, 0.0499, 2.0, True, "success"),
+        (0.0199, 0.0501, -0.0000995 - 0.002505, False, ""),
+    ):
+        task = began({"ee_target_pose": facing(DEFAULT, forward, turned)}, parity=parity)
+        score = task.score(state(DEFAULT), QUIET)
+        assert score.reward[0] == pytest.approx(reward, abs=1e-9)
+        assert (bool(score.terminated[0]), score.info["final_status"][0]) == (terminated, status)
+        assert bool(score.success[0]) == terminated
+        np.testing.assert_allclose(score.info["dist_coord"], [forward], atol=1e-9)
+        np.testing.assert_allclose(score.info["dist_rot"], [turned], atol=1e-7)
+        np.testing.assert_array_equal(score.info["target_coord"], task.target)
+        np.testing.assert_array_equal(score.info["target_rot"], task.quaternion)
+
+
+@pytest.mark.parametrize("parity", [False, True])
+def test_a_collision_is_worse_than_an_arrival(parity):
+    task = began({"ee_target_pose": facing(DEFAULT)}, parity=parity)
+    score = task.score(state(DEFAULT, collision=True), QUIET)
+    assert (score.reward[0], score.terminated[0], score.success[0]) == (-1.0, True, False)
+    assert score.info["final_status"][0] == "collision"
+
+
+def test_the_time_limit():
+    for parity in (False, True):
+        task = began({"ee_target_pose": facing(DEFAULT, 0.1)}, parity=parity)
+        for _ in range(599):
+            assert task.score(state(DEFAULT), QUIET).info["final_status"][0] == ""
+        score = task.score(state(DEFAULT), QUIET)
+        assert (score.terminated[0], score.info["final_status"][0]) == (parity, "max_steps_exceeded")
+        assert not score.success[0]
+
+
+def test_an_arrival_in_the_last_step():
+    """robo-gym pays for it, and says that the time is over."""
+    for parity, status in ((False, "success"), (True, "max_steps_exceeded")):
+        task = began({"ee_target_pose": facing(DEFAULT)}, parity=parity)
+        task.steps[:] = 599
+        score = task.score(state(DEFAULT), QUIET)
+        assert (score.reward[0], score.terminated[0], score.success[0]) == (2.0, True, True)
+        assert score.info["final_status"][0] == status
+
+
+@pytest.mark.parametrize("parity", [False, True])
+def test_what_is_seen(parity):
+    task = began({"ee_target_pose": [0.4, 0.1, 0.3, 0.0, H, 0.0, H]}, parity=parity)
+    action = np.array([[0.1, -0.2, 0.3, 0.4, 0.5, -0.6]], np.float32)
+    task.command(action, state(DEFAULT))
+    joints = np.add(DEFAULT, [0.1, 0.2, -0.3, 0.0, 0.5, 0.6])
+    velocity = np.array([0.1, -0.1, 0.2, 0.0, 0.3, 0.4])
+    observation = task.observe(state(joints, velocity))[0]
+    place, speed = [0.4, 0.1, 0.3], velocity
+    if not parity:
+        place = [(0.4 - 0.5) / 0.15, 0.1 / 0.2, (0.3 - 0.325) / 0.175]
+        speed = velocity / (0.2 * ur_model("ur10").max_velocity)
+    off = (joints - DEFAULT) / (1 if parity else math.pi)
+    expected = [*off, *speed, *place, H, 0.0, H, 0.0, *action[0]]
+    np.testing.assert_allclose(observation, np.array(expected, np.float32), rtol=1e-6, atol=1e-7)
+    assert task.observation_space.contains(observation)
+
+
+def test_commands():
+    where = np.array(DEFAULT)
+    for options, span in (({}, math.pi), ({"parity": True}, 0.5), ({"parity": True, "isaac_scale": 0.25}, 0.25)):
+        task = began(**options)
+        action = np.array([[0.1, 0, 0, 0, 0, -0.05]], np.float32)
+        command = task.command(action / span, state(where))
+        np.testing.assert_allclose(command[0] - where, np.array([0.1, 0, 0, 0, 0, -0.05]) / 15, atol=1e-8)
+    command = began().command(np.array([[0, 0, 1, 0, 0, 0]], np.float32), state([0, -1.7, math.pi - 0.01, 0, 0, 0]))
+    assert command[0, 2] < math.pi  # the elbow's limit, and not pi from the default
+
+
+def test_it_goes_on_from_where_it_ended():
+    ended = np.array(DEFAULT) + 0.1
+    rng = np.random.default_rng(0)
+    for parity in (False, True):
+        for options, end, start in (
+            ({}, {}, ended),
+            ({}, {"collision": True}, DEFAULT),
+            ({"continue_except_collision": False}, {}, DEFAULT),
+        ):
+            task = IsaacReachTask(parity=parity, **options)
+            first = task.begin(ROW, [rng], {"ee_target_pose": facing(ended)}).signals["joint_position"]
+            np.testing.assert_array_equal(first[0], DEFAULT)
+            assert task.score(state(ended, **end), QUIET).terminated[0]
+            np.testing.assert_array_equal(task.begin(ROW, [rng]).signals["joint_position"][0], start)
+            np.testing.assert_array_equal(task.begin(ROW, [rng]).signals["joint_position"][0], DEFAULT)
+
+
+def test_it_does_not_go_on_from_an_episode_that_was_broken_off():
+    task, rng = IsaacReachTask(), np.random.default_rng(0)
+    task.begin(ROW, [rng], {"ee_target_pose": facing(DEFAULT, 0.1)})
+    task.score(state(np.array(DEFAULT) + 0.1), QUIET)
+    np.testing.assert_array_equal(task.begin(ROW, [rng]).signals["joint_position"][0], DEFAULT)
+
+
+def test_a_seed_and_an_option_say_where_it_starts(make):
+    env = make("bam/isaac-reach-v0")
+    joints = [0.1, -1.6, 1.6, 0.1, 0.2, 0.3]
+    starts = []
+    for seed in (3, None, 3):
+        observation, _ = env.reset(seed=seed, options={"ee_target_pose": facing(joints)} if seed else None)
+        starts.append(observation[:6])
+        env.unwrapped.task.score(state(joints), QUIET)  # it arrived
+    np.testing.assert_allclose(starts[1] * math.pi + DEFAULT, joints, atol=1e-6)
+    np.testing.assert_array_equal(starts[0], starts[2])
+    np.testing.assert_allclose(starts[0], 0)
+    observation, _ = env.reset(options={"joint_positions": joints})
+    np.testing.assert_allclose(observation[:6] * math.pi + DEFAULT, joints, atol=1e-6)
+
+
+def test_saved_memory_goes_on_from_where_it_ended():
+    task, rng = IsaacReachTask(), np.random.default_rng(0)
+    ended = np.array(DEFAULT) + 0.1
+    task.begin(ROW, [rng], {"ee_target_pose": facing(ended)})
+    task.score(state(ended), QUIET)
+    other = IsaacReachTask()
+    other.load_state_dict(task.state_dict())
+    np.testing.assert_array_equal(other.begin(ROW, [np.random.default_rng(1)]).signals["joint_position"][0], ended)
+
+
+def test_options():
+    for options, text in (
+        ({"ee_target_pose": [0.4, 0.1, 0.3]}, "The reset option ee_target_pose must be 6 finite numbers, not [0.4, "),
+        ({"ee_target_pose": [0, 0, 0, 0, 0, 0, 2]}, "The quaternion of ee_target_pose must have length 1, not 2."),
+        ({"joint_positions": "home"}, "The reset option joint_positions must be 6 finite numbers, not 'home'."),
+    ):
+        with pytest.raises(InvalidValue) as caught:
+            began(options)
+        assert str(caught.value).startswith(text)
+    with pytest.raises(InvalidValue) as caught:
+        IsaacReachTask(isaac_scale=0.0)
+    assert str(caught.value) == "isaac_scale must be a joint angle above 0 rad, not 0.0."
+    with pytest.raises(UnknownName, match="Did you mean 'ur10'"):
+        IsaacReachTask(ur_model="ur100")
+
+
+def test_wire_states():
+    task = began({"ee_target_pose": facing(DEFAULT)}, rs_state_to_info=True)
+    wire = pickle.loads(pickle.dumps(task.score(state(DEFAULT), QUIET).info["rs_state"][0]))
+    assert len(wire) == 27
+    assert {type(value) for value in wire.values()} == {float}
+    assert [wire[f"object_0_to_ref_translation_{axis}"] for axis in "xyz"] == task.target[0].tolist()
+    turned = np.array([wire[f"ee_to_ref_rotation_{axis}"] for axis in "xyzw"])
+    assert abs(turned @ task.quaternion[0]) == pytest.approx(1.0, abs=1e-12)  # tool1 is at the target
+
+
+def test_gymnasiums_checker():
+    check_env(gym.make("bam/isaac-reach-v0", disable_env_checker=True).unwrapped, skip_render_check=True)
+
+
+@pytest.mark.filterwarnings("ignore:.*Box (observation|action) space:UserWarning")  # Isaac's are in radians
+@pytest.mark.filterwarnings("ignore:.*action spaces? .* symmetric:UserWarning")
+def test_gymnasiums_checker_of_parity():
+    env = gym.make("bam/isaac-reach-v0", parity=True, disable_env_checker=True)
+    check_env(env.unwrapped, skip_render_check=True)
+
+
+def test_the_arm_gets_there(make):
+    """With the target's own joints as the action: within 600 steps of 1/30 s, at a fifth of its speed."""
+    joints = UR10.reach_down(np.array([[0.5, 0.0, 0.3]]), np.zeros(1))[0]
+    env = make("bam/isaac-reach-v0")
+    env.reset(seed=0, options={"ee_target_pose": facing(joints)})
+    action = ((joints - DEFAULT) / math.pi).astype(np.float32)
+    assert np.abs(action).max() < 1
+    for _ in range(600):
+        _, reward, terminated, truncated, info = env.step(action)
+        if terminated or truncated:
+            break
+    assert (reward, terminated, truncated, info["final_status"], info["is_success"]) == (2.0, True, False, "success", 1)

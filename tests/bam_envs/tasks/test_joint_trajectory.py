@@ -1,0 +1,88 @@
+"""Recorded joint trajectories."""
+
+import json
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bam_envs.errors import InvalidValue
+from bam_envs.robots.simulated.contacts import ArmContacts
+from bam_envs.robots.ur import UR_MODELS, ur_model
+from bam_envs.tasks.joint_trajectory import load_trajectory
+
+ROOT = Path(__file__).parents[3]
+LIMITS = ur_model("ur5").joint_limits
+
+
+def shipped():
+    trajectory = load_trajectory(None, LIMITS)
+    return [one[:length] for one, length in zip(trajectory.waypoints, trajectory.lengths, strict=True)]
+
+
+def test_the_shipped_one():
+    segments = shipped()
+    assert [len(one) for one in segments] == [162, 137, 213]
+    for one, following in zip(segments, segments[1:] + segments[:1], strict=True):
+        np.testing.assert_array_equal(one[-1], following[0])
+        speed = np.diff(one, axis=0) * 20
+        assert np.abs(speed).max() < 0.2 * np.pi  # what the arm's controller does at most
+        assert np.abs(np.diff(speed, axis=0) * 20).max() < 0.6
+        np.testing.assert_allclose(speed[[0, -1]], 0, atol=0.01)
+
+
+@pytest.mark.parametrize("name", UR_MODELS)
+def test_no_arm_touches_anything_on_it(name):
+    assert not ArmContacts(UR_MODELS[name]).touching(np.concatenate(shipped())).any()
+
+
+def test_the_script_makes_it():
+    script = runpy.run_path(str(ROOT / "scripts" / "make_ur_track.py"))
+    for one, made in zip(shipped(), script["trajectory"](), strict=True):
+        np.testing.assert_allclose(one, made, atol=1.01e-4)  # the last digit may be another on another machine
+
+
+def test_waypoints_and_waiting(tmp_path):
+    path = tmp_path / "two.json"
+    first, second = np.arange(18.0).reshape(3, 6) / 10, np.full((2, 6), -1.0)
+    path.write_text(json.dumps({"trajectory": [first.tolist(), second.tolist()], "comment": "x"}))
+    trajectory = load_trajectory(path, LIMITS)
+    np.testing.assert_array_equal(trajectory.lengths, [3, 2])
+    segment, step = np.array([0, 0, 0, 0, 1, 1, 1]), np.array([0, 2, 3, 99, 1, 2, 3])
+    waypoints, waits = trajectory.at(segment, step)
+    np.testing.assert_array_equal(waypoints, [first[0], *[first[2]] * 3, *[second[0]] * 3])
+    np.testing.assert_array_equal(waits, [False, False, True, True, False, True, True])
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        ("[", "The trajectory {path} is not JSON: Expecting value: line 1 column 2 (char 1)."),
+        ("[]", 'The trajectory {path} has no list of segments under the key "trajectory".'),
+        ('{"trajectory": []}', 'The trajectory {path} has no list of segments under the key "trajectory".'),
+        ('{"trajectory": [[]]}', "Segment 0 of the trajectory {path} must have shape (waypoints, 6), not (0,)."),
+        (
+            '{"trajectory": [[[0, 0, 0, 0, 0, 0]], [[1, 2], [3]]]}',
+            "Segment 1 of the trajectory {path} is not a list of waypoints of six numbers each.",
+        ),
+        ('{"trajectory": [[[0, 0, 0, 0, 0, NaN]]]}', "Segment 0 of the trajectory {path} must be finite numbers."),
+        (
+            '{"trajectory": [[[0, 0, 3, 0, 0, 0], [0, 0, 3.2, 0, 0, 0]]]}',
+            "Segment 0 of the trajectory has joint 2 at 3.2 rad in waypoint 1; expected -3.14159 to 3.14159.",
+        ),
+    ],
+)
+def test_files_that_are_none(tmp_path, content, text):
+    path = tmp_path / "bad.json"
+    path.write_text(content)
+    with pytest.raises(InvalidValue) as caught:
+        load_trajectory(path, LIMITS)
+    assert str(caught.value) == text.format(path=path)
+
+
+def test_no_file(tmp_path):
+    path = tmp_path / "none.json"
+    with pytest.raises(InvalidValue) as caught:
+        load_trajectory(path, LIMITS)
+    assert str(caught.value) == f"The trajectory {path} cannot be read: No such file or directory."

@@ -1,0 +1,208 @@
+"""Driving round boxes: ranges, collisions, rewards and samples, in numbers."""
+
+import copy
+import math
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import bam_envs  # noqa: F401 - registers the environments
+from bam_envs.errors import InvalidValue
+from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS
+from bam_envs.robots.robot import RobotState
+from bam_envs.tasks.mir100_avoidance import BEAMS, Mir100AvoidanceTask
+
+ENV = "bam/mir100-avoidance-v0"
+ROW = np.zeros(1, np.int64)
+STILL = np.zeros((1, 2), np.float32)
+
+
+def at(x, y, yaw=0.0, *, scan=None, touching=None):
+    """A state; without `touching` that of a live robot."""
+    scan = np.full(FRONT_RAYS + BACK_RAYS, 5.0) if scan is None else scan
+    signals = {
+        "base_pose": np.array([[x, y, yaw]]),
+        "base_velocity": np.zeros((1, 2)),
+        "f_scan": scan[None, :FRONT_RAYS],
+        "b_scan": scan[None, FRONT_RAYS:],
+    }
+    truth = {} if touching is None else {"collision": np.array([touching])}
+    return RobotState(signals, np.zeros(1), np.zeros((1, 2)), truth)
+
+
+def begun(start=(0.0, -2.5, 0.0), target=(0.0, 2.5, 0.0), **options):
+    task = Mir100AvoidanceTask(1, **options)
+    task.begin(ROW, [np.random.default_rng(0)], {"start_pose": start, "target_pose": target})
+    task.start(ROW, at(*start))
+    return task
+
+
+def near(ray, metres):
+    scan = np.full(FRONT_RAYS + BACK_RAYS, 5.0)
+    scan[ray] = metres
+    return scan
+
+
+def test_the_rays_of_robo_gym():
+    indices = [0, 67, 135, 202, 270, 337, 404, 472, 539, 607, 674, 741, 809, 876, 944, 1011]
+    assert BEAMS.tolist() == indices
+    task, scan = begun(parity=True), np.arange(FRONT_RAYS + BACK_RAYS) / 100.0
+    observation = task.observe(at(0.0, -2.5, scan=scan))
+    np.testing.assert_array_equal(observation[0, 4:], np.float32(np.array(indices) / 100.0))
+    np.testing.assert_array_equal(observation[0, :4], np.float32([5.0, math.pi / 2, 0.0, 0.0]))
+    space = task.observation_space
+    np.testing.assert_array_equal(space.low, np.float32([-np.inf, -math.pi, -1.1, -1.6] + [0.0] * 16))
+    np.testing.assert_array_equal(space.high, np.float32([np.inf, math.pi, 1.1, 1.6] + [29.0] * 16))
+
+
+def test_no_ray_escapes_a_sector():
+    task = begun()
+    front = [0, 62, 125, 187, 250, 313, 375, 438]
+    back = [0, 63, 127, 191, 255, 319, 383, 447]
+    edges = front + [FRONT_RAYS + edge for edge in back]
+    for ray in range(FRONT_RAYS + BACK_RAYS):
+        seen = task.observe(at(0.0, -2.5, scan=near(ray, 0.75)))[0, 4:]
+        assert seen.max() == np.float32(0.75)  # 1 - 0.75 / 3
+        assert (seen > 0).sum() == 1
+        assert seen.argmax() == np.searchsorted(edges, ray, side="right") - 1
+
+
+@pytest.mark.parametrize(("parity", "reward"), [(False, -2.0), (True, -200.0)])
+@pytest.mark.parametrize("ray", [0, 500, 501, 1011])
+def test_a_short_ray_is_a_collision(parity, reward, ray):
+    for metres, hit in ((0.1501, False), (0.1499, True)):
+        score = begun(parity=parity).score(at(0.0, -2.5, scan=near(ray, metres), touching=False), STILL)
+        assert score.terminated.item() == hit
+        assert score.info["final_status"].item() == ("collision" if hit else "")
+        assert (score.reward.item() == reward) == hit
+
+
+@pytest.mark.parametrize("parity", [False, True])
+def test_a_touch_is_a_collision(parity):
+    score = begun(parity=parity).score(at(0.0, -2.5, touching=True), STILL)
+    assert (score.terminated.item(), score.info["final_status"].item()) == (True, "collision")
+
+
+def test_corners_near_the_middle_of_a_box_in_parity():
+    """About the base's frame, though the footprint's middle is 3.76 cm ahead of it."""
+    for parity in (False, True):
+        for gap in (-1e-6, 1e-6):
+            task = begun(parity=parity)
+            task.obstacles[:] = 50.0
+            yaw, corner = 0.3, np.array([0.45, -0.29])
+            turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+            away = (0.4 + gap) * np.array([0.6, -0.8])
+            task.obstacles[0, 2, :2] = np.array([0.5, -2.0]) + turn @ (corner + away)
+            score = task.score(at(0.5, -2.0, yaw, touching=False), STILL)
+            assert score.terminated.item() == (parity and gap < 0)
+
+
+def test_a_live_robot_collides_by_its_rays_alone_and_in_parity_not_at_all():
+    for parity in (False, True):
+        task = begun(parity=parity)
+        task.obstacles[:] = [0.0, -2.5, 0.0]  # drawn, and not there
+        assert not task.score(at(0.0, -2.5), STILL).terminated.item()
+        assert task.score(at(0.0, -2.5, scan=near(3, 0.1)), STILL).terminated.item() == (not parity)
+
+
+def test_arriving_and_colliding_at_once():
+    arrived = at(0.0, 2.4, touching=True)
+    for parity, reward, status in ((False, -2.0, "collision"), (True, 100.0, "success")):
+        score = begun(parity=parity).score(arrived, STILL)
+        assert (score.reward.item(), score.info["final_status"].item()) == (reward, status)
+        assert score.success.item() == parity
+
+
+@pytest.mark.parametrize(("parity", "reward"), [(False, 2.0), (True, 100.0)])
+def test_success(parity, reward):
+    score = begun(parity=parity).score(at(0.1, 2.4, touching=False), STILL)
+    assert (score.reward.item(), score.terminated.item(), score.success.item()) == (reward, True, True)
+    assert score.info["final_status"].item() == "success"
+
+
+def test_samples():
+    rows, task = np.arange(2000), Mir100AvoidanceTask(2000)
+    signals = task.begin(rows, [np.random.default_rng(seed) for seed in rows]).signals
+    pose, boxes = signals["base_pose"], signals["obstacle_pose"]
+    np.testing.assert_array_equal(boxes, task.obstacles)
+    task.start(rows, RobotState({"base_pose": pose}, np.zeros(2000), np.zeros((2000, 2))))
+    assert 0.45 < (pose[:, 1] > 0).mean() < 0.55
+    assert (pose[:, 1] * task.target[:, 1] < 0).all()
+    columns = [
+        *((values, -2.0, 2.0) for values in (pose[:, 0], task.target[:, 0])),
+        *((np.abs(values), 2.1, 3.1) for values in (pose[:, 1], task.target[:, 1])),
+        *((boxes[:, box, 0], *span) for box, span in enumerate([(-2.4, -1.5), (-0.5, 0.5), (1.5, 2.4)])),
+        *((boxes[:, box, 1], -1.0, 1.0) for box in range(3)),
+        *((values, -math.pi, math.pi) for values in (pose[:, 2], boxes[:, 0, 2], boxes[:, 1, 2], boxes[:, 2, 2])),
+    ]
+    for values, low, high in columns:
+        assert low <= values.min() < low + 0.02
+        assert high - 0.02 < values.max() <= high
+
+
+@pytest.mark.parametrize(("y", "low", "high"), [(0.5, -3.1, -2.1), (0.0, 2.1, 3.1), (-0.5, 2.1, 3.1)])
+def test_the_target_is_across_from_where_a_live_base_stands(y, low, high):
+    task = Mir100AvoidanceTask()
+    for seed in range(20):
+        task.begin(ROW, [np.random.default_rng(seed)])
+        task.start(ROW, at(0.0, y))
+        assert low <= task.target[0, 1] <= high
+
+
+def test_driving_into_a_box_ends_the_episode(make):
+    for parity in (False, True):
+        env = make(ENV, parity=parity)
+        env.reset(seed=1, options={"start_pose": [0.0, -2.5, math.pi / 2], "target_pose": [0.0, 2.5, 0.0]})
+        for _ in range(100):
+            _, reward, terminated, _, info = env.step(np.float32([1.0, 0.0]))
+            if terminated:
+                break
+        assert info["final_status"] == "collision"
+        assert reward == (-200.0 if parity else -2.0)
+        assert env.unwrapped.state is None
+
+
+def test_a_start_in_a_wall(make):
+    with pytest.raises(InvalidValue, match=r"base_pose must be free .* at \[2.8, 0.0, 0.0\]"):
+        make(ENV).reset(options={"start_pose": [2.8, 0.0, 0.0]})
+
+
+@pytest.mark.parametrize("parity", [False, True])
+def test_the_state_of_robo_gyms_server(make, parity):
+    env = make(ENV, parity=parity, rs_state_to_info=True)
+    env.reset(seed=3)
+    sent = env.step(np.float32([0.2, 0.0]))[4]["rs_state"]
+    state = env.unwrapped.state
+    assert len(sent) == 1030
+    assert sent[8:509] == state.signals["f_scan"][0].tolist()
+    assert sent[509:1020] == state.signals["b_scan"][0].tolist()
+    assert sent[1020] == 0.0
+    assert sent[1021:] == ([0.0] * 9 if parity else env.unwrapped.task.obstacles.ravel().tolist())
+    assert pickle.loads(pickle.dumps(sent)) == copy.deepcopy(sent) == sent
+
+
+@pytest.mark.parametrize("parity", [False, True])
+@pytest.mark.filterwarnings("ignore:.*A Box observation space .* value is .*infinity.*")
+def test_gymnasiums_checker(parity):
+    check_env(gym.make(ENV, parity=parity, disable_env_checker=True).unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize("parity", [False, True])
+@pytest.mark.parametrize("randomize", [False, True])
+def test_rows_are_single_environments(make, make_rows, actions_of, parity, randomize):
+    envs, alone = make_rows(ENV, 3, parity=parity, randomize=randomize), make(ENV, parity=parity, randomize=randomize)
+    together, rewards = [envs.reset(seed=7)[0][2]], []
+    actions = [actions_of(row, 150, 2) for row in range(3)]
+    for step in range(150):
+        observation, reward, *_ = envs.step(np.stack([row[step] for row in actions]))
+        together.append(observation[2])
+        rewards.append(reward[2])
+    single = [alone.reset(seed=9)[0]]
+    for action, reward in zip(actions[2], rewards, strict=True):
+        observation, same, terminated, truncated, _ = alone.step(action)
+        assert same == reward
+        single.append(alone.reset()[0] if terminated or truncated else observation)
+    np.testing.assert_array_equal(together, single)

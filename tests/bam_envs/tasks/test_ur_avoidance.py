@@ -1,0 +1,289 @@
+"""Staying at a pose out of the way of an obstacle."""
+
+import math
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.robots.robot import RobotState
+from bam_envs.robots.simulated.ur import obstacle_arm
+from bam_envs.robots.ur import START, ur_model
+from bam_envs.tasks.ur_avoidance import POSE, UrAvoidanceTask
+from bam_envs.testing import TaskContract
+
+ROW = np.zeros(1, np.int64)
+UR5 = ur_model("ur5").geometry
+AWAY = np.array([0.0, 0.0, 1.9])
+QUIET = np.zeros((1, 5), np.float32)
+LIMITS = np.array([2 * math.pi, 2 * math.pi, math.pi, 2 * math.pi, 2 * math.pi, 2 * math.pi])
+
+
+class Avoidance(TaskContract):
+    options = {}  # noqa: RUF012
+
+    def make(self, num_rows):
+        return UrAvoidanceTask(num_rows, **self.options)
+
+    def make_robot(self, num_robots):
+        return obstacle_arm(num_robots, ur_model=self.options.get("ur_model", "ur5"))
+
+    def check_pace(self, last, command):
+        fastest = ur_model(self.options.get("ur_model", "ur5")).max_velocity
+        assert (np.abs(command - last) <= 0.2 * fastest / 20 * (1 + 1e-9)).all()
+
+
+class TestAvoidance(Avoidance):
+    pass
+
+
+class TestAvoidanceParity(Avoidance):
+    options = {"parity": True, "rs_state_to_info": True}  # noqa: RUF012
+
+
+class TestAvoidanceOfAnotherArm(Avoidance):
+    options = {"ur_model": "ur10e", "include_polar_to_elbow": True, "fix_base": True}  # noqa: RUF012
+
+
+class TestAvoidanceOfAStillObstacle(Avoidance):
+    options = {"fixed_object_position": (0.12, 0.34, 0.5)}  # noqa: RUF012
+
+
+def began(options=None, **arguments):
+    """A task at the start of an episode, and what it began with."""
+    task = UrAvoidanceTask(**arguments)
+    initial = task.begin(ROW, [np.random.default_rng(0)], options or {})
+    return task, initial
+
+
+def state(joints, obstacle=AWAY, collision=False):
+    """One arm at rest at `joints`."""
+    signals = {"joint_position": np.array([joints], float), "joint_velocity": np.zeros((1, 6))}
+    signals |= {"object_position": np.array([obstacle], float), "object_quaternion": np.array([[1.0, 0, 0, 0]])}
+    return RobotState(signals, np.zeros(1), np.zeros((1, 6)), {"collision": np.array([collision])})
+
+
+def scored(task, where, action=QUIET):
+    score = task.score(where, np.array(action, np.float32).reshape(1, -1))
+    return score.reward[0], bool(score.terminated[0]), score.info["final_status"][0]
+
+
+def test_where_it_starts():
+    assert began()[1].signals["joint_position"].tolist() == [list(POSE)]
+    assert began(parity=True)[1].signals["joint_position"].tolist() == [list(START)] == [[0, -2.5, 1.5, 0, -1.4, 0]]
+    joints = [0.1, -1.5, 1.0, 0.2, -1.0, 0.3]
+    task, initial = began({"joint_positions": joints, "fixed_object_position": [0.4, 0.3, 0.2]})
+    assert initial.signals["joint_position"].tolist() == [joints]
+    assert task.reference.tolist() == [joints]
+    assert initial.signals["obstacle_position"].tolist() == [[0.4, 0.3, 0.2]]
+    assert "obstacle_wave" not in initial.signals
+
+
+def test_how_the_obstacle_is_drawn():
+    task = UrAvoidanceTask(200)
+    initial = task.begin(np.arange(200), [np.random.default_rng(seed) for seed in range(200)])
+    amplitude, frequency = initial.signals["obstacle_wave"].T
+    middle = initial.signals["obstacle_position"]
+    assert (frequency == 0.125).all()
+    assert (middle[:, :2] == [0.12, 0.34]).all()
+    for values, low, high in ((amplitude, 0.09, 0.35), (middle[:, 2], 0.2, 0.6)):
+        assert low <= values.min() < low + 0.02
+        assert high - 0.02 < values.max() <= high
+
+
+def test_at_the_pose_without_an_action():
+    task, _ = began()
+    assert scored(task, state(POSE)) == (pytest.approx(0.002, abs=1e-15), False, "")
+
+
+def test_actions_cost_and_so_do_jumps():
+    task, _ = began()
+    assert scored(task, state(POSE), [1, 0.5, 0, 0, 0])[0] == pytest.approx(0.001 + (1 - 1.25 / 6 - 0.2) / 1000)
+    assert scored(task, state(POSE), [0.25, -0.25, 0, 0, 0])[0] == pytest.approx(0.001 + (1 - 0.125 / 6 - 0.4) / 1000)
+    assert scored(task, state(POSE), [0.25, -0.25, 0, 0, 0])[0] == pytest.approx(0.001 + (1 - 0.125 / 6) / 1000)
+
+
+@pytest.mark.parametrize("parity", [False, True])
+def test_offsets_in_shares_of_the_limits(parity):
+    task, initial = began(parity=parity)
+    start = initial.signals["joint_position"][0]
+    off = np.array([0.05, 0.0, -0.1, 0.0, 0.0, 0.04])
+    reward = (1 - 0.19 / 0.6 + 1) / 1000
+    assert scored(task, state(start + off * LIMITS))[0] == pytest.approx(reward, abs=1e-9)
+
+
+def test_which_offsets_robo_gym_looks_at():
+    """0.7 off in the first three joints: too far, but robo-gym's gate is the last three and the elbow's polars."""
+    off = np.array([0.3, 0.2, 0.2, 0.0, 0.0, 0.0]) * LIMITS
+    for options, staying in (
+        ({}, 0.0),
+        ({"parity": True}, 1 - 0.7 / 0.6),
+        ({"parity": True, "include_polar_to_elbow": True}, 0.0),
+    ):
+        task, initial = began(**options)
+        reward = scored(task, state(initial.signals["joint_position"][0] + off))[0]
+        assert reward == pytest.approx((staying + 1) / 1000, abs=1e-9)
+
+
+def test_robo_gym_gates_out_wrists_that_ours_does_not():
+    off = np.array([0.0, 0.0, 0.0, 0.3, 0.2, 0.05]) * LIMITS
+    task, _ = began(parity=True, include_polar_to_elbow=False)
+    assert scored(task, state(np.array(START) + off))[0] == pytest.approx((1 - 0.55 / 0.6 + 1) / 1000, abs=1e-9)
+    task, _ = began(parity=True, include_polar_to_elbow=True)
+    assert scored(task, state(START))[0] == pytest.approx(0.001, abs=1e-9)  # the obstacle is 1 m and more away
+    task, _ = began(include_polar_to_elbow=True)
+    assert scored(task, state(POSE))[0] == pytest.approx(0.002, abs=1e-12)
+
+
+def test_nearness_to_flange_and_elbow():
+    positions, _ = UR5.link_poses(np.array([POSE]))
+    for place in (positions[0, -1], positions[0, 2]):
+        for distance, reward in ((0.29, 0.0), (0.31, 0.002)):
+            task, _ = began()
+            assert scored(task, state(POSE, np.add(place, [0, 0, distance])))[0] == pytest.approx(reward, abs=1e-15)
+
+
+def test_collisions():
+    task, _ = began()
+    assert scored(task, state(POSE, collision=True)) == (-0.1, True, "collision")
+    task, _ = began(parity=True)
+    assert scored(task, state(START, collision=True)) == (pytest.approx(0.002), True, "collision")
+    task, _ = began()
+    live = state(POSE)
+    live.truth = {}
+    assert scored(task, live)[1:] == (False, "")
+
+
+@pytest.mark.parametrize("parity", [False, True])
+def test_the_last_step_is_a_success(parity):
+    task, initial = began(parity=parity)
+    where = state(initial.signals["joint_position"][0])
+    for _ in range(999):
+        score = task.score(where, QUIET)
+        assert not score.success[0]
+    score = task.score(where, QUIET)
+    assert (score.success[0], score.terminated[0], score.info["final_status"][0]) == (True, parity, "success")
+    hit = state(where.signals["joint_position"][0], collision=True)
+    score = task.score(hit, QUIET)
+    assert (score.success[0], score.terminated[0], score.info["final_status"][0]) == (False, True, "collision")
+
+
+def test_what_is_seen_with_parity():
+    """All joints zero: a UR5's flange is at (0.81725, 0.19145, -0.005491), its z axis along y; the elbow's along -y."""
+    task, _ = began({"joint_positions": [0.2, -0.1, 0.3, 0.4, 0.0, 0.0]}, parity=True, include_polar_to_elbow=True)
+    positions, rotations = UR5.link_poses(np.zeros((1, 6)))
+    np.testing.assert_allclose(positions[0, -1], [0.81725, 0.19145, -0.005491], atol=1e-9)
+    np.testing.assert_allclose(rotations[0, -1, :, 2], [0, 1, 0], atol=1e-12)
+    obstacle = positions[0, -1] + rotations[0, -1] @ [0.1, 0.2, 0.2]
+    elbow = rotations[0, 2].T @ (obstacle - positions[0, 2])
+    length = np.linalg.norm(elbow)
+    reference = np.array([0.2, -0.1, 0.3, 0.4, 0.0, 0.0]) / LIMITS
+    expected = [0.3, math.acos(2 / 3), math.atan2(0.2, 0.1), *[0.0] * 6, *-reference]
+    expected += [length, math.acos(elbow[2] / length), math.atan2(elbow[1], elbow[0])]
+    observation = task.observe(state(np.zeros(6), obstacle))
+    np.testing.assert_array_equal(observation, np.array([expected], np.float32))
+    space = task.observation_space
+    assert space.contains(observation[0])
+    inf = math.inf
+    np.testing.assert_array_equal(space.high, np.array([*[inf] * 3, *[1.1] * 12, *[inf] * 3], np.float32))
+    np.testing.assert_array_equal(space.low, -space.high)
+
+
+def test_what_is_seen_scaled():
+    task, _ = began({"joint_positions": [0.2, -0.1, 0.3, 0.4, 0.0, 0.0]})
+    positions, rotations = UR5.link_poses(np.zeros((1, 6)))
+    observation = task.observe(state(np.zeros(6), positions[0, -1] + rotations[0, -1] @ [0.1, 0.2, 0.2]))
+    expected = [0.15, math.acos(2 / 3) / math.pi, math.atan2(0.2, 0.1) / math.pi, *[0.0] * 6]
+    expected += [*-np.array([0.2, -0.1, 0.3, 0.4, 0.0, 0.0]) / LIMITS * 10, 0.0, 0.0, 0.0]
+    np.testing.assert_allclose(observation, [expected], rtol=1e-6)
+    assert task.observation_space.contains(observation[0])
+
+
+def test_commands_are_radians_beside_the_pose():
+    """Slowly: a tenth of the way a step within 0.314 rad, 0.0314 rad a step beyond."""
+    task, _ = began()
+    where = np.array(POSE)
+    command = task.command(np.array([[0.2, -0.1, 0.0, 0.0, 0.3]], np.float32), state(where))
+    np.testing.assert_allclose(command[0] - where, [0.02, -0.01, 0, 0, 0.03, 0], atol=1e-8)
+    command = task.command(np.array([[1.0, -0.5, 0.0, 0.0, 0.0]], np.float32), state(where))
+    np.testing.assert_allclose(command[0] - where, [math.pi / 100, -math.pi / 200, 0, 0, 0, 0], atol=1e-8)
+
+
+def test_fixed_joints_go_back_to_the_pose():
+    task, _ = began(fix_base=True, fix_elbow=True)
+    assert task.action_space.shape == (3,)
+    assert [label.name for label in task.action_labels] == ["shoulder_lift_joint", "wrist_1_joint", "wrist_2_joint"]
+    command = task.command(np.array([[0.1, 0.1, 0.1]], np.float32), state(np.array(POSE) + 0.1))
+    np.testing.assert_allclose(command[0] - np.array(POSE) - 0.1, [-0.01, 0, -0.01, 0, 0, -0.01], atol=1e-8)
+
+
+def test_options():
+    assert UrAvoidanceTask(fix_wrist_3=False).action_space.shape == (6,)
+    for options, text in (
+        ({"joint_positions": [0.0] * 5}, "The reset option joint_positions must be 6 finite numbers, not [0.0, "),
+        (
+            {"joint_positions": [0, 0, 4, 0, 0, 0]},
+            "The reset option joint_positions has elbow_joint at 4 rad, outside ",
+        ),
+        ({"fixed_object_position": [1, 2]}, "The reset option fixed_object_position must be 3 finite numbers, not "),
+    ):
+        with pytest.raises(InvalidValue) as caught:
+            began(options)
+        assert str(caught.value).startswith(text)
+    with pytest.raises(InvalidValue, match="At least one of the six joints must be free"):
+        UrAvoidanceTask(fix_base=True, fix_shoulder=True, fix_elbow=True, fix_wrist_1=True, fix_wrist_2=True)
+    with pytest.raises(UnknownName, match="Did you mean 'ur5'"):
+        UrAvoidanceTask(ur_model="urr5")
+    with pytest.raises(InvalidValue, match="fixed_object_position must be 3 finite numbers, not 'here'"):
+        UrAvoidanceTask(fixed_object_position="here")
+
+
+def test_wire_states():
+    task, _ = began(rs_state_to_info=True)
+    score = task.score(state(POSE, [0.1, 0.2, 0.3], collision=True), QUIET)
+    wire = pickle.loads(pickle.dumps(score.info["rs_state"][0]))
+    assert len(wire) == 34
+    assert {type(value) for value in wire.values()} == {float}
+    assert [wire[f"object_0_to_ref_translation_{axis}"] for axis in "xyz"] == [0.1, 0.2, 0.3]
+    assert wire["in_collision"] == 1.0
+    positions, _ = UR5.link_poses(np.array([POSE]))
+    for frame, place in (("ee", positions[0, -1]), ("forearm", positions[0, 2])):
+        assert [wire[f"{frame}_to_ref_translation_{axis}"] for axis in "xyz"] == place.tolist()
+
+
+def test_gymnasiums_checker():
+    check_env(gym.make("bam/ur-avoidance-v0", disable_env_checker=True).unwrapped, skip_render_check=True)
+
+
+@pytest.mark.filterwarnings("ignore:.*Box observation space:UserWarning")  # robo-gym's are without limits, or [0, 0]
+def test_gymnasiums_checker_of_parity():
+    env = gym.make("bam/ur-avoidance-v0", parity=True, disable_env_checker=True)
+    check_env(env.unwrapped, skip_render_check=True)
+
+
+def test_an_episode_in_the_environment(make):
+    env = make("bam/ur-avoidance-v0", parity=True)
+    env.reset(seed=0, options={"fixed_object_position": [1.0, 1.0, 1.0]})
+    steps = 0
+    while True:
+        *_, terminated, truncated, info = env.step(np.zeros(5, np.float32))
+        steps += 1
+        assert not truncated
+        if terminated:
+            break
+    assert (steps, info["final_status"], info["is_success"]) == (1000, "success", True)
+    np.testing.assert_array_equal(info["target_coord"], [1.0, 1.0, 1.0])
+    with pytest.raises(UnknownName, match="Did you mean 'joint_positions'"):
+        env.reset(options={"joint_position": [0.0] * 6})
+
+
+def test_the_default_is_truncated(make):
+    env = make("bam/ur-avoidance-v0", fixed_object_position=(1.0, 1.0, 1.0))
+    env.reset(seed=0)
+    for step in range(1000):
+        *_, terminated, truncated, info = env.step(np.zeros(5, np.float32))
+        assert (terminated, truncated) == (False, step == 999)
+    assert (info["final_status"], info["is_success"]) == ("success", True)

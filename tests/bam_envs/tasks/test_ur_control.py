@@ -1,0 +1,160 @@
+"""How targets become set points, and what reset options may be."""
+
+import numpy as np
+import pytest
+
+from bam_envs.errors import InvalidValue
+from bam_envs.robots.robot import RobotState
+from bam_envs.robots.ur import UR_MODELS
+from bam_envs.tasks.ur_control import (
+    FIX_OPTIONS,
+    UrControl,
+    collisions,
+    flag_option,
+    in_frame,
+    joint_option,
+    normalised,
+    number_option,
+    spherical,
+)
+
+UR5, UR10 = UR_MODELS["ur5"], UR_MODELS["ur10"]
+HERE = np.array([[0.0, -2.5, 1.5, 0.0, -1.4, 0.0]])
+
+
+def at(joints, sent=None, **truth):
+    joints = np.array(joints, dtype=float)
+    sent = joints if sent is None else np.array(sent, dtype=float)
+    return RobotState({"joint_position": joints}, np.zeros(len(joints)), sent, truth)
+
+
+def test_far_targets_are_gone_to_at_a_share_of_the_speed():
+    control = UrControl(UR5, 1, 10.0, 0.1)
+    command = control.command(HERE + np.array([[1.0, -0.5, 0.0, 0.25, 0.0, -1.0]]), at(HERE))
+    step = 0.1 * np.pi / 10
+    np.testing.assert_allclose(command - HERE, [[step, -step / 2, 0, step / 4, 0, -step]], atol=1e-15)
+
+
+def test_near_targets_are_gone_to_in_half_a_second():
+    control = UrControl(UR5, 1, 10.0, 0.1)
+    command = control.command(HERE + np.array([[0.15, 0, 0, 0, 0, 0.01]]), at(HERE))
+    np.testing.assert_allclose(command - HERE, [[0.03, 0, 0, 0, 0, 0.002]], atol=1e-15)
+    quick = UrControl(UR5, 1, 20.0, 0.2)
+    command = quick.command(HERE + np.array([[0.3, 0, 0, 0, 0, 0.01]]), at(HERE))
+    np.testing.assert_allclose(command - HERE, [[0.03, 0, 0, 0, 0, 0.001]], atol=1e-15)
+
+
+def test_the_slowest_joint_sets_the_pace():
+    """A UR10's base does 120 degrees/s, its wrists 180."""
+    control = UrControl(UR10, 1, 10.0, 0.1)
+    command = control.command(HERE + np.array([[1.0, 0, 0, 1.2, 0, 0]]), at(HERE))
+    step = 0.1 * (2 * np.pi / 3) / 10
+    np.testing.assert_allclose(command - HERE, [[step, 0, 0, 1.2 * step, 0, 0]], atol=1e-15)
+
+
+def test_set_points_go_on_from_the_last_one_unless_the_arm_is_elsewhere():
+    control = UrControl(UR5, 2, 10.0, 0.1)
+    here = np.tile(HERE, (2, 1))
+    sent = here + np.array([[0.1, 0, 0, 0, 0, 0], [0.1, 0, 0, 0, 0.21, 0]])
+    command = control.command(here + 1.0, at(here, sent))
+    begin = np.stack([sent[0], here[1]])
+    way = here + 1.0 - begin
+    duration = np.abs(way).max(axis=1, keepdims=True) / (0.1 * np.pi)
+    np.testing.assert_allclose(command, begin + way * 0.1 / duration, atol=1e-14)
+
+
+def test_commands_stay_inside_the_limits():
+    control = UrControl(UR5, 1, 10.0, 0.1)
+    end = np.array([[0.0, 0.0, np.pi - 0.01, 0.0, 0.0, 0.0]])
+    command = control.command(end + 2.0, at(end))
+    assert command[0, 2] == np.pi
+
+
+def test_fixed_joints_are_not_in_the_action():
+    control = UrControl(UR5, 2, 10.0, 0.1, (True, False, False, False, False, True))
+    assert control.free.tolist() == [1, 2, 3, 4]
+    assert control.fixed.tolist() == [0, 5]
+    action = np.array([[0.1, 0.2, -0.3, 7.0], [0, 0, 0, -7.0]], np.float32)
+    held = np.full((2, 6), 0.5)
+    expected = np.array([[0.5, 0.1, 0.2, -0.3, 1.0, 0.5], [0.5, 0, 0, 0, -1.0, 0.5]])
+    np.testing.assert_allclose(control.full(action, held), expected, atol=1e-7)
+    assert control.full(action)[:, [0, 5]].tolist() == [[0, 0], [0, 0]]
+    assert control.full(action).dtype == np.float64
+
+
+def test_not_all_joints_can_be_fixed():
+    with pytest.raises(InvalidValue) as caught:
+        UrControl(UR5, 1, 10.0, 0.1, (True,) * 6)
+    assert str(caught.value) == (
+        "At least one of the six joints must be free to move: set one of the fix_ options False."
+    )
+    assert list(FIX_OPTIONS.values()) == [False] * 5 + [True]
+
+
+def test_joints_as_shares_of_their_limits():
+    joints = np.array([[np.pi, -np.pi, np.pi / 2, 7.0, -7.0, 0.0]])
+    np.testing.assert_allclose(normalised(UR5, joints), [[0.5, -0.5, 0.5, 1.0, -1.0, 0.0]])
+
+
+def test_spherical_coordinates():
+    points = np.array([[0, 0, 2.0], [0, 0, -2.0], [3.0, 0, 0], [0, -1.0, 0], [1.0, 1.0, np.sqrt(2)], [0, 0, 0]])
+    half = np.pi / 2
+    expected = [[2, 0, 0], [2, np.pi, 0], [3, half, 0], [1, half, -half], [2, half / 2, half / 2], [0, 0, 0]]
+    np.testing.assert_allclose(spherical(points), expected, atol=1e-12)
+
+
+def test_a_point_as_a_frame_sees_it():
+    rng = np.random.default_rng(0)
+    position, rotation = UR5.geometry.flange_pose(rng.uniform(-3, 3, (5, 6)))
+    local = rng.standard_normal((5, 3))
+    point = position + np.einsum("nij,nj->ni", rotation, local)
+    np.testing.assert_allclose(in_frame(point, position, rotation), local, atol=1e-12)
+
+
+def test_collisions_are_what_a_simulation_knows():
+    assert collisions(at(HERE)).tolist() == [False]
+    assert collisions(at(HERE, collision=np.array([True]))).tolist() == [True]
+
+
+def test_options_that_are_not_given_are_the_defaults():
+    for options in ({}, {"joint_positions": None, "randomize_start": None}):
+        np.testing.assert_array_equal(joint_option(options, "joint_positions", HERE[0], UR5), HERE[0])
+        assert flag_option(options, "randomize_start") is False
+
+
+def test_options_that_are_given():
+    given = [0, -1, 1, 0, 0.5, 6]
+    for value in (given, tuple(given), np.array(given)):
+        np.testing.assert_array_equal(joint_option({"joint_positions": value}, "joint_positions", HERE[0], UR5), given)
+    assert flag_option({"randomize_start": np.bool_(True)}, "randomize_start") is True
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        ([0, 0, 0], "The reset option joint_positions must be 6 finite numbers, not [0, 0, 0]."),
+        (
+            [0, 0, 0, 0, 0, np.nan],
+            "The reset option joint_positions must be 6 finite numbers, not [0, 0, 0, 0, 0, nan].",
+        ),
+        ("home", "The reset option joint_positions must be 6 finite numbers, not 'home'."),
+        ([[1], [2, 3]], "The reset option joint_positions must be 6 finite numbers, not [[1], [2, 3]]."),
+        (
+            [0, 0, 3.5, 0, 0, 0],
+            "The reset option joint_positions has elbow_joint at 3.5 rad, outside -3.142 to 3.142 rad.",
+        ),
+    ],
+)
+def test_joint_options_that_do_not_fit(value, text):
+    with pytest.raises(InvalidValue) as caught:
+        joint_option({"joint_positions": value}, "joint_positions", HERE[0], UR5)
+    assert str(caught.value) == text
+
+
+def test_other_options_that_do_not_fit():
+    with pytest.raises(InvalidValue) as caught:
+        flag_option({"randomize_start": 1}, "randomize_start")
+    assert str(caught.value) == "The reset option randomize_start must be True or False, not 1."
+    with pytest.raises(InvalidValue) as caught:
+        number_option({"place": [1, 2]}, "place", (), 3)
+    assert str(caught.value) == "The reset option place must be 3 finite numbers, not [1, 2]."

@@ -1,0 +1,306 @@
+"""Bringing the flange of a UR arm to a point, in our numbers and in robo-gym's."""
+
+import numpy as np
+import pytest
+
+from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.robots.robot import RobotState
+from bam_envs.robots.ur import UR_MODELS
+from bam_envs.tasks.ur_reach import START, UrReachTask, workspace_point
+
+UR5 = UR_MODELS["ur5"]
+LIMITS = np.array([2 * np.pi, 2 * np.pi, np.pi, 2 * np.pi, 2 * np.pi, 2 * np.pi])
+FLANGE = UR5.geometry.tool_position(np.array([START]))[0]
+ONES = np.ones(5, np.float32)
+
+
+def above(offset):
+    """A place from the flange's, where episodes start [m]."""
+    return FLANGE + np.array(offset)
+
+
+def far_pose(distance=0.4):
+    return [*(above([0.0, 0.0, distance])), 0.0, 0.0, 0.0]
+
+
+def state_at(joints, collision=False):
+    joints = np.array([joints], dtype=float)
+    signals = {"joint_position": joints, "joint_velocity": np.zeros((1, 6))}
+    return RobotState(signals, np.zeros(1), joints, {"collision": np.array([collision])})
+
+
+def begun(parity=False, target=None, **options):
+    task = UrReachTask(parity=parity, **options)
+    task.begin(np.arange(1), [np.random.default_rng(0)])
+    task.target[0] = above([0, 0, 0.4]) if target is None else target
+    task.start(np.arange(1), state_at(START))
+    return task
+
+
+def wrist_1(action):
+    return (action + 1) * (0.31 + 3.48) / 2 - 3.48
+
+
+def test_the_observation_in_parity(make):
+    env = make("bam/ur-reach-v0", parity=True)
+    observation, _ = env.reset(options={"ee_target_pose": far_pose()})
+    position, axes = UR5.geometry.flange_pose(np.array([START]))
+    local = axes[0].T @ [0, 0, 0.4]
+    spherical = [0.4, np.arccos(local[2] / 0.4), np.arctan2(local[1], local[0])]
+    np.testing.assert_allclose(observation[:3], spherical, rtol=1e-5)
+    np.testing.assert_allclose(observation[3:9], START / LIMITS, rtol=1e-6)
+    np.testing.assert_array_equal(observation[9:15], np.zeros(6))
+    np.testing.assert_allclose(observation[15:18], far_pose()[:3], rtol=1e-6)
+    np.testing.assert_allclose(observation[18:21], position[0], rtol=1e-6)
+    np.testing.assert_array_equal(observation[21:], np.zeros(6))
+    high = [np.inf] * 3 + [np.float32(1.1)] * 6 + [np.inf] * 12 + [np.float32(1.01)] * 6
+    assert env.observation_space.high.tolist() == high
+    assert (env.observation_space.low == -env.observation_space.high).all()
+
+
+def test_the_action_in_the_observation_is_one_step_old_in_parity(make):
+    for parity, delay in ((True, 1), (False, 0)):
+        env = make("bam/ur-reach-v0", parity=parity)
+        env.reset(options={"ee_target_pose": far_pose()})
+        actions = [np.full(5, 0.1 * k, np.float32) for k in range(4)]
+        for k, action in enumerate(actions):
+            observation, *_ = env.step(action)
+            expected = actions[k - delay] if k >= delay else np.zeros(5)
+            np.testing.assert_array_equal(observation[21:26], expected)
+            assert observation[26] == 0.0  # of the fixed joint: where it started
+
+
+def test_the_observation_otherwise(make):
+    env = make("bam/ur-reach-v0")
+    env.reset(options={"ee_target_pose": far_pose()})
+    observation, *_ = env.step(np.array([1, 0, 0, 0, 0], np.float32))
+    joints = env.unwrapped.state.signals["joint_position"]
+    position, axes = UR5.geometry.flange_pose(joints)
+    np.testing.assert_allclose(observation[:3], axes[0].T @ (far_pose()[:3] - position[0]) / 0.75, rtol=1e-5)
+    np.testing.assert_allclose(observation[3:9], joints[0] / LIMITS, rtol=1e-6)
+    assert observation[9] == pytest.approx(1.0)
+    np.testing.assert_allclose(observation[15:18], np.array(far_pose()[:3]) / 0.75, rtol=1e-6)
+    np.testing.assert_allclose(observation[18:21], position[0] / 0.75, rtol=1e-6)
+
+
+def test_actions_are_places_of_joints():
+    task = begun()
+    command = task.command(np.array([[1, 0, 0, 0, 0]], np.float32), state_at(START))
+    way = np.array([1, 0, 0, wrist_1(0) / (2 * np.pi), 0, 0]) * LIMITS - START
+    way[5] = 0.0
+    np.testing.assert_allclose(command[0], START + way * 0.1 * 0.1 * np.pi / np.abs(way).max(), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("action", "joint"), [(-1.0, -3.48), (1.0, 0.31), (0.0, -1.585)])
+def test_wrist_1_is_restricted(action, joint):
+    start = [0.0, -2.5, 1.5, joint + 0.1, -1.4, 0.0]
+    full = np.array([0.0, -2.5, 1.5, 0.0, -1.4]) / LIMITS[:5]
+    full[3] = action
+    command = begun().command(full[None].astype(np.float32), state_at(start))
+    assert command[0, 3] == pytest.approx(joint + 0.08, abs=1e-6)
+    free = begun(restrict_wrist_1=False).command(full[None].astype(np.float32), state_at(start))
+    way = action * 2 * np.pi - start[3]
+    assert free[0, 3] - start[3] == pytest.approx(np.sign(way) * min(abs(way) / 5, 0.01 * np.pi), abs=1e-6)
+
+
+def test_a_fixed_wrist_1_stays_and_in_parity_moves_as_robo_gym_moves_it():
+    action = (np.array([0.0, -2.5, 1.5, -1.4]) / LIMITS[[0, 1, 2, 4]])[None].astype(np.float32)
+    stays = begun(fix_wrist_1=True).command(action, state_at(START))
+    np.testing.assert_allclose(stays[0], START, atol=1e-6)
+    moves = begun(parity=True, fix_wrist_1=True).command(action, state_at(START))
+    goal = wrist_1(-1.5 / (2 * np.pi))
+    assert moves[0, 3] == pytest.approx(-1.5 + np.sign(goal + 1.5) * min(abs(goal + 1.5) / 5, 0.01 * np.pi), abs=1e-6)
+
+
+def test_the_reward():
+    task = begun(target=above([0.0, 0.3, 0.4]))
+    score = task.score(state_at(START), ONES[None])
+    assert score.reward[0] == pytest.approx(-0.005 * 0.5, abs=1e-15)
+    assert (score.terminated[0], score.success[0], score.info["final_status"][0]) == (False, False, "")
+    assert score.info["distance"][0] == pytest.approx(0.5)
+    np.testing.assert_array_equal(score.info["target_coord"], task.target)
+
+
+@pytest.mark.parametrize("parity", [False, True])
+def test_success_replaces_the_reward(parity):
+    task = begun(parity=parity, target=above([0.0999999, 0.0, 0.0]))
+    score = task.score(state_at(START), ONES[None])
+    assert (score.reward[0], score.terminated[0], score.success[0]) == (2.0, True, True)
+    assert score.info["final_status"][0] == "success"
+    task.target[0] = above([0.1000001, 0.0, 0.0])
+    assert not task.score(state_at(START), ONES[None]).success[0]
+
+
+@pytest.mark.parametrize("parity", [False, True])
+def test_a_collision_replaces_even_success(parity):
+    task = begun(parity=parity, target=FLANGE)
+    score = task.score(state_at(START, collision=True), ONES[None])
+    assert (score.reward[0], score.terminated[0], score.success[0]) == (-1.0, True, False)
+    assert score.info["final_status"][0] == "collision"
+
+
+def test_a_live_arm_never_collides():
+    task, state = begun(target=FLANGE), state_at(START)
+    state.truth.clear()
+    assert task.score(state, ONES[None]).success[0]
+
+
+def test_the_time_limit(make):
+    for parity in (True, False):
+        env = make("bam/ur-reach-v0", parity=parity)
+        env.reset(options={"ee_target_pose": far_pose()})
+        still = np.array([0.0, -2.5, 1.5, 0.0, -1.4]) / LIMITS[:5]
+        still[3] = (-1.5 + 3.48) / 3.79 * 2 - 1
+        for step in range(300):
+            _, reward, terminated, truncated, info = env.step(still.astype(np.float32))
+            assert (terminated or truncated) == (step == 299)
+        assert reward == pytest.approx(-0.002, abs=1e-6)
+        assert (terminated, truncated) == (parity, not parity)
+        assert info.get("final_status") == ("max_steps_exceeded" if parity else None)
+        assert info["is_success"] is False
+
+
+def test_a_success_in_the_last_step_is_told_as_robo_gym_tells_it():
+    task = begun(parity=True, target=FLANGE)
+    task.elapsed[:] = 300
+    score = task.score(state_at(START), ONES[None])
+    assert (score.reward[0], score.terminated[0], score.success[0]) == (2.0, True, True)
+    assert score.info["final_status"][0] == "max_steps_exceeded"
+
+
+def test_the_threshold_can_be_another():
+    assert begun(target=above([0, 0, 0.29]), ee_distance_threshold=0.3).score(state_at(START), ONES[None]).success[0]
+    with pytest.raises(InvalidValue) as caught:
+        UrReachTask(ee_distance_threshold=0)
+    assert str(caught.value) == "ee_distance_threshold must be above 0 m, not 0."
+
+
+@pytest.mark.parametrize("name", UR_MODELS)
+def test_targets_are_all_over_the_workspace(name):
+    model, rng = UR_MODELS[name], np.random.default_rng(0)
+    points = np.array([workspace_point(model, rng) for _ in range(4000)])
+    radius, across = np.linalg.norm(points, axis=1), np.hypot(points[:, 0], points[:, 1])
+    assert radius.max() <= model.workspace_radius
+    assert across.min() > model.workspace_inner
+    assert points[:, 2].min() >= 0
+    full = np.pi * (model.workspace_radius**2 - model.workspace_inner**2) ** 1.5 * 2 / 3
+    half = model.workspace_radius / 2  # what of the volume is above this height
+    low = np.pi * (half * (model.workspace_radius**2 - model.workspace_inner**2) - half**3 / 3)
+    high = 1 - low / full if half < np.sqrt(model.workspace_radius**2 - model.workspace_inner**2) else 0
+    assert (points[:, 2] > half).mean() == pytest.approx(high, abs=0.03)
+    assert abs(np.arctan2(points[:, 1], points[:, 0]).mean()) < 0.1
+
+
+@pytest.mark.parametrize("parity", [False, True])
+def test_seeds_decide(make, parity):
+    env = make("bam/ur-reach-v0", parity=parity)
+    first, _ = env.reset(seed=3)
+    second, _ = env.reset(seed=3)
+    third, _ = env.reset()
+    np.testing.assert_array_equal(first, second)
+    assert (third != first).any()
+
+
+def test_random_starts(make):
+    env = make("bam/ur-reach-v0")
+    starts = []
+    for seed in range(50):
+        env.reset(seed=seed, options={"randomize_start": True})
+        starts.append(env.unwrapped.state.signals["joint_position"][0])
+    offsets = np.abs(np.array(starts) - START)
+    assert (offsets <= [1.5, 0.25, 0.5, 1.0, 0.4, 3.14]).all()
+    assert (offsets.max(axis=0) >= 0.8 * np.array([1.5, 0.25, 0.5, 1.0, 0.4, 3.14])).all()
+    env.reset(seed=0)
+    np.testing.assert_array_equal(env.unwrapped.state.signals["joint_position"], [START])
+    given = [0.5, -2.0, 1.0, -1.0, -1.4, 0.0]
+    env.reset(seed=0, options={"randomize_start": True, "joint_positions": given})
+    assert (np.abs(env.unwrapped.state.signals["joint_position"][0] - given) <= [1.5, 0.25, 0.5, 1.0, 0.4, 3.14]).all()
+
+
+@pytest.mark.parametrize(("parity", "after_a_failure"), [(False, False), (True, True)])
+def test_going_on_after_a_success(make, parity, after_a_failure):
+    """robo-gym goes on from the last success, whatever came after it; ours only from the last episode."""
+    env = make("bam/ur-reach-v0", parity=parity)
+    going_on = {"continue_on_success": True, "ee_target_pose": [*FLANGE, 0, 0, 0]}
+    env.reset(options=going_on)
+    np.testing.assert_array_equal(env.unwrapped.state.signals["joint_position"], [START])
+    assert env.step(ONES)[2]
+    end = env.unwrapped.last_state.signals["joint_position"].copy()
+    assert (end != START).any()
+    env.reset(options=going_on | {"ee_target_pose": far_pose()})
+    np.testing.assert_array_equal(env.unwrapped.state.signals["joint_position"], end)
+    env.step(ONES)
+    env.reset(options=going_on)
+    expected = end if after_a_failure else [START]
+    np.testing.assert_array_equal(env.unwrapped.state.signals["joint_position"], expected)
+
+
+def test_options_that_do_not_fit(make):
+    env = make("bam/ur-reach-v0")
+    for options, text in (
+        ({"ee_target_pose": [1, 2, 3]}, "The reset option ee_target_pose must be 6 finite numbers, not [1, 2, 3]."),
+        (
+            {"ee_target_pose": [0, 0, 2.089159, 0, 0, 0]},
+            "The reset option ee_target_pose is 2 m from the shoulder of a ur5, which reaches 1.08 m.",
+        ),
+        ({"continue_on_success": "yes"}, "The reset option continue_on_success must be True or False, not 'yes'."),
+    ):
+        with pytest.raises(InvalidValue) as caught:
+            env.reset(options=options)
+        assert str(caught.value) == text
+    with pytest.raises(UnknownName) as caught:
+        env.reset(options={"ee_target": far_pose()})
+    assert str(caught.value) == "Unknown reset option 'ee_target'. Did you mean 'ee_target_pose'?"
+    with pytest.raises(UnknownName):
+        make("bam/ur-reach-v0", ur_model="panda")
+
+
+def test_robo_gyms_state_in_the_info(make):
+    env = make("bam/ur-reach-v0", rs_state_to_info=True)
+    env.reset(options={"ee_target_pose": far_pose()})
+    info = env.step(ONES)[4]
+    assert len(info["rs_state"]) == 27
+    assert [info["rs_state"][f"object_0_to_ref_translation_{axis}"] for axis in "xyz"] == far_pose()[:3]
+    np.testing.assert_array_equal(info["target_coord"], far_pose()[:3])
+    assert env.unwrapped.task.marks()[0][0].tolist() == far_pose()[:3]
+
+
+def test_rows_are_single_environments(make, make_rows, actions_of):
+    envs = make_rows("bam/ur-reach-v0", 3, parity=True, ur_model="ur10e")
+    observations, _ = envs.reset(seed=5)
+    actions = np.stack([actions_of(row, 60, 5) for row in range(3)], axis=1)
+    for row in range(3):
+        env = make("bam/ur-reach-v0", parity=True, ur_model="ur10e")
+        np.testing.assert_array_equal(env.reset(seed=5 + row)[0], observations[row])
+    singles = [make("bam/ur-reach-v0", parity=True, ur_model="ur10e") for _ in range(3)]
+    for row, env in enumerate(singles):
+        env.reset(seed=5 + row)
+    for action in actions:
+        observations, rewards, terminated, *_ = envs.step(action)
+        for row, env in enumerate(singles):
+            observation, reward, ended, *_ = env.step(action[row])
+            assert (reward, ended) == (rewards[row], terminated[row])
+            if ended:
+                return
+            np.testing.assert_array_equal(observation, observations[row])
+
+
+@pytest.mark.parametrize("name", UR_MODELS)
+def test_the_joints_of_a_place_bring_the_flange_there(make_rows, name):
+    """Twenty places: an action that never changes is a success, with every model."""
+    model, rng = UR_MODELS[name], np.random.default_rng(1)
+    goals = START + rng.uniform(-0.8, 0.8, (20, 6)) * [1.5, 0.25, 0.5, 1.0, 0.4, 0.0]
+    envs = make_rows("bam/ur-reach-v0", 20, ur_model=name)
+    envs.reset(seed=0)
+    envs.unwrapped.task.target[:] = model.geometry.tool_position(goals)
+    actions = (goals / LIMITS)[:, :5].astype(np.float32)
+    actions[:, 3] = (goals[:, 3] + 3.48) / 3.79 * 2 - 1
+    succeeded = np.zeros(20, dtype=bool)
+    for _ in range(120):
+        _, rewards, terminated, _, infos = envs.step(actions)
+        won = terminated & ~succeeded
+        if won.any():
+            assert (rewards[won] == 2.0).all()
+            assert set(infos["final_info"]["final_status"][won]) == {"success"}
+        succeeded |= terminated
+    assert succeeded.all()

@@ -1,0 +1,177 @@
+"""Two nodes on one computer, a runner on each: a runner is killed in mid-training, then a whole node."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import time
+
+import pytest
+
+pytest.importorskip("ray.rllib")
+
+import ray
+from ray.cluster_utils import Cluster
+
+from bam_train.checkpoint import Checkpoint
+from bam_train.errors import ProcessesLost
+from bam_train.trainers.resolve import resolve
+from bam_train.trainers.rllib.cluster import loopback_only
+from bam_train.trainers.rllib.trainer import RLlibTrainer
+
+pytestmark = pytest.mark.slow
+
+BATCH = 512
+PATIENCE = 240.0
+"""Seconds in which a busy computer must have started a runner again."""
+
+
+@pytest.fixture
+def nodes(monkeypatch):
+    """A cluster of two nodes with one CPU each, and its second node."""
+    for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS"):
+        monkeypatch.delenv(name, raising=False)
+    memory = {"num_cpus": 1, "object_store_memory": 100 * 2**20}
+    with loopback_only():
+        cluster = Cluster(initialize_head=True, head_node_args={**memory, "include_dashboard": False})
+        try:
+            yield cluster, cluster.add_node(**memory)
+        finally:
+            cluster.shutdown()
+
+
+def train_settings(address, **given):
+    return resolve(
+        {
+            "env": "bam/reach",
+            "algo": "ppo",
+            "trainer": "rllib",
+            "steps": 10**9,
+            "num_envs": 8,
+            "num_env_runners": 2,
+            "address": address,
+            "hyperparameters": {"train_batch_size_per_learner": BATCH, "minibatch_size": 128, "num_epochs": 1},
+            **given,
+        }
+    )
+
+
+def runners(trainer):
+    """Index of each healthy runner to its node's id and its process."""
+    return {
+        index: (node, process)
+        for index, node, process in trainer.algorithm.env_runner_group.foreach_env_runner(
+            lambda runner: (runner.worker_index, ray.get_runtime_context().get_node_id(), os.getpid()),
+            local_env_runner=False,
+        )
+    }
+
+
+class Plan:
+    """What happens between updates: `steps` grows by a whole batch with each, whatever happens."""
+
+    def __init__(self, trainer, stages):
+        self.trainer, self.stages, self.steps, self.since = trainer, list(stages), [], time.monotonic()
+
+    def __call__(self, progress):
+        self.steps.append(progress.steps)
+        if time.monotonic() - self.since > PATIENCE:
+            pytest.fail(f"nothing came of {self.stages[0].__name__}; {self.trainer.notices}")
+        if self.stages[0]():
+            self.stages.pop(0)
+            self.since = time.monotonic()
+        return bool(self.stages)
+
+
+def test_a_runner_and_a_node_die_in_mid_training(nodes, tmp_path):
+    cluster, second = nodes
+    with contextlib.closing(RLlibTrainer.create(train_settings(cluster.address))) as trainer:
+        places = {}
+
+        def after(notice):
+            def seen():
+                return notice in trainer.notices
+
+            return seen
+
+        def kill_a_runner():
+            places.update(runners(trainer))
+            assert {node for node, _ in places.values()} == {cluster.head_node.node_id, second.node_id}
+            os.kill(next(pid for node, pid in places.values() if node != second.node_id), signal.SIGKILL)
+            return True
+
+        def kill_a_node():
+            now = runners(trainer)
+            assert len(now) == 2
+            assert now != places
+            cluster.remove_node(second, allow_graceful=False)
+            return True
+
+        def ten_more_updates():
+            plan.later = getattr(plan, "later", 0) + 1
+            return plan.later == 10
+
+        killed, second_index = None, None
+        plan = Plan(trainer, [kill_a_runner])
+        trainer.train(10**9, plan)
+        killed, second_index = sorted(places, key=lambda index: places[index][0] == second.node_id)
+        plan.stages = [
+            after(f"env runner {killed} is back"),
+            kill_a_node,
+            after(f"env runner {second_index} died: what it had not delivered yet is lost"),
+            ten_more_updates,
+        ]
+        trainer.train(10**9, plan)
+
+        assert list(dict.fromkeys(plan.steps)) == [BATCH * (k + 1) for k in range(len(set(plan.steps)))]
+        assert trainer.steps == plan.steps[-1]
+        assert trainer.notices == [
+            f"env runner {killed} died: what it had not delivered yet is lost",
+            "training goes on with 1 of 2 env runners",
+            f"env runner {killed} is back",
+            f"env runner {second_index} died: what it had not delivered yet is lost",
+            "training goes on with 1 of 2 env runners",
+        ]
+        learnt = trainer._result["learners"]["default_policy"]["num_module_steps_trained_lifetime"]
+        assert learnt >= trainer.steps
+        saved = trainer.save(tmp_path / "one.zip", {}, {})
+        assert Checkpoint.open(saved.path).manifest.steps == trainer.steps
+
+
+BROKEN = """
+import gymnasium as gym
+import numpy as np
+
+class Broken(gym.Env):
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+    steps = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps > 600:
+            raise ConnectionError("the simulator is gone")
+        return np.zeros(2, np.float32), 0.0, self.steps % 20 == 0, False, {}
+
+gym.register("test/Broken-v0", entry_point=Broken)
+"""
+
+
+def test_a_runner_that_dies_again_and_again(tmp_path, monkeypatch):
+    (tmp_path / "broken.py").write_text(BROKEN)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setattr("bam_train.trainers.rllib.fault_tolerance.MOST_DEATHS", 1)
+    settings = train_settings(None, env="broken:test/Broken-v0", num_envs=1, num_env_runners=1)
+    with contextlib.closing(RLlibTrainer.create(settings)) as trainer:
+        with pytest.raises(ProcessesLost) as caught:
+            trainer.train(10**9, Plan(trainer, [lambda: False]))
+        assert str(caught.value).startswith("env runner 1 died 2 times within ")
+        assert str(caught.value).endswith(" updates (ConnectionError: the simulator is gone)")
+        assert trainer.steps >= BATCH
+        assert Checkpoint.open(trainer.save(tmp_path / "one.zip", {}, {}).path).manifest.steps == trainer.steps

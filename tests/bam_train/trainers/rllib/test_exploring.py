@@ -1,0 +1,76 @@
+"""A policy that draws its actions: about the best ones, inside the action space, the same for a seed."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from ray.rllib.algorithms.ppo import PPOConfig
+
+from bam_envs.spaces import space_to_json
+from bam_train.errors import SettingsError
+from bam_train.policy import FrozenPolicy
+from bam_train.trainers.rllib.exploring import ExploringPolicy
+from bam_train.trainers.rllib.freeze import freeze
+from bam_train.trainers.rllib.parts import parts_of
+
+OBSERVED = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
+ACTED = gym.spaces.Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 4.0], np.float32))
+SEEN = np.array([0.1, -0.5, 0.3], np.float32)
+
+
+@pytest.fixture(scope="module")
+def config():
+    made = PPOConfig().environment(observation_space=OBSERVED, action_space=ACTED)
+    return made.rl_module(model_config={"fcnet_hiddens": [8]})
+
+
+@pytest.fixture(scope="module")
+def module(config):
+    return config.get_rl_module_spec(spaces={"default_policy": (OBSERVED, ACTED)}).build()
+
+
+@pytest.fixture(scope="module")
+def parts(module, config):
+    return parts_of(module, None, config, (OBSERVED, ACTED))
+
+
+def drawn(policy, count):
+    return np.array([policy.act(SEEN) for _ in range(count)])
+
+
+def test_actions_are_drawn_about_the_best_one_and_stay_inside(parts, module, config):
+    policy = ExploringPolicy(parts, module, None, config)
+    policy.reset()
+    actions = drawn(policy, 300)
+    assert actions.dtype == np.float32
+    assert ((ACTED.low <= actions) & (actions <= ACTED.high)).all()
+    assert (actions.std(axis=0) > 0.5).all()
+    frozen = FrozenPolicy.from_graph(freeze(parts), space_to_json(OBSERVED), space_to_json(ACTED))
+    np.testing.assert_allclose(actions.mean(axis=0), frozen.act(SEEN), atol=0.4)
+
+
+def test_a_seed_gives_the_same_actions(parts, module, config):
+    policy = ExploringPolicy(parts, module, None, config)
+    torch.manual_seed(3)
+    first = drawn(policy, 4)
+    torch.manual_seed(3)
+    np.testing.assert_array_equal(drawn(policy, 4), first)
+
+
+def test_the_trainer_may_go_on(parts, module, config):
+    policy = ExploringPolicy(parts, module, None, config)
+    before = {name: value.clone() for name, value in module.state_dict().items()}
+    torch.manual_seed(0)
+    first = policy.act(SEEN)
+    with torch.no_grad():
+        for value in module.parameters():
+            value.add_(1.0)
+    torch.manual_seed(0)
+    np.testing.assert_array_equal(policy.act(SEEN), first)
+    module.load_state_dict(before)
+
+
+def test_a_recurrent_policy_is_refused(parts, module, config, monkeypatch):
+    monkeypatch.setattr(module, "is_stateful", lambda: True)
+    with pytest.raises(SettingsError, match="a recurrent policy cannot explore here"):
+        ExploringPolicy(parts, module, None, config)

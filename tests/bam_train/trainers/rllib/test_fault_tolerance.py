@@ -1,0 +1,174 @@
+"""Deaths of runners, as an algorithm would show them; Ray is not started."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip("ray.rllib")
+
+from ray.exceptions import RayError
+from ray.rllib.algorithms.ppo import PPOConfig
+
+from bam_train.errors import ProcessesLost, TrainingFailed
+from bam_train.trainers.rllib import faults
+from bam_train.trainers.rllib.fault_tolerance import RunnerWatch, fault_tolerance
+
+
+class Algorithm:
+    """Its `iterations` are lists of steps: who dies before each, and who comes back; `last` die in the very last."""
+
+    def __init__(self, iterations, runners=2, last=()):
+        self.iterations, self.last, self.healthy = list(iterations), last, set(range(1, runners + 1))
+        self.env_runner_group = SimpleNamespace(
+            num_remote_env_runners=lambda: runners, healthy_env_runner_ids=lambda: sorted(self.healthy)
+        )
+
+    def restore_env_runners(self, group):
+        self.healthy |= set(self.back)
+        return self.back
+
+    def train(self):
+        for died, back in self.iterations.pop(0):
+            self.back = back
+            self.healthy -= set(died)
+            assert self.restore_env_runners(self.env_runner_group) == self.back
+        if not self.iterations:
+            self.healthy -= set(self.last)
+        return {"iterations left": len(self.iterations)}
+
+
+QUIET = [((), [])]
+
+
+@pytest.fixture(autouse=True)
+def causes(monkeypatch):
+    """What runners said before they died."""
+    said = {}
+    monkeypatch.setattr(faults, "take", lambda index: said.pop(index, None))
+    return said
+
+
+def test_nothing_happens():
+    watch = RunnerWatch(Algorithm([QUIET] * 30))
+    assert watch.train() == ({"iterations left": 29}, [])
+    assert [watch.train()[1] for _ in range(29)] == [[]] * 29
+
+
+def test_without_runners():
+    algorithm = Algorithm([[]], runners=0)
+    assert RunnerWatch(algorithm).train() == ({"iterations left": 0}, [])
+    assert "restore_env_runners" not in vars(algorithm)
+
+
+def test_runners_of_others_are_left_alone():
+    algorithm = Algorithm([QUIET])
+    RunnerWatch(algorithm)
+    algorithm.back, algorithm.healthy = [7], set()
+    assert algorithm.restore_env_runners(SimpleNamespace()) == [7]
+
+
+def test_one_dies_and_comes_back(causes):
+    causes[2] = "ConnectionError: the simulator is gone"
+    watch = RunnerWatch(Algorithm([[([2], [])], QUIET, [((), [2])], QUIET]))
+    assert [watch.train()[1] for _ in range(4)] == [
+        [
+            "env runner 2 died (ConnectionError: the simulator is gone): what it had not delivered yet is lost",
+            "training goes on with 1 of 2 env runners",
+        ],
+        [],
+        ["env runner 2 is back"],
+        [],
+    ]
+
+
+def test_within_one_update_and_in_the_last():
+    watch = RunnerWatch(Algorithm([[([1], []), ((), [1])]], last=[1, 2]))
+    assert watch.train()[1] == [
+        "env runner 1 died: what it had not delivered yet is lost",
+        "training goes on with 1 of 2 env runners",
+        "env runner 1 is back",
+        "env runner 1 died: what it had not delivered yet is lost",
+        "env runner 2 died: what it had not delivered yet is lost",
+        "no env runner is left: waiting for one to come back",
+    ]
+
+
+def test_all_are_gone_for_a_while():
+    now = [0.0]
+    watch = RunnerWatch(Algorithm([[((1, 2), [])], QUIET, [((), [1])], [([1], [])], [((), [2])]]), lambda: now[0])
+    for now[0] in (0.0, 180.0, 181.0, 361.0, 600.0):
+        _, lines = watch.train()
+    assert lines == ["env runner 2 is back"]
+
+
+def test_all_are_gone_for_good(causes):
+    causes |= {1: "ConnectionError: no simulator", 2: "ConnectionError: no simulator"}
+    now = [0.0]
+    watch = RunnerWatch(Algorithm([[((1, 2), [])], QUIET]), lambda: now[0])
+    watch.train()
+    now[0] = 180.4
+    with pytest.raises(ProcessesLost) as caught:
+        watch.train()
+    assert str(caught.value) == ("all 2 env runners died (ConnectionError: no simulator), and none came back in 180 s")
+
+
+def test_one_dies_again_and_again(causes):
+    watch = RunnerWatch(Algorithm([[([2], [2])]] * 6))
+    for _ in range(5):
+        watch.train()
+    causes[2] = "RuntimeError: out of licences"
+    with pytest.raises(ProcessesLost) as caught:
+        watch.train()
+    assert str(caught.value) == "env runner 2 died 6 times within 6 updates (RuntimeError: out of licences)"
+
+
+def test_an_iteration_that_never_ends_for_want_of_samples_does_end():
+    watch = RunnerWatch(Algorithm([[([1], [1])] * 100], runners=1))
+    with pytest.raises(ProcessesLost, match=r"^env runner 1 died 6 times within 1 update$"):
+        watch.train()
+
+
+def test_rare_deaths_and_deaths_of_many_are_borne():
+    watch = RunnerWatch(Algorithm([[([2], [2])] if step % 5 == 0 else QUIET for step in range(60)]))
+    for _ in range(60):
+        watch.train()
+    everybody = list(range(1, 31))
+    watch = RunnerWatch(Algorithm([[(everybody, everybody)], QUIET], runners=30))
+    assert len(watch.train()[1]) == 61
+
+
+def test_updates_without_any_runner_do_not_count():
+    watch = RunnerWatch(Algorithm([[([1], [])], *([QUIET] * 30), [((), [1])]] * 6, runners=1))
+    for _ in range(5 * 32):
+        watch.train()
+    with pytest.raises(ProcessesLost, match=r"^env runner 1 died 6 times within 6 updates$"):
+        watch.train()
+
+
+def test_a_cluster_that_is_gone():
+    algorithm = Algorithm([])
+
+    def die():
+        raise RayError("The actor died:\n the learner")
+
+    algorithm.train = die
+    with pytest.raises(TrainingFailed) as caught:
+        RunnerWatch(algorithm).train()
+    assert not isinstance(caught.value, ProcessesLost)
+    assert str(caught.value) == ("a process of the cluster that training needs is gone (The actor died: the learner)")
+
+
+def test_a_config():
+    config = fault_tolerance(PPOConfig())
+    assert config.restart_failed_env_runners is True
+    assert (config.env_runner_health_probe_timeout_s, config.delay_between_env_runner_restarts_s) == (0.25, 1.0)
+    assert config.env_runner_cls is faults.ReportingEnvRunner
+
+
+def test_a_runner_class_that_was_chosen_stays():
+    class Own(faults.ReportingEnvRunner):
+        pass
+
+    assert fault_tolerance(PPOConfig().env_runners(env_runner_cls=Own)).env_runner_cls is Own

@@ -1,0 +1,302 @@
+"""The frozen graph against RLlib's own module, distribution and connectors, for every algorithm and kind of network."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete
+from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
+from ray.rllib.connectors.env_to_module import FlattenObservations, MeanStdFilter
+from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
+from ray.rllib.core.rl_module.rl_module import RLModuleSpec
+from ray.rllib.core.rl_module.torch import TorchRLModule
+from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
+from ray.rllib.env.single_agent_episode import SingleAgentEpisode
+
+from bam_envs.spaces import space_to_json
+from bam_train.checkpoint import safetensors_file
+from bam_train.errors import PolicyError
+from bam_train.policy import FrozenPolicy
+from bam_train.policy.onnx_mlp import MlpRunner
+from bam_train.trainers.rllib.algorithms import ALGORITHMS
+from bam_train.trainers.rllib.by_hand import actions_by_hand
+from bam_train.trainers.rllib.freeze import freeze
+from bam_train.trainers.rllib.golden import clear_observations, draw, golden
+from bam_train.trainers.rllib.parts import connector_parts, parts_of
+from bam_train.trainers.rllib.reference import remade, rllib_actions
+
+NUMBERS = Box(-np.array([1, 2, 3], np.float32), np.array([1, 2, 3], np.float32))
+ARM = Box(-np.array([2, 3], np.float32), np.array([1, 5], np.float32))
+SEVERAL = Dict(
+    {
+        "b": Box(-1, 1, (2, 2), np.float32),
+        "a": Discrete(3),
+        "c": MultiDiscrete([2, 3]),
+        "d": Box(-5, 5, (), np.float64),
+        "e": MultiBinary(2),
+    }
+)
+
+
+class Live:
+    """A module of an algorithm, untrained, with the connectors and the configuration that it would be trained with."""
+
+    def __init__(self, algo="ppo", seen=NUMBERS, acts=ARM, pieces=(), training=None, spec=None, **model):
+        self.spaces = (seen, acts)
+        config = ALGORITHMS[algo].load()().environment(observation_space=seen, action_space=acts)
+        if spec is None:
+            config.rl_module(model_config=DefaultModelConfig(**{"fcnet_hiddens": [16, 16], **model}))
+        else:
+            config.rl_module(rl_module_spec=spec)
+        if pieces:
+            config.env_runners(env_to_module_connector=lambda env=None, spaces=None, device=None: [p() for p in pieces])
+        self.config = config.training(**(training or {}))
+        pair = {INPUT_ENV_SPACES: self.spaces, INPUT_ENV_SINGLE_SPACES: self.spaces}
+        self.before = config.build_env_to_module_connector(env=None, spaces=pair)
+        self._learn_statistics()
+        spaces = {**pair, "default_policy": (self.before.observation_space, acts)}
+        torch.manual_seed(0)
+        self.module = config.get_rl_module_spec(spaces=spaces, inference_only=False).build()
+        with torch.no_grad():
+            for weight in self.module.parameters():
+                weight.mul_(1.5)  # so that some actions reach their bounds
+
+    def _learn_statistics(self):
+        """Let filters see a few observations."""
+        seen = self.spaces[0]
+        seen.seed(3)
+        for _ in range(20):
+            episode = SingleAgentEpisode(
+                observations=[seen.sample()], observation_space=seen, action_space=self.spaces[1]
+            )
+            for piece in self.before.connectors:
+                if type(piece).__name__ in ("FlattenObservations", "MeanStdFilter"):
+                    piece(rl_module=None, episodes=[episode], batch={}, explore=False, shared_data={})
+
+    @property
+    def parts(self):
+        return parts_of(self.module, self.before, self.config, self.spaces)
+
+    def policy(self):
+        return FrozenPolicy.from_graph(freeze(self.parts), *map(space_to_json, self.spaces))
+
+    def actions(self, observations):
+        return rllib_actions(self.parts, self.module, self.before, self.config, observations)
+
+
+def both(live, n=300):
+    """RLlib's actions and the frozen policy's for the same observations."""
+    observations = draw(live.parts, n, np.random.default_rng(0))
+    found = live.policy().act_batch(observations.get("", observations))
+    return live.actions(observations), found
+
+
+def require_same(live, n=300):
+    expected, found = both(live, n)
+    assert found.dtype == live.spaces[1].dtype
+    assert len(np.unique(expected, axis=0)) > 1
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
+    if isinstance(live.spaces[1], Box):
+        assert not np.array_equal(found, expected.round(2))
+
+
+@pytest.mark.parametrize("algo", [name for name, row in ALGORITHMS.items() if "Box" in row.actions])
+def test_continuous_actions(algo):
+    live = Live(algo)
+    require_same(live)
+    assert isinstance(live.policy()._runner, MlpRunner)
+
+
+@pytest.mark.parametrize("algo", [name for name, row in ALGORITHMS.items() if "Discrete" in row.actions])
+def test_discrete_actions(algo):
+    require_same(Live(algo, acts=Discrete(4), head_fcnet_hiddens=[8]))
+
+
+@pytest.mark.parametrize("algo", ["ppo", "appo", "impala", "bc", "marwil"])
+def test_several_discrete_actions(algo):
+    require_same(Live(algo, acts=MultiDiscrete([3, 4])))
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_value_network_of_its_own_or_not(shared):
+    require_same(Live(vf_share_layers=shared))
+
+
+@pytest.mark.parametrize("word", ["tanh", "relu", "swish", "silu", "elu", "linear", None, "LeakyReLU", "GELU"])
+def test_activations(word):
+    live = Live(fcnet_activation=word, head_fcnet_hiddens=[8], head_fcnet_activation=word)
+    require_same(live)
+    assert isinstance(live.policy()._runner, MlpRunner) == (word != "GELU")
+
+
+@pytest.mark.parametrize("model", [{"free_log_std": True}, {"fcnet_use_layernorm": True}, {"fcnet_hiddens": [16]}])
+def test_other_networks(model):
+    require_same(Live(**model))
+
+
+def test_normalised_observations():
+    require_same(Live("sac", pieces=[MeanStdFilter]))
+
+
+def test_observations_that_are_normalised_far_from_their_mean():
+    live = Live(pieces=[MeanStdFilter])
+    observation = np.array([[0.9, -1.9, 2.9], [1e6, 1e6, -1e6]], np.float32)
+    np.testing.assert_allclose(live.policy().act_batch(observation), live.actions({"": observation}), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("pieces", [[FlattenObservations], [FlattenObservations, MeanStdFilter]])
+def test_dict_observations(pieces):
+    require_same(Live(seen=SEVERAL, pieces=pieces))
+
+
+def test_filter_before_flattening():
+    require_same(Live(seen=Box(-1, 1, (2, 3), np.float64), pieces=[MeanStdFilter, FlattenObservations]))
+
+
+@pytest.mark.parametrize("seen", [Discrete(4), MultiBinary(4), MultiDiscrete([2, 3])])
+def test_whole_numbers_one_hot(seen):
+    require_same(Live(seen=seen, pieces=[FlattenObservations]))
+
+
+def test_double_precision():
+    live = Live(seen=Box(-1, 1, (3,), np.float64), acts=Box(-2, 2, (2,), np.float64), pieces=[MeanStdFilter])
+    require_same(live)
+
+
+@pytest.mark.parametrize(
+    ("normalize", "clip"), [(True, False), (False, True), (False, False), (True, True)], ids=["n", "c", "-", "nc"]
+)
+def test_what_is_done_with_actions(normalize, clip):
+    live = Live()
+    live.config.environment(normalize_actions=normalize, clip_actions=clip)
+    require_same(live)
+
+
+def test_unbounded_actions():
+    require_same(Live(acts=Box(-np.inf, np.inf, (2,), np.float32)))
+
+
+@pytest.mark.parametrize(
+    ("algo", "shape", "model"),
+    [
+        ("ppo", (10, 10, 3), {}),
+        ("sac", (64, 64, 1), {}),
+        ("dqn", (20, 30, 4), {"conv_filters": [[8, 4, 2, "valid"], [8, [3, 3], 1]], "conv_activation": "elu"}),
+    ],
+)
+def test_images(algo, shape, model):
+    live = Live(algo, Box(-1, 1, shape, np.float32), Discrete(3), **model)
+    require_same(live, 60)
+
+
+@pytest.mark.parametrize(
+    "training",
+    [
+        {"dueling": False},
+        {"double_q": False},
+        {"num_atoms": 11, "v_min": -5.0, "v_max": 5.0},
+        {"num_atoms": 11, "v_min": -5.0, "v_max": 5.0, "dueling": False},
+    ],
+)
+def test_kinds_of_dqn(training):
+    require_same(Live("dqn", acts=Discrete(3), training=training))
+
+
+class OwnModule(TorchRLModule):
+    """A network that is not RLlib's."""
+
+    def setup(self):
+        self.layer = torch.nn.Linear(3, 4)
+
+    def _forward(self, batch, **kwargs):
+        return {"action_dist_inputs": torch.sin(self.layer(batch["obs"]))}
+
+
+def test_a_module_of_ones_own_is_traced():
+    live = Live(spec=RLModuleSpec(module_class=OwnModule))
+    require_same(live)
+    assert live.parts.module is live.module
+
+
+def test_the_live_module_is_left_as_it_was():
+    live = Live(pieces=[MeanStdFilter])
+    before = {name: weight.clone() for name, weight in live.module.state_dict().items()}
+    state = live.before.get_state()
+    golden(live.parts, live.module, live.before, live.config)
+    live.policy()
+    assert live.before.get_state() == state
+    assert all(torch.equal(weight, before[name]) for name, weight in live.module.state_dict().items())
+
+
+def test_golden_actions_are_rllibs():
+    live = Live(pieces=[MeanStdFilter])
+    arrays = safetensors_file.parse(golden(live.parts, live.module, live.before, live.config, n=50))
+    assert {name: array.shape for name, array in arrays.items()} == {"observation": (50, 3), "action": (50, 2)}
+    np.testing.assert_array_equal(arrays["action"], live.actions({"": arrays["observation"]}))
+
+
+@pytest.mark.parametrize(
+    "live",
+    [
+        {},
+        {"algo": "sac", "pieces": [MeanStdFilter]},
+        {"algo": "dqn", "acts": Discrete(3)},
+        {"algo": "bc", "seen": SEVERAL, "pieces": [FlattenObservations, MeanStdFilter], "free_log_std": True},
+        {"fcnet_use_layernorm": True, "acts": MultiDiscrete([2, 3]), "fcnet_activation": "silu"},
+    ],
+)
+def test_made_again_from_parts_and_computed_by_hand(live):
+    live = Live(**live)
+    observations = clear_observations(live.parts, 100)
+    expected = live.actions(observations)
+    np.testing.assert_array_equal(rllib_actions(live.parts, *remade(live.parts), observations), expected)
+    np.testing.assert_allclose(actions_by_hand(live.parts, observations), expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("live", "message"),
+    [
+        ({"use_lstm": True}, "a recurrent network of RLlib cannot be frozen; train without use_lstm"),
+        ({"fcnet_activation": "PReLU"}, "activation 'PReLU' has weights of its own and cannot be frozen"),
+    ],
+)
+def test_what_cannot_be_frozen(live, message):
+    with pytest.raises(PolicyError) as error:
+        freeze(Live(**live).parts)
+    assert str(error.value) == message
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["FrameStacking"], "connector FrameStacking cannot be frozen; expected FlattenObservations or MeanStdFilter"),
+        (["MeanStdFilter"] * 2, "connectors MeanStdFilter, MeanStdFilter cannot be frozen: one is there twice"),
+    ],
+)
+def test_other_connectors_cannot_be_frozen(names, message):
+    with pytest.raises(PolicyError) as error:
+        connector_parts([*names, "NumpyToTensor"])
+    assert str(error.value) == message
+
+
+def test_starts_of_whole_numbers():
+    """RLlib counts from 0; a trainer that shifts the environment's numbers gives the environment's own spaces."""
+    live = Live(seen=Discrete(4), acts=Discrete(3), pieces=[FlattenObservations])
+    parts = parts_of(live.module, live.before, live.config, (Discrete(4, start=5), Discrete(3, start=-1)))
+    policy = FrozenPolicy.from_graph(freeze(parts), *map(space_to_json, (parts.observation_space, parts.action_space)))
+    found = policy.act_batch(np.arange(5, 9))
+    np.testing.assert_array_equal(found, live.actions({"": np.arange(4)}) - 1)
+
+
+def test_spaces_that_do_not_fit_the_weights():
+    live = Live()
+    parts = parts_of(live.module, live.before, live.config, (Box(-1, 1, (5,), np.float32), ARM))
+    with pytest.raises(PolicyError, match=r"^the weights do not fit the spaces: mat1 and mat2 shapes cannot be"):
+        freeze(parts)
+
+
+def test_the_config_is_not_one_of_an_algorithm():
+    live = Live()
+    config = AlgorithmConfig().environment(observation_space=NUMBERS, action_space=ARM)
+    assert parts_of(live.module, live.before, config, live.spaces).algorithm == ""
+    assert isinstance(live.parts.observation_space, gym.Space)

@@ -1,0 +1,231 @@
+"""One run of RLlib: what it saves, what it freezes, how it goes on and how it is refused."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("ray")
+
+import ray
+
+from bam_train.checkpoint import Checkpoint
+from bam_train.errors import CheckpointMismatch, SettingsError
+from bam_train.policy import FrozenPolicy
+from bam_train.settings import TrainSettings
+from bam_train.trainers.resolve import resolve, resolve_resumed
+from bam_train.trainers.rllib import hyperparameters, registration, state
+from bam_train.trainers.rllib.algorithms import ALGORITHMS
+from bam_train.trainers.rllib.cluster import cluster
+from bam_train.trainers.rllib.trainer import RLlibTrainer
+
+pytestmark = pytest.mark.filterwarnings("default")  # Ray's own
+
+SMALL = {"fcnet_hiddens": [16, 16]}
+PPO = {"train_batch_size_per_learner": 128, "minibatch_size": 64, "num_epochs": 2, "model_config": SMALL}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_ray():
+    """One Ray for all runs of this module."""
+    with cluster(TrainSettings(env="bam/reach-v0", algo="ppo", trainer="rllib")):
+        yield
+    assert not ray.is_initialized()
+
+
+def settled(algo="ppo", env="bam/reach", hyper=PPO, **given):
+    return resolve(
+        {"env": env, "algo": algo, "trainer": "rllib", "steps": 256, "num_envs": 4, "hyperparameters": hyper, **given}
+    )
+
+
+@pytest.fixture
+def trained(tmp_path):
+    trainer = RLlibTrainer.create(settled(normalize=True, seed=3))
+    seen = []
+    trainer.train(256, lambda progress: seen.append((progress.steps, progress.total)) or True)
+    assert seen == [(128, 256), (256, 256)]
+    yield trainer, trainer.save(tmp_path / "a.zip", {"success_rate": 0.5}, {"best": None})
+    trainer.close()
+
+
+def test_a_run_saves_what_it_is(trained):
+    trainer, checkpoint = trained
+    manifest = checkpoint.manifest
+    assert (manifest.env, manifest.algorithm, manifest.trainer, manifest.steps) == ("bam/reach-v0", "ppo", "rllib", 256)
+    assert manifest.versions["ray"] == ray.__version__
+    assert manifest.period == pytest.approx(0.05)
+    assert checkpoint.has("bam/resume/rllib/learner_group/learner/rl_module/default_policy/module_state.pkl")
+    assert TrainSettings.from_mapping(manifest.settings) == trainer.settings
+
+
+def test_the_frozen_policy_is_the_policy(trained):
+    trainer, checkpoint = trained
+    observations = np.random.default_rng(0).uniform(-1, 1, (50, *trainer._seen.observation_space.shape))
+    observations = observations.astype(np.float32)
+    frozen = FrozenPolicy.load(checkpoint.path).act_batch(observations)
+    assert np.abs(frozen - trainer.freeze().act_batch(observations)).max() <= 1e-6
+    runner = trainer.algorithm.env_runner
+    runner._seen = runner._filter.rows(observations, update=False)
+    _, actions = runner._act(0, explore=False)
+    assert np.abs(frozen - actions).max() <= 1e-5
+
+
+def test_it_goes_on_where_it_stopped(trained):
+    trainer, checkpoint = trained
+    again = RLlibTrainer.load(Checkpoint.open(checkpoint.path))
+    assert again.steps == 256
+    mine, theirs = trainer._module().state_dict(), again._module().state_dict()
+    assert all(np.array_equal(mine[name], theirs[name]) for name in mine)
+    ours, its = (one.algorithm.env_runner._filter._filters[None].running_stats for one in (trainer, again))
+    assert (ours.num_pushes, ours.mean_array.tolist()) == (its.num_pushes, its.mean_array.tolist())
+    first, second = (one.algorithm.learner_group._learner._optimizer_parameters for one in (trainer, again))
+    moments = [next(iter(one)).state_dict()["state"][0]["exp_avg"] for one in (first, second)]
+    assert np.array_equal(moments[0], moments[1])
+    again.train(384, lambda progress: True)
+    assert again.steps == 384
+    assert again.algorithm.iteration == 3
+    assert "running episodes" in again.notices[0]
+    again.close()
+
+
+def test_it_goes_on_with_other_runners_and_not_with_another_ray(trained, monkeypatch):
+    _, checkpoint = trained
+    given = {"num_env_runners": 1, "steps": 1000}
+    assert resolve_resumed(given, checkpoint).num_env_runners == 1
+    monkeypatch.setattr(ray, "__version__", "9.1.0")
+    with pytest.raises(CheckpointMismatch, match=r"was trained with Ray 2\.\d+\.\d+, and this is Ray 9\.1\.0"):
+        state.require_version(checkpoint)
+
+
+def test_one_runner_process_samples_and_counts_exactly():
+    trainer = RLlibTrainer.create(settled(num_env_runners=1, normalize=True, env_kwargs={"randomize": True}))
+    trainer.train(128, lambda progress: True)
+    assert trainer.steps == 128
+    stats = trainer._env_to_module().connectors[0]._filters[None].running_stats
+    assert stats.num_pushes >= 128
+    trainer.close()
+
+
+@pytest.mark.parametrize(
+    ("algo", "env", "hyper"),
+    [
+        ("appo", "bam/reach", {"train_batch_size_per_learner": 100, "model_config": SMALL}),
+        ("impala", "bam/reach", {"train_batch_size_per_learner": 100, "model_config": SMALL}),
+        ("dqn", "CartPole-v1", {"num_steps_sampled_before_learning_starts": 100, "model_config": SMALL}),
+        ("sac", "bam/reach", {"num_steps_sampled_before_learning_starts": 190, "train_batch_size_per_learner": 16}),
+    ],
+)
+def test_other_algorithms_train_and_freeze(algo, env, hyper, tmp_path):
+    trainer = RLlibTrainer.create(settled(algo, env, hyper, steps=200))
+    trainer.train(200, lambda progress: True)
+    assert trainer.steps >= 200
+    trainer.save(tmp_path / "a.zip", {}, {"best": None})
+    trainer.close()
+    FrozenPolicy.load(tmp_path / "a.zip")
+
+
+def test_a_foreign_environment_of_this_process_reaches_the_runners(corridor):
+    trainer = RLlibTrainer.create(settled(env=corridor, normalize=True))
+    trainer.train(128, lambda progress: True)
+    statistics = trainer._statistics()
+    assert statistics.episodes > 5
+    assert 0 <= statistics.success_rate <= 1
+    assert statistics.length_mean >= 1
+    trainer.close()
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"algo": "pp"}, "Unknown algorithm 'pp'. Did you mean 'ppo'?"),
+        ({"hyperparameters": {"gama": 0.9}}, "Unknown ppo hyperparameter 'gama'. Did you mean 'gamma'?"),
+        (
+            {"hyperparameters": {"train_batch_size": 9}},
+            "train_batch_size is not a hyperparameter here: use train_batch",
+        ),
+        ({"hyperparameters": {"lr": -1}}, "lr: expected a number above 0, found -1"),
+        ({"hyperparameters": {"model_config": {"fcnet_hidden": []}}}, "Unknown model_config argument 'fcnet_hidden'"),
+        ({"algo": "dqn"}, "dqn does not fit bam/reach-v0: it takes Discrete actions, found Box"),
+        ({"algo": "bc"}, "data: bc learns from recorded episodes, found none"),
+        ({"data": "x"}, "data: ppo learns in the environment"),
+        ({"transport": ["tcp://127.0.0.1:1"]}, "transport: the rllib trainer makes its environments"),
+        ({"normalize": {"clip_value": 1}}, "Unknown normalize argument 'clip_value'. Did you mean 'clip_by_value'?"),
+    ],
+)
+def test_settings_are_refused(given, text):
+    with pytest.raises(SettingsError) as caught:
+        resolve({"env": "bam/reach", "algo": "ppo", "trainer": "rllib", **given})
+    assert text in str(caught.value)
+
+
+def test_settings_of_rllib_are_refused_with_sb3():
+    with pytest.raises(SettingsError, match="num_env_runners: the sb3 trainer has no use for it"):
+        resolve({"env": "bam/reach", "algo": "ppo", "num_env_runners": 2})
+
+
+@pytest.mark.parametrize("name", sorted(ALGORITHMS))
+def test_complete_settings_stay_as_they_are(name):
+    values = hyperparameters.complete(ALGORITHMS[name], {})
+    assert hyperparameters.complete(ALGORITHMS[name], values) == values
+
+
+def test_the_preset_belongs_to_its_trainer():
+    assert resolve({"env": "bam/pick", "algo": "ppo", "trainer": "rllib"}).hyperparameters["action_init_scale"] == 0.01
+    assert "n_steps" in resolve({"env": "bam/pick", "algo": "ppo"}).hyperparameters
+
+
+@pytest.mark.parametrize("runners", [0, 1])
+def test_a_script_needs_one_import(runners):
+    from ray.rllib.algorithms.ppo import PPOConfig
+
+    for name in ("bam/reach", "bam/reach-v0"):
+        config = (
+            PPOConfig()
+            .environment(name, env_config={"randomize": True})
+            .env_runners(num_env_runners=runners, num_envs_per_env_runner=2)
+            .training(train_batch_size_per_learner=64, minibatch_size=32, num_epochs=1)
+        )
+        algorithm = config.build_algo()
+        assert algorithm.train()["env_runners"]["num_env_steps_sampled_lifetime"] >= 64
+        algorithm.stop()
+
+
+def test_every_environment_of_ours_is_registered():
+    from ray.tune.registry import ENV_CREATOR, _global_registry
+
+    for env_id in registration.own_ids():
+        assert _global_registry.contains(ENV_CREATOR, env_id)
+        assert _global_registry.contains(ENV_CREATOR, env_id.rpartition("-v")[0])
+
+
+def test_recorded_episodes_teach_bc(trained, tmp_path, monkeypatch, capsys):
+    _, checkpoint = trained
+    sys.path.insert(0, str(Path(__file__).parents[4] / "scripts"))
+    import record_parquet
+
+    folder = tmp_path / "recorded"
+    arguments = ["record_parquet.py", str(checkpoint.path), "--out", str(folder), "--episodes", "5", "--num-envs", "2"]
+    monkeypatch.setattr(sys, "argv", arguments)
+    record_parquet.main()
+    assert "5 episodes" in capsys.readouterr().out
+    hyper = {"train_batch_size_per_learner": 64, "model_config": SMALL}
+    for algo in ("bc", "marwil"):
+        trainer = RLlibTrainer.create(settled(algo, hyper=hyper, data=str(folder), steps=640))
+        trainer.train(640, lambda progress: True)
+        assert trainer.steps == 640
+        saved = trainer.save(tmp_path / f"{algo}.zip", {}, {"best": None})
+        trainer.close()
+        again = RLlibTrainer.load(Checkpoint.open(saved.path))
+        again.train(641, lambda progress: True)
+        assert again.steps > 640
+        again.close()
+
+
+def test_data_that_is_not_there_or_not_like_this(tmp_path):
+    for data, text in ((tmp_path / "no", "does not exist"), (tmp_path, "has no .parquet file in it")):
+        with pytest.raises(SettingsError, match=text):
+            RLlibTrainer.create(settled("bc", hyper={}, data=str(data)))

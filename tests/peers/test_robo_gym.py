@@ -1,0 +1,55 @@
+"""robo-gym's own environment classes, run where they are installed."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from tests.peers.conftest import PEERS
+
+PYTHON = str(PEERS / "robo_gym" / "bin" / "python")
+ENV = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST", "PYTHON"))}
+
+
+@pytest.fixture(scope="session", autouse=True)
+def robo_gym(peers):
+    if not (PEERS / "robo_gym").exists():
+        pytest.fail("no robo-gym among the peers: run scripts/install_peers")
+
+
+def run(*command, root, limit=900.0):
+    """Standard output of a program that does well."""
+    env = ENV | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [*map(str, command)], cwd=root, env=env, capture_output=True, text=True, check=False, timeout=limit
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_parity(request):
+    """Observation, reward and end of ours with parity=True are those of robo-gym's classes."""
+    tests = ["tests/bam_envs/robo_gym/test_parity.py", "tests/bam_envs/robo_gym/test_rs_state.py"]
+    output = run(PYTHON, "-m", "pytest", "-p", "no:cacheprovider", "-rs", *tests, root=request.config.rootpath)
+    assert "skipped" not in output, output
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("env_id", ["NoObstacleNavigationMir100Sim-v0", "EndEffectorPositioningURSim-v0"])
+def test_a_policy_of_ours_in_robo_gym(env_id, request, tmp_path):
+    """A checkpoint that was trained with parity=True does there what it does here."""
+    pytest.importorskip("stable_baselines3")
+    root, path = request.config.rootpath, tmp_path / "policy.zip"
+    arguments = ["--env", env_id, "--algo", "ppo", "--steps", "8192", "--eval-episodes", "2", "--out", path]
+    parity = ["--set", "env_kwargs.parity=true"]
+    run(sys.executable, "-m", "bam_train.cli.train", *arguments, *parity, "--runs", tmp_path / "runs", root=root)
+    program = ["-m", "tests.peers.robo_gym_policy", path, env_id, "4"]
+    episodes = [json.loads(line) for line in run(PYTHON, *program, root=root).splitlines()]
+    assert len(episodes) == 4
+    for episode in episodes:
+        ours, theirs = episode["ours"], episode["theirs"]
+        assert (ours["status"], ours["steps"]) == (theirs["status"], theirs["steps"])
+        assert ours["return"] == pytest.approx(theirs["return"], abs=1e-2)  # wire states are float32

@@ -1,0 +1,142 @@
+"""The scripts that run the policy of a checkpoint: ours, a directory of RLlib, on a simulated and on a live robot."""
+
+import importlib.util
+import re
+import sys
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import bam_envs  # noqa: F401 - registers the environments
+from bam_envs.registry import ENVIRONMENTS
+from bam_envs.serve.options import ServeOptions
+from bam_envs.serve.program import ServedEnvironment
+from bam_train.cli.program import guarded
+
+ROOT = Path(__file__).parents[2]
+PICK = ROOT / "checkpoints" / "pick-ppo.zip"
+EPISODE = re.compile(r"episode \d+: return -?\d+\.\d\d, (?:no )?success, clipped (\d+) of (\d+) actions")
+
+
+@pytest.fixture(scope="module")
+def script():
+    spec = importlib.util.spec_from_file_location("policy_from_cp_mir", ROOT / "scripts" / "policy_from_cp_mir.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def run(script, capsys, monkeypatch):
+    """Run it with these arguments; status, standard output, standard error."""
+
+    def run_it(*arguments):
+        monkeypatch.setattr(sys, "argv", ["policy_from_cp_mir.py", *map(str, arguments)])
+        try:
+            status = guarded(lambda: script.main(script.parse()), script.NAME)
+        except SystemExit as end:
+            status = end.code
+        return status, *capsys.readouterr()
+
+    return run_it
+
+
+@pytest.fixture(scope="module")
+def checkpoint(trained):
+    return trained[0] / "checkpoints" / "mir100-navigation-rllib-ppo.zip"
+
+
+@pytest.fixture(scope="module")
+def directory(checkpoint, tmp_path_factory):
+    """The files that RLlib wrote, which are in the checkpoint."""
+    folder = tmp_path_factory.mktemp("directory")
+    with zipfile.ZipFile(checkpoint) as archive:
+        archive.extractall(folder)
+    return folder / "bam" / "resume" / "rllib"
+
+
+def test_a_checkpoint_of_ours(run, checkpoint):
+    status, out, err = run(checkpoint, "--num-episodes", 2, "--seed", 5)
+    assert (status, err) == (0, "")
+    *episodes, last = out.splitlines()
+    counts = [EPISODE.fullmatch(line).groups() for line in episodes]
+    assert len(counts) == 2
+    assert all(0 <= int(clipped) <= int(steps) <= 500 for clipped, steps in counts)
+    assert re.fullmatch(r"success in [0-2] of 2 episodes on bam/mir100-navigation-v0", last)
+
+
+def test_a_directory_of_rllib_acts_the_same(run_script, run, checkpoint, directory, tmp_path):
+    """Of the whole algorithm, and of the policy alone, in a process of its own: RLlib's code is imported there."""
+    options = ("--num-episodes", 1, "--seed", 5)
+    _, expected, _ = run(checkpoint, *options)
+    alone = tmp_path / "alone"
+    (directory / "learner_group" / "learner" / "rl_module" / "default_policy").rename(alone)
+    try:
+        done = run_script("policy_from_cp_mir", alone, *options, folder=tmp_path)
+    finally:
+        alone.rename(directory / "learner_group" / "learner" / "rl_module" / "default_policy")
+    assert (done.returncode, done.stdout) == (0, expected), done.stderr
+    done = run_script("policy_from_cp_mir", directory, *options, folder=tmp_path)
+    assert (done.returncode, done.stdout) == (0, expected), done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+class Bound:
+    """A policy that goes half as fast as it may on even steps, and faster than it may on odd ones."""
+
+    def __init__(self):
+        self.calls = 0
+
+    def reset(self):
+        self.calls = 0
+
+    def act(self, observation):
+        self.calls += 1
+        return np.array([0.5 if self.calls % 2 else -1.5, 0.0], np.float32)
+
+
+def test_clipped_actions_are_counted(script):
+    env = gym.make("bam/mir100-navigation-v0", max_episode_steps=10)
+    total, success, clipped, steps = script.play(env, Bound(), 0)
+    env.close()
+    assert (success, clipped, steps) == (False, 5, 10) or steps < 10
+    assert isinstance(total, float)
+
+
+def test_it_drives_a_robot_behind_rosbridge(run, checkpoint, monkeypatch):
+    """In real time: a short episode."""
+    short = replace(ENVIRONMENTS["bam/mir100-navigation-v0"], max_episode_steps=10)
+    monkeypatch.setitem(ENVIRONMENTS, short.id, short)
+    with ServedEnvironment(gym.make("bam/mir100-navigation-v0"), ServeOptions(port=0, tcp=0)) as served:
+        status, out, err = run(checkpoint, "--num-episodes", 1, "--robot", served.bus.url)
+    assert (status, err) == (0, "")
+    assert EPISODE.fullmatch(out.splitlines()[0])[2] == "10"
+
+
+WRONG = [
+    (["nowhere.zip"], "nowhere.zip: no such file"),
+    ([PICK, "--env", "bam/reach"], f"{PICK}: was trained on bam/pick-v0, not on bam/reach-v0"),
+    ([PICK, "--env", "bam/pik"], "Unknown environment 'bam/pik'. Did you mean 'bam/pick-v0'?"),
+    ([ROOT / "ros"], f"{ROOT / 'ros'}: is no checkpoint directory of RLlib"),
+    ([PICK, "--robot", "nonsense"], "nonsense"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "text"), WRONG, ids=[str(one[0][-1]) for one in WRONG])
+def test_what_cannot_be_is_one_line(run, arguments, text):
+    status, out, err = run(*arguments)
+    assert (status, out) == (1, "")
+    assert err.startswith("policy_from_cp_mir: ")
+    assert text in err
+    assert err.count("\n") == 1
+
+
+def test_the_command_line(run):
+    assert run()[2] == "policy_from_cp_mir: the following arguments are required: CHECKPOINT\n"
+    assert run(PICK, "--num-episodes", 0)[2] == (
+        "policy_from_cp_mir: --num-episodes: expected a whole number from 1, found '0'\n"
+    )

@@ -1,0 +1,156 @@
+"""The scripts that train with RLlib and with stable-baselines3, and then use what they trained."""
+
+import difflib
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+
+from bam_train.checkpoint import Checkpoint
+from bam_train.policy import FrozenPolicy
+
+SCRIPTS = Path(__file__).parents[2] / "scripts"
+RLLIB = ("training_inference_mir", "training_inference_ur")
+TRAINING = (*RLLIB, "td3_mir")
+ALL = (*TRAINING, "policy_from_cp_mir", "policy_from_cp_ur")
+OPTIONS = (
+    "--run",
+    "--num-cpus",
+    "--framework",
+    "--stop-iters",
+    "--stop-timesteps",
+    "--stop-reward",
+    "--explore-during-inference",
+    "--num-episodes-during-inference",
+    "--robot",
+    "--seed",
+)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_each_is_short_enough_to_copy(name):
+    assert len((SCRIPTS / f"{name}.py").read_text().splitlines()) < 120
+
+
+@pytest.mark.parametrize(("stem", "most"), [("training_inference", 9), ("policy_from_cp", 9)])
+def test_a_pair_differs_in_its_environment_and_examples_alone(stem, most):
+    mir, ur = ((SCRIPTS / f"{stem}_{robot}.py").read_text().splitlines() for robot in ("mir", "ur"))
+    assert len(mir) == len(ur)
+    differing = [line for line in difflib.ndiff(mir, ur) if line.startswith("- ")]
+    assert len(differing) <= most, differing
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_help_has_examples(run_script, name, tmp_path):
+    done = run_script(name, "-h", folder=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.count(f"\n  python scripts/{name}.py") >= 3
+    assert "\nExamples:\n" in done.stdout
+
+
+@pytest.mark.parametrize("name", RLLIB)
+def test_the_options_are_those_of_robo_gym_and_ours(run_script, name, tmp_path):
+    out = run_script(name, "-h", folder=tmp_path).stdout
+    assert set(re.findall(r"^  (--[a-z-]+)", out, re.MULTILINE)) == {*OPTIONS, "--yes"}
+
+
+WRONG = [
+    (["--framework", "tf2"], 2, "--framework tf2: RLlib has nothing but torch any more; leave it out"),
+    (["--stop-itrs", "3"], 2, "unknown option '--stop-itrs'. Did you mean '--stop-iters'?"),
+    (["--seed", "-1"], 2, "--seed: expected a whole number from 0, found '-1'"),
+    (["--stop-iters", "0"], 2, "--stop-iters: expected a whole number from 1, found '0'"),
+    (["--stop-reward", "high"], 2, "--stop-reward: invalid float value: 'high'"),
+    (["--run", "PPOO"], 1, "Unknown algorithm 'ppoo'. Did you mean 'ppo'?"),
+    (["--run", "DQN"], 1, "dqn does not fit bam/mir100-navigation-v0: it takes Discrete actions, found Box. "),
+    (["--num-cpus", "1000"], 1, "999 env runners ask for 999 CPUs, "),
+    (
+        ["--robot", "ws://10.0.0.5:9090", "--explore-during-inference"],
+        2,
+        "--explore-during-inference draws actions at random, which is not for a live robot; leave it out",
+    ),
+]
+
+
+@pytest.mark.parametrize(("arguments", "status", "text"), WRONG, ids=[" ".join(one[0]) for one in WRONG])
+def test_what_cannot_be_is_one_line(run_script, arguments, status, text, tmp_path):
+    done = run_script("training_inference_mir", *arguments, folder=tmp_path)
+    assert done.returncode == status, done.stderr
+    assert done.stderr.splitlines()[-1].startswith(f"training_inference_mir: {text}")
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_gpus_that_are_no_number(run_script, tmp_path):
+    done = run_script("training_inference_ur", folder=tmp_path, RLLIB_NUM_GPUS="abc")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == (
+        "training_inference_ur: RLLIB_NUM_GPUS: expected a whole number of GPUs, such as 1, found 'abc'. "
+        "Mend or unset it\n"
+    )
+
+
+def test_without_ray(run_script, environment, tmp_path):
+    (tmp_path / "ray.py").write_text('raise ModuleNotFoundError("No module named \'ray\'", name="ray")\n')
+    path = os.pathsep.join([str(tmp_path), environment["PYTHONPATH"]])
+    done = run_script("training_inference_mir", folder=tmp_path, PYTHONPATH=path)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert len(done.stderr.splitlines()) == 1
+    assert 'pip install "bam-train[rllib]"' in done.stderr
+
+
+def test_it_trains_saves_and_explores_in_a_new_environment(trained):
+    folder, done = trained
+    lines = done.stdout.splitlines()
+    assert lines[0].startswith("iteration 1: 4,096 steps, mean total reward ")
+    assert lines[1] == "saved checkpoints/mir100-navigation-rllib-ppo.zip"
+    assert [re.sub(r"reward -?\d+\.\d\d(, success)?$", "reward R", line) for line in lines[2:]] == [
+        "episode 1: total reward R",
+        "episode 2: total reward R",
+    ]
+    path = folder / "checkpoints" / "mir100-navigation-rllib-ppo.zip"
+    assert FrozenPolicy.load(path).act([0.0] * 4).shape == (2,)
+    assert Checkpoint.open(path).manifest.steps == 4096
+
+
+def test_ctrl_c_saves_and_leaves_no_process(environment, tmp_path):
+    command = [sys.executable, "-u", str(SCRIPTS / "training_inference_ur.py"), "--num-cpus", "2"]
+    process = subprocess.Popen(
+        command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout.readline().startswith("iteration 1: ")
+        rays = psutil.Process(process.pid).children(recursive=True)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=120)
+    finally:
+        process.kill()
+        process.communicate()
+    assert process.returncode == 130, err
+    assert out.splitlines()[-1] == "saved checkpoints/ur-reach-rllib-ppo.zip"
+    assert err.splitlines() == [
+        "finishing the update and saving; Ctrl-C again quits at once",
+        "training_inference_ur: interrupted",
+    ]
+    assert Checkpoint.open(tmp_path / "checkpoints" / "ur-reach-rllib-ppo.zip").manifest.env_kwargs == {
+        "ur_model": "ur5"
+    }
+    assert rays
+    assert psutil.wait_procs(rays, timeout=10)[1] == []
+
+
+def test_td3_trains_saves_and_runs_and_overwrites_nothing(run_script, tmp_path):
+    (tmp_path / "checkpoints").mkdir()
+    taken = tmp_path / "checkpoints" / "mir100-navigation-td3.zip"
+    taken.write_text("somebody's")
+    done = run_script("td3_mir", "--steps", 300, "--episodes", 1, "--seed", 3, folder=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    lines = done.stdout.splitlines()
+    assert lines[-3].startswith("      300 steps, mean total reward ")
+    assert lines[-2] == "saved checkpoints/mir100-navigation-td3-2.zip"
+    assert re.fullmatch(r"episode 1: total reward -?\d+\.\d\d(, success)?", lines[-1])
+    assert taken.read_text() == "somebody's"
