@@ -37,9 +37,9 @@ def open_checkpoint(path: Path, env: str | None, trust: bool, folder: str) -> Ch
         if env is not None:
             checkpoint.requires_env(resolve_id(env))
         return checkpoint
-    from bam_train.trainers.rllib.directory import find_policy
-    from bam_train.trainers.rllib.export import export
-    from bam_train.trainers.rllib.foreign import read_policy
+    from bam_train.trainers.rllib.foreign.directory import find_policy
+    from bam_train.trainers.rllib.foreign.export import export
+    from bam_train.trainers.rllib.foreign.reading import read_policy
 
     if env is None and read_policy(find_policy(path, trust=trust)).env is None:
         env = ENV

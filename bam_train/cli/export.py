@@ -15,7 +15,7 @@ from bam_train.cli.program import run_program
 if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
     from bam_train.trainers.output import Output
-    from bam_train.trainers.rllib.export import Exported
+    from bam_train.trainers.rllib.foreign.export import Exported
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class ExportConfig:
 
 def export_directory(config: ExportConfig) -> int:
     """The program, with its arguments read."""
-    from bam_train.trainers.rllib.export import export
+    from bam_train.trainers.rllib.foreign.export import export
 
     exported = export(
         config.directory,

@@ -1,15 +1,20 @@
+import json
+
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
+from bam_envs.registry import ENVIRONMENTS
+from bam_envs.robo_gym.table import ROBO_GYM
+from bam_envs.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint
 from bam_train.environments import control_period, first_difference, is_batched, make_env, make_rows, require_fit
 from bam_train.errors import CheckpointMismatch, SettingsError
 
 
 def test_rows_reset_in_the_same_step(corridor):
-    for env_id in (corridor, "CartPole-v1", "bam/reach-v0"):
+    for env_id in (corridor, "CartPole-v1", *ENVIRONMENTS):
         rows = make_rows(env_id, None, 2)
         assert rows.num_envs == 2
         assert rows.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
@@ -24,8 +29,7 @@ def test_arguments_reach_the_environment(corridor):
 
 
 def test_only_ours_are_batched(corridor):
-    assert is_batched("bam/pick-v0")
-    assert is_batched("EndEffectorPositioningURSim-v0")
+    assert all(is_batched(env_id) for env_id in (*ENVIRONMENTS, *ROBO_GYM))
     assert not is_batched(corridor)
 
 
@@ -50,7 +54,8 @@ def test_what_cannot_be_made(corridor, env_id, kwargs, message):
 
 
 def test_period(corridor, monkeypatch):
-    assert control_period(make_env("bam/pick-v0")) == 0.05
+    for env_id, entry in ENVIRONMENTS.items():
+        assert control_period(make_env(env_id)) == entry.period
     assert control_period(make_env("CartPole-v1")) == 0.02
     env = make_env(corridor)
     assert control_period(env) == 0.05
@@ -114,6 +119,22 @@ def test_signals_and_period_must_fit(corridor, corridor_checkpoint, fields, mess
         f"{checkpoint.path}: {message} test/Corridor-v0 as installed; "
         "train it anew, or install the version it was trained with"
     )
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_every_environment_of_ours_fits_what_it_says_of_itself(corridor_checkpoint, env_id):
+    env, rows = make_env(env_id), make_rows(env_id, None, 2)
+    said = {
+        "observation_space": space_to_json(env.observation_space),
+        "action_space": space_to_json(env.action_space),
+        "signals": env.unwrapped.describe(),
+        "period": env.unwrapped.period,
+    }
+    checkpoint = Checkpoint.open(corridor_checkpoint(**json.loads(json.dumps(said))))
+    require_fit(checkpoint, env)
+    require_fit(checkpoint, rows)
+    env.close()
+    rows.close()
 
 
 def test_rows_fit_as_one_environment_does(corridor, corridor_checkpoint):

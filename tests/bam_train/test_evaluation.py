@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from bam_envs.registry import ENVIRONMENTS
 from bam_train.environments import make_rows
 from bam_train.errors import PolicyError, SettingsError
 from bam_train.evaluation import (
@@ -167,6 +168,31 @@ def test_same_seeds_same_numbers_on_gymnasium():
     assert one.success_rate is None
     assert 8 <= one.length_mean <= 11
     assert one.return_mean == one.length_mean
+
+
+class Steady:
+    """Acts on what it sees, and the same in any number of rows."""
+
+    def __init__(self, size):
+        self.size = size
+
+    def reset(self, rows=None):
+        pass
+
+    def act_batch(self, observations):
+        return np.tile(np.tanh(observations[:, :1]), (1, self.size)).astype(np.float32)
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_an_episode_depends_on_its_seed_and_on_no_other_episode(env_id):
+    options = {"max_episode_steps": 40}
+    rows = make_rows(env_id, options, 4)
+    policy = Steady(rows.single_action_space.shape[0])
+    together = evaluate(policy, env_id, episodes=4, seed=3, env=rows)
+    rows.close()
+    assert together.length_mean > 1
+    assert together == evaluate(policy, env_id, options, episodes=4, seed=3, num_envs=1)
+    assert together == evaluate(policy, env_id, options, episodes=4, seed=3, num_envs=3)
 
 
 def test_given_rows_are_left_open_after_an_exception():

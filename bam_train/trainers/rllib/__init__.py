@@ -17,7 +17,7 @@ import importlib.util
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from bam_train.trainers.rllib.env_runner import RobotEnvRunner
+    from bam_train.trainers.rllib.sampling.env_runner import RobotEnvRunner
 
 __all__ = ["RobotEnvRunner"]
 
@@ -30,7 +30,7 @@ if importlib.util.find_spec("ray") is not None:  # `foreign` and `pickles` read 
 def __getattr__(name: str) -> Any:
     """`RobotEnvRunner`, imported on use: it imports all of RLlib."""
     if name == "RobotEnvRunner":
-        from bam_train.trainers.rllib.env_runner import RobotEnvRunner
+        from bam_train.trainers.rllib.sampling.env_runner import RobotEnvRunner
 
         return RobotEnvRunner
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -12,8 +12,8 @@ from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
 from bam_train.errors import SettingsError
-from bam_train.trainers.rllib.golden import shifted
-from bam_train.trainers.rllib.parts import PolicyParts
+from bam_train.trainers.rllib.freezing.golden import shifted
+from bam_train.trainers.rllib.freezing.parts import PolicyParts
 
 
 class ExploringPolicy:

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from bam_train.errors import FormatError
-from bam_train.trainers.rllib.parts import Array
+from bam_train.trainers.rllib.freezing.parts import Array
 
 _MOST_BYTES = 2**31
 _MOST_INSTRUCTIONS = 5_000_000

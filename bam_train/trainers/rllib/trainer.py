@@ -27,14 +27,14 @@ from bam_train.settings import TrainSettings
 from bam_train.trainers.provenance import git_commit, now, versions
 from bam_train.trainers.rllib import hyperparameters, state
 from bam_train.trainers.rllib.algorithms import ALGORITHMS
-from bam_train.trainers.rllib.cluster import cluster
+from bam_train.trainers.rllib.cluster.cluster import cluster
+from bam_train.trainers.rllib.cluster.fault_tolerance import RunnerWatch
 from bam_train.trainers.rllib.config import make_config, refusals
-from bam_train.trainers.rllib.env_runner import ENDS
 from bam_train.trainers.rllib.exploring import ExploringPolicy
-from bam_train.trainers.rllib.fault_tolerance import RunnerWatch
-from bam_train.trainers.rllib.freeze import freeze
-from bam_train.trainers.rllib.golden import golden
-from bam_train.trainers.rllib.parts import PolicyParts, parts_of
+from bam_train.trainers.rllib.freezing.freeze import freeze
+from bam_train.trainers.rllib.freezing.golden import golden
+from bam_train.trainers.rllib.freezing.parts import PolicyParts, parts_of
+from bam_train.trainers.rllib.sampling.env_runner import ENDS
 from bam_train.trainers.rllib.tensorboard import TensorBoard
 from bam_train.trainers.trainer import OnProgress, Progress, Statistics
 
@@ -247,7 +247,8 @@ class RLlibTrainer:
     def exploring(self) -> ExploringPolicy:
         """The policy as it is now, drawing its actions as in training."""
         with state.undisturbed():
-            return ExploringPolicy(self._parts(), self._module(), self._env_to_module(), self._config)
+            module = copy.deepcopy(self._module())
+            return ExploringPolicy(self._parts(module), module, self._env_to_module(), self._config)
 
     @contextlib.contextmanager
     def undisturbed(self) -> Iterator[None]:

@@ -155,13 +155,22 @@ class RobotService:
             raise RemoteError(f"{self._profile.name} failed, and needs a reset: {self._robot.fault}")
 
     def _on_halt(self, message: Message, caller: Caller) -> None:
-        """Anybody may halt; it waits for nothing but the part of a period that is being computed."""
-        self._rest()
+        """Anybody may halt; it waits for nothing but the part of a period that is being computed.
 
-    def _rest(self) -> None:
+        In lockstep the one whose command it overtook waits for an answer, and gets it: nothing moved.
+        """
+        order = self._rest()
+        if order is not None and order.complete and self.info.lockstep:
+            self.clock.wake()
+
+    def _rest(self) -> Order | None:
+        """What was to be executed next, and is not."""
         with self._moving:
-            self._slot.clear()
+            order = self._slot.take()
             self._robot.halt()
+            if order is not None and order.complete and self.info.lockstep:
+                self._answered = order.tag
+        return order
 
     def _on_leave(self, caller: Caller) -> None:
         for client in self._clients.left(caller):

@@ -301,6 +301,18 @@ def test_anybody_may_halt(serve, bus):
     assert service.lease.holder == "a:1"
 
 
+def test_a_command_that_a_halt_overtakes_is_answered_and_moves_nothing(serve, bus, tagger):
+    """Who waits for the state behind it would wait for nothing."""
+    service, tag = serve(), tagger.next(1, 5.0)
+    service.service.clock.stop()  # the command waits for it
+    assert service.send(command(0.5), tag, "a") is None
+    assert bus.say("/bam/halt", {}, "somebody") is None
+    service.service._tick_lockstep()
+    assert read_tag(service.joints()["header"]["frame_id"]) == tag
+    assert service.robot.state.stamp == 0.0
+    assert service.robot._resting
+
+
 @pytest.mark.parametrize("realtime", [True, False])
 def test_a_halt_wins_over_a_command_that_is_just_being_taken(serve, bus, realtime):
     service = serve(SimulatedArm(1), realtime=realtime)

@@ -13,7 +13,8 @@ def test_table(run):
     lines = out.splitlines()
     assert (status, err) == (0, "")
     assert lines[0].split() == ["id", "observation", "action", "steps", "Hz", "what", "to", "do"]
-    assert [line.split()[0] for line in lines[1:4]] == ["bam/reach-v0", "bam/pick-v0", "bam/pick-place-v0"]
+    assert [line.split()[0] for line in lines[1 : 1 + len(ENVIRONMENTS)]] == list(ENVIRONMENTS)
+    assert lines[1 + len(ENVIRONMENTS)] == ""
     assert lines[2].endswith("pick up a cube that lies anywhere in 30 x 40 cm with any yaw")
     assert lines[-1] == "Details: bam-envs ID. Training: bam-train --env ID --algo ppo; any Gymnasium id will do."
 
@@ -81,7 +82,19 @@ def test_details_as_json(run):
     facts = json.loads(run(main, "bam/pick", "--json")[1])
     assert facts["id"] == "bam/pick-v0"
     assert facts["action_space"]["shape"] == [5]
-    assert len(facts["signals"]["observation"]) == facts["observation_space"]["shape"][0]
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_details_of_every_environment(run, env_id):
+    status, out, err = run(main, env_id, "--json")
+    assert (status, err) == (0, "")
+    facts, entry = json.loads(out), ENVIRONMENTS[env_id]
+    assert (facts["id"], facts["summary"], facts["episode_steps"]) == (env_id, entry.summary, entry.max_episode_steps)
+    assert facts["rate_hz"] == 1 / entry.period
+    for kind in ("observation", "action"):
+        assert [len(facts["signals"][kind])] == facts[f"{kind}_space"]["shape"]
+    lines = run(main, env_id)[1].splitlines()
+    assert lines[1] == f"{entry.max_episode_steps} steps an episode, {1 / entry.period:g} Hz"
 
 
 def test_details_of_any_gymnasium_id(run):

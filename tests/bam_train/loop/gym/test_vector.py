@@ -11,6 +11,7 @@ from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import Autoreset, TimeLimit
 
+from bam_envs.registry import ENVIRONMENTS
 from bam_train.errors import LoopError, SettingsError, ValueMismatch
 from bam_train.loop import Agent, Agents, ParallelGymAgent, TemporalAgent, VecGymAgent, Workspace
 
@@ -201,8 +202,6 @@ def test_gymnasiums_vectorised_cartpole(toys):
 
 @pytest.mark.parametrize("include_last_state", [True, False])
 def test_our_robots(toys, include_last_state):
-    import bam_envs  # noqa: F401 - registers them
-
     n, steps = 6, 25
     make = partial(gym.make_vec, "bam/pick-v0", num_envs=n, max_episode_steps=10)
     agent = VecGymAgent(make, include_last_state=include_last_state, info_keys=("is_success",)).seed(2)
@@ -221,13 +220,12 @@ def test_our_robots(toys, include_last_state):
     assert (ends == 10).all()
 
 
-def test_a_robots_episode_is_that_of_one_environment(toys):
-    import bam_envs  # noqa: F401 - registers them
-
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_a_robots_episode_is_that_of_one_environment(toys, env_id):
     n = 3
-    make = partial(gym.make_vec, "bam/pick-v0", num_envs=n, max_episode_steps=8)
+    make = partial(gym.make_vec, env_id, num_envs=n, max_episode_steps=8)
     agent = VecGymAgent(make)
-    single = ParallelGymAgent(partial(gym.make, "bam/pick-v0", max_episode_steps=8), n)
+    single = ParallelGymAgent(partial(gym.make, env_id, max_episode_steps=8), n)
 
     def act(t):
         return torch.full((n, *agent.get_action_space().shape), 0.1 * (t % 3))

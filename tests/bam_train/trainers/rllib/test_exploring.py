@@ -10,8 +10,8 @@ from bam_envs.spaces import space_to_json
 from bam_train.errors import SettingsError
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.rllib.exploring import ExploringPolicy
-from bam_train.trainers.rllib.freeze import freeze
-from bam_train.trainers.rllib.parts import parts_of
+from bam_train.trainers.rllib.freezing.freeze import freeze
+from bam_train.trainers.rllib.freezing.parts import parts_of
 
 OBSERVED = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
 ACTED = gym.spaces.Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 4.0], np.float32))

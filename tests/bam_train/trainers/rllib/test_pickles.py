@@ -14,8 +14,8 @@ import pytest
 from gymnasium import spaces
 
 from bam_train.errors import FormatError
+from bam_train.trainers.rllib.foreign.records import class_name, space_of
 from bam_train.trainers.rllib.pickles import Record, RefusedPickle, dtype_of, read_record, read_state, unpacked_array
-from bam_train.trainers.rllib.records import class_name, space_of
 
 READERS = [read_state, read_record]
 

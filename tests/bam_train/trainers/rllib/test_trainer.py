@@ -19,7 +19,7 @@ from bam_train.settings import TrainSettings
 from bam_train.trainers.resolve import resolve, resolve_resumed
 from bam_train.trainers.rllib import hyperparameters, registration, state
 from bam_train.trainers.rllib.algorithms import ALGORITHMS
-from bam_train.trainers.rllib.cluster import cluster
+from bam_train.trainers.rllib.cluster.cluster import cluster
 from bam_train.trainers.rllib.trainer import RLlibTrainer
 
 pytestmark = pytest.mark.filterwarnings("default")  # Ray's own

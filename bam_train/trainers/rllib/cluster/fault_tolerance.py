@@ -14,7 +14,7 @@ from typing import Any
 from ray.exceptions import RayError
 
 from bam_train.errors import ProcessesLost, TrainingFailed
-from bam_train.trainers.rllib import faults
+from bam_train.trainers.rllib.cluster import faults
 
 SAMPLE_TIMEOUT = 60.0
 """How long an update waits for the samples of its slowest runner [s]."""

@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 
 from bam_train.errors import AlteredCheckpoint, FormatError, PolicyError
-from bam_train.trainers.rllib.directory import ARGUMENTS, MODULE, Directory
-from bam_train.trainers.rllib.foreign_parts import FAULTS, ForeignPolicy, read_filter, read_weights
-from bam_train.trainers.rllib.old_stack import read_old_policy
-from bam_train.trainers.rllib.parts import (
+from bam_train.trainers.rllib.foreign.directory import ARGUMENTS, MODULE, Directory
+from bam_train.trainers.rllib.foreign.old_stack import read_old_policy
+from bam_train.trainers.rllib.foreign.parts import FAULTS, ForeignPolicy, read_filter, read_weights
+from bam_train.trainers.rllib.foreign.records import attributes, class_name, constructor, last_name, space_of
+from bam_train.trainers.rllib.freezing.parts import (
     AnySpace,
     PolicyParts,
     connector_parts,
     is_own,
     plain_config,
 )
-from bam_train.trainers.rllib.records import attributes, class_name, constructor, last_name, space_of
 
 _AFTER = frozenset(  # connectors that only move actions about
     {

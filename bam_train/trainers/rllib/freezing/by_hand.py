@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium import spaces
 
 from bam_train.errors import PolicyError
-from bam_train.trainers.rllib.parts import Array, PolicyParts, leaf_spaces
+from bam_train.trainers.rllib.freezing.parts import Array, PolicyParts, leaf_spaces
 
 _ERF = np.vectorize(math.erf, otypes=[np.float64])
 _ACTIVATIONS: dict[str, Callable[[Array], Array]] = {

@@ -20,9 +20,9 @@ import ray
 
 from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.settings import TrainSettings
-from bam_train.trainers.rllib import cluster as module
-from bam_train.trainers.rllib.cluster import cluster
-from bam_train.trainers.rllib.descendants import Descendants
+from bam_train.trainers.rllib.cluster import cluster as module
+from bam_train.trainers.rllib.cluster.cluster import cluster
+from bam_train.trainers.rllib.cluster.descendants import Descendants
 
 pytestmark = pytest.mark.slow
 
@@ -125,7 +125,7 @@ def test_a_ray_that_does_not_start(monkeypatch):
 
 
 def test_a_process_that_does_not_go_is_killed(monkeypatch):
-    monkeypatch.setattr("bam_train.trainers.rllib.descendants.GRACE", 0.2)
+    monkeypatch.setattr("bam_train.trainers.rllib.cluster.descendants.GRACE", 0.2)
     descendants = Descendants()
     code = "import signal, time; signal.signal(15, signal.SIG_IGN); print(flush=True); time.sleep(60)"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as process:
@@ -149,7 +149,7 @@ JOIN = """
 import sys, ray
 from bam_train.cli.program import guarded
 from bam_train.settings import TrainSettings
-from bam_train.trainers.rllib.cluster import cluster
+from bam_train.trainers.rllib.cluster.cluster import cluster
 given = {"env": "bam/reach-v0", "algo": "ppo", "trainer": "rllib", "address": sys.argv[1]}
 def join():
     with cluster(TrainSettings.from_mapping(given | {"num_env_runners": int(sys.argv[2])})):

@@ -24,12 +24,13 @@ from bam_train.policy import FrozenPolicy
 from bam_train.policy.golden import TOLERANCE, worst_difference
 from bam_train.policy.spaces import leaf, leaves
 from bam_train.trainers.provenance import git_commit, now, versions
-from bam_train.trainers.rllib.by_hand import actions_by_hand
-from bam_train.trainers.rllib.directory import Directory, find_policy
-from bam_train.trainers.rllib.foreign import ForeignPolicy, read_policy
-from bam_train.trainers.rllib.freeze import freeze
-from bam_train.trainers.rllib.golden import clear_observations, pack
-from bam_train.trainers.rllib.parts import AnySpace, Array, PolicyParts, leaf_spaces
+from bam_train.trainers.rllib.foreign.directory import Directory, find_policy
+from bam_train.trainers.rllib.foreign.parts import ForeignPolicy
+from bam_train.trainers.rllib.foreign.reading import read_policy
+from bam_train.trainers.rllib.freezing.by_hand import actions_by_hand
+from bam_train.trainers.rllib.freezing.freeze import freeze
+from bam_train.trainers.rllib.freezing.golden import clear_observations, pack
+from bam_train.trainers.rllib.freezing.parts import AnySpace, Array, PolicyParts, leaf_spaces
 
 EXPORTED = "exported"
 """Setting of the manifest that says where an exported checkpoint comes from; a run's own has none of this name."""
@@ -262,7 +263,7 @@ def _reference_actions(parts: PolicyParts, observations: dict[str, Array]) -> tu
     if parts.old_stack:
         return actions_by_hand(parts, observations), "NumPy"
     try:
-        from bam_train.trainers.rllib.reference import remade, rllib_actions
+        from bam_train.trainers.rllib.freezing.reference import remade, rllib_actions
     except ModuleNotFoundError:
         return actions_by_hand(parts, observations), "NumPy"
     return rllib_actions(parts, *remade(parts), observations), f"RLlib {metadata.version('ray')}"

@@ -17,7 +17,7 @@ from ray.cluster_utils import Cluster
 from bam_train.checkpoint import Checkpoint
 from bam_train.errors import ProcessesLost
 from bam_train.trainers.resolve import resolve
-from bam_train.trainers.rllib.cluster import loopback_only
+from bam_train.trainers.rllib.cluster.cluster import loopback_only
 from bam_train.trainers.rllib.trainer import RLlibTrainer
 
 pytestmark = pytest.mark.slow
@@ -166,7 +166,7 @@ def test_a_runner_that_dies_again_and_again(tmp_path, monkeypatch):
     (tmp_path / "broken.py").write_text(BROKEN)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
-    monkeypatch.setattr("bam_train.trainers.rllib.fault_tolerance.MOST_DEATHS", 1)
+    monkeypatch.setattr("bam_train.trainers.rllib.cluster.fault_tolerance.MOST_DEATHS", 1)
     settings = train_settings(None, env="broken:test/Broken-v0", num_envs=1, num_env_runners=1)
     with contextlib.closing(RLlibTrainer.create(settings)) as trainer:
         with pytest.raises(ProcessesLost) as caught:

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from torch import nn
 
 from bam_train.errors import PolicyError
-from bam_train.trainers.rllib.parts import Array, Filter, PolicyParts, leaf_spaces
+from bam_train.trainers.rllib.freezing.parts import Array, Filter, PolicyParts, leaf_spaces
 
 
 class Layer(nn.Module):  # type: ignore[misc]

@@ -11,10 +11,10 @@ import pytest
 from bam_envs.spaces import space_to_json
 from bam_train.errors import AlteredCheckpoint, BamTrainError, CheckpointMismatch, NotACheckpoint
 from bam_train.policy import FrozenPolicy
-from bam_train.trainers.rllib.by_hand import actions_by_hand
-from bam_train.trainers.rllib.directory import find_policy
-from bam_train.trainers.rllib.foreign import read_policy
-from bam_train.trainers.rllib.freeze import freeze
+from bam_train.trainers.rllib.foreign.directory import find_policy
+from bam_train.trainers.rllib.foreign.reading import read_policy
+from bam_train.trainers.rllib.freezing.by_hand import actions_by_hand
+from bam_train.trainers.rllib.freezing.freeze import freeze
 
 NEW, OLD = "learner_group/learner/rl_module/default_policy", "policies/default_policy"
 KINDS = ["ppo", "several", "sac", "dqn", "ppo-old", "sac-old", "dqn-old"]

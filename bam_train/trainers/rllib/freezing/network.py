@@ -16,8 +16,8 @@ import torch
 from torch import nn
 
 from bam_train.errors import PolicyError
-from bam_train.trainers.rllib.layers import Layer, outputs_of
-from bam_train.trainers.rllib.parts import Array, PolicyParts, leaf_spaces
+from bam_train.trainers.rllib.freezing.layers import Layer, outputs_of
+from bam_train.trainers.rllib.freezing.parts import Array, PolicyParts, leaf_spaces
 
 _EPSILON = 1e-3  # of RLlib's layer norms
 # Where the actor's encoder and its head are: PPO and its relatives with separate and shared encoders; SAC, CQL and IQL;

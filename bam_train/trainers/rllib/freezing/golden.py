@@ -13,8 +13,8 @@ import torch
 from gymnasium import spaces
 
 from bam_train.checkpoint import safetensors_file
-from bam_train.trainers.rllib.freeze import FrozenModule
-from bam_train.trainers.rllib.parts import Array, Filter, PolicyParts, leaf_spaces
+from bam_train.trainers.rllib.freezing.freeze import FrozenModule
+from bam_train.trainers.rllib.freezing.parts import Array, Filter, PolicyParts, leaf_spaces
 
 _BUDGET = 200_000  # bytes of observations; images are random and do not pack
 _FAR = 1e6  # a bound beyond this says nothing about the values that occur
@@ -34,7 +34,7 @@ def golden(parts: PolicyParts, module: Any, env_to_module: Any, config: Any, n: 
     Returns:
         A safetensors file with ``observation`` (or ``observation.<key>``), (n, ...), and ``action``, (n, ...).
     """
-    from bam_train.trainers.rllib.reference import rllib_actions
+    from bam_train.trainers.rllib.freezing.reference import rllib_actions
 
     observations = clear_observations(parts, n, seed)
     actions = rllib_actions(parts, module, env_to_module, config, observations)

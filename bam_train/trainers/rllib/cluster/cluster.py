@@ -25,10 +25,10 @@ import ray.rllib  # sets up its loggers
 
 from bam_train.errors import TrainingFailed
 from bam_train.settings import TrainSettings
-from bam_train.trainers.rllib.address import find, reach
-from bam_train.trainers.rllib.descendants import Descendants
-from bam_train.trainers.rllib.fault_tolerance import fault_tolerance
-from bam_train.trainers.rllib.resources import cores, gpus, learners, require_resources
+from bam_train.trainers.rllib.cluster.address import find, reach
+from bam_train.trainers.rllib.cluster.descendants import Descendants
+from bam_train.trainers.rllib.cluster.fault_tolerance import fault_tolerance
+from bam_train.trainers.rllib.cluster.resources import cores, gpus, learners, require_resources
 
 __all__ = ["cluster", "fault_tolerance", "gpus", "learners", "require_resources"]
 

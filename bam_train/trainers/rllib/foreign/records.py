@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from bam_train.errors import FormatError
-from bam_train.trainers.rllib.parts import AnySpace
+from bam_train.trainers.rllib.freezing.parts import AnySpace
 from bam_train.trainers.rllib.pickles import Record, dtype_of, unpacked_array
 
 _FAULTS = (

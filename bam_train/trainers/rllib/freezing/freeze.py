@@ -17,9 +17,9 @@ import torch
 from gymnasium import spaces
 
 from bam_train.errors import PolicyError
-from bam_train.trainers.rllib.layers import Layer, encoder, head, outputs_of, torch_dtype
-from bam_train.trainers.rllib.network import network
-from bam_train.trainers.rllib.parts import PolicyParts, leaf_spaces
+from bam_train.trainers.rllib.freezing.layers import Layer, encoder, head, outputs_of, torch_dtype
+from bam_train.trainers.rllib.freezing.network import network
+from bam_train.trainers.rllib.freezing.parts import PolicyParts, leaf_spaces
 
 __all__ = ["FrozenModule", "freeze"]
 

@@ -8,10 +8,10 @@ from typing import Any
 from gymnasium import spaces
 
 from bam_train.errors import CheckpointMismatch, FormatError, PolicyError
-from bam_train.trainers.rllib.directory import STATE, Directory
-from bam_train.trainers.rllib.foreign_parts import FAULTS, ForeignPolicy, read_filter, read_weights
-from bam_train.trainers.rllib.parts import AnySpace, Filter, PolicyParts
-from bam_train.trainers.rllib.records import attributes, old_space
+from bam_train.trainers.rllib.foreign.directory import STATE, Directory
+from bam_train.trainers.rllib.foreign.parts import FAULTS, ForeignPolicy, read_filter, read_weights
+from bam_train.trainers.rllib.foreign.records import attributes, old_space
+from bam_train.trainers.rllib.freezing.parts import AnySpace, Filter, PolicyParts
 
 _OLD_BEFORE = frozenset({"ObsPreprocessorConnector", "StateBufferConnector", "ViewRequirementAgentConnector"})
 _OLD_FILTERS = ("MeanStdObservationFilterAgentConnector", "ConcurrentMeanStdObservationFilterAgentConnector")

@@ -12,8 +12,8 @@ from ray.rllib.connectors.env_to_module.mean_std_filter import MeanStdFilter as 
 from ray.rllib.utils.filter import RunningStat
 
 from bam_train.environments import make_rows
-from bam_train.trainers.rllib.filters import MeanStdFilter, push
-from bam_train.trainers.rllib.rows import Rollout, Running
+from bam_train.trainers.rllib.sampling.filters import MeanStdFilter, push
+from bam_train.trainers.rllib.sampling.rows import Rollout, Running
 
 BOX = gym.spaces.Box(-10, 10, (2,), np.float32)
 

@@ -29,9 +29,9 @@ from ray.rllib.utils.spaces.space_utils import clip_action, unsquash_action
 
 from bam_train.environments import is_batched, make_rows
 from bam_train.errors import SettingsError
-from bam_train.trainers.rllib.faults import FaultReporting
-from bam_train.trainers.rllib.filters import MeanStdFilter
-from bam_train.trainers.rllib.rows import End, Rollout, Running
+from bam_train.trainers.rllib.cluster.faults import FaultReporting
+from bam_train.trainers.rllib.sampling.filters import MeanStdFilter
+from bam_train.trainers.rllib.sampling.rows import End, Rollout, Running
 
 Array = NDArray[Any]
 
@@ -70,8 +70,8 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
         if strange or self.config._module_to_env_connector is not None:
             found = ", ".join(strange) or "a module-to-env connector"
             raise SettingsError(
-                f"RobotEnvRunner: expected the MeanStdFilter of bam_train.trainers.rllib.filters or no connector, "
-                f"found {found}; leave env_runner_cls out to use RLlib's own runner"
+                "RobotEnvRunner: expected the MeanStdFilter of bam_train.trainers.rllib.sampling.filters or no "
+                f"connector, found {found}; leave env_runner_cls out to use RLlib's own runner"
             )
         return own[0] if own else None
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from bam_train.errors import PolicyError
-from bam_train.trainers.rllib.directory import Directory
-from bam_train.trainers.rllib.parts import Array, Filter, PolicyParts, filter_of
+from bam_train.trainers.rllib.foreign.directory import Directory
+from bam_train.trainers.rllib.freezing.parts import Array, Filter, PolicyParts, filter_of
 from bam_train.trainers.rllib.pickles import unpacked_array
 
 FAULTS = (AttributeError, IndexError, KeyError, TypeError, ValueError)

@@ -12,8 +12,8 @@ pytest.importorskip("ray.rllib")
 from ray._private import utils as ray_utils
 
 from bam_train.errors import SettingsError, TrainingFailed
-from bam_train.trainers.rllib import address
-from bam_train.trainers.rllib.address import find, reach
+from bam_train.trainers.rllib.cluster import address
+from bam_train.trainers.rllib.cluster.address import find, reach
 
 
 @pytest.fixture

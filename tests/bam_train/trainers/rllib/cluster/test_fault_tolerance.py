@@ -12,8 +12,8 @@ from ray.exceptions import RayError
 from ray.rllib.algorithms.ppo import PPOConfig
 
 from bam_train.errors import ProcessesLost, TrainingFailed
-from bam_train.trainers.rllib import faults
-from bam_train.trainers.rllib.fault_tolerance import RunnerWatch, fault_tolerance
+from bam_train.trainers.rllib.cluster import faults
+from bam_train.trainers.rllib.cluster.fault_tolerance import RunnerWatch, fault_tolerance
 
 
 class Algorithm:

@@ -1,0 +1,1 @@
+"""Collecting samples: one batched simulation in each runner."""
