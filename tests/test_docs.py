@@ -12,7 +12,19 @@ import pytest
 
 from bam_envs.registry import ENVIRONMENTS
 from bam_envs.robots.simulated.imperfection import Ranges
-from bam_envs.tasks import pick, pick_place, reach
+from bam_envs.tasks import (
+    isaac_reach,
+    mir100_avoidance,
+    mir100_drive,
+    mir100_navigation,
+    pick,
+    pick_place,
+    reach,
+    ur_avoidance,
+    ur_obstacle,
+    ur_reach,
+    ur_track,
+)
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli import train
 from bam_train.settings import tomllib
@@ -104,6 +116,10 @@ def test_every_number_of_an_environment_is_in_its_table(make_docs):
         assert f"**{name}.** " in text
 
 
+DRIVING = (mir100_drive.NEARER, mir100_drive.ARRIVING, mir100_drive.FAILING, mir100_drive.TIME, *mir100_drive.POWER)
+"""Numbers in the reward of a base."""
+
+
 def metres(value):
     return f"{100 * value:g} cm"
 
@@ -121,6 +137,25 @@ def metres(value):
         (pick_place.PickPlaceTask, "Success", [metres(pick_place.GOAL_RADIUS), metres(pick_place.PICKED)]),
         (pick_place.PickPlaceTask, "Success", [f"{pick_place.REST_STEPS} steps", f"{pick_place.REST_STEPS / 20} s"]),
         (pick_place.PickPlaceTask, "Reward", [metres(pick_place.CARRY), metres(pick_place.PICKED)]),
+        (mir100_navigation.Mir100NavigationTask, "Success", [metres(mir100_drive.ARRIVED)]),
+        (mir100_navigation.Mir100NavigationTask, "Start", [f"at least {mir100_drive.MIN_DISTANCE:g} m"]),
+        (mir100_navigation.Mir100NavigationTask, "End", [f"{2 * mir100_drive.BOUNDARY:g} x "]),
+        (mir100_navigation.Mir100NavigationTask, "Reward", [f"{x:g}" for x in DRIVING]),
+        (mir100_avoidance.Mir100AvoidanceTask, "Success", [metres(mir100_drive.ARRIVED)]),
+        (mir100_avoidance.Mir100AvoidanceTask, "Start", ["{} to {} m".format(*mir100_avoidance.SIDE)]),
+        (mir100_avoidance.Mir100AvoidanceTask, "End", [metres(mir100_avoidance.NEAREST)]),
+        (mir100_avoidance.Mir100AvoidanceTask, "Reward", [f"{x:g}" for x in DRIVING]),
+        (ur_reach.UrReachTask, "Success", [metres(ur_reach.NEAR)]),
+        (ur_reach.UrReachTask, "Start", [f"{x}" for x in ur_reach.START_OFFSET]),
+        (ur_avoidance.UrAvoidanceTask, "Start", [str(list(ur_avoidance.POSE)).replace("0.0]", "0]")]),
+        (ur_avoidance.UrAvoidanceTask, "Reward", [f"{ur_avoidance.NEAREST:.2f} m", f"{ur_avoidance.RAPID}"]),
+        (ur_avoidance.UrAvoidanceTask, "Reward", [f"{ur_avoidance.SPREAD}", f"collision {ur_avoidance.COLLISION}"]),
+        (ur_avoidance.UrAvoidanceTask, "Success", [f"{ur_obstacle.MAX_STEPS} steps"]),
+        (ur_track.UrTrackTask, "Reward", [f"{ur_track.NEAREST} m", f"{ur_track.RAPID}", f"{ur_track.CLOSE}"]),
+        (ur_track.UrTrackTask, "Reward", [f"{ur_track.BONUS}", f"collision {ur_track.COLLISION}"]),
+        (ur_track.UrTrackTask, "Success", [f"{ur_obstacle.MAX_STEPS} steps"]),
+        (isaac_reach.IsaacReachTask, "Success", [f"{isaac_reach.CLOSE} m", f"{isaac_reach.ALIGNED} rad"]),
+        (isaac_reach.IsaacReachTask, "Start", [f"{x:g}" for x in isaac_reach.TARGETS.ravel()]),
     ],
 )
 def test_prose_has_the_numbers_of_the_code(make_docs, task, section, facts):

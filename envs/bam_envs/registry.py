@@ -325,12 +325,12 @@ def make_vector_env(
     from bam_envs.robot_env import RobotVectorEnv
 
     entry = ENVIRONMENTS[env_id]
-    if max_episode_steps is None and entry.parity:
-        max_episode_steps = entry.max_episode_steps
     task = resolve(entry.task)(num_envs, **task_options)
+    if max_episode_steps is None and not getattr(task, "ends_by_itself", False):
+        max_episode_steps = entry.max_episode_steps if entry.parity else None  # Gymnasium gives that of the others
     return RobotVectorEnv(
         entry.make_robot(num_envs, randomize, task_options),
         task,
-        max_episode_steps=None if getattr(task, "ends_by_itself", False) else max_episode_steps,
+        max_episode_steps=max_episode_steps,
         render_mode=render_mode,
     )

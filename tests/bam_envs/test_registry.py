@@ -1,6 +1,7 @@
 """The one table of environments."""
 
 import gymnasium as gym
+import numpy as np
 import pytest
 
 from bam_envs.errors import InvalidValue, UnknownName
@@ -32,6 +33,21 @@ def test_every_row_makes_what_it_says(env_id):
     robot, task = resolve(entry.robot)(2), resolve(entry.task)(2)
     assert robot.num_robots == task.num_rows == 2
     assert robot.spec.period == entry.period
+
+
+@pytest.mark.parametrize("env_id", [env_id for env_id, entry in ENVIRONMENTS.items() if entry.parity])
+def test_tasks_that_count_steps_count_to_the_limit_of_the_table(make_rows, env_id):
+    """With ``parity=True`` they end there by themselves."""
+    envs = make_rows(env_id, 1, parity=True)
+    memory = envs.unwrapped.task.state_dict()
+    (name,) = {"elapsed", "steps"} & memory.keys()
+    for left, ends in ((2, False), (1, True)):
+        envs.reset(seed=0)
+        memory = envs.unwrapped.task.state_dict()
+        memory[name] = np.array([ENVIRONMENTS[env_id].max_episode_steps - left])
+        envs.unwrapped.task.load_state_dict(memory)
+        _, _, terminated, truncated, _ = envs.step(np.zeros(envs.action_space.shape, np.float32))
+        assert (terminated.tolist(), truncated.tolist()) == ([ends], [False])
 
 
 def test_registering_again_changes_nothing():

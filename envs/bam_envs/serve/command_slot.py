@@ -48,7 +48,8 @@ class CommandSlot:
             order, self._order = self._order, Order()
         return order
 
-    def clear(self) -> None:
-        """Forget what came."""
+    def clear(self) -> Order:
+        """Forget what came; what it was."""
         with self._lock:
-            self._order = Order()
+            order, self._order = self._order, Order()
+        return order

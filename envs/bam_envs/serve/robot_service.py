@@ -159,16 +159,15 @@ class RobotService:
 
         In lockstep the one whose command it overtook waits for an answer, and gets it: nothing moved.
         """
-        order = self._rest()
-        if order is not None and order.complete and self.info.lockstep:
+        if self._rest().complete and self.info.lockstep:
             self.clock.wake()
 
-    def _rest(self) -> Order | None:
+    def _rest(self) -> Order:
         """What was to be executed next, and is not."""
         with self._moving:
-            order = self._slot.take()
+            order = self._slot.clear()
             self._robot.halt()
-            if order is not None and order.complete and self.info.lockstep:
+            if order.complete and self.info.lockstep:
                 self._answered = order.tag
         return order
 

@@ -308,7 +308,7 @@ def test_a_command_that_a_halt_overtakes_is_answered_and_moves_nothing(serve, bu
     assert service.send(command(0.5), tag, "a") is None
     assert bus.say("/bam/halt", {}, "somebody") is None
     service.service._tick_lockstep()
-    assert read_tag(service.joints()["header"]["frame_id"]) == tag
+    assert service.joints()["header"]["frame_id"] == tag.to_text()
     assert service.robot.state.stamp == 0.0
     assert service.robot._resting
 
