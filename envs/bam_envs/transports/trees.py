@@ -25,7 +25,9 @@ def plain_info(value: Any) -> Tree:
 
     Numbers keep their values and NumPy's keep their dtypes; NaN is let through: an info is for people.
     """
-    if value is None or isinstance(value, (bool, float, str, np.bool_, np.number)):
+    if isinstance(value, str):
+        return str(value)  # also NumPy's, which would be taken for a number
+    if value is None or isinstance(value, (bool, float, np.bool_, np.number)):
         return value
     if isinstance(value, int):
         return value if value in _INT64 else str(value)

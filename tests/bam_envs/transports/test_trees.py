@@ -40,6 +40,13 @@ def test_infos_become_plain():
     assert 1 in info
 
 
+def test_texts_of_numpy_are_texts():
+    """As those of rows are: a scalar of text would be refused at the other end."""
+    tree = plain_info({"final_status": np.array(["success"])[0]})
+    assert type(tree["final_status"]) is str
+    assert tree_from_json(tree_to_json(tree)) == {"final_status": "success"}
+
+
 TREE = {
     "array": np.array([[1.5, np.nan]], np.float32),
     "empty": np.zeros((0, 3), np.int16),
