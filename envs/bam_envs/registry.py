@@ -7,6 +7,8 @@ environment is made.
 from __future__ import annotations
 
 import importlib
+import inspect
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -20,6 +22,10 @@ if TYPE_CHECKING:
     from bam_envs.remote_env import RemoteVectorEnv
     from bam_envs.robot_env import RobotEnv, RobotVectorEnv
     from bam_envs.robots.robot import Robot
+    from bam_envs.tasks.task import Task
+
+_NO_OPTIONS = {"env_id", "task_options"}
+"""Arguments of `make_env` that nobody gives to `gymnasium.make`."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +49,20 @@ class EnvEntry:
     environment here, and not by Gymnasium, which would do it in any case."""
     robot_options: tuple[str, ...] = ()
     """Arguments of the task that its robot takes too."""
+
+    def make_task(self, num_rows: int, options: Mapping[str, Any]) -> Task:
+        """The task, of so many rows.
+
+        Raises:
+            UnknownName: It has no such option.
+            InvalidValue: An option cannot be what it is.
+        """
+        from bam_envs.tasks.options import require_options
+
+        kind = resolve(self.task)
+        require_options(self.id, kind, options, frozenset(inspect.signature(make_env).parameters) - _NO_OPTIONS)
+        task: Task = kind(num_rows, **options)
+        return task
 
     def make_robot(self, num_robots: int, randomize: bool, task_options: Mapping[str, Any]) -> Robot:
         """The simulated robot, or n of them."""
@@ -245,7 +265,7 @@ def make_env(
     from bam_envs.robot_env import RobotEnv
 
     entry = ENVIRONMENTS[env_id]
-    task = resolve(entry.task)(1, **task_options)
+    task = entry.make_task(1, task_options)
     simulated = entry.make_robot(1, randomize, task_options)
     if robot is None:
         return limited(RobotEnv(simulated, task, render_mode=render_mode), entry)
@@ -260,9 +280,24 @@ def make_env(
 
 def limited(env: RobotEnv, entry: EnvEntry) -> gym.Env[Any, Any]:
     """`env` with the time limit that Gymnasium does not put around it."""
-    if not entry.parity or getattr(env.task, "ends_by_itself", False):
+    if not entry.parity or getattr(env.task, "ends_by_itself", False) or _gymnasium_limits():
         return env
     return gym.wrappers.TimeLimit(env, entry.max_episode_steps)
+
+
+def _gymnasium_limits() -> bool:
+    """Whether `gymnasium.make`, which calls this, was told of a limit, or of -1 for none.
+
+    It keeps its ``max_episode_steps`` to itself, and a limit within would cut what is to be longer. So its frame is
+    asked; where there is none, nobody was told of a limit.
+    """
+    frame: Any = sys._getframe()
+    while frame is not None and frame.f_code is not gym.make.__code__:
+        frame = frame.f_back
+    if frame is None:
+        return False
+    spec = frame.f_locals["env_spec"]
+    return (frame.f_locals["max_episode_steps"], spec.max_episode_steps) != (None, None)
 
 
 def _require_simulation(elsewhere: object, render_mode: str | None, randomize: bool) -> None:
@@ -325,7 +360,7 @@ def make_vector_env(
     from bam_envs.robot_env import RobotVectorEnv
 
     entry = ENVIRONMENTS[env_id]
-    task = resolve(entry.task)(num_envs, **task_options)
+    task = entry.make_task(num_envs, task_options)
     if max_episode_steps is None and not getattr(task, "ends_by_itself", False):
         max_episode_steps = entry.max_episode_steps if entry.parity else None  # Gymnasium gives that of the others
     return RobotVectorEnv(

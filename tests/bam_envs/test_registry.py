@@ -130,8 +130,41 @@ def test_the_time_limit_of_rows_can_be_changed():
 
 
 def test_an_option_that_does_not_exist_is_an_error(make):
-    with pytest.raises(TypeError, match="randomise"):
+    with pytest.raises(UnknownName) as caught:
         make("bam/pick-v0", randomise=True)
+    assert str(caught.value) == "Unknown argument of bam/pick-v0 'randomise'. Did you mean 'randomize'?"
+
+
+@pytest.mark.parametrize("making", [gym.make, gym.make_vec])
+def test_a_flag_that_is_none_is_an_error(making):
+    with pytest.raises(InvalidValue, match=r"parity= of bam/ur-reach-v0 must be True or False, not 'false'\."):
+        making("bam/ur-reach-v0", parity="false")
+
+
+@pytest.mark.parametrize("env_id", ["bam/mir100-navigation-v0", "NoObstacleNavigationMir100Sim-v0", "bam/reach-v0"])
+@pytest.mark.parametrize("steps", [7, 700, -1])
+def test_the_time_limit_can_be_changed(make, env_id, steps):
+    """Of environments that Gymnasium does not limit by itself, too; also by what they say of themselves."""
+    env = make(env_id, max_episode_steps=steps)
+    for one in (env, gym.make(env.spec)) if steps > 0 else (env,):
+        one.reset(seed=0)
+        still, ends = np.zeros(one.action_space.shape, np.float32), []
+        for _ in range(701):
+            ends.append(one.step(still)[3])
+            if ends[-1]:
+                break
+        assert len(ends) == (steps if steps > 0 else 701)
+        assert ends[-1] == (steps > 0)
+        one.close()
+
+
+@pytest.mark.parametrize(("steps", "ended", "flags"), [(7, 7, (False, True)), (700, 500, (True, False))])
+def test_the_time_limit_of_robo_gym_cannot_be_put_off(make, steps, ended, flags):
+    env = make("bam/mir100-navigation-v0", parity=True, max_episode_steps=steps)
+    env.reset(seed=0)
+    for _ in range(ended):
+        *_, terminated, truncated, _ = env.step(np.zeros(2, np.float32))
+    assert (terminated, truncated) == flags
 
 
 @pytest.mark.parametrize(

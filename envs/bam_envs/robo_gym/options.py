@@ -11,6 +11,7 @@ from bam_envs.errors import InvalidValue, UnknownName
 from bam_envs.robo_gym.notices import say_once
 from bam_envs.robo_gym.table import RoboGymId
 from bam_envs.robot_env import render_modes
+from bam_envs.tasks.options import option_names
 
 _MANAGER = ("ip", "lower_bound_port", "upper_bound_port", "server_manager_port")
 """Where robo-gym finds the Server Manager that starts Gazebo."""
@@ -57,8 +58,7 @@ def translate(entry: RoboGymId, given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _require_known(entry: RoboGymId, given: Mapping[str, Any]) -> None:
-    task = registry.resolve(registry.ENVIRONMENTS[entry.env_id].task)
-    of_task = set(inspect.signature(task).parameters) - {"num_rows"}
+    of_task = option_names(registry.resolve(registry.ENVIRONMENTS[entry.env_id].task))
     known = {*of_task, *_OF_ENVIRONMENT, *_SIMULATED, "rs_address"} - {"env_id", "task_options"}
     for name in given:
         if name in known:

@@ -1,0 +1,58 @@
+"""Options of tasks, before they are made."""
+
+import numpy as np
+import pytest
+
+from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.tasks.options import option_names, require_options
+
+
+class Task:
+    def __init__(self, num_rows=1, *, parity=False, near=0.1, name="ur5", place=None):
+        pass
+
+
+def checked(**options):
+    require_options("bam/task-v0", Task, options, frozenset({"robot"}))
+
+
+def test_names():
+    assert option_names(Task) == {"parity", "near", "name", "place"}
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"parity": True},
+        {"parity": np.bool_(True)},
+        {"near": 1},
+        {"near": np.float32(1)},
+        {"name": 5},
+        {"place": []},
+    ],
+)
+def test_what_fits(options):
+    checked(**options)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"parity": "false"}, "parity= of bam/task-v0 must be True or False, not 'false'."),
+        ({"parity": 1}, "parity= of bam/task-v0 must be True or False, not 1."),
+        ({"near": "a"}, "near= of bam/task-v0 must be a number, not 'a'."),
+        ({"near": True}, "near= of bam/task-v0 must be a number, not True."),
+    ],
+)
+def test_what_does_not(options, text):
+    with pytest.raises(InvalidValue) as caught:
+        checked(**options)
+    assert str(caught.value) == text
+
+
+@pytest.mark.parametrize(("name", "closest"), [("paritty", "parity"), ("robott", "robot")])
+def test_what_there_is_not(name, closest):
+    with pytest.raises(UnknownName) as caught:
+        checked(**{name: 1})
+    assert str(caught.value) == f"Unknown argument of bam/task-v0 {name!r}. Did you mean {closest!r}?"
