@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from bam_envs.robots.mir100 import BACK_RAYS, FOOTPRINT, FRONT_RAYS
 from bam_envs.robots.robot import RobotState, Rows
+from bam_envs.robots.simulated.room import touches
 from bam_envs.tasks.mir100_drive import DriveTask
 from bam_envs.tasks.poses import spread
 from bam_envs.tasks.task import Array, Flags, Floats, Label
@@ -33,6 +35,9 @@ SIGHT = 3.0
 """What is farther than this is observed as if it were there [m]."""
 _FRONT_STARTS = np.linspace(0, FRONT_RAYS, SECTORS + 1).astype(np.int64)[:-1]
 _BACK_STARTS = np.linspace(0, BACK_RAYS, SECTORS + 1).astype(np.int64)[:-1]
+_OF_BOXES = slice(6, 15)
+"""Which of the numbers that are drawn the boxes are made of."""
+_TRIES = 1000
 _CORNERS = np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]]) * np.array(FOOTPRINT) / 2
 
 
@@ -104,11 +109,17 @@ class Mir100AvoidanceTask(DriveTask):
         x, y = spread(draws[:, 4], -WIDTH, WIDTH), side * spread(draws[:, 5], *SIDE)
         return np.stack([x, y, np.zeros(len(start))], axis=1)
 
+    def make_way(self, start: Array, draws: Array, rngs: Sequence[np.random.Generator]) -> None:
+        """Boxes are drawn until none is where the base starts; a start in a wall is the robot's to refuse."""
+        for k, rng in enumerate(rngs):
+            for _ in range(_TRIES):
+                if not touches(start[k : k + 1], None, _boxes(draws[k : k + 1]))[0]:
+                    break
+                draws[k, _OF_BOXES] = rng.random(9)
+
     def scene(self, rows: Rows, draws: Array) -> dict[str, Array]:
         """The boxes."""
-        x = BOXES[:, 0] + draws[:, 6:9] * (BOXES[:, 1] - BOXES[:, 0])
-        y, yaw = spread(draws[:, 9:12], -BOX_DEPTH, BOX_DEPTH), spread(draws[:, 12:15], -math.pi, math.pi)
-        self.obstacles[rows] = np.stack([x, y, yaw], axis=2)
+        self.obstacles[rows] = _boxes(draws)
         return {"obstacle_pose": self.obstacles[rows]}
 
     def sectors(self, state: RobotState) -> Array:
@@ -155,3 +166,10 @@ class Mir100AvoidanceTask(DriveTask):
         """Go to what `state_dict` returned."""
         super().load_state_dict(state)
         self.obstacles, self._sectors = np.array(state["obstacles"]), None
+
+
+def _boxes(draws: Array) -> Array:
+    """Where the boxes are: x, y [m] and yaw [rad]. Shape: (k, draws) -> (k, 3, 3)."""
+    of_x, of_y, of_yaw = np.moveaxis(draws[:, _OF_BOXES].reshape(-1, 3, len(BOXES)), 1, 0)
+    x = BOXES[:, 0] + of_x * (BOXES[:, 1] - BOXES[:, 0])
+    return np.stack([x, spread(of_y, -BOX_DEPTH, BOX_DEPTH), spread(of_yaw, -math.pi, math.pi)], axis=2)

@@ -95,6 +95,9 @@ class DriveTask:
         """Hook: targets for bases that stand at `start` (k, 3). Shapes: (k, draws) -> (k, 3)."""
         raise NotImplementedError
 
+    def make_way(self, start: Array, draws: Array, rngs: Sequence[np.random.Generator]) -> None:
+        """Hook: draw anew, in `draws` (k, draws), what is where bases are to start, at `start` (k, 3)."""
+
     def scene(self, rows: Rows, draws: Array) -> dict[str, Array]:
         """Hook: start values of other signals than the pose."""
         return {}
@@ -109,14 +112,14 @@ class DriveTask:
         """A start pose; the target is chosen when it is known where the base really is."""
         draws = np.stack([rng.random(self.draws) for rng in rngs])
         seeds = np.array([rng.integers(2**63) for rng in rngs], dtype=np.int64)
-        asked = [
-            floor_pose(name, options[name], BOUNDARY) if options and name in options else np.nan
-            for name in self.reset_options
-        ]
-        self._draws[rows] = draws
+        given = [(name, (options or {}).get(name)) for name in self.reset_options]
+        asked = [np.nan if value is None else floor_pose(name, value, BOUNDARY) for name, value in given]
         for which, pose in enumerate(asked):
             self._asked[rows, which] = pose
         start = preferred(self._asked[rows, 0], self.starts(draws))
+        if given[0][1] is not None:
+            self.make_way(start, draws, rngs)
+        self._draws[rows] = draws
         return Initial({"base_pose": start, **self.scene(rows, draws)}, seeds)
 
     def start(self, rows: Rows, state: RobotState) -> None:

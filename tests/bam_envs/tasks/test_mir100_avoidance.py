@@ -13,7 +13,7 @@ import bam_envs  # noqa: F401 - registers the environments
 from bam_envs.errors import InvalidValue
 from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS
 from bam_envs.robots.robot import RobotState
-from bam_envs.tasks.mir100_avoidance import BEAMS, Mir100AvoidanceTask
+from bam_envs.tasks.mir100_avoidance import BEAMS, BOXES, Mir100AvoidanceTask
 
 ENV = "bam/mir100-avoidance-v0"
 ROW = np.zeros(1, np.int64)
@@ -168,6 +168,21 @@ def test_driving_into_a_box_ends_the_episode(make):
 def test_a_start_in_a_wall(make):
     with pytest.raises(InvalidValue, match=r"base_pose must be free .* at \[2.8, 0.0, 0.0\]"):
         make(ENV).reset(options={"start_pose": [2.8, 0.0, 0.0]})
+
+
+def test_boxes_make_way_for_a_start_that_is_asked_for(make, make_rows):
+    env, envs, places = make(ENV), make_rows(ENV, 3), []
+    options = {"start_pose": [0.0, 0.0, 0.0]}
+    rows, _ = envs.reset(seed=5, options=options)
+    for seed in range(20):
+        observation, _ = env.reset(seed=seed, options=options)  # many a box would be there
+        places.append(env.unwrapped.state.truth["obstacle_pose"][0])
+        np.testing.assert_array_equal(env.unwrapped.task.obstacles[0], places[-1])
+        if 5 <= seed < 8:
+            np.testing.assert_array_equal(observation, rows[seed - 5])
+    x, y, _ = np.array(places).transpose(2, 0, 1)
+    assert ((x >= BOXES[:, 0]) & (x <= BOXES[:, 1]) & (np.abs(y) <= 1.0)).all()
+    assert len(np.unique(y)) == y.size
 
 
 @pytest.mark.parametrize("parity", [False, True])

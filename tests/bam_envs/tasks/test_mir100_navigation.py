@@ -199,6 +199,14 @@ def test_bad_poses(make, pose, text):
     assert str(caught.value) == text
 
 
+def test_none_is_no_pose(make):
+    """As in robo-gym."""
+    env = make(ENV)
+    drawn, _ = env.reset(seed=1)
+    same, _ = env.reset(seed=1, options={"start_pose": None, "target_pose": None})
+    np.testing.assert_array_equal(drawn, same)
+
+
 def test_a_robot_that_stays_where_it_is_is_not_started_elsewhere():
     task = Mir100NavigationTask()
     task.begin(ROW, [np.random.default_rng(0)], {"start_pose": [1.0, 0.0, 0.0]})
