@@ -67,11 +67,11 @@ class IsaacReachTask:
         Terminated at success, and at a collision of the arm with itself or the table.
 
     Info:
-        `final_status`, `dist_coord` [m] (also as `distance`), `dist_rot` [rad], `target_coord` [m], `target_rot` as x,
-        y, z, w, and `rs_state` where it is asked for.
+        `dist_coord` [m] (also as `distance`), `dist_rot` [rad], `target_coord` [m], `target_rot` as x, y, z, w,
+        `rs_state` where it is asked for, and at the end `final_status`: "success" or "collision".
 
     With ``parity=True`` nothing is scaled, an action is in units of 0.5 rad and as large as the joints' limits let
-    it be, and 600 steps terminate, as in robo-gym: so policies of Isaac Lab fit.
+    it be, and 600 steps terminate as "max_steps_exceeded", as in robo-gym: so policies of Isaac Lab fit.
 
     Args:
         num_rows: How many robots are scored together.
@@ -209,7 +209,7 @@ class IsaacReachTask:
         reward = np.where(collision, -1.0, np.where(success, 2.0, -0.005 * distance - 0.05 * angle))
         goes_on = (success | last)[:, None] & self.continue_except_collision
         self._ended = np.where(goes_on, state.signals["joint_position"], np.nan)
-        status = np.where(success, "success", np.where(last, "max_steps_exceeded", ""))
+        status = np.where(success, "success", "")
         if self.parity:
             status = np.where(last, "max_steps_exceeded", status)  # also of an arrival in the last step
         info: dict[str, Any] = {
@@ -265,7 +265,7 @@ def _target(options: Mapping[str, Any]) -> Array | None:
     given = options.get("ee_target_pose")
     if given is None:
         return None
-    if np.shape(given) == (7,):
+    if np.array(given, dtype=object).shape == (7,):
         pose = number_option(options, "ee_target_pose", (), 7)
         length = float(np.sqrt((pose[3:] ** 2).sum()))
         if abs(length - 1) > 1e-3:

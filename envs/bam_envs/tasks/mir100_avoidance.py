@@ -48,7 +48,7 @@ class Mir100AvoidanceTask(DriveTask):
         The base is at rest at x -2 to 2 m, 2.1 to 3.1 m from the middle of the room to either side along y, with any
         yaw; a live one where it is. The target is as far on the other side, at x -2 to 2 m. The boxes, cubes of 0.5 m,
         are about x -2, 0 and 2 m, y -1 to 1 m, with any yaw. The reset options ``start_pose`` and ``target_pose``
-        (x, y [m], yaw [rad]) choose the former two.
+        (x, y [m], yaw [rad]) choose the former two; no box is where the base is told to start.
 
     Reward:
         Each step 0.5 for each metre nearer, less 0.005 for the time, 0.003 |forward| and 0.0003 |turn|. At success 2

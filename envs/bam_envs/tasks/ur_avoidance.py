@@ -51,8 +51,8 @@ class UrAvoidanceTask(UrObstacleTask):
         Terminated at a collision, of the arm with itself, the table or the obstacle; a live arm does not notice any.
 
     Info:
-        `final_status`, `target_coord` of the obstacle [m], its `distance` from flange or elbow, the nearer one [m],
-        and `rs_state` where it is asked for.
+        `target_coord` of the obstacle [m], its `distance` from flange or elbow, the nearer one [m], `rs_state` where it
+        is asked for, and at the end `final_status`: "success" or "collision".
 
     With ``parity=True`` the pose is robo-gym's [0, -2.5, 1.5, 0, -1.4, 0], the first reward depends on the sum over
     the observation's last six numbers, as robo-gym's does, a collision costs nothing, and 1000 steps terminate.

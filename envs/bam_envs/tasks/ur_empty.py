@@ -42,9 +42,9 @@ class UrEmptyTask:
         Terminated at a collision of the arm with itself, the table or the ground.
 
     Info:
-        `final_status` (success, collision or empty).
+        `final_status` at the end: "collision".
 
-    With ``parity=True`` joint velocities are in rad/s, and after 300 steps an episode is terminated.
+    With ``parity=True`` joint velocities are in rad/s, and after 300 steps an episode is terminated as "success".
 
     Args:
         num_rows: How many robots are scored together.

@@ -71,10 +71,10 @@ class UrReachTask:
         Terminated at success and at a collision: of the arm with itself, the table or the ground.
 
     Info:
-        `final_status` (success, collision, max_steps_exceeded or empty), `target_coord` [m], `distance` [m].
+        `target_coord` [m], `distance` [m], at the end `final_status`: "success" or "collision".
 
     With ``parity=True`` observations are robo-gym's numbers, in its units; the last six are the action before the last
-    one; and after 300 steps an episode is terminated.
+    one; and after 300 steps an episode is terminated as "max_steps_exceeded".
 
     Args:
         num_rows: How many robots are scored together.

@@ -94,8 +94,9 @@ class UrTrackTask(UrObstacleTask):
         Terminated at a collision, of the arm with itself, the table or the obstacle; a live arm does not notice any.
 
     Info:
-        `targets_reached`, the ends of segments; `final_status`, `target_coord` of the obstacle [m], its `distance` from
-        flange or elbow, the nearer one [m], and `rs_state` where it is asked for.
+        `targets_reached`, the ends of segments; `target_coord` of the obstacle [m], its `distance` from flange or
+        elbow, the nearer one [m], `rs_state` where it is asked for, and at the end `final_status`: "success" or
+        "collision".
 
     With ``parity=True`` nothing is scaled, the end of a segment is worth nothing and is counted one step later, the
     arm starts at the first waypoint whatever the reset option says, and 1000 steps terminate, as in robo-gym.
