@@ -66,7 +66,7 @@ class TrainSettings:
     address: str | None = None
     """Ray cluster to train on, such as auto or 10.0.0.5:6379; None starts one here for the run."""
     data: str | None = None
-    """Recorded episodes that bc, marwil and cql learn from: a folder of Parquet files, or its fsspec address."""
+    """Recorded episodes that bc, marwil, cql and iql learn from: a folder of Parquet files, or its fsspec address."""
     normalize: bool | dict[str, Any] = False
     """Normalise observations and rewards by running statistics; a table gives VecNormalize's arguments."""
     hyperparameters: dict[str, Any] = field(default_factory=dict)

@@ -265,7 +265,7 @@ def algorithms(trainer: str = "sb3") -> str:
 
 def rllib_algorithms() -> str:
     """The table of RLlib's algorithms."""
-    from bam_train.trainers.rllib.algorithms import ALGORITHMS
+    from bam_train.trainers.rllib_algorithms import ALGORITHMS
 
     rows = []
     for row in ALGORITHMS.values():

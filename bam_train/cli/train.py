@@ -43,7 +43,7 @@ class TrainConfig:
     """Environment: any Gymnasium id, such as bam/pick, CartPole-v1 or some_module:Env-v0."""
     algo: Text = None
     """Algorithm: ppo, a2c, sac, td3, ddpg, dqn, tqc, trpo, qrdqn, crossq or recurrent-ppo.
-    With --trainer rllib: ppo, appo, impala, sac, dqn, bc, marwil or cql."""
+    With --trainer rllib: ppo, appo, impala, sac, tqc, dqn, bc, marwil, cql or iql."""
     trainer: Text = None
     """Library that trains: sb3 (default) or rllib."""
     steps: Whole = None
@@ -61,7 +61,7 @@ class TrainConfig:
     address: Annotated[str | None, _flag("auto|HOST:PORT")] = None
     """Ray cluster that rllib trains on; by default it starts one on this computer, for this run."""
     data: Annotated[str | None, _flag("FOLDER")] = None
-    """Recorded episodes that bc, marwil and cql of rllib learn from: Parquet files, also at an fsspec address."""
+    """Recorded episodes that bc, marwil, cql and iql of rllib learn from: Parquet files, also at an fsspec address."""
     device: Text = None
     """Where to compute: auto, cpu, cuda, cuda:1."""
     threads: Whole = None

@@ -18,7 +18,7 @@ TRAINERS: dict[str, str] = {
 """Name of a trainer to its ``"module:Class"``."""
 
 ALGORITHMS: dict[str, str] = {
-    "rllib": "bam_train.trainers.rllib.algorithms:ALGORITHMS",
+    "rllib": "bam_train.trainers.rllib_algorithms:ALGORITHMS",
     "sb3": "bam_train.trainers.sb3.algorithms:ALGORITHMS",
 }
 """Name of a trainer to the table of its algorithms; reading it imports no learning library."""

@@ -15,12 +15,12 @@ from bam_train.environments import is_batched
 from bam_train.errors import BamTrainError, SettingsError
 from bam_train.settings import TrainSettings
 from bam_train.trainers.rllib import hyperparameters
-from bam_train.trainers.rllib.algorithms import ALGORITHMS
 from bam_train.trainers.rllib.cluster.cluster import fault_tolerance, learners
 from bam_train.trainers.rllib.registration import register_foreign
 from bam_train.trainers.rllib.sampling.env_runner import RobotEnvRunner, log_end
 from bam_train.trainers.rllib.sampling.filters import MeanStdFilter
 from bam_train.trainers.rllib.sampling.rows import End
+from bam_train.trainers.rllib_algorithms import ALGORITHMS
 
 STEPS_AT_LEAST = 200
 """Steps of an iteration of an algorithm that updates after every few: its overhead is then small."""

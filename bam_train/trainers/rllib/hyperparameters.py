@@ -23,7 +23,7 @@ from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 
 from bam_train.errors import SettingsError
 from bam_train.settings import HINTS
-from bam_train.trainers.rllib.algorithms import Algorithm
+from bam_train.trainers.rllib_algorithms import Algorithm
 from bam_train.values import closest, expected, fit, fits
 
 ELSEWHERE = {

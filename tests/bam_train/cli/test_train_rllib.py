@@ -66,6 +66,18 @@ def test_ray_is_not_installed():
     )
 
 
+def test_an_algorithm_that_rllib_does_not_have():
+    code = (
+        "import sys; sys.modules['ray'] = None; sys.argv[1:] = ['--env', 'bam/reach', '--algo', 'ppp', '--trainer', "
+        "'rllib']; from bam_train.cli.train import main; main()"
+    )  # before ray is imported, which takes seconds
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, env=environment(), check=False
+    )
+    expected = "bam-train: Unknown algorithm 'ppp'. Did you mean 'ppo'?\n"
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", expected)
+
+
 def test_more_cpus_than_there_are(bam_train):
     status, err = bam_train(num_env_runners=1000)
     assert status == 1

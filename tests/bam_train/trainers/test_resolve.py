@@ -111,7 +111,7 @@ def test_the_tables_agree():
 def test_every_preset_is_complete_and_of_an_environment_of_ours(name):
     from bam_envs.registry import ENVIRONMENTS
     from bam_train.trainers.presets import preset_name
-    from bam_train.trainers.rllib.algorithms import ALGORITHMS as OF_RLLIB
+    from bam_train.trainers.rllib_algorithms import ALGORITHMS as OF_RLLIB
     from bam_train.trainers.sb3.algorithms import ALGORITHMS as OF_SB3
 
     runs = [("sb3", algo) for algo in OF_SB3] + [("rllib", algo) for algo in OF_RLLIB]

@@ -18,12 +18,12 @@ from bam_train.checkpoint import safetensors_file
 from bam_train.errors import PolicyError
 from bam_train.policy import FrozenPolicy
 from bam_train.policy.onnx_mlp import MlpRunner
-from bam_train.trainers.rllib.algorithms import ALGORITHMS
 from bam_train.trainers.rllib.freezing.by_hand import actions_by_hand
 from bam_train.trainers.rllib.freezing.freeze import freeze
 from bam_train.trainers.rllib.freezing.golden import clear_observations, draw, golden
 from bam_train.trainers.rllib.freezing.parts import connector_parts, parts_of
 from bam_train.trainers.rllib.freezing.reference import remade, rllib_actions
+from bam_train.trainers.rllib_algorithms import ALGORITHMS
 
 NUMBERS = Box(-np.array([1, 2, 3], np.float32), np.array([1, 2, 3], np.float32))
 ARM = Box(-np.array([2, 3], np.float32), np.array([1, 5], np.float32))

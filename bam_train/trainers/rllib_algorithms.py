@@ -1,4 +1,7 @@
-"""The table of RLlib's algorithms on its new API stack; nothing here is imported but when a row is loaded."""
+"""The table of RLlib's algorithms on its new API stack; nothing here is imported but when a row is loaded.
+
+It is beside the package `rllib` and not in it: importing that registers our environments, and imports ray for it.
+"""
 
 from __future__ import annotations
 
