@@ -3,7 +3,7 @@
 ``bam/resume/rllib/…`` is what ``Algorithm.save_to_path`` writes, so that ``Algorithm.from_checkpoint`` of the unpacked
 folder works for those who trust it. Ours builds the algorithm from its settings and sets the states in those files,
 which are read as arrays and plain values (`pickles.read_state`); how objects are made (``class_and_ctor_args.pkl``) is
-never read.
+never read. ``bam/resume/learner.json`` is what the tree leaves out (`learner_extras`).
 """
 
 from __future__ import annotations
@@ -20,9 +20,11 @@ import numpy as np
 import torch
 
 from bam_train.checkpoint import Checkpoint
-from bam_train.errors import AlteredCheckpoint, CheckpointMismatch
+from bam_train.errors import AlteredCheckpoint, CheckpointMismatch, FormatError
+from bam_train.trainers.rllib.learner_extras import extras_of, set_extras
+from bam_train.trainers.rllib.pickles import read_state
 
-FOLDER, NOTES = "bam/resume/rllib/", "bam/resume/notes.json"
+FOLDER, NOTES, EXTRAS = "bam/resume/rllib/", "bam/resume/notes.json", "bam/resume/learner.json"
 _STATES = ("state.pkl", "algorithm_state.pkl", "module_state.pkl", "policy_state.pkl")
 
 
@@ -38,7 +40,7 @@ def members(algorithm: Any, notes: Mapping[str, Any]) -> dict[str, bytes]:
         algorithm.save_to_path(str(root))
         files = sorted(path for path in root.rglob("*") if path.is_file())
         tree = {FOLDER + path.relative_to(root).as_posix(): path.read_bytes() for path in files}
-    return {NOTES: json.dumps(dict(notes)).encode(), **tree}
+    return {NOTES: json.dumps(dict(notes)).encode(), EXTRAS: json.dumps(extras_of(algorithm)).encode(), **tree}
 
 
 def load(checkpoint: Checkpoint, algorithm: Any) -> None:
@@ -50,22 +52,33 @@ def load(checkpoint: Checkpoint, algorithm: Any) -> None:
     """
     require_version(checkpoint)
     state = read(checkpoint)
-    try:
+    with _fitting(checkpoint, FOLDER):
         _set(algorithm, state)
+        hand_out(algorithm)
+    if checkpoint.has(EXTRAS):
+        with _fitting(checkpoint, EXTRAS):
+            set_extras(algorithm, json.loads(checkpoint.read(EXTRAS)))
+
+
+@contextmanager
+def _fitting(checkpoint: Checkpoint, member: str) -> Iterator[None]:
+    """What a state does to an algorithm that it does not fit, as our own error."""
+    try:
+        yield
     except (RuntimeError, ValueError, KeyError, TypeError, IndexError, AttributeError, AssertionError) as error:
         reason = " ".join(str(error).split())
         raise AlteredCheckpoint(
-            checkpoint.path, FOLDER, f"{FOLDER} does not fit these settings: {reason:.200}"
+            checkpoint.path, member, f"{member} does not fit these settings: {reason:.200}"
         ) from error
 
 
 def _set(algorithm: Any, state: dict[str, Any]) -> None:
-    """What ``Algorithm.set_state`` does, which expects runners."""
+    """What ``Algorithm.set_state`` does, which expects runners, and tells them how far the run is only after this."""
+    algorithm.metrics.set_state(state["metrics_logger"])
     if algorithm.env_runner_group is not None:
         algorithm.set_state(state)
         return
     algorithm.learner_group.set_state(state["learner_group"])
-    algorithm.metrics.set_state(state["metrics_logger"])
     algorithm._iteration = state["training_iteration"]
 
 
@@ -73,10 +86,8 @@ def read(checkpoint: Checkpoint) -> dict[str, Any]:
     """The nested state of the whole algorithm, arrays and plain values.
 
     Raises:
-        AlteredCheckpoint: A state holds something else; names it.
+        AlteredCheckpoint: A state cannot be read, or holds something else; names it.
     """
-    from bam_train.trainers.rllib.pickles import read_state
-
     tree: dict[str, Any] = {}
     for name in sorted(checkpoint.manifest.sha256):
         path = PurePosixPath(name)
@@ -85,10 +96,41 @@ def read(checkpoint: Checkpoint) -> dict[str, Any]:
         inner = tree
         for part in path.parent.relative_to(FOLDER).parts:
             inner = inner.setdefault(part, {})
-        inner.update(read_state(checkpoint.read(name)))
+        inner.update(_state(checkpoint, name))
     if not tree:
         raise AlteredCheckpoint(checkpoint.path, FOLDER, f"has no {FOLDER}; it was not made by RLlib")
     return tree
+
+
+def _state(checkpoint: Checkpoint, name: str) -> dict[str, Any]:
+    """One member, which must be a table by name."""
+    try:
+        state = read_state(checkpoint.read(name))
+    except FormatError as error:
+        raise AlteredCheckpoint(checkpoint.path, name, f"{name} {error}. Train anew, or get it again") from error
+    if not isinstance(state, dict):
+        text = f"{name} holds a {type(state).__name__}, expected a table of names"
+        raise AlteredCheckpoint(checkpoint.path, name, f"{text}. Train anew, or get it again")
+    return state
+
+
+def hand_out(algorithm: Any) -> None:
+    """Give the learner's weights and the observations' statistics to every runner, and wait until it has them.
+
+    RLlib's `sync_weights` leaves out a runner that has not answered the call before, and `set_state` makes two such
+    calls one after the other: runners would take their first samples with random weights.
+    """
+    group = algorithm.env_runner_group
+    if group is None:
+        return
+    weights = algorithm.learner_group.get_state(components="learner/rl_module", inference_only=True)["learner"]
+    connectors = algorithm.env_runner.get_state(not_components="rl_module")
+    state = {
+        **connectors,
+        "rl_module": weights["rl_module"],
+    }  # without a number, so that it is not taken for an old one
+    algorithm.env_runner.set_state(state)
+    group.foreach_env_runner("set_state", kwargs={"state": state}, local_env_runner=False)
 
 
 def start_actions(algorithm: Any, log_std: float | None, scale: float) -> None:
@@ -110,8 +152,6 @@ def start_actions(algorithm: Any, log_std: float | None, scale: float) -> None:
             elif name in last_layer(module):
                 module[name] = module[name] * np.float32(scale)
     group.set_weights(weights)
-    if algorithm.env_runner_group is not None:
-        algorithm.env_runner_group.sync_weights(from_worker_or_learner_group=group, inference_only=True)
 
 
 def last_layer(module: Mapping[str, Any]) -> set[str]:

@@ -1,4 +1,8 @@
-"""`RLlibTrainer`: a run of an algorithm of RLlib that can be stopped, saved and gone on with between two iterations."""
+"""`RLlibTrainer`: a run of an algorithm of RLlib that can be stopped, saved and gone on with between two iterations.
+
+The file is long because a trainer has many small methods: those of the protocol `Trainer`, and what each of them asks
+of RLlib. What is more than that (configuration, states, freezing, the cluster) is in modules of its own.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,8 @@ import copy
 import dataclasses
 import logging
 import math
+import tempfile
+import warnings
 from collections import deque
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -17,6 +23,7 @@ import torch
 from gymnasium import Space
 from gymnasium.vector import VectorEnv
 from ray.rllib.core import DEFAULT_MODULE_ID
+from ray.tune.trainable import trainable
 
 from bam_envs.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint, write_checkpoint
@@ -26,7 +33,6 @@ from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.provenance import git_commit, now, versions
 from bam_train.trainers.rllib import hyperparameters, state
-from bam_train.trainers.rllib.algorithms import ALGORITHMS
 from bam_train.trainers.rllib.cluster.cluster import cluster
 from bam_train.trainers.rllib.cluster.fault_tolerance import RunnerWatch
 from bam_train.trainers.rllib.config import make_config, refusals
@@ -36,6 +42,7 @@ from bam_train.trainers.rllib.freezing.golden import golden
 from bam_train.trainers.rllib.freezing.parts import PolicyParts, parts_of
 from bam_train.trainers.rllib.sampling.env_runner import ENDS
 from bam_train.trainers.rllib.tensorboard import TensorBoard
+from bam_train.trainers.rllib_algorithms import ALGORITHMS
 from bam_train.trainers.trainer import OnProgress, Progress, Statistics
 
 _FINITE = "expected finite numbers: try a smaller lr"
@@ -71,17 +78,17 @@ class RLlibTrainer:
         self._result: dict[str, Any] = {}
         self._steps = 0
         self._tensorboard: TensorBoard | None = None
+        self._spare: Any = None
         logging.getLogger("ray.rllib").setLevel(logging.ERROR)
         torch.set_num_threads(settings.threads)
         with contextlib.ExitStack() as stack:
             stack.enter_context(cluster(settings))
-            with refusals(settings):
+            with refusals(settings), _no_folder_at_home():
                 self._config = make_config(settings, seen.observation_space, seen.action_space, seed)
                 self.algorithm = self._config.build_algo()
             stack.callback(self.algorithm.stop)
             self._watch = RunnerWatch(self.algorithm)
             self._open = stack.pop_all()
-        _remove_empty(Path(self.algorithm.logdir))
 
     @classmethod
     def complete(cls, settings: TrainSettings) -> TrainSettings:
@@ -102,7 +109,9 @@ class RLlibTrainer:
         """Set up a new run of complete settings."""
         trainer = cls(settings, Seen.of(settings), settings.seed)
         values = settings.hyperparameters
-        state.start_actions(trainer.algorithm, values["log_std_init"], values["action_init_scale"])
+        with trainer._or_close():
+            state.start_actions(trainer.algorithm, values["log_std_init"], values["action_init_scale"])
+            state.hand_out(trainer.algorithm)
         return trainer
 
     @classmethod
@@ -113,14 +122,20 @@ class RLlibTrainer:
             require_fit(checkpoint, env)
         steps = checkpoint.manifest.steps
         trainer = cls(settings, Seen.of(settings), settings.seed + steps)  # other episodes than the first ones again
-        try:
+        with trainer._or_close():
             state.load(checkpoint, trainer.algorithm)
-        except BaseException:
-            trainer.close()
-            raise
         trainer._steps = steps
         trainer.notices += _not_saved(settings)
         return trainer
+
+    @contextlib.contextmanager
+    def _or_close(self) -> Iterator[None]:
+        """Whatever goes wrong within leaves nothing open."""
+        try:
+            yield
+        except BaseException:
+            self.close()
+            raise
 
     def log_to(self, folder: Path) -> None:
         """Write TensorBoard files into a folder from now on."""
@@ -139,7 +154,8 @@ class RLlibTrainer:
                 return
 
     def _iterate(self) -> None:
-        self._result, news = self._watch.train()
+        with _without_false_alarms():
+            self._result, news = self._watch.train()
         self.notices += news
         before, self._steps = self._steps, self._count()
         if self._steps == before:  # every runner was gone
@@ -193,10 +209,20 @@ class RLlibTrainer:
         group = self.algorithm.learner_group
         if group.is_local:
             return group._learner.module[DEFAULT_MODULE_ID].unwrapped()
-        module = self.algorithm.env_runner.module
+        module = self._own_module()
         weights = group.get_state(components=f"learner/rl_module/{DEFAULT_MODULE_ID}", inference_only=True)
         module.set_state(weights["learner"]["rl_module"][DEFAULT_MODULE_ID])
         return module
+
+    def _own_module(self) -> Any:
+        """Of the runner in this process; without one, a module that is there for nothing else."""
+        if self.algorithm.env_runner is not None:
+            return self.algorithm.env_runner.module
+        if self._spare is None:
+            spaces = self._seen.observation_space, self._seen.action_space
+            spec = self._config.get_rl_module_spec(spaces={DEFAULT_MODULE_ID: spaces}, inference_only=True)
+            self._spare = spec.build()
+        return self._spare
 
     def _env_to_module(self) -> Any:
         runner = self.algorithm.env_runner
@@ -284,6 +310,11 @@ def _require_fitting(settings: TrainSettings) -> None:
             "transport: the rllib trainer makes its environments in its own runners. Leave --transport out and put "
             "runners on the other computers with --address, or train there with --trainer sb3"
         )
+    if settings.device not in ("auto", "cpu"):
+        raise SettingsError(
+            f"device: rllib learns on the CPU, or on as many GPUs as --num-gpus says; found {settings.device!r}. "
+            "Leave --device out, and give --num-gpus 1"
+        )
     offline = ALGORITHMS[settings.algo].offline
     if settings.data is not None and not offline:
         names = ", ".join(sorted(row.name for row in ALGORITHMS.values() if row.offline))
@@ -313,11 +344,24 @@ def _not_saved(settings: TrainSettings) -> list[str]:
     return [f"RLlib saves no {lost}: new ones begin, so the rest differs from an unbroken run"]
 
 
-def _remove_empty(folder: Path) -> None:
-    """RLlib makes a folder below ~/ray_results for files that it then does not write."""
-    with contextlib.suppress(OSError):
-        folder.rmdir()
-        folder.parent.rmdir()
+@contextlib.contextmanager
+def _no_folder_at_home() -> Iterator[None]:
+    """RLlib makes a folder below ~/ray_results for files that it then does not write; within, one that goes away."""
+    before = trainable.DEFAULT_STORAGE_PATH
+    with tempfile.TemporaryDirectory(prefix="bam-rllib-") as folder:
+        trainable.DEFAULT_STORAGE_PATH = folder
+        try:
+            yield
+        finally:
+            trainable.DEFAULT_STORAGE_PATH = before
+
+
+@contextlib.contextmanager
+def _without_false_alarms() -> Iterator[None]:
+    """TQC compares every quantile with every other, which torch takes for a mistake."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Using a target size", UserWarning)
+        yield
 
 
 def _number(value: Any) -> float | None:

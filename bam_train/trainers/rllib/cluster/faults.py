@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import gymnasium as gym
 import ray
 from ray.experimental import internal_kv
 from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
@@ -34,6 +35,11 @@ class FaultReporting:
 
 class ReportingEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc]
     """RLlib's own runner of single agents, which says why it dies."""
+
+    def make_env(self) -> None:
+        """As RLlib's, which registers the same name every time, and Gymnasium warns of it from the second time on."""
+        gym.registry.pop("rllib-single-agent-env-v0", None)
+        super().make_env()
 
 
 def report(index: int, error: BaseException) -> None:

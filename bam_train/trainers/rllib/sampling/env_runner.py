@@ -3,6 +3,8 @@
 RLlib's own `SingleAgentEnvRunner` appends to n Python episodes at every step, and runs its connectors over each. Here a
 step of n rows is one pass of the module, one batched action and one `RobotVectorEnv.step`. What comes out is the same:
 a list of `SingleAgentEpisode`, the ones that ended with what they observed last, the running ones in pieces.
+
+The file is long because it is one class, each of whose methods stands in for one of RLlib's.
 """
 
 from __future__ import annotations

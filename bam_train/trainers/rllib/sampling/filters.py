@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import tree  # of dm-tree, which RLlib needs
 from numpy.typing import NDArray
 from ray.rllib.connectors.env_to_module.mean_std_filter import MeanStdFilter as _MeanStdFilter
 from ray.rllib.utils.filter import RunningStat
@@ -54,6 +55,24 @@ class MeanStdFilter(_MeanStdFilter):  # type: ignore[misc]
             episode.set_observations(at_indices=-1, new_data=filtered)
             episode.observation_space = space
         return kwargs["batch"]
+
+    def set_state(self, state: Any) -> None:
+        """As RLlib's, which also takes over what another has not handed in yet: it would be counted twice."""
+        super().set_state(state)
+        for own in self._filters.values():
+            for stat in _statistics(own):
+                forget_deltas(stat)
+
+
+def _statistics(own: Any) -> list[RunningStat]:
+    return [stat for stat in tree.flatten(own.running_stats) if isinstance(stat, RunningStat)]
+
+
+def forget_deltas(stat: RunningStat) -> None:
+    """The next merge is sent what comes from here on."""
+    stat.num_pushes_delta = 0
+    stat.mean_delta_array = np.zeros_like(stat.mean_delta_array)
+    stat.sum_sq_diff_delta_array = np.zeros_like(stat.sum_sq_diff_delta_array)
 
 
 def push(stat: RunningStat, observations: Array) -> None:

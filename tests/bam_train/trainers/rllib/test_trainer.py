@@ -18,11 +18,11 @@ from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.resolve import resolve, resolve_resumed
 from bam_train.trainers.rllib import hyperparameters, registration, state
-from bam_train.trainers.rllib.algorithms import ALGORITHMS
 from bam_train.trainers.rllib.cluster.cluster import cluster
 from bam_train.trainers.rllib.trainer import RLlibTrainer
+from bam_train.trainers.rllib_algorithms import ALGORITHMS
 
-pytestmark = pytest.mark.filterwarnings("default")  # Ray's own
+pytestmark = pytest.mark.filterwarnings("ignore:.*:DeprecationWarning:ray")  # Ray's own, of its data library
 
 SMALL = {"fcnet_hiddens": [16, 16]}
 PPO = {"train_batch_size_per_learner": 128, "minibatch_size": 64, "num_epochs": 2, "model_config": SMALL}
@@ -152,6 +152,7 @@ def test_a_foreign_environment_of_this_process_reaches_the_runners(corridor):
         ({"algo": "dqn"}, "dqn does not fit bam/reach-v0: it takes Discrete actions, found Box"),
         ({"algo": "bc"}, "data: bc learns from recorded episodes, found none"),
         ({"data": "x"}, "data: ppo learns in the environment"),
+        ({"device": "cuda"}, "device: rllib learns on the CPU, or on as many GPUs as --num-gpus says; found 'cuda'."),
         ({"transport": ["tcp://127.0.0.1:1"]}, "transport: the rllib trainer makes its environments"),
         ({"normalize": {"clip_value": 1}}, "Unknown normalize argument 'clip_value'. Did you mean 'clip_by_value'?"),
     ],
@@ -178,6 +179,7 @@ def test_the_preset_belongs_to_its_trainer():
     assert "n_steps" in resolve({"env": "bam/pick", "algo": "ppo"}).hyperparameters
 
 
+@pytest.mark.filterwarnings("ignore:.*Overriding environment rllib-single-agent-env-v0")  # by RLlib's own runner
 @pytest.mark.parametrize("runners", [0, 1])
 def test_a_script_needs_one_import(runners):
     from ray.rllib.algorithms.ppo import PPOConfig
@@ -219,8 +221,13 @@ def test_recorded_episodes_teach_bc(trained, tmp_path, monkeypatch, capsys):
         assert trainer.steps == 640
         saved = trainer.save(tmp_path / f"{algo}.zip", {}, {"best": None})
         trainer.close()
-        again = RLlibTrainer.load(Checkpoint.open(saved.path))
+        saved = Checkpoint.open(saved.path)
+        more = resolve_resumed({"num_learners": int(algo == "bc"), "steps": 641}, saved)
+        again = RLlibTrainer.load(saved, more)
+        zeros = np.zeros(again._seen.observation_space.shape, np.float32)
+        np.testing.assert_allclose(again.freeze().act(zeros), FrozenPolicy.load(saved.path).act(zeros), atol=1e-6)
         again.train(641, lambda progress: True)
+        again.save(tmp_path / f"{algo}-2.zip", {}, {"best": None})
         assert again.steps > 640
         again.close()
 

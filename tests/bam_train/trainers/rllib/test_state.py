@@ -1,0 +1,175 @@
+"""How a run goes on from a checkpoint: everything that adapts itself, any number of runners, nothing in it run."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("ray")
+
+from bam_train.checkpoint import Checkpoint, write_checkpoint
+from bam_train.errors import AlteredCheckpoint
+from bam_train.settings import TrainSettings
+from bam_train.trainers.resolve import resolve, resolve_resumed
+from bam_train.trainers.rllib import state
+from bam_train.trainers.rllib.cluster.cluster import cluster
+from bam_train.trainers.rllib.learner_extras import extras_of
+from bam_train.trainers.rllib.trainer import RLlibTrainer
+
+SMALL = {"fcnet_hiddens": [8]}
+ON_POLICY = {"train_batch_size_per_learner": 64, "minibatch_size": 64, "num_epochs": 1, "model_config": SMALL}
+OFF_POLICY = {
+    "num_steps_sampled_before_learning_starts": 8,
+    "train_batch_size_per_learner": 8,
+    "model_config": SMALL,
+    "rollout_fragment_length": 4,
+}
+MODULE = "default_policy"
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*:DeprecationWarning:ray")  # Ray's own, of its own data library
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_ray():
+    """One Ray for all runs of this module."""
+    with cluster(TrainSettings(env="bam/reach-v0", algo="ppo", trainer="rllib")):
+        yield
+
+
+def made(algo="ppo", hyper=ON_POLICY, **given):
+    wanted = {"env": "bam/reach", "algo": algo, "trainer": "rllib", "steps": 64, "num_envs": 4, "eval_every": 32}
+    return RLlibTrainer.create(resolve({**wanted, "hyperparameters": hyper, **given}))
+
+
+def trained(path, algo="ppo", hyper=ON_POLICY, **given):
+    """A checkpoint, and what its learner kept beside its state."""
+    with contextlib.closing(made(algo, hyper, **given)) as trainer:
+        trainer.train(64, lambda progress: True)
+        return trainer.save(path, {}, {"best": None}), extras_of(trainer.algorithm)
+
+
+@pytest.mark.parametrize(
+    ("algo", "hyper", "name", "start"),
+    [
+        ("ppo", ON_POLICY, "curr_kl_coeffs_per_module", 0.2),
+        ("sac", OFF_POLICY, "curr_log_alpha", 0.0),
+        ("tqc", OFF_POLICY, "curr_log_alpha", 0.0),
+    ],
+)
+@pytest.mark.parametrize("learners", [0, 1])
+def test_what_adapts_itself_goes_on(tmp_path, algo, hyper, name, start, learners):
+    if learners and algo == "tqc":
+        pytest.skip("as sac")
+    checkpoint, extras = trained(tmp_path / "a.zip", algo, hyper, num_learners=learners)
+    assert extras[name][MODULE] != pytest.approx(start, abs=1e-6)
+    again = RLlibTrainer.load(Checkpoint.open(checkpoint.path))
+    assert extras_of(again.algorithm) == extras
+    again.train(again.steps + 8, lambda progress: True)  # an optimiser still has hold of it
+    assert extras_of(again.algorithm)[name] != extras[name]
+    again.close()
+
+
+def test_a_checkpoint_without_them_goes_on_too(tmp_path):
+    checkpoint, _ = trained(tmp_path / "a.zip")
+    older = altered(checkpoint, {state.EXTRAS: None})
+    again = RLlibTrainer.load(older)
+    assert extras_of(again.algorithm)["curr_kl_coeffs_per_module"] == {MODULE: pytest.approx(0.2)}
+    again.close()
+
+
+def test_it_goes_on_with_any_number_of_runners(tmp_path):
+    path, pushes = tmp_path / "a.zip", []
+    checkpoint, _ = trained(path, normalize=True)
+    for runners, steps in ((1, 128), (0, 192)):
+        again = RLlibTrainer.load(checkpoint, resolve_resumed({"num_env_runners": runners, "steps": steps}, checkpoint))
+        _require_same_everywhere(again)
+        again.train(steps, lambda progress: True)
+        assert again.steps == steps
+        pushes.append(again._env_to_module().connectors[0]._filters[None].running_stats.num_pushes)
+        checkpoint = again.save(path, {}, {"best": None})
+        again.close()
+    assert pushes[0] == pytest.approx(128, abs=40)  # not what the checkpoint had twice; ends and resets come on top
+    assert pushes[1] == pytest.approx(192, abs=60)
+
+
+def test_first_samples_are_drawn_with_the_weights_of_the_learner():
+    hyper = {**ON_POLICY, "model_config": {**SMALL, "free_log_std": True}, "log_std_init": -1.5}
+    with contextlib.closing(made(hyper=hyper, num_env_runners=1, normalize=True)) as trainer:
+        _require_same_everywhere(trainer)
+
+
+def _require_same_everywhere(trainer):
+    """Weights and statistics of every runner are those of this process."""
+    runners = trainer.algorithm.env_runner_group
+    states = runners.foreach_env_runner(lambda one: one.get_state()["rl_module"])
+    counts = runners.foreach_env_runner(lambda one: one._env_to_module.connectors[0].get_state()[None])
+    assert len(states) == len(counts) == 1 + runners.num_remote_env_runners()
+    for own in states:
+        own = own.get(MODULE, own)
+        for name, value in trainer._module().state_dict().items():
+            if name in own:
+                assert np.array_equal(own[name], value.numpy()), name
+    assert [one["running_stats"] for one in counts] == [counts[0]["running_stats"]] * len(counts)
+
+
+def altered(checkpoint, members):
+    """The checkpoint with other bytes in some members, and hashes that fit; None takes one away."""
+    whole = {name: checkpoint.read(name) for name in checkpoint.manifest.sha256} | members
+    manifest = dataclasses.asdict(checkpoint.manifest)
+    for name in ("format", "sha256"):
+        manifest.pop(name, None)
+    kept = {name: data for name, data in whole.items() if data is not None}
+    return write_checkpoint(checkpoint.path.with_name("altered.zip"), manifest, kept)
+
+
+class Payload:
+    """Runs code when it is unpickled."""
+
+    def __init__(self, target):
+        self.target = str(target)
+
+    def __reduce__(self):
+        return Path.touch, (Path(self.target),)
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    return trained(tmp_path_factory.mktemp("run") / "a.zip", normalize=True)[0]
+
+
+def test_nothing_in_any_member_is_run(checkpoint, tmp_path):
+    target = tmp_path / "was here"
+    payload = pickle.dumps(Payload(target))
+    pickles = [name for name in checkpoint.manifest.sha256 if name.endswith(".pkl")]
+    states = [name for name in pickles if Path(name).name in state._STATES]
+    assert len(states) >= 4
+    assert len(pickles) > len(states)
+    for name in states:
+        with pytest.raises(AlteredCheckpoint) as caught:
+            state.read(altered(checkpoint, {name: payload}))
+        assert caught.value.member == name
+        assert f"{name} names pathlib" in str(caught.value)
+    others = altered(checkpoint, {name: payload for name in pickles if name not in states})
+    RLlibTrainer.load(others, resolve_resumed({"steps": 1000}, others)).close()
+    assert not target.exists()
+
+
+@pytest.mark.parametrize("data", [b"", b"\x80\x05", b"hello", pickle.dumps([1, 2])])
+def test_a_state_that_cannot_be_read_is_named(checkpoint, data):
+    name = f"{state.FOLDER}env_runner/state.pkl"
+    with pytest.raises(AlteredCheckpoint) as caught:
+        state.read(altered(checkpoint, {name: data}))
+    assert caught.value.member == name
+    assert f"altered.zip: {name} " in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_numbers_that_do_not_fit_are_named(checkpoint):
+    with pytest.raises(AlteredCheckpoint) as caught:
+        RLlibTrainer.load(altered(checkpoint, {state.EXTRAS: b'{"no_such_table": {"default_policy": 1}}'}))
+    assert caught.value.member == state.EXTRAS
