@@ -2,7 +2,8 @@
 
     train ─▶ between two updates: stop asked for? ─ evaluation due? ─ save due? ─ record ─▶ train …
 
-The best policy by evaluation (success rate, ties by return) goes to ``out``, the newest state to ``last.zip``.
+The best policy by evaluation (success rate, ties by return) goes to ``out``, the newest state to ``last.zip``. The file
+is long because each of these steps may fail in ways that must not end the run, and says what it does then.
 """
 
 from __future__ import annotations

@@ -59,11 +59,10 @@ def cores() -> int:
 def asked(settings: TrainSettings) -> dict[str, int]:
     """CPUs and GPUs that a run's processes ask Ray for: one CPU for each runner and each learner without a GPU.
 
-    The trainer's own process asks for none. Reading recorded episodes needs one CPU more.
+    The trainer's own process asks for none.
     """
     number, gpus_each = learners(settings)
-    cpus = settings.num_env_runners + number * (gpus_each == 0) + (settings.data is not None)
-    return {"CPU": cpus, "GPU": number * gpus_each}
+    return {"CPU": settings.num_env_runners + number * (gpus_each == 0), "GPU": number * gpus_each}
 
 
 def require_resources(settings: TrainSettings) -> None:
@@ -122,9 +121,7 @@ def _cpus_missing(settings: TrainSettings, wanted: int, there: Mapping[str, floa
     found = int(there.get("CPU", 0))
     number, gpus_each = learners(settings)
     for_what = [_number(settings.num_env_runners, "env runner")] * (settings.num_env_runners > 0)
-    for_what += [_number(number, "learner")] * (number > 0 and not gpus_each) + ["the data"] * (
-        settings.data is not None
-    )
+    for_what += [_number(number, "learner")] * (number > 0 and not gpus_each)
     add = "add computers with ray start" if joined else "join a cluster with --address"
     return (
         f"{' and '.join(for_what)} ask for {_number(wanted, 'CPU')}, {found} {where}. "

@@ -1,4 +1,7 @@
-"""From a checkpoint directory of RLlib to a checkpoint.zip that can be evaluated and deployed, and not resumed."""
+"""From a checkpoint directory of RLlib to a checkpoint.zip that can be evaluated and deployed, and not resumed.
+
+The file is long because every way in which directory and environment may differ has a refusal of its own.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """What a frozen policy is made of: weights, spaces, and what RLlib's connectors do before and after the network.
 
 `parts_of` takes them from a live algorithm; `foreign` reads them from a checkpoint directory; `freeze` makes one ONNX
-graph of them. Nothing here imports ray: a connector is known by the name of its class.
+graph of them. Nothing here imports ray: a connector is known by the name of its class. The file is long because each
+field of the parts has its sentence.
 """
 
 from __future__ import annotations

@@ -26,12 +26,18 @@ def config():
 
 @pytest.fixture(scope="module")
 def module(config):
+    torch.manual_seed(0)  # its weights; what ran before has drawn from the same generator
     return config.get_rl_module_spec(spaces={"default_policy": (OBSERVED, ACTED)}).build()
 
 
 @pytest.fixture(scope="module")
 def parts(module, config):
     return parts_of(module, None, config, (OBSERVED, ACTED))
+
+
+@pytest.fixture(autouse=True)
+def same_draws():
+    torch.manual_seed(1)
 
 
 def drawn(policy, count):

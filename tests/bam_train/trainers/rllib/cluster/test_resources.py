@@ -73,7 +73,7 @@ def test_gpus_that_learners_cannot_share():
         ({"num_env_runners": 2, "num_learners": 1}, 3, 0),
         ({"num_env_runners": 2, "num_gpus": 1}, 2, 0),
         ({"num_env_runners": 2, "num_gpus": 2}, 2, 2),
-        ({"num_learners": 1, "data": "recorded"}, 2, 0),
+        ({"num_learners": 1, "data": "recorded"}, 1, 0),
     ],
 )
 def test_asked(given, cpus, number):
