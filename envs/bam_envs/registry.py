@@ -296,8 +296,8 @@ def _gymnasium_limits() -> bool:
         frame = frame.f_back
     if frame is None:
         return False
-    spec = frame.f_locals["env_spec"]
-    return (frame.f_locals["max_episode_steps"], spec.max_episode_steps) != (None, None)
+    told, registered = frame.f_locals.get("max_episode_steps"), frame.f_locals.get("env_spec")
+    return told is not None or getattr(registered, "max_episode_steps", None) is not None
 
 
 def _require_simulation(elsewhere: object, render_mode: str | None, randomize: bool) -> None:
