@@ -37,13 +37,12 @@ def open_checkpoint(path: Path, env: str | None, trust: bool, folder: str) -> Ch
         if env is not None:
             checkpoint.requires_env(resolve_id(env))
         return checkpoint
-    from bam_train.trainers.rllib.foreign.directory import find_policy
     from bam_train.trainers.rllib.foreign.export import export
-    from bam_train.trainers.rllib.foreign.reading import read_policy
 
-    if env is None and read_policy(find_policy(path, trust=trust)).env is None:
-        env = ENV
-    exported = export(path, env=env, trust=trust, warn=lambda text: print(f"{NAME}: warning: {text}", file=sys.stderr))
+    def warn(text: str) -> None:
+        print(f"{NAME}: warning: {text}", file=sys.stderr, flush=True)
+
+    exported = export(path, env=env, otherwise=ENV, trust=trust, warn=warn)
     return exported.write(Path(folder) / "policy.zip")
 
 

@@ -1,7 +1,9 @@
 """The scripts that run the policy of a checkpoint: ours, a directory of RLlib, on a simulated and on a live robot."""
 
 import importlib.util
+import pickle
 import re
+import shutil
 import sys
 import zipfile
 from dataclasses import replace
@@ -83,6 +85,31 @@ def test_a_directory_of_rllib_acts_the_same(run_script, run, checkpoint, directo
     done = run_script("policy_from_cp_mir", directory, *options, folder=tmp_path)
     assert (done.returncode, done.stdout) == (0, expected), done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+class Payload:
+    """Writes into a file when it is unpickled."""
+
+    def __init__(self, mark):
+        self.code = f"with open({str(mark)!r}, 'a') as file: file.write('ran ')"
+
+    def __reduce__(self):
+        return exec, (self.code,)
+
+
+def test_code_in_a_directory_runs_only_if_trusted_and_after_a_warning(run, directory, tmp_path):
+    copied, mark = tmp_path / "copied", tmp_path / "mark"
+    shutil.copytree(directory / "learner_group" / "learner" / "rl_module" / "default_policy", copied)
+    (copied / "module_state.pkl").write_bytes(pickle.dumps(Payload(mark)))
+    status, out, err = run(copied)
+    assert (status, out, err.count("\n"), mark.exists()) == (1, "", 1, False)
+    assert "add --trust-pickle" in err
+    status, out, err = run(copied, "--trust-pickle")
+    assert status == 1
+    assert err.splitlines()[0].endswith(
+        "warning: reading module_state.pkl runs whatever code is in it (--trust-pickle)"
+    )
+    assert mark.read_text() == "ran "  # once
 
 
 class Bound:

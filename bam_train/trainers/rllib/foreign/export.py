@@ -100,6 +100,7 @@ def export(
     env: str | None = None,
     algo: str | None = None,
     policy: str | None = None,
+    otherwise: str | None = None,
     trust: bool = False,
     warn: Callable[[str], None] = lambda text: None,
 ) -> Exported:
@@ -110,6 +111,7 @@ def export(
         env: Its environment, where the directory does not say it or means another.
         algo: Its algorithm, where the directory does not say it.
         policy: Its name, where there are several.
+        otherwise: Its environment, where neither `env` nor the directory says it.
         trust: Files that only their own code can read are unpickled, which runs it.
         warn: Told before that is done, and what else the user should know.
 
@@ -121,6 +123,8 @@ def export(
     """
     directory = find_policy(given, policy, trust=trust, warn=warn)
     foreign = read_policy(directory)
+    if env is None and foreign.env is None:
+        env = otherwise
     env_id, env_kwargs = _environment(directory, foreign, env)
     made = make_env(env_id, env_kwargs)
     try:
