@@ -11,10 +11,8 @@ import importlib
 import logging
 import os
 import secrets
-import shutil
 import signal
 import sys
-import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,6 +26,7 @@ from bam_train.settings import TrainSettings
 from bam_train.trainers.rllib.cluster.address import find, reach
 from bam_train.trainers.rllib.cluster.descendants import Descendants
 from bam_train.trainers.rllib.cluster.fault_tolerance import fault_tolerance
+from bam_train.trainers.rllib.cluster.folder import own_folder
 from bam_train.trainers.rllib.cluster.resources import cores, gpus, learners, require_resources
 
 __all__ = ["cluster", "fault_tolerance", "gpus", "learners", "require_resources"]
@@ -70,10 +69,8 @@ def cluster(settings: TrainSettings) -> Iterator[None]:
 @contextlib.contextmanager
 def _own(settings: TrainSettings) -> Iterator[None]:
     """A Ray of the run's own, on this computer alone."""
-    root = "/tmp" if os.path.isdir("/tmp") else None  # the names of its sockets must be short
-    folder = Path(tempfile.mkdtemp(prefix="bam-ray-", dir=root))
     descendants = Descendants()
-    with _private_token():
+    with own_folder() as folder, _private_token():
         try:
             _start(folder, gpus(settings))
             yield
@@ -82,7 +79,6 @@ def _own(settings: TrainSettings) -> Iterator[None]:
             with contextlib.suppress(Exception):  # whatever it says about its end, nothing of it must be left
                 ray.shutdown(wait_for_processes=True)
             descendants.end()
-            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _start(folder: Path, num_gpus: int) -> None:
