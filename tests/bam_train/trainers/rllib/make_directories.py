@@ -5,6 +5,7 @@ and what RLlib's own restoring (`RLModule.from_checkpoint`, `Policy.from_checkpo
 """
 
 import sys
+import tempfile
 
 import gymnasium as gym
 import numpy as np
@@ -21,6 +22,7 @@ from ray.rllib.core.rl_module.torch import TorchRLModule
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.policy.policy import Policy
 from ray.rllib.utils.policy import local_policy_inference
+from ray.tune.trainable import trainable
 
 ROWS = 100
 POLICY = "learner_group/learner/rl_module/default_policy"
@@ -159,4 +161,6 @@ def main(root):
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    with tempfile.TemporaryDirectory() as folder:
+        trainable.DEFAULT_STORAGE_PATH = folder  # else ~/ray_results
+        main(sys.argv[1])

@@ -181,8 +181,11 @@ def test_the_preset_belongs_to_its_trainer():
 
 @pytest.mark.filterwarnings("ignore:.*Overriding environment rllib-single-agent-env-v0")  # by RLlib's own runner
 @pytest.mark.parametrize("runners", [0, 1])
-def test_a_script_needs_one_import(runners):
+def test_a_script_needs_one_import(runners, tmp_path, monkeypatch):
     from ray.rllib.algorithms.ppo import PPOConfig
+    from ray.tune.trainable import trainable
+
+    monkeypatch.setattr(trainable, "DEFAULT_STORAGE_PATH", str(tmp_path))  # else ~/ray_results
 
     for name in ("bam/reach", "bam/reach-v0"):
         config = (
