@@ -7,6 +7,7 @@ its own, and is gone when the run ends, however it ends. A cluster is joined and
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib
 import logging
 import os
@@ -83,7 +84,7 @@ def _own(settings: TrainSettings) -> Iterator[None]:
 
 def _start(folder: Path, num_gpus: int) -> None:
     try:
-        with _starting(), loopback_only():
+        with _starting(), loopback_only(), _out_of_the_group():
             ray.init(
                 address="local",
                 num_cpus=cores(),
@@ -154,6 +155,27 @@ def loopback_only() -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def _out_of_the_group() -> Iterator[None]:
+    """Ray started within has sessions of its own: what a whole process group is sent does not reach it.
+
+    ``timeout``, systemd, batch systems and terminals send their signal to the group; Ray's processes would be gone
+    before the update is finished and saved. They end with this process as before, as Linux kills them then. Elsewhere
+    Ray itself kills the group for that, so they stay in it.
+    """
+    from ray._private import services, utils
+
+    if not (sys.platform == "linux" and utils.detect_fate_sharing_support()):
+        yield
+        return
+    before = services.ConsolePopen
+    services.ConsolePopen = functools.partial(before, start_new_session=True)
+    try:
+        yield
+    finally:
+        services.ConsolePopen = before
+
+
+@contextlib.contextmanager
 def _quiet() -> Iterator[None]:
     """Within, Ray and RLlib say nothing: `RunnerWatch` and the errors here say what the user needs to know."""
     from ray._private import worker
@@ -200,15 +222,20 @@ def _say_nothing(*_: object, **__: object) -> None:
 
 @contextlib.contextmanager
 def _own_signals() -> Iterator[None]:
-    """Keeps the handler of SIGTERM, which `ray.init` replaces."""
+    """Keeps the handler of SIGTERM, which `ray.init` replaces; signals wait until the end: Ray's C++ would abort."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.getsignal(signal.SIGTERM)
+    came: list[int] = []
+    numbers = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) is not None]
+    before = [(number, signal.signal(number, lambda number, _: came.append(number))) for number in numbers]
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before:
+            signal.signal(number, handler)
+    if came:
+        signal.raise_signal(came[0])
 
 
 @contextlib.contextmanager
