@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import signal
 import sys
+import time
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -13,6 +15,10 @@ if TYPE_CHECKING:
 
 SHOW_CURSOR = b"\x1b[?25h"
 """Undoes what a live panel did to the terminal."""
+
+TOGETHER = 0.5
+"""A signal of a program that comes again within this time is the same one [s]: ``timeout`` sends SIGTERM to the process
+and then to its group. Ctrl-C is a person's, and counts each time."""
 
 
 class StopSignals:
@@ -34,6 +40,7 @@ class StopSignals:
         self.run = run
         self.status = 0
         self._before: dict[int, Any] = {}
+        self._first = -math.inf
 
     def __enter__(self) -> StopSignals:
         for number in self.SIGNALS:
@@ -51,13 +58,19 @@ class StopSignals:
             signal.signal(number, handler)
 
     def _handle(self, number: int, frame: object) -> None:
+        if self._is_the_first_again(number):
+            return
         if self.status:
             self._quit(number)
-        self.status = 128 + number
+        self.status, self._first = 128 + number, time.monotonic()
         doing = "all is saved; ending" if self.run.done else "finishing the update and saving"
         self.run.stop()
         again = "Ctrl-C again" if number == signal.SIGINT else "another signal"
         _write(f"{doing}; {again} quits at once\n")
+
+    def _is_the_first_again(self, number: int) -> bool:
+        soon = time.monotonic() < self._first + TOGETHER
+        return soon and number != signal.SIGINT and self.status == 128 + number
 
     def _quit(self, number: int) -> None:
         """End the process here, wherever it is: an exception might be caught, or wait for threads."""

@@ -5,7 +5,7 @@ by the name they have in ``torch.nn.init``), ``rollout_fragment_length``, how ma
 hands over what it has, and two on where actions start: ``log_std_init``, of their standard deviation if it does not
 depend on the observation (``model_config.free_log_std``), and ``action_init_scale``, what the weights of the last layer
 are multiplied by: with 0.01 the first actions are about 0 and not biased. A schedule is a list of steps and values:
-``lr=[[0, 3e-4], [1000000, 0.0]]``.
+``lr=[[0, 3e-4], [1000000, 0.0]]``. The file is long for its tables of names.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from bam_train.errors import SettingsError
 from bam_train.settings import HINTS
 from bam_train.trainers.rllib_algorithms import Algorithm
-from bam_train.values import closest, expected, fit, fits
+from bam_train.values import closest, describe, expected, fit, fits
 
 ELSEWHERE = {
     "train_batch_size": "train_batch_size_per_learner",
@@ -37,10 +37,27 @@ ELSEWHERE = {
     "q_model_config": "model_config",
     "hiddens": "model_config.head_fcnet_hiddens",
     "optimization_config": "actor_lr, critic_lr and alpha_lr",
+    "learning_rate": "lr",
+    "observation_filter": "normalize=true",
+    "num_workers": "--num-env-runners",
+    "num_rollout_workers": "--num-env-runners",
+    "num_envs_per_worker": "--num-envs",
     "num_envs_per_env_runner": "--num-envs",
     "seed": "--seed",
 }
 """Arguments of RLlib's old stack, or of other methods, and what to use instead."""
+
+_NONE_HERE = {
+    "num_gpus_per_worker": "env runners use no GPU, and --num-gpus is for the learners",
+    "num_gpus_per_env_runner": "env runners use no GPU, and --num-gpus is for the learners",
+    "num_cpus_per_worker": "each env runner has one CPU",
+    "num_cpus_per_env_runner": "each env runner has one CPU",
+    "log_level": "RLlib's log is off",
+    "horizon": "the environment ends its episodes",
+    "soft_horizon": "the environment ends its episodes",
+    "framework": "RLlib has nothing but torch any more",
+}
+"""Settings of RLlib that are not needed, and why."""
 
 _OF_THE_OLD_STACK = frozenset(
     {
@@ -95,7 +112,7 @@ def complete(algorithm: Algorithm, given: Mapping[str, Any]) -> dict[str, Any]:
     for name in given:
         _require_known(name, [*defaults, "model_config"], f"{algorithm.name} hyperparameter", HINTS)
     values = {
-        name: fit(name, given[name], _hint(hint, default)) if name in given else _plain(default)
+        name: _fit(name, given[name], _hint(hint, default)) if name in given else _plain(default)
         for name, (hint, default) in defaults.items()
     }
     if isinstance(given.get("replay_buffer_config"), Mapping):
@@ -148,6 +165,16 @@ def _defaults(algorithm: Algorithm, config: Any) -> dict[str, tuple[Any, Any]]:
     return found
 
 
+def _fit(name: str, value: Any, hint: Any) -> Any:
+    """`fit`; RLlib's annotation of a schedule is not for the user to read."""
+    if hint is Any or not fits(_SCHEDULE, hint) or fits(value, hint):
+        return fit(name, value, hint)
+    raise SettingsError(f"{name}: expected a number or a schedule [[step, value], ...], found {describe(value)}")
+
+
+_SCHEDULE = [[0, 3e-4], [1000000, 0.0]]
+
+
 def _hint(hint: Any, default: Any) -> Any:
     """The annotation, unless RLlib's own default does not fit it (``grad_clip: Optional[int] = 40.0``)."""
     if hint is inspect.Parameter.empty:
@@ -183,6 +210,8 @@ def _require_known(name: str, known: Iterable[str], what: str, others: Iterable[
         return
     if name in ELSEWHERE:
         raise SettingsError(f"{name} is not a hyperparameter here: use {ELSEWHERE[name]}")
+    if name in _NONE_HERE:
+        raise SettingsError(f"{name}: there is none here; {_NONE_HERE[name]}. Leave it out")
     if name in _OF_THE_OLD_STACK:
         raise SettingsError(f"{name} cannot be set: it belongs to RLlib's old API stack, or bam-train takes care of it")
     raise SettingsError(f"Unknown {what} {name!r}. {closest(name, [*known, *others])}")

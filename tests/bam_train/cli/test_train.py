@@ -278,6 +278,19 @@ def test_two_signals_quit_at_once(here):
     assert err == "bam-train: quit at once; no checkpoint had been saved yet\n"
 
 
+def test_a_signal_that_comes_twice_at_once_is_one(here):
+    """`timeout` sends SIGTERM to the program, and then to its group."""
+    process = started(here, *LONG)
+    wait_for(process, "evaluation at 512 steps")
+    for pause in (0.0, 0.001, 0.02):
+        time.sleep(pause)
+        process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 143, err
+    assert err.count("finishing the update and saving") == 1
+    assert err.splitlines()[-1] == "  bam-train --resume runs/CartPole-v1-ppo/last.zip"
+
+
 @pytest.mark.parametrize("pause", [0.05, 0.2])
 def test_two_signals_while_saving_quit_at_once_too(here, pause):
     process = started(here, *LONG)

@@ -182,9 +182,21 @@ def wait_for(process, words):
     raise AssertionError(f"never said {words!r}, but {lines}")
 
 
+def as_timeout_does(group, number):
+    """To the program, and then to its whole group; `systemctl stop` and batch systems do alike."""
+    os.kill(group, number)
+    os.killpg(group, number)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("number", "send", "status"), [(signal.SIGINT, os.killpg, 130), (signal.SIGTERM, os.kill, 143)]
+    ("number", "send", "status"),
+    [
+        (signal.SIGINT, os.killpg, 130),
+        (signal.SIGTERM, os.kill, 143),
+        (signal.SIGTERM, as_timeout_does, 143),
+        (signal.SIGHUP, os.killpg, 129),
+    ],
 )
 def test_a_signal_saves_and_leaves_no_process(here, start, number, send, status):
     process = start("--eval-every", "100000000")
@@ -192,7 +204,7 @@ def test_a_signal_saves_and_leaves_no_process(here, start, number, send, status)
     processes = psutil.Process(process.pid).children(recursive=True)
     assert len(processes) > 5
     folders = {found for one in processes for found in re.findall(r"/\S*bam-ray-\w+", " ".join(one.cmdline()))}
-    send(process.pid, number)  # Ctrl-C in a terminal goes to the whole group
+    send(process.pid, number)  # a terminal sends Ctrl-C, and SIGHUP at its end, to the whole group
     _, err = process.communicate(timeout=120)
     assert process.returncode == status, err
     assert "finishing the update and saving" in err

@@ -147,6 +147,28 @@ def test_a_foreign_environment_of_this_process_reaches_the_runners(corridor):
             {"hyperparameters": {"train_batch_size": 9}},
             "train_batch_size is not a hyperparameter here: use train_batch",
         ),
+        *(
+            ({"hyperparameters": {old: 1}}, f"{old} is not a hyperparameter here: use {now}")
+            for old, now in (
+                ("num_workers", "--num-env-runners"),
+                ("num_rollout_workers", "--num-env-runners"),
+                ("num_envs_per_worker", "--num-envs"),
+                ("observation_filter", "normalize=true"),
+                ("learning_rate", "lr"),
+            )
+        ),
+        *(
+            ({"hyperparameters": {old: 1}}, f"{old}: there is none here; {why}")
+            for old, why in (
+                ("num_gpus_per_worker", "env runners use no GPU, and --num-gpus is for the learners"),
+                ("log_level", "RLlib's log is off"),
+                ("horizon", "the environment ends its episodes"),
+            )
+        ),
+        (
+            {"hyperparameters": {"lr": "fast"}},
+            "lr: expected a number or a schedule [[step, value], ...], found 'fast' (text)",
+        ),
         ({"hyperparameters": {"lr": -1}}, "lr: expected a number above 0, found -1"),
         ({"hyperparameters": {"model_config": {"fcnet_hidden": []}}}, "Unknown model_config argument 'fcnet_hidden'"),
         ({"algo": "dqn"}, "dqn does not fit bam/reach-v0: it takes Discrete actions, found Box"),

@@ -64,6 +64,7 @@ def test_one_of_its_own_is_here_alone_and_gone_afterwards(home, capfd):
     with cluster(settings()):
         processes = started()
         assert len(processes) >= 5
+        assert os.getpgrp() not in {os.getpgid(process.pid) for process in processes}
         assert listening([psutil.Process(), *processes]) == {"127.0.0.1"}
         assert ray.cluster_resources()["CPU"] == module.cores()
         assert signal.getsignal(signal.SIGTERM) is handler
