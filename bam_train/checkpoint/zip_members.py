@@ -37,8 +37,9 @@ def open_zip(path: Path) -> Iterator[zipfile.ZipFile]:
         why = error.strerror or error
         raise NotACheckpoint(path, f"cannot be read: {why}. Check its permissions and the disk") from error
     except _DAMAGE as error:
+        why = "" if str(error) == "File is not a zip file" else f" ({error})"
         raise NotACheckpoint(
-            path, f"not a whole zip file ({error}): truncated, altered or something else. {AGAIN}"
+            path, f"not a whole zip file{why}: truncated, altered or something else. {AGAIN}"
         ) from error
 
 

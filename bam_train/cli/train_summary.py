@@ -54,15 +54,15 @@ def _rows(outcome: Outcome, folder: RunFolder) -> list[tuple[str, str]]:
 
 
 def _score_text(outcome: Outcome) -> str:
-    best, scores = outcome.best, outcome.scores
+    best = outcome.best
     if best is None:
         return "-"
     success = ""
     if best.success_rate is not None:
-        interval = scores.get("success_interval")
+        interval = best.success_interval
         between = f" (95 %: {percent(interval[0])} to {percent(interval[1])})" if interval else ""
         success = f"success {percent(best.success_rate)}{between}, "
-    episodes = f" over {scores['episodes']} episodes" if "episodes" in scores else ""
+    episodes = "" if best.episodes is None else f" over {best.episodes} episodes"
     return f"{success}return {number(best.return_mean)}{episodes}, after {count(best.steps)} steps"
 
 

@@ -66,7 +66,9 @@ def _own_best(resumed: Checkpoint, settings: TrainSettings) -> Output | None:
         return None
     if there.steps != noted["steps"] or _what(there.settings) != _what(resumed.manifest.settings):
         return None
-    return Output(path.resolve(), Best(noted["steps"], noted["success_rate"], noted["return_mean"]))
+    interval: Any = there.scores.get("success_interval")
+    known = noted["steps"], noted["success_rate"], noted["return_mean"], interval and tuple(interval)
+    return Output(path.resolve(), Best(*known, there.scores.get("episodes")))
 
 
 def _what(settings: dict[str, Any]) -> dict[str, Any]:

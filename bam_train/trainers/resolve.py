@@ -143,24 +143,29 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
     """Refuse an argument that one of our environments does not have; others are asked when they are made.
 
     Raises:
-        SettingsError: Carries the closest match.
+        SettingsError: Carries the closest match of what can be had; or a value is of the wrong kind.
     """
+    from bam_envs.errors import InvalidValue
     from bam_envs.registry import entry_of, make_env
     from bam_envs.registry import resolve as resolve_reference
-    from bam_envs.robo_gym.options import CONSTRUCTOR_OPTIONS
+    from bam_envs.robo_gym.options import constructor_options, require_values
     from bam_envs.robo_gym.table import ROBO_GYM
+    from bam_envs.tasks.options import option_names, require_kinds
 
     entry = entry_of(env)
     if entry is None or not given:
         return
+    task, theirs = resolve_reference(entry.task), ROBO_GYM.get(env.rpartition(":")[2])
+    taken, refused = constructor_options(theirs) if theirs else (frozenset(), frozenset())
     own = set(inspect.signature(make_env).parameters) - _NOT_OF_THE_ENVIRONMENT
-    if env.rpartition(":")[2] in ROBO_GYM:
-        own |= CONSTRUCTOR_OPTIONS
-    of_task = set(inspect.signature(resolve_reference(entry.task)).parameters) - {"num_rows"}
+    known = own | taken | option_names(task) | {"max_episode_steps"}
     for name in given:
-        if name not in own | of_task | {"max_episode_steps"}:
-            known = closest(name, own | of_task | {"max_episode_steps"})
-            raise SettingsError(f"env_kwargs: unknown setting {name!r} of {env}. {known}")
+        if name not in known | refused:  # making it says why it is refused
+            raise SettingsError(f"env_kwargs: unknown setting {name!r} of {env}. {closest(name, known)}")
+    try:
+        require_values(theirs, given) if theirs else require_kinds(env, task, given)
+    except InvalidValue as error:
+        raise SettingsError(f"env_kwargs: {error}") from error
 
 
 def _require_same(asked: Mapping[str, Any], own: Mapping[str, Any], checkpoint: Checkpoint) -> None:

@@ -2,7 +2,7 @@
 
     train ─▶ between two updates: stop asked for? ─ evaluation due? ─ save due? ─ record ─▶ train …
 
-The best policy by evaluation (success rate, ties by return) goes to ``out``, the newest state to ``last.zip``. The file
+The best policy by evaluation (success, ties by return) goes to ``out``, the newest state to ``last.zip``. The file
 is long because each of these steps may fail in ways that must not end the run, and says what it does then.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -59,11 +59,20 @@ class Best:
     """Steps trained when it was made."""
     success_rate: float | None
     return_mean: float | None
+    success_interval: tuple[float, float] | None = None
+    """Wilson's 95 % interval of the success rate."""
+    episodes: int | None = None
+    """Over how many it was made."""
 
     def rank(self) -> tuple[float, float]:
-        """Larger is better: success first, then return; what is unknown ranks last."""
+        """Larger is better: success first, then return; what is unknown ranks last.
+
+        Success is what is sure of it, the low end of its interval: 1 of 5 is less than 4 of 20. Over the same number
+        of episodes this is the order of the success rates.
+        """
         lowest = float("-inf")
-        return tuple(lowest if value is None else value for value in (self.success_rate, self.return_mean))  # type: ignore[return-value]
+        sure = self.success_rate if self.success_interval is None else self.success_interval[0]
+        return tuple(lowest if value is None else value for value in (sure, self.return_mean))  # type: ignore[return-value]
 
 
 @dataclass(frozen=True)
@@ -232,7 +241,7 @@ class TrainingRun:
         if report.success_rate is None and self.settings.until_success is not None and self._report is None:
             self.watcher.note(f"{self.settings.env} reports no is_success, so --until-success has no effect")
         self._report = report
-        found = Best(steps, report.success_rate, report.return_mean)
+        found = Best(steps, report.success_rate, report.return_mean, report.success_interval, report.episodes)
         better = self.best is None or found.rank() > self.best.rank()
         seconds = round(self._clock() - self._start, 3)
         self._add({"kind": "evaluation", "steps": steps, "seconds": seconds, **report.to_json()})
@@ -316,7 +325,9 @@ class TrainingRun:
         """What a resumed run needs to go on keeping the best in the same file."""
         if self.best is None or kept is None:
             return {"best": None}
-        return {"best": {**asdict(self.best), "path": str(kept.resolve())}}
+        best = self.best  # the rest is among the scores of the file itself
+        noted = {"steps": best.steps, "success_rate": best.success_rate, "return_mean": best.return_mean}
+        return {"best": {**noted, "path": str(kept.resolve())}}
 
 
 def _training_record(steps: int, seconds: float, rate: float, statistics: Statistics) -> dict[str, Any]:

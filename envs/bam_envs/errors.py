@@ -45,14 +45,23 @@ class UnknownName(BamEnvsError, ValueError):  # noqa: N818 - reads as what happe
         name: See above.
         choices: See above.
         examples: What to suggest when nothing is similar; every choice by default.
+        similar: How similar a choice must be to be suggested, from 0 to 1.
     """
 
-    def __init__(self, kind: str, name: str, choices: Iterable[str], examples: Iterable[str] | None = None) -> None:
+    def __init__(
+        self,
+        kind: str,
+        name: str,
+        choices: Iterable[str],
+        examples: Iterable[str] | None = None,
+        similar: float = 0.65,
+    ) -> None:
         self.kind, self.name, self.choices = kind, name, sorted(choices)
-        matches = difflib.get_close_matches(name, self.choices, n=1, cutoff=0.5)
+        matches = difflib.get_close_matches(name, self.choices, n=1, cutoff=similar)
         self.closest = matches[0] if matches else None
         some = ", ".join(self.choices if examples is None else examples)
-        hint = f"Did you mean {self.closest!r}?" if self.closest else f"Choose from: {some}."
+        rest = f"Choose from: {some}." if some else "There are none."
+        hint = f"Did you mean {self.closest!r}?" if self.closest else rest
         super().__init__(f"Unknown {kind} {name!r}. {hint}")
 
 

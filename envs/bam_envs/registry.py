@@ -65,7 +65,14 @@ class EnvEntry:
         return task
 
     def make_robot(self, num_robots: int, randomize: bool, task_options: Mapping[str, Any]) -> Robot:
-        """The simulated robot, or n of them."""
+        """The simulated robot, or n of them.
+
+        Raises:
+            InvalidValue: `randomize` is neither True nor False.
+        """
+        from bam_envs.tasks.options import require_kinds
+
+        require_kinds(self.id, resolve(self.task), {"randomize": randomize})
         shared = {name: task_options[name] for name in self.robot_options if name in task_options}
         robot: Robot = resolve(self.robot)(num_robots, randomize=randomize, **shared)
         return robot

@@ -49,12 +49,24 @@ def start_rows(
     return state
 
 
+def require_table(options: object) -> None:
+    """Refuse options of `reset` that are no dict.
+
+    Raises:
+        InvalidValue: They are not.
+    """
+    if options is not None and not isinstance(options, Mapping):
+        raise InvalidValue(f"options= of reset must be a dict of names and values, not {options!r}.")
+
+
 def task_options(task: Task, options: Mapping[str, Any] | None) -> dict[str, Any]:
     """What `reset` was given for the task.
 
     Raises:
         UnknownName: The task has no such option; it carries the closest match.
+        InvalidValue: It was given no table of options.
     """
+    require_table(options)
     known: Sequence[str] = getattr(task, "reset_options", ())
     for name in options or {}:
         if name not in known:
@@ -249,6 +261,7 @@ class RobotVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.float3
             seed: Row i is seeded with ``seed + i``, or with ``seed[i]``.
             options: ``reset_mask``, and what the task's ``reset_options`` names, for every row alike.
         """
+        require_table(options)
         given = dict(options or {})
         mask = np.asarray(given.pop("reset_mask", self._all), dtype=bool)
         given = task_options(self.task, given)

@@ -139,6 +139,23 @@ def test_an_option_that_does_not_exist_is_an_error(make):
 def test_a_flag_that_is_none_is_an_error(making):
     with pytest.raises(InvalidValue, match=r"parity= of bam/ur-reach-v0 must be True or False, not 'false'\."):
         making("bam/ur-reach-v0", parity="false")
+    with pytest.raises(InvalidValue, match=r"randomize= of bam/ur-reach-v0 must be True or False, not 'no'\."):
+        making("bam/ur-reach-v0", randomize="no")
+
+
+@pytest.mark.parametrize("making", [gym.make, gym.make_vec])
+def test_options_of_reset_are_a_table(making):
+    env = making("bam/mir100-navigation-v0")
+    with pytest.raises(InvalidValue, match=r"^options= of reset must be a dict of names and values, not \[1, 2\]\.$"):
+        env.reset(options=[1, 2])
+    env.close()
+
+
+def test_a_reset_option_where_there_is_none():
+    env = gym.make("bam/reach-v0")
+    with pytest.raises(UnknownName, match=r"^Unknown reset option 'place'\. There are none\.$"):
+        env.reset(options={"place": 1})
+    env.close()
 
 
 @pytest.mark.parametrize("env_id", ["bam/mir100-navigation-v0", "NoObstacleNavigationMir100Sim-v0", "bam/reach-v0"])

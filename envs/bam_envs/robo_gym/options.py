@@ -11,7 +11,7 @@ from bam_envs.errors import InvalidValue, UnknownName
 from bam_envs.robo_gym.notices import say_once
 from bam_envs.robo_gym.table import RoboGymId
 from bam_envs.robot_env import render_modes
-from bam_envs.tasks.options import option_names
+from bam_envs.tasks.options import FLAGS, option_names, require_kinds
 
 _MANAGER = ("ip", "lower_bound_port", "upper_bound_port", "server_manager_port")
 """Where robo-gym finds the Server Manager that starts Gazebo."""
@@ -32,8 +32,6 @@ _NOT_HERE = {
     "continue_except_collision": "give reset the start itself: options={'joint_positions': [...]}",
 }
 """Options of robo-gym's modular environments that are none of ours, and what to do instead."""
-CONSTRUCTOR_OPTIONS = frozenset({*_SIMULATED, "rs_address", *_NOT_HERE})
-"""What robo-gym's constructors take and ours do not; its other options are those of our tasks."""
 
 
 def translate(entry: RoboGymId, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -41,14 +39,16 @@ def translate(entry: RoboGymId, given: Mapping[str, Any]) -> dict[str, Any]:
 
     Raises:
         UnknownName: Neither robo-gym nor we have such an option; it carries the closest match.
-        InvalidValue: An option that is there and cannot be had, a live robot without an address, or a simulated one
-            with one.
+        InvalidValue: An option that is there and cannot be had, or is of the wrong kind; a live robot without an
+            address, or a simulated one with one.
     """
     _require_known(entry, given)
+    require_values(entry, given)
     options = {name: value for name, value in given.items() if name not in (*_SIMULATED, "rs_address")}
     address = _live_address(entry, given)
     if address is not None:
         options["robot"] = address
+        _say_what_is_live(entry, given)
     else:
         _say_where_it_runs(given)
         options |= _window(given)
@@ -57,15 +57,37 @@ def translate(entry: RoboGymId, given: Mapping[str, Any]) -> dict[str, Any]:
     return options if options.get("transport") is not None else {**entry.defaults, **options}
 
 
+def constructor_options(entry: RoboGymId) -> tuple[frozenset[str], frozenset[str]]:
+    """What robo-gym's constructors take and ours do not: what is taken here too, and what is refused with a reason.
+
+    Its other options are those of our tasks.
+    """
+    taken = frozenset({*_SIMULATED, "rs_address"} if entry.is_live else _SIMULATED)
+    return taken, frozenset({"rs_address", *_NOT_HERE}) - taken - option_names(_task(entry))
+
+
+def require_values(entry: RoboGymId, given: Mapping[str, Any]) -> None:
+    """Refuse options of the wrong kind.
+
+    Raises:
+        InvalidValue: A flag is neither True nor False, or a number is none.
+    """
+    said = {name: value for name, value in given.items() if value is not None or name not in _WINDOWS}
+    require_kinds(entry.id, _task(entry), said, {*FLAGS, *_WINDOWS})
+
+
+def _task(entry: RoboGymId) -> Any:
+    return registry.resolve(registry.ENVIRONMENTS[entry.env_id].task)
+
+
 def _require_known(entry: RoboGymId, given: Mapping[str, Any]) -> None:
-    of_task = option_names(registry.resolve(registry.ENVIRONMENTS[entry.env_id].task))
-    known = {*of_task, *_OF_ENVIRONMENT, *_SIMULATED, "rs_address"} - {"env_id", "task_options"}
+    taken, refused = constructor_options(entry)
+    known = {*option_names(_task(entry)), *_OF_ENVIRONMENT, *taken} - {"env_id", "task_options"}
     for name in given:
-        if name in known:
-            continue
-        if name in _NOT_HERE:
+        if name in refused and name in _NOT_HERE:
             raise InvalidValue(f"{name}= of {entry.id}: there is none here; {_NOT_HERE[name]}.")
-        raise UnknownName(f"argument of {entry.id}", name, known)
+        if name not in known | refused:
+            raise UnknownName(f"argument of {entry.id}", name, known)
 
 
 def _live_address(entry: RoboGymId, given: Mapping[str, Any]) -> str | None:
@@ -80,7 +102,6 @@ def _live_address(entry: RoboGymId, given: Mapping[str, Any]) -> str | None:
         return robot
     if given.get("transport") is not None:
         return None
-    _require_nothing_simulated(entry, given)
     if robot is not None and address is not None:
         raise InvalidValue(f"rs_address={address!r} and robot={robot!r} name the same thing; leave one out.")
     if robot is not None or address is not None:
@@ -89,15 +110,6 @@ def _live_address(entry: RoboGymId, given: Mapping[str, Any]) -> str | None:
         f"{entry.id} is a live robot, and it has no address: give robot='ws://IP:PORT' of the rosbridge in front of "
         f"it (rs_address='IP:PORT' is the same), or use {entry.twin} for the simulated one."
     )
-
-
-def _require_nothing_simulated(entry: RoboGymId, given: Mapping[str, Any]) -> None:
-    for name in _SIMULATED:
-        if given.get(name):
-            raise InvalidValue(
-                f"{name}={given[name]!r} belongs to the simulation, {entry.twin}; the robot of {entry.id} is "
-                "named by rs_address='IP:PORT' or robot='ws://IP:PORT'."
-            )
 
 
 def _rosbridge_address(address: Any) -> str:
@@ -115,6 +127,18 @@ def _rosbridge_address(address: Any) -> str:
         "was given another), and not through a robot server of robo-gym's.",
     )
     return url
+
+
+def _say_what_is_live(entry: RoboGymId, given: Mapping[str, Any]) -> None:
+    """Of options for a simulation, given with a robot: scripts pass the same to both."""
+    names = [name for name in _SIMULATED if given.get(name)]
+    if names:
+        said = ", ".join(f"{name}={given[name]!r}" for name in names)
+        say_once(
+            f"live {' '.join(names)}",
+            f"{said}: accepted, and without effect. The robot of this {entry.id} is a live one: it has no window here, "
+            "and no Server Manager.",
+        )
 
 
 def _say_where_it_runs(given: Mapping[str, Any]) -> None:

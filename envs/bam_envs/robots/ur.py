@@ -120,7 +120,7 @@ def ur_model(name: str) -> UrModel:
         UnknownName: There is none; it carries the closest match.
     """
     if name not in UR_MODELS:
-        raise UnknownName("ur_model", str(name), UR_MODELS, examples=UR_MODELS)
+        raise UnknownName("ur_model", str(name), UR_MODELS, examples=UR_MODELS, similar=0.85)  # ur7 is not ur5
     return UR_MODELS[name]
 
 

@@ -6,13 +6,16 @@ A text where a flag is meant would be True whatever it says, ``parity="false"`` 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from numbers import Real
 from typing import Any
 
 import numpy as np
 
 from bam_envs.errors import InvalidValue, UnknownName
+
+FLAGS = frozenset({"randomize"})
+"""Options of every environment that are no task's, and True or False."""
 
 
 def option_names(task: Callable[..., Any]) -> set[str]:
@@ -33,11 +36,31 @@ def require_options(env_id: str, task: Callable[..., Any], given: Mapping[str, A
         UnknownName: It has no such option.
         InvalidValue: A flag is neither True nor False, or a number is none.
     """
-    parameters, known = inspect.signature(task).parameters, option_names(task)
-    for name, value in given.items():
+    known = option_names(task)
+    for name in given:
         if name not in known:
             raise UnknownName(f"argument of {env_id}", name, known | others)
-        default = parameters[name].default
+    require_kinds(env_id, task, given)
+
+
+def require_kinds(
+    env_id: str, task: Callable[..., Any], given: Mapping[str, Any], flags: Iterable[str] = FLAGS
+) -> None:
+    """Refuse a value of another kind than its default; what is no option of `task` and no flag is left alone.
+
+    Args:
+        env_id: For texts.
+        task: Its class.
+        given: Options of the environment, the task's among them.
+        flags: Options that are not the task's, and True or False.
+
+    Raises:
+        InvalidValue: A flag is neither True nor False, or a number is none.
+    """
+    defaults = {name: parameter.default for name, parameter in inspect.signature(task).parameters.items()}
+    defaults |= dict.fromkeys(flags, False)
+    for name, value in given.items():
+        default = defaults.get(name)
         if isinstance(default, bool) and not isinstance(value, (bool, np.bool_)):
             raise InvalidValue(f"{name}= of {env_id} must be True or False, not {value!r}.")
         if isinstance(default, float) and (not isinstance(value, Real) or isinstance(value, bool)):

@@ -2,6 +2,7 @@
 
 import logging
 
+import numpy as np
 import pytest
 
 from bam_envs.errors import InvalidValue, UnknownName
@@ -95,11 +96,14 @@ def test_the_address_of_a_robot(told):
         (ROB, {"rs_address": "10.0.0.5"}, "rs_address must be 'IP:PORT', such as '10.0.0.5:9090', not '10.0.0.5'."),
         (ROB, {"rs_address": ":9090"}, "rs_address must be 'IP:PORT', such as '10.0.0.5:9090', not ':9090'."),
         (ROB, {"rs_address": "a:70000"}, "rs_address must be 'IP:PORT', such as '10.0.0.5:9090', not 'a:70000'."),
+        (SIM, {"gui": "no"}, "gui= of EndEffectorPositioningURSim-v0 must be True or False, not 'no'."),
+        (ROB, {"rviz_gui": 1}, "rviz_gui= of EndEffectorPositioningURRob-v0 must be True or False, not 1."),
+        (SIM, {"randomize": "no"}, "randomize= of EndEffectorPositioningURSim-v0 must be True or False, not 'no'."),
+        (SIM, {"parity": "no"}, "parity= of EndEffectorPositioningURSim-v0 must be True or False, not 'no'."),
         (
-            ROB,
-            {"ip": "10.0.0.5"},
-            "ip='10.0.0.5' belongs to the simulation, EndEffectorPositioningURSim-v0; the robot of "
-            "EndEffectorPositioningURRob-v0 is named by rs_address='IP:PORT' or robot='ws://IP:PORT'.",
+            SIM,
+            {"ee_distance_threshold": "a"},
+            "ee_distance_threshold= of EndEffectorPositioningURSim-v0 must be a number, not 'a'.",
         ),
         (
             ROB,
@@ -146,6 +150,28 @@ def test_a_typo_is_not_swallowed(name, closest):
     )
 
 
+def test_a_live_robot_takes_what_a_simulated_one_does(told):
+    given = {"robot": "ws://10.0.0.5:9090", "ip": "127.0.0.1", "gui": True, "gazebo_gui": None}
+    for entry in (ROB, ROB, SIM):
+        assert options.translate(entry, given) == {**DEFAULTS, "robot": "ws://10.0.0.5:9090"}
+    assert told() == [
+        "ip='127.0.0.1', gui=True: accepted, and without effect. The robot of this EndEffectorPositioningURRob-v0 is a "
+        "live one: it has no window here, and no Server Manager."
+    ]
+
+
+@pytest.mark.parametrize("entry", [SIM, ROB])
+def test_what_robo_gym_takes_and_we_do_not(entry):
+    assert options.translate(entry, {"robot": "ws://a:1", "parity": np.True_})["parity"]
+    taken, refused = options.constructor_options(entry)
+    assert {"ip", "gui"} <= taken
+    assert "rs_address" in (taken if entry.is_live else refused)
+    assert "action_rate" in refused
+    assert "ee_distance_threshold" not in taken | refused, "an option of the task"
+
+
 def test_options_of_arms_are_none_of_bases():
-    with pytest.raises(UnknownName, match=r"Unknown argument of NoObstacleNavigationMir100Sim-v0 'ur_model'"):
+    with pytest.raises(
+        UnknownName, match=r"Unknown argument of NoObstacleNavigationMir100Sim-v0 'ur_model'\. Choose from: ca_file, "
+    ):
         options.translate(ROBO_GYM["NoObstacleNavigationMir100Sim-v0"], {"ur_model": "ur5"})

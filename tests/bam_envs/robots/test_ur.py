@@ -49,9 +49,10 @@ def test_a_model_that_does_not_exist():
     with pytest.raises(UnknownName) as caught:
         ur_model("ur16")
     assert str(caught.value) == "Unknown ur_model 'ur16'. Did you mean 'ur16e'?"
-    with pytest.raises(UnknownName) as caught:
-        ur_model("panda")
-    assert str(caught.value) == ("Unknown ur_model 'panda'. Choose from: ur3, ur3e, ur5, ur5e, ur10, ur10e, ur16e.")
+    for name in ("panda", "ur7"):
+        with pytest.raises(UnknownName) as caught:
+            ur_model(name)
+        assert str(caught.value) == f"Unknown ur_model {name!r}. Choose from: ur3, ur3e, ur5, ur5e, ur10, ur10e, ur16e."
 
 
 @pytest.mark.parametrize("name", UR_MODELS)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bam_envs.errors import InvalidValue, UnknownName
-from bam_envs.tasks.options import option_names, require_options
+from bam_envs.tasks.options import option_names, require_kinds, require_options
 
 
 class Task:
@@ -56,3 +56,11 @@ def test_what_there_is_not(name, closest):
     with pytest.raises(UnknownName) as caught:
         checked(**{name: 1})
     assert str(caught.value) == f"Unknown argument of bam/task-v0 {name!r}. Did you mean {closest!r}?"
+
+
+def test_what_is_no_option_of_the_task():
+    require_kinds("bam/task-v0", Task, {"randomize": np.False_, "robot": "ws://a:1", "max_episode_steps": 7})
+    with pytest.raises(InvalidValue, match=r"^randomize= of bam/task-v0 must be True or False, not 'no'\.$"):
+        require_kinds("bam/task-v0", Task, {"randomize": "no"})
+    with pytest.raises(InvalidValue, match=r"^gui= of bam/task-v0 must be True or False, not 'no'\.$"):
+        require_kinds("bam/task-v0", Task, {"gui": "no"}, {"gui"})

@@ -151,7 +151,7 @@ def test_truncated_at_any_byte_is_refused(path: Path, tmp_path: Path):
     bad = tmp_path / "bad.zip"
     for size in {*range(0, len(whole), 53), *range(len(whole) - 30, len(whole))}:
         bad.write_bytes(whole[:size])
-        with pytest.raises(NotACheckpoint, match=r"not a whole zip file .*Copy it again from its source"):
+        with pytest.raises(NotACheckpoint, match=r"not a whole zip file.*Copy it again from its source"):
             Checkpoint.open(bad)
 
 
@@ -163,7 +163,7 @@ def test_what_is_no_file_is_refused(tmp_path: Path):
     (tmp_path / "file").write_text("text")
     with pytest.raises(NotACheckpoint, match=r"cannot be read: Not a directory\. Check its permissions"):
         Checkpoint.open(tmp_path / "file" / "a.zip")
-    with pytest.raises(NotACheckpoint, match=r"file: not a whole zip file \(File is not a zip file\)"):
+    with pytest.raises(NotACheckpoint, match=r"file: not a whole zip file: truncated, altered"):
         Checkpoint.open(tmp_path / "file")
 
 

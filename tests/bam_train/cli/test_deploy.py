@@ -153,7 +153,7 @@ def test_a_truncated_checkpoint(corridor_checkpoint, run):
     path.write_bytes(path.read_bytes()[:-40])
     status, out, err = run(main, path)
     assert (status, out) == (1, "")
-    assert err.startswith(f"bam-deploy: {path}: not a whole zip file (File is not a zip file)")
+    assert err.startswith(f"bam-deploy: {path}: not a whole zip file: truncated, altered or something else.")
     assert err.count("\n") == 1
 
 

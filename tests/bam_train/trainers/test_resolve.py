@@ -154,11 +154,11 @@ def saved(tmp_path):
     """A checkpoint that trained 3000 of 6000 steps, and a function that writes more like it."""
     settings = resolve({"env": "CartPole-v1", "algo": "ppo", "steps": 6000, "normalize": True, "seed": 3})
 
-    def write(path, steps=3000, best=None, **changes):
+    def write(path, steps=3000, best=None, scores=None, **changes):
         from dataclasses import replace
 
         members = {"bam/resume/notes.json": json.dumps({"best": best}).encode()}
-        return write_checkpoint(path, fields(replace(settings, **changes), steps), members)
+        return write_checkpoint(path, fields(replace(settings, **changes), steps, scores=scores or {}), members)
 
     write.settings = settings
     write.checkpoint = write(tmp_path / "half.zip")
@@ -292,6 +292,13 @@ def test_what_is_not_its_own_best_is_left_alone(saved, here, there):
     assert (str(output.path), output.best) == ("checkpoints/CartPole-v1-ppo.zip", None)
 
 
+def test_the_best_of_before_keeps_its_interval(saved, here):
+    best = {"steps": 2000, "success_rate": 0.5, "return_mean": 90.0, "path": str(here / "best.zip")}
+    saved(here / "best.zip", steps=2000, best=best, scores={"success_interval": [0.3, 0.7], "episodes": 20})
+    output = choose_output(saved.settings, None, False, saved(here / "last.zip", best=best))
+    assert output.best == Best(2000, 0.5, 90.0, (0.3, 0.7), 20)
+
+
 def test_settings_of_another_time_to_stop_are_the_same_run(saved, here):
     best = {"steps": 2000, "success_rate": None, "return_mean": 90.0, "path": str(here / "best.zip")}
     saved(here / "best.zip", steps=2000, best=best)
@@ -314,3 +321,22 @@ def test_an_argument_that_neither_robo_gym_nor_we_have():
     assert str(caught.value) == (
         "env_kwargs: unknown setting 'ur_modle' of EndEffectorPositioningURSim-v0. Did you mean 'ur_model'?"
     )
+
+
+def test_only_what_an_id_takes_is_offered():
+    given = {"env": "NoObstacleNavigationMir100Sim", "algo": "ppo", "env_kwargs": {"ur_model": "ur10e"}}
+    with pytest.raises(SettingsError) as caught:
+        resolve(given)
+    assert str(caught.value) == (
+        "env_kwargs: unknown setting 'ur_model' of NoObstacleNavigationMir100Sim-v0. Choose from: gazebo_gui, gui, ip, "
+        "lower_bound_port, max_episode_steps, parity, randomize, rs_state_to_info, rviz_gui, server_manager_port, "
+        "timeout, upper_bound_port."
+    )
+
+
+@pytest.mark.parametrize("env", ["bam/ur-reach-v0", "EndEffectorPositioningURSim-v0"])
+@pytest.mark.parametrize("name", ["parity", "randomize"])
+def test_a_flag_in_env_kwargs_is_true_or_false(env, name):
+    with pytest.raises(SettingsError) as caught:
+        resolve({"env": env, "algo": "ppo", "env_kwargs": {name: "yes"}})
+    assert str(caught.value) == f"env_kwargs: {name}= of {env} must be True or False, not 'yes'."

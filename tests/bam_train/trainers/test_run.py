@@ -10,7 +10,7 @@ import pytest
 
 from bam_envs.errors import LinkLost
 from bam_train.errors import OutputError, ProcessesLost, TrainingFailed
-from bam_train.evaluation import EvaluationReport
+from bam_train.evaluation import EvaluationReport, wilson_interval
 from bam_train.settings import TrainSettings
 from bam_train.trainers import judge as judge_module
 from bam_train.trainers import run as run_module
@@ -28,7 +28,7 @@ def report(success, total=0.0, episodes=10, seed=0):
         seed=seed,
         successes=None if success is None else round(success * episodes),
         success_rate=success,
-        success_interval=None,
+        success_interval=None if success is None else wilson_interval(round(success * episodes), episodes),
         return_mean=total,
         return_std=0.0,
         return_min=total,
@@ -314,6 +314,17 @@ def test_records_that_cannot_be_written_do_not_end_training(start, monkeypatch):
     monkeypatch.setattr(run.folder, "add", full)
     assert str(run.run().failure) == "progress.jsonl: full"
     assert watcher.notes == ["progress.jsonl: full. Training goes on, and some records are missing"]
+
+
+def test_a_few_episodes_are_not_better_than_many(start):
+    """One success of five is less sure than four of twenty, and more than none of twenty."""
+    short, extra = report(0.2, 9.0, episodes=5), {"until_success": 0.8, "eval_episodes": 20}
+    run, _, watcher = start({30: short, 60: report(0.0, episodes=5), 90: short, 100: report(0.2, episodes=20)}, **extra)
+    outcome = run.run()
+    assert [row[3] for row in watcher.evaluations] == [True, False, False, True]
+    assert (outcome.best.steps, outcome.best.episodes) == (100, 20)
+    run, _, _ = start({30: short, 60: short, 90: short, 100: report(0.0, 10.0, episodes=20)}, **extra)
+    assert run.run().best.steps == 30
 
 
 def test_a_resumed_run_keeps_a_better_best(start):

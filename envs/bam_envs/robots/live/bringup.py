@@ -115,8 +115,8 @@ class TopicTypes:
             if time.monotonic() > deadline:
                 raise ProtocolError(
                     f"Nobody listens to {topic} ({expected}), which takes {', '.join(sink.labels)}. Is the controller "
-                    f"active, and is the topic called so? Topics are in the profile of {self._profile.name}. A robot "
-                    "that has none of this runs environments that do not command it."
+                    f"active, and is the topic called so? Topics are in the profile of {self._profile.name}; "
+                    "this may be another robot than it describes."
                 )
             time.sleep(_ASK_AGAIN)  # nodes of a ROS graph find each other after a while
         found = self._found(topic) or expected

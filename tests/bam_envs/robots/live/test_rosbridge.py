@@ -416,8 +416,8 @@ def test_a_controller_that_is_not_there(server, monkeypatch):
     robot = robot_at(server.url)
     assert raised(ProtocolError, robot.connect) == (
         f"Nobody listens to {JOINT_COMMANDS} (std_msgs/Float64MultiArray), which takes {', '.join(JOINTS)}. Is the "
-        "controller active, and is the topic called so? Topics are in the profile of ur5e. A robot that has none of "
-        "this runs environments that do not command it."
+        "controller active, and is the topic called so? Topics are in the profile of ur5e; this may be another "
+        "robot than it describes."
     )
 
 

@@ -132,8 +132,8 @@ def test_a_served_arm_without_gripper_offers_none_and_says_so(serve, monkeypatch
         robot.connect()
     assert str(caught.value) == (
         f"Nobody listens to {GRIPPER} (std_msgs/Float64MultiArray), which takes gripper_width. Is the controller "
-        "active, and is the topic called so? Topics are in the profile of ur5e. A robot that has none of this runs "
-        "environments that do not command it."
+        "active, and is the topic called so? Topics are in the profile of ur5e; this may be another robot "
+        "than it describes."
     )
     np.testing.assert_array_equal(served.state.signals["joint_position"], [START])
 
