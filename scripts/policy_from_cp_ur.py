@@ -27,6 +27,7 @@ from bam_train.evaluation import FIRST_SEED
 from bam_train.policy import FrozenPolicy
 
 ENV = "bam/ur-reach-v0"  # of a directory that does not say on which it was trained
+ROBOT = "ur"  # how the names of such robots begin
 NAME = Path(__file__).stem
 
 
@@ -67,6 +68,9 @@ def main(args: argparse.Namespace) -> None:
         checkpoint = open_checkpoint(args.checkpoint.expanduser(), args.env, args.trust_pickle, folder)
         policy = FrozenPolicy.from_checkpoint(checkpoint)
         with open_env(checkpoint, args.robot, who=NAME, episodes=args.num_episodes, yes=args.yes) as env:
+            robot = env.unwrapped.robot.spec.name  # type: ignore[attr-defined]
+            if not robot.startswith(ROBOT):
+                print(f"{NAME}: note: {checkpoint.manifest.env} moves a {robot}", file=sys.stderr, flush=True)
             successes = 0
             for k in range(args.num_episodes):
                 total, success, clipped, steps = play(env, policy, args.seed + k)

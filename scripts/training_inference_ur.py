@@ -19,7 +19,7 @@ import gymnasium as gym
 
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.console import number
-from bam_train.cli.experiment import ScriptParser, ctrl_c_asks, open_env, whole
+from bam_train.cli.experiment import ScriptParser, ctrl_c_asks, open_env, require_cpus, whole
 from bam_train.cli.program import guarded
 from bam_train.evaluation import FIRST_SEED
 from bam_train.policy import FrozenPolicy
@@ -38,6 +38,7 @@ def train(args: argparse.Namespace) -> tuple[Checkpoint, Any]:
     """Train until something says stop; the checkpoint, and the policy to go on with."""
     given = {"env": ENV, "env_kwargs": ENV_KWARGS, "trainer": "rllib", "algo": args.run.lower(), "seed": args.seed}
     settings = resolve({**given, "steps": args.stop_timesteps, "num_env_runners": max(0, args.num_cpus - 1)})
+    require_cpus(args.num_cpus)
     output, iterations = choose_output(settings, None, False, None), 0
 
     def goes_on(progress: Progress) -> bool:

@@ -66,6 +66,22 @@ def whole(least: int) -> Callable[[str], int]:
     return read
 
 
+def require_cpus(number: int) -> None:
+    """Refuse ``--num-cpus``, of which one learns and the others run episodes, where there are fewer.
+
+    Raises:
+        SettingsError: With the most that there can be; the one that learns counts as none.
+    """
+    from bam_train.errors import SettingsError
+    from bam_train.trainers.rllib.cluster.resources import cores
+
+    if number - 1 > cores():
+        raise SettingsError(
+            f"--num-cpus: expected at most {cores() + 1}, one to learn and one for each CPU of this computer, "
+            f"found {number}"
+        )
+
+
 @contextlib.contextmanager
 def ctrl_c_asks() -> Iterator[Callable[[], bool]]:
     """Within, the first Ctrl-C interrupts nothing, and what this gives says that it came; the second interrupts."""

@@ -71,6 +71,12 @@ def test_a_checkpoint_of_ours(run, checkpoint):
     assert re.fullmatch(r"success in [0-2] of 2 episodes on bam/mir100-navigation-v0", last)
 
 
+def test_a_policy_of_another_robot_is_noted(run):
+    status, out, err = run(PICK, "--num-episodes", 1)
+    assert (status, err) == (0, "policy_from_cp_mir: note: bam/pick-v0 moves a ur5e\n")
+    assert out.splitlines()[-1].endswith(" of 1 episodes on bam/pick-v0")
+
+
 def test_a_directory_of_rllib_acts_the_same(run_script, run, checkpoint, directory, tmp_path):
     """Of the whole algorithm, and of the policy alone, in a process of its own: RLlib's code is imported there."""
     options = ("--num-episodes", 1, "--seed", 5)
