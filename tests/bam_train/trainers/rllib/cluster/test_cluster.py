@@ -39,9 +39,19 @@ def home(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.fixture(autouse=True)
+def _others():
+    """Processes of other tests, such as multiprocessing's tracker, are not Ray's."""
+    OTHERS.clear()
+    OTHERS.update(psutil.Process().children(recursive=True))
+
+
+OTHERS = set()
+
+
 def started():
     """Processes that Ray runs for this one."""
-    return psutil.Process().children(recursive=True)
+    return [process for process in psutil.Process().children(recursive=True) if process not in OTHERS]
 
 
 def listening(processes):

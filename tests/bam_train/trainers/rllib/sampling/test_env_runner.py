@@ -18,6 +18,7 @@ from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 from ray.rllib.utils.filter import RunningStat
 
 from bam_train.environments import make_rows
+from bam_train.trainers.rllib.registration import register
 from bam_train.trainers.rllib.sampling.env_runner import RobotEnvRunner
 from bam_train.trainers.rllib.sampling.filters import MeanStdFilter, forget_deltas, push
 from bam_train.trainers.rllib.sampling.rows import Rollout, Running
@@ -143,6 +144,7 @@ def test_episodes_are_those_of_rllibs_own_runner(rows):
 def _collected(kind, rows):
     """By their first observation: observations, actions, rewards, and how each episode ended."""
     torch.manual_seed(0)
+    register()  # another test may have shut Ray down, and RLlib's registry with it
     config = PPOConfig().environment("bam/mir100-avoidance").debugging(seed=5).rl_module(model_config=NETWORK)
     config.env_runners(num_env_runners=0, num_envs_per_env_runner=rows, env_runner_cls=kind)
     with warnings.catch_warnings():
