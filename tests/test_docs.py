@@ -248,7 +248,14 @@ def test_the_table_of_checkpoints_is_of_the_files():
     known = script.old_wall_times((ROOT / "checkpoints" / "README.md").read_text())
     del known["checkpoint", "command", "seed", "steps"], known[("---",) * 4]
     names = [row[0].partition("]")[0].removeprefix("[") for row in known]
-    assert {name.removesuffix(".zip").rpartition("-")[0] for name in names} == {"reach", "pick", "pick-place"}
+    assert {name.removesuffix(".zip").rpartition("-")[0] for name in names} == {
+        "mir100-avoidance",
+        "mir100-navigation",
+        "pick",
+        "pick-place",
+        "reach",
+        "ur-reach",
+    }
     for name, (_, command, seed, steps) in zip(names, known, strict=True):
         path = ROOT / "checkpoints" / name
         manifest = Checkpoint.open(path).manifest
