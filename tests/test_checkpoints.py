@@ -15,8 +15,10 @@ LEAST = {
     "pick-place-ppo": 0.95,
     "mir100-navigation-ppo": 0.99,
     "mir100-avoidance-ppo": 0.95,
-    "ur-reach-ppo": 0.985,
+    "ur-reach-ppo": 0.99,
 }
+WIDE = {"mir100-avoidance-ppo", "ur-reach-ppo"}
+"""Two layers of 128 instead of 64: four times the weights, and their optimiser's."""
 
 
 def test_the_committed_checkpoints():
@@ -26,7 +28,7 @@ def test_the_committed_checkpoints():
 @pytest.mark.parametrize(("name", "least"), LEAST.items())
 def test_a_committed_checkpoint_succeeds_and_is_small(name, least):
     path = FOLDER / f"{name}.zip"
-    assert path.stat().st_size < 1_200_000
+    assert path.stat().st_size < (1_200_000 if name in WIDE else 500_000)
     manifest = Checkpoint.open(path).manifest
     report = evaluate(FrozenPolicy.load(path), manifest.env, manifest.env_kwargs, episodes=200, seed=7_000_000)
     assert report.episodes == 200
