@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from bam_envs.errors import MissingExtra
 from bam_train.errors import SettingsError
 from bam_train.values import closest
 
@@ -24,15 +25,23 @@ ALGORITHMS: dict[str, str] = {
 """Name of a trainer to the table of its algorithms; reading it imports no learning library."""
 
 
+EXTRAS: dict[str, str] = {"rllib": "rllib", "sb3": "train"}
+"""Name of a trainer to the extra of bam-train that brings all it needs."""
+
+
 def load_trainer(name: str) -> type[Trainer]:
     """The class of a trainer; this imports its library.
 
     Raises:
         SettingsError: No trainer has this name.
+        MissingExtra: A package that its library needs is not installed.
     """
     if name not in TRAINERS:
         raise SettingsError(f"Unknown trainer {name!r}. {closest(name, TRAINERS)}")
-    trainer: type[Trainer] = _resolve(TRAINERS[name])
+    try:
+        trainer: type[Trainer] = _resolve(TRAINERS[name])
+    except ModuleNotFoundError as error:
+        raise MissingExtra(str(error.name).partition(".")[0], EXTRAS[name], f"The {name} trainer") from error
     return trainer
 
 

@@ -380,5 +380,5 @@ def test_a_missing_extra_says_what_to_install(here):
         env=environment,
         check=False,
     )
-    expected = 'bam-train: needs torch, which is not installed. Run: pip install "bam-train[train]"\n'
+    expected = 'bam-train: The sb3 trainer needs torch, which is not installed. Run: pip install "bam-train[train]"\n'
     assert (done.returncode, done.stderr) == (1, expected)
