@@ -64,7 +64,8 @@ def describe(value: Any) -> str:
 def closest(name: str, choices: Iterable[str]) -> str:
     """A hint that follows an unknown name: the most similar choice, or all of them."""
     ordered = sorted(choices)
-    matches = difflib.get_close_matches(name, ordered, n=1, cutoff=0.65)
+    same = [choice for choice in ordered if choice.lower() == name.lower()]
+    matches = same or difflib.get_close_matches(name, ordered, n=1, cutoff=0.65)
     return f"Did you mean {matches[0]!r}?" if matches else f"Choose from: {', '.join(ordered)}."
 
 

@@ -165,4 +165,6 @@ def report(result: Result, reference: Result) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from bam_train.cli.program import guarded
+
+    sys.exit(guarded(main, "bench_scale.py"))

@@ -1,7 +1,8 @@
 """Write the generated parts of ``docs/*.md`` from the code; with ``--check``, only say whether they are current.
 
 A generated part stands between ``<!-- generated: NAME -->`` and ``<!-- /generated -->``; NAME may carry an argument,
-as in ``environment bam/pick-v0``. The rest of a page is written by hand.
+as in ``environment bam/pick-v0``. The rest of a page is written by hand. Longer than most files here: every kind of
+part has its function in it.
 """
 
 from __future__ import annotations
@@ -156,8 +157,8 @@ def topics_of(name: str) -> str:
     rows = [[f"`{topic}`", f"`{kind}`", "from the robot", ", ".join(what)] for (topic, kind), what in published.items()]
     for way, sinks in profile.commands.items():
         for sink in sinks:
-            unit = profile.command.units[profile.command.labels.index(sink.labels[0])]
-            what = f"{', '.join(sink.labels)} [{unit}]"
+            unit_of = dict(zip(profile.command.labels, profile.command.units, strict=True))
+            what = f"{', '.join(sink.labels)} [{', '.join(dict.fromkeys(unit_of[label] for label in sink.labels))}]"
             rows.append([f"`{sink.topic}`", f"`{sink.type}`", f"to the robot ({way})", what])
     return table(["topic", "type", "direction", "what"], _once(rows))
 
@@ -281,16 +282,14 @@ def robo_gym() -> str:
     rows = []
     for entry in (entry for entry in ROBO_GYM.values() if not entry.is_live):
         ours = ENVIRONMENTS[entry.env_id]
-        options = {} if entry.no_parity else {"parity": True}
-        task = resolve(ours.task)(1, **options)
+        task = resolve(ours.task)(1, parity=True, **entry.defaults)
         numbers = [len(task.observation_labels), len(task.action_labels)]
         told = ", ".join(f"`{name}={value!r}`" for name, value in entry.defaults.items() if value is not False)
         link = f"[`{ours.id}`](environments.md#{anchor(ours.id)})"
-        parity = "no" if entry.no_parity else "yes"
         rate = f"{1 / ours.period:g} Hz"
-        rows.append([f"`{entry.stem}`", link, told, *numbers, ours.max_episode_steps, rate, parity])
+        rows.append([f"`{entry.stem}`", link, told, *numbers, ours.max_episode_steps, rate])
     names = ["id, before `Sim-v0` or `Rob-v0`", "is", "with"]
-    header = [*names, "observation", "action", "steps", "rate", "`parity=True`"]
+    header = [*names, "observation", "action", "steps", "rate"]
     return table(header, rows)
 
 

@@ -1,51 +1,92 @@
 """Record episodes of a trained policy as Parquet files, which bc, marwil, cql and iql of RLlib learn from.
 
-    python scripts/record_parquet.py checkpoints/pick-ppo.zip --out recorded --episodes 100
-    bam-train --trainer rllib --env bam/pick --algo bc --data recorded
-
 One row a step: eps_id, t, obs, actions, rewards, new_obs, terminateds, truncateds; actions are the environment's own.
+
+Examples:
+  python scripts/record_parquet.py checkpoints/pick-ppo.zip --out recorded
+  python scripts/record_parquet.py checkpoints/pick-ppo.zip --out noisy --episodes 500 --noise 0.3 --seed 1
+  bam-train --trainer rllib --env bam/pick --algo bc --data recorded
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet
 
 from bam_train.checkpoint import Checkpoint
+from bam_train.cli.experiment import ScriptParser, whole
+from bam_train.cli.program import guarded
 from bam_train.environments import make_rows
+from bam_train.errors import OutputError
 from bam_train.policy import FrozenPolicy
 
 ROWS_A_FILE = 50_000
+NAME = Path(__file__).stem
 
 
 def main() -> None:
     """Read the options, record, say how it went."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("checkpoint", type=Path, help="checkpoint.zip of the policy")
-    parser.add_argument("--out", type=Path, required=True, help="folder for the files")
-    parser.add_argument("--episodes", type=int, default=100, help="how many")
-    parser.add_argument("--seed", type=int, default=0, help="of the environments and the noise")
-    parser.add_argument("--noise", type=float, default=0.0, help="standard deviation added to continuous actions")
-    parser.add_argument("--num-envs", type=int, default=16, help="environments stepped side by side")
-    options = parser.parse_args()
-    checkpoint = Checkpoint.open(options.checkpoint)
-    policy = FrozenPolicy.load(options.checkpoint)
+    options = parse()
+    import pyarrow.parquet  # noqa: F401 - what is missing is said before the work
+
+    checkpoint = Checkpoint.open(options.checkpoint.expanduser())
+    policy = FrozenPolicy.from_checkpoint(checkpoint)
+    folder = make_folder(options.out.expanduser())
     kwargs = checkpoint.manifest.env_kwargs
     rows = make_rows(checkpoint.manifest.env, kwargs, min(options.num_envs, options.episodes))
     episodes = record(rows, policy, options.episodes, options.seed, options.noise)
     rows.close()
-    files = write(episodes, options.out)
+    files = write(episodes, folder)
     returns = [float(episode["rewards"].sum()) for episode in episodes]
     steps = sum(len(episode["rewards"]) for episode in episodes)
     print(
         f"{len(episodes)} episodes, {steps} steps, mean return {np.mean(returns):.2f}, "
-        f"in {len(files)} file{'' if len(files) == 1 else 's'} in {options.out}"
+        f"in {len(files)} file{'' if len(files) == 1 else 's'} in {folder}"
     )
+
+
+def parse() -> argparse.Namespace:
+    """Read the command line."""
+    parser = ScriptParser(__file__, __doc__)
+    add = parser.add_argument
+    add("checkpoint", type=Path, metavar="CHECKPOINT", help="checkpoint.zip of the policy")
+    add("--out", type=Path, required=True, metavar="DIR", help="folder for the files, without any so far")
+    add("--episodes", type=whole(1), default=100, metavar="N", help="how many (default 100)")
+    add("--seed", type=whole(0), default=0, metavar="N", help="of the environments and the noise (default 0)")
+    add("--noise", type=deviation, default=0.0, metavar="X", help="deviation added to continuous actions (default 0)")
+    add("--num-envs", type=whole(1), default=16, metavar="N", help="environments stepped side by side (default 16)")
+    options: argparse.Namespace = parser.parse_args()
+    return options
+
+
+def deviation(text: str) -> float:
+    """A number from 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a number from 0, found {text!r}")
+    return value
+
+
+def make_folder(folder: Path) -> Path:
+    """The folder, in which there is nothing yet that would be read with what is to come.
+
+    Raises:
+        OutputError: It cannot be made, or has Parquet files.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"--out: {folder} cannot be made: {error.strerror}. Give another folder") from error
+    if any(folder.glob("*.parquet")):
+        raise OutputError(f"--out: {folder} has Parquet files already, of other episodes. Give another folder")
+    return folder
 
 
 def record(rows: Any, policy: Any, count: int, seed: int, noise: float) -> list[dict[str, Any]]:
@@ -105,7 +146,9 @@ def columns(number: int, steps: list[Any]) -> dict[str, Any]:
 
 def write(episodes: list[dict[str, Any]], folder: Path) -> list[Path]:
     """Write whole episodes into as few files as will do; the files."""
-    folder.mkdir(parents=True, exist_ok=True)
+    import pyarrow as pa
+    import pyarrow.parquet
+
     joined = {name: np.concatenate([episode[name] for episode in episodes]) for name in episodes[0]}
     table = pa.table({name: _arrow(values) for name, values in joined.items()})
     files = []
@@ -117,6 +160,8 @@ def write(episodes: list[dict[str, Any]], folder: Path) -> list[Path]:
 
 def _arrow(values: Any) -> Any:
     """A column: lists of a fixed size for arrays, nested for those of several axes."""
+    import pyarrow as pa
+
     if values.ndim == 1:
         return pa.array(values.tolist() if values.dtype.kind == "U" else values)
     inner = _arrow(values.reshape(-1, *values.shape[2:]))
@@ -124,4 +169,4 @@ def _arrow(values: Any) -> Any:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(guarded(main, NAME))

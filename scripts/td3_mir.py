@@ -14,7 +14,7 @@ from pathlib import Path
 
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.console import number
-from bam_train.cli.experiment import ScriptParser, ctrl_c_asks, open_env, whole
+from bam_train.cli.experiment import ScriptParser, ctrl_c_asks, open_env, require_address, whole
 from bam_train.cli.program import guarded
 from bam_train.evaluation import FIRST_SEED
 from bam_train.policy import FrozenPolicy
@@ -49,6 +49,7 @@ def train(steps: int, seed: int) -> Checkpoint:
 
 def main(args: argparse.Namespace) -> None:
     """Train, save, load, run."""
+    require_address(args.robot)
     checkpoint = train(args.steps, args.seed)
     policy = FrozenPolicy.load(checkpoint.path)
     with open_env(checkpoint, args.robot, who=NAME, episodes=args.episodes, yes=args.yes) as env:

@@ -105,12 +105,14 @@ class Checkpoint:
             raise AlteredCheckpoint(self.path, member, f"{member} is not JSON: {error}") from error
 
     def requires_env(self, env_id: str) -> None:
-        """Refuse to be used with another environment than its own.
+        """Refuse to be used with another environment than its own; robo-gym's names of one of ours are no other.
 
         Raises:
             CheckpointMismatch: Names both environments.
         """
-        if env_id != self.manifest.env:
+        from bam_envs.registry import are_same
+
+        if not are_same(env_id, self.manifest.env):
             own = self.manifest.env
             text = f"was trained on {own}, not on {env_id}. Use --env {own}, or train one for {env_id}"
             raise CheckpointMismatch(self.path, text)

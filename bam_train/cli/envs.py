@@ -5,6 +5,7 @@ from __future__ import annotations
 import json as json_module
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Annotated, Any
 
 import tyro
@@ -126,8 +127,22 @@ def detail_lines(facts: dict[str, Any]) -> list[str]:
     if not facts["signals"]:
         lines += [f"{kind}: {json_module.dumps(facts[kind + '_space'])}" for kind in ("observation", "action")]
     for kind, rows in facts["signals"].items():
-        lines += ["", kind, *_signal_lines(rows)]
+        lines += ["", kind, *_signal_lines(folded(rows))]
     return lines
+
+
+def folded(rows: list[dict[str, Any]], most: int = 16) -> list[dict[str, Any]]:
+    """`rows`, but one for each run of over `most` that differ by their number alone: ``f_scan_0 to f_scan_500``."""
+
+    def sort_of(row: dict[str, Any]) -> dict[str, Any]:
+        return {**row, "name": row["name"].rstrip("0123456789")}
+
+    shown = []
+    for _, group in groupby(rows, sort_of):
+        run = list(group)
+        one = {**run[0], "name": f"{run[0]['name']} to {run[-1]['name']}"}
+        shown += [one] if len(run) > most else run
+    return shown
 
 
 def _signal_lines(rows: list[dict[str, Any]]) -> list[str]:

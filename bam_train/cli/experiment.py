@@ -82,6 +82,18 @@ def require_cpus(number: int) -> None:
         )
 
 
+def require_address(robot: str | None) -> None:
+    """Refuse a ``--robot`` that is no address before anything is trained for it; nothing is connected.
+
+    Raises:
+        InvalidValue: Says what was expected.
+    """
+    if robot is not None:
+        from bam_envs.robots.live.building import require_robot_address
+
+        require_robot_address(robot)
+
+
 @contextlib.contextmanager
 def ctrl_c_asks() -> Iterator[Callable[[], bool]]:
     """Within, the first Ctrl-C interrupts nothing, and what this gives says that it came; the second interrupts."""

@@ -8,11 +8,13 @@ from __future__ import annotations
 import contextlib
 import errno
 import io
+import math
 import os
 import re
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from types import FrameType
 from typing import TextIO, TypeVar
@@ -24,6 +26,7 @@ EXTRAS = {
     "stable_baselines3": "train",
     "sb3_contrib": "train",
     "ray": "rllib",
+    "pyarrow": "rllib",
     "onnx": "train",
     "tensorboard": "train",
     "matplotlib": "train",
@@ -32,6 +35,10 @@ EXTRAS = {
     "imageio": "video",
 }
 """Optional package to the extra of bam-train that brings it."""
+
+TOGETHER = 0.5
+"""A signal of a program that comes again within this time is the same one [s]: ``timeout`` sends SIGTERM to the process
+and then to its group. Ctrl-C is a person's, and counts each time."""
 
 INTERRUPTED = 130
 """Exit status of a program that Ctrl-C ended (128 + SIGINT)."""
@@ -58,8 +65,7 @@ def run_program(
         SystemExit: Always.
     """
     sys.path.append(os.getcwd())  # --env my_module:Env-v0, as with python -m; last, so that it hides nothing
-    parsed = parse(config, prog, description, arguments)
-    sys.exit(guarded(lambda: main(parsed), prog))
+    sys.exit(guarded(lambda: main(parse(config, prog, description, arguments)), prog))
 
 
 def parse(config: type[Config], prog: str, description: str, arguments: Sequence[str] | None) -> Config:
@@ -104,12 +110,12 @@ def guarded(main: Callable[[], int | None], prog: str) -> int:
     try:
         with _terminable():
             return main() or 0
-    except KeyboardInterrupt as stop:
-        _complain(prog, str(stop) or "interrupted")
-        return INTERRUPTED
     except Terminated as stop:
         _complain(prog, f"ended by {stop.signal.name}")
         return 128 + stop.signal
+    except KeyboardInterrupt as stop:
+        _complain(prog, str(stop) or "interrupted")
+        return INTERRUPTED
     except BrokenPipeError:  # somebody closed our standard output, such as head
         _silence(sys.stdout)
         return 1
@@ -134,8 +140,8 @@ def _expected(prog: str, error: Exception) -> int:
     return 1
 
 
-class Terminated(BaseException):
-    """A signal other than Ctrl-C asked for the end.
+class Terminated(KeyboardInterrupt):
+    """A signal other than Ctrl-C asked for the end; Ray, waiting in C++, hears of no other kind of exception.
 
     Attributes:
         signal: Which.
@@ -143,17 +149,26 @@ class Terminated(BaseException):
 
     def __init__(self, number: int) -> None:
         self.signal = signal.Signals(number)
-        super().__init__(self.signal.name)
+        super().__init__(self.signal)  # what it is made from, so that it can be copied
 
 
 @contextlib.contextmanager
 def _terminable() -> Iterator[None]:
-    """Within this, SIGTERM and SIGHUP raise `Terminated`, so that what is open is closed; in the main thread only."""
+    """Within this, SIGTERM and SIGHUP raise `Terminated`, so that what is open is closed; in the main thread only.
+
+    One that comes again at once is the same one: it does not interrupt the closing.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
+    first, came = -math.inf, 0
+
     def stop(number: int, _: FrameType | None) -> None:
+        nonlocal first, came
+        if time.monotonic() < first + TOGETHER:
+            return
+        first, came = time.monotonic(), number
         raise Terminated(number)
 
     numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]  # not on Windows
@@ -161,6 +176,10 @@ def _terminable() -> Iterator[None]:
     before = [(number, signal.signal(number, stop)) for number in heard]
     try:
         yield
+    except KeyboardInterrupt as error:
+        if came and not isinstance(error, Terminated):  # Ray raises one of its own instead
+            raise Terminated(came) from None
+        raise
     finally:
         for number, handler in before:
             signal.signal(number, handler)

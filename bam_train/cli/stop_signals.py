@@ -10,15 +10,14 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any
 
+from bam_train.cli.program import TOGETHER
+from bam_train.trainers.at_quit import before_quitting
+
 if TYPE_CHECKING:
     from bam_train.trainers.run import TrainingRun
 
 SHOW_CURSOR = b"\x1b[?25h"
 """Undoes what a live panel did to the terminal."""
-
-TOGETHER = 0.5
-"""A signal of a program that comes again within this time is the same one [s]: ``timeout`` sends SIGTERM to the process
-and then to its group. Ctrl-C is a person's, and counts each time."""
 
 
 class StopSignals:
@@ -78,6 +77,7 @@ class StopSignals:
         kept = f"the last checkpoint on the disk is {last}" if last else "no checkpoint had been saved yet"
         _write(f"bam-train: quit at once; {kept}\n")
         self.run.folder.remove_unfinished()
+        before_quitting()
         os._exit(128 + number)
 
 

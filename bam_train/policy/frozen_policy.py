@@ -202,7 +202,8 @@ class FrozenPolicy:
             return None, [], np.empty(0)
         plan = self._runner.single
         result = plan.outputs["action"]
-        return plan.inputs["observation"][0], plan.calls, result[0] if self._action.shape else result.reshape(())
+        seen = plan.inputs["observation"][0, ...]  # an array also of one number
+        return seen, plan.calls, result[0] if self._action.shape else result.reshape(())
 
     def _check_golden(self, checkpoint: Checkpoint) -> None:
         """Act on the recorded observations, and compare with what the trainer did."""

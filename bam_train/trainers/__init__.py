@@ -49,13 +49,18 @@ def require_algorithm(trainer: str, algorithm: str) -> None:
     """Refuse an algorithm that the trainer does not have.
 
     Raises:
-        SettingsError: Carries the closest match.
+        SettingsError: Carries the closest match, or the other trainer that has it.
     """
     if trainer not in ALGORITHMS:
         raise SettingsError(f"Unknown trainer {trainer!r}. {closest(trainer, ALGORITHMS)}")
     table = _resolve(ALGORITHMS[trainer])
     if algorithm not in table:
-        raise SettingsError(f"Unknown algorithm {algorithm!r}. {closest(algorithm, table)}")
+        others = [name for name in ALGORITHMS if algorithm in _resolve(ALGORITHMS[name])]
+        if others:
+            hint = f"It is one of {others[0]}'s; those of {trainer} are: {', '.join(sorted(table))}."
+        else:
+            hint = closest(algorithm, table)
+        raise SettingsError(f"Unknown algorithm {algorithm!r}. {hint}")
 
 
 def _resolve(reference: str) -> Any:

@@ -5,54 +5,26 @@ It is beside the package `rllib` and not in it: importing that registers our env
 
 from __future__ import annotations
 
-import importlib
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
-from bam_train.errors import SettingsError
+from bam_train.trainers.algorithm import BOX, DISCRETE, AlgorithmRow
 
-BOX = ("Box",)
-DISCRETE = ("Discrete",)
 ANY = ("Box", "Discrete", "MultiDiscrete")
 
 
 @dataclass(frozen=True)
-class Algorithm:
-    """One algorithm of RLlib."""
+class Algorithm(AlgorithmRow):
+    """One algorithm of RLlib; `load` gives the class of its configuration."""
 
-    name: str
-    """As ``--algo`` takes it."""
-    reference: str
-    """``"module:Class"`` of its `AlgorithmConfig`."""
-    actions: tuple[str, ...]
-    """Kinds of action space that it can learn on."""
     on_policy: bool = False
     """Whether it learns from fresh episodes alone; the others keep a replay buffer or recorded episodes."""
     offline: bool = False
     """Whether it learns from recorded episodes, and takes no step in an environment."""
 
-    def load(self) -> Any:
-        """The class of its configuration; imports RLlib."""
-        module, _, name = self.reference.partition(":")
-        return getattr(importlib.import_module(module), name)
-
-    def require_actions(self, env: str, kind: str) -> None:
-        """Refuse an action space that this algorithm cannot learn on.
-
-        Args:
-            env: Environment id, as the error names it.
-            kind: Class name of its action space.
-
-        Raises:
-            SettingsError: Names the algorithms that can.
-        """
-        if kind in self.actions:
-            return
-        fitting = ", ".join(sorted(row.name for row in _ROWS if kind in row.actions and row.offline == self.offline))
-        remedy = f"Use one of: {fitting}." if fitting else "No algorithm here does."
-        raise SettingsError(
-            f"{self.name} does not fit {env}: it takes {' or '.join(self.actions)} actions, found {kind}. {remedy}"
-        )
+    def alternatives(self) -> Iterable[AlgorithmRow]:
+        """Those that learn from the same: recorded episodes, or an environment."""
+        return (row for row in _ROWS if row.offline == self.offline)
 
 
 _ROWS = (

@@ -57,7 +57,7 @@ class UnknownName(BamEnvsError, ValueError):  # noqa: N818 - reads as what happe
         similar: float = 0.65,
     ) -> None:
         self.kind, self.name, self.choices = kind, name, sorted(choices)
-        matches = difflib.get_close_matches(name, self.choices, n=1, cutoff=similar)
+        matches = difflib.get_close_matches(str(name), self.choices, n=1, cutoff=similar)
         self.closest = matches[0] if matches else None
         some = ", ".join(self.choices if examples is None else examples)
         rest = f"Choose from: {some}." if some else "There are none."

@@ -1,7 +1,7 @@
 """The one table of environments: it registers them with Gymnasium, and other learners read the same rows.
 
 Importing this imports neither a simulator nor a task; a row's task and robot are strings, resolved when the
-environment is made.
+environment is made. The file is long for its table.
 """
 
 from __future__ import annotations
@@ -195,6 +195,17 @@ def entry_of(env_id: str) -> EnvEntry | None:
     return ENVIRONMENTS.get(ROBO_GYM[own].env_id if own in ROBO_GYM else own)
 
 
+def are_same(one: str, other: str) -> bool:
+    """Whether two ids name one environment, as ours and robo-gym's do, but for robo-gym's variants of ours."""
+    entry = entry_of(one)
+    return one == other or (entry is not None and entry is entry_of(other) and _variant(one) == _variant(other))
+
+
+def _variant(env_id: str) -> str:
+    theirs = ROBO_GYM.get(env_id.rpartition(":")[2])
+    return "" if theirs is None else theirs.variant
+
+
 def resolve_id(name: str) -> str:
     """The id that `name` means: with its version added, ours or Gymnasium's, ``module:Env-v0`` as it is.
 
@@ -289,7 +300,9 @@ def limited(env: RobotEnv, entry: EnvEntry) -> gym.Env[Any, Any]:
     """`env` with the time limit that Gymnasium does not put around it."""
     if not entry.parity or getattr(env.task, "ends_by_itself", False) or _gymnasium_limits():
         return env
-    return gym.wrappers.TimeLimit(env, entry.max_episode_steps)
+    from bam_envs.robot_env import StatedTimeLimit
+
+    return StatedTimeLimit(env, entry.max_episode_steps)
 
 
 def _gymnasium_limits() -> bool:

@@ -155,6 +155,8 @@ def test_a_reset_option_where_there_is_none():
     env = gym.make("bam/reach-v0")
     with pytest.raises(UnknownName, match=r"^Unknown reset option 'place'\. There are none\.$"):
         env.reset(options={"place": 1})
+    with pytest.raises(UnknownName, match=r"^Unknown reset option 1\. There are none\.$"):
+        env.reset(options={1: "place"})
     env.close()
 
 

@@ -105,4 +105,5 @@ def test_linear_start():
 
 def test_closest_falls_back_to_all_choices():
     assert closest("lerning", ["learning", "gamma"]) == "Did you mean 'learning'?"
+    assert closest("PPO", ["ppo", "appo"]) == "Did you mean 'ppo'?"
     assert closest("zzz", ["b", "a"]) == "Choose from: a, b."

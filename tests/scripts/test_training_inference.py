@@ -68,6 +68,7 @@ WRONG = [
     (["--run", "PPOO"], 1, "Unknown algorithm 'ppoo'. Did you mean 'ppo'?"),
     (["--run", "DQN"], 1, "dqn does not fit bam/mir100-navigation-v0: it takes Discrete actions, found Box. "),
     (["--num-cpus", "1000"], 1, "--num-cpus: expected at most "),
+    (["--robot", "nonsense"], 1, "A live robot's address is ws://host:port or wss://host:port, not 'nonsense'. "),
     (
         ["--robot", "ws://10.0.0.5:9090", "--explore-during-inference"],
         2,
@@ -82,6 +83,16 @@ def test_what_cannot_be_is_one_line(run_script, arguments, status, text, tmp_pat
     assert done.returncode == status, done.stderr
     assert done.stderr.splitlines()[-1].startswith(f"training_inference_mir: {text}")
     assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_address_that_is_none_is_refused_before_td3_trains(run_script, tmp_path):
+    done = run_script("td3_mir", "--robot", "10.0.0.5:9090", folder=tmp_path)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == (
+        "td3_mir: A live robot's address is ws://host:port or wss://host:port, not '10.0.0.5:9090'. "
+        "Did you mean 'ws://10.0.0.5:9090'?\n"
+    )
     assert list(tmp_path.iterdir()) == []
 
 

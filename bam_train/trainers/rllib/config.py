@@ -7,14 +7,17 @@ import functools
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+import numpy as np
 from gymnasium import Space, spaces
 from ray.rllib.callbacks.callbacks import RLlibCallback
 from ray.rllib.connectors.env_to_module import FlattenObservations
+from ray.rllib.utils.error import UnsupportedSpaceException
 
 from bam_train.environments import is_batched
 from bam_train.errors import BamTrainError, SettingsError
 from bam_train.settings import TrainSettings
 from bam_train.trainers.rllib import hyperparameters
+from bam_train.trainers.rllib.cluster import faults
 from bam_train.trainers.rllib.cluster.cluster import fault_tolerance, learners
 from bam_train.trainers.rllib.registration import register_foreign
 from bam_train.trainers.rllib.sampling.env_runner import RobotEnvRunner, log_end
@@ -77,7 +80,9 @@ def connectors(
 
 
 def _is_plain(space: Space[Any]) -> bool:
-    return isinstance(space, spaces.Box)
+    """Whether RLlib's networks take it as it is: a vector or an image, of floats."""
+    floats = isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating)
+    return floats and len(space.shape or ()) in (1, 3)
 
 
 def _least_steps(settings: TrainSettings) -> int:
@@ -94,15 +99,22 @@ def _offline(config: Any, settings: TrainSettings, observation_space: Space[Any]
     return add_data(config, settings, observation_space, action_space)
 
 
+_REFUSALS = (
+    *(AssertionError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError),
+    UnsupportedSpaceException,
+)
+
+
 @contextlib.contextmanager
 def refusals(settings: TrainSettings) -> Iterator[None]:
     """What RLlib says about settings that cannot be, as our own error."""
     try:
         yield
-    except (AssertionError, ValueError, TypeError, KeyError, AttributeError, NotImplementedError) as error:
-        if isinstance(error, BamTrainError):
-            raise
-        text = " ".join(str(error).partition("To suppress all validation errors")[0].split())
+    except BamTrainError:
+        raise
+    except _REFUSALS as error:
+        said = " ".join(str(error).partition("To suppress all validation errors")[0].split()) or type(error).__name__
+        text = faults.take_first(settings.num_env_runners) or said  # RLlib's is about runners that are not there
         raise SettingsError(f"{settings.algo} on {settings.env} cannot be set up: {text:.400}") from error
 
 

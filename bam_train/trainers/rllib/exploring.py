@@ -14,6 +14,7 @@ from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from bam_train.errors import SettingsError
 from bam_train.trainers.rllib.freezing.golden import shifted
 from bam_train.trainers.rllib.freezing.parts import PolicyParts
+from bam_train.trainers.sb3.from_zero import less_start
 
 
 class ExploringPolicy:
@@ -50,7 +51,9 @@ class ExploringPolicy:
         """An action drawn for one observation, in the environment's action space."""
         parts = self._parts
         episode = SingleAgentEpisode(
-            observations=[observation], observation_space=parts.observation_space, action_space=parts.action_space
+            observations=[less_start(parts.observation_space, observation)],  # RLlib counts from 0
+            observation_space=parts.observation_space,
+            action_space=parts.action_space,
         )
         given = {"rl_module": self._module, "episodes": [episode], "explore": True, "shared_data": {}}
         with torch.no_grad():

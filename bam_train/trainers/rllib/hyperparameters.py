@@ -13,18 +13,19 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import json
-import math
 import typing
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from ray.rllib.connectors.env_to_module.mean_std_filter import MeanStdFilter
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
+from ray.rllib.utils.replay_buffers import EpisodeReplayBuffer, PrioritizedEpisodeReplayBuffer
 
 from bam_train.errors import SettingsError
 from bam_train.settings import HINTS
+from bam_train.trainers.rllib.ranges import check_ranges
 from bam_train.trainers.rllib_algorithms import Algorithm
-from bam_train.values import closest, describe, expected, fit, fits
+from bam_train.values import closest, describe, fit, fits
 
 ELSEWHERE = {
     "train_batch_size": "train_batch_size_per_learner",
@@ -112,15 +113,15 @@ def complete(algorithm: Algorithm, given: Mapping[str, Any]) -> dict[str, Any]:
     for name in given:
         _require_known(name, [*defaults, "model_config"], f"{algorithm.name} hyperparameter", HINTS)
     values = {
-        name: _fit(name, given[name], _hint(hint, default)) if name in given else _plain(default)
+        name: _fit(name, given[name], _hint(name, hint, default)) if name in given else _plain(default)
         for name, (hint, default) in defaults.items()
     }
     if isinstance(given.get("replay_buffer_config"), Mapping):
-        values["replay_buffer_config"] = {**_plain(config.replay_buffer_config), **given["replay_buffer_config"]}
-    values["model_config"] = _complete_model(config, given.get("model_config") or {})
+        values["replay_buffer_config"] = _complete_buffer(config, given["replay_buffer_config"])
+    values["model_config"] = _complete_model(config, given.get("model_config", {}))
     if values["log_std_init"] is not None and not values["model_config"]["free_log_std"]:
         raise SettingsError("log_std_init: only a free standard deviation has one; add model_config.free_log_std=true")
-    _check_ranges(values)
+    check_ranges(values)
     return values
 
 
@@ -157,6 +158,8 @@ def _defaults(algorithm: Algorithm, config: Any) -> dict[str, tuple[Any, Any]]:
         for name, row in inspect.signature(method).parameters.items() if method else ():
             if name not in left_out | {"self", "kwargs"} and not name.startswith("_") and name not in found:
                 found[name] = row.annotation, getattr(config, name, None)
+    if "entropy_coeff" in found:  # PPO takes a schedule too, and is annotated otherwise
+        found["entropy_coeff"] = found["lr"][0], found["entropy_coeff"][1]
     if "actor_lr" in found:  # RLlib refuses any other, and its own CQL has one
         found["lr"] = found["lr"][0], None
     found["rollout_fragment_length"] = typing.Union[int, str], config.rollout_fragment_length  # noqa: UP007
@@ -175,11 +178,25 @@ def _fit(name: str, value: Any, hint: Any) -> Any:
 _SCHEDULE = [[0, 3e-4], [1000000, 0.0]]
 
 
-def _hint(hint: Any, default: Any) -> Any:
-    """The annotation, unless RLlib's own default does not fit it (``grad_clip: Optional[int] = 40.0``)."""
+_MAY_BE_NONE = frozenset(
+    {"grad_clip", "vf_clip_param", "minibatch_size", "target_entropy"}
+    | {"vtrace_clip_rho_threshold", "vtrace_clip_pg_rho_threshold"}
+)
+"""Hyperparameters with a number for a default that mean something without one."""
+
+
+def _hint(name: str, hint: Any, default: Any) -> Any:
+    """The annotation, unless RLlib's own default does not fit it (``grad_clip: Optional[int] = 40.0``).
+
+    RLlib writes Optional where it means "not given"; where there is a default, None is a number that is missing.
+    """
     if hint is inspect.Parameter.empty:
         return Any
-    return hint if fits(_plain(default), hint) else typing.Optional[type(_plain(default))]  # noqa: UP045
+    plain = _plain(default)
+    hint = hint if fits(plain, hint) else typing.Optional[type(plain)]  # noqa: UP045
+    if plain is None or name in _MAY_BE_NONE or typing.get_origin(hint) is not typing.Union:
+        return hint
+    return typing.Union[tuple(one for one in typing.get_args(hint) if one is not type(None))]  # noqa: UP007
 
 
 def _plain(value: Any) -> Any:
@@ -187,8 +204,33 @@ def _plain(value: Any) -> Any:
     return json.loads(json.dumps(value, default=str))
 
 
-def _complete_model(config: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+_BUFFERS = {
+    "EpisodeReplayBuffer": EpisodeReplayBuffer,
+    "PrioritizedEpisodeReplayBuffer": PrioritizedEpisodeReplayBuffer,
+}
+
+
+def _complete_buffer(config: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Check the names in ``replay_buffer_config``, which RLlib does not, and add the defaults."""
+    default = _plain(config.replay_buffer_config)
+    values = {**default, **given}
+    if default["type"] not in _BUFFERS:  # of CQL, which has no use for it
+        return values
+    buffer = _BUFFERS.get(values["type"])
+    if buffer is None:
+        raise SettingsError(f"replay_buffer_config.type: expected {' or '.join(_BUFFERS)}, found {values['type']!r}")
+    known = {*inspect.signature(buffer).parameters, *default} - _OF_CONNECTORS
+    for name in given:
+        _require_known(name, known, "replay_buffer_config argument")
+    capacity = fit("replay_buffer_config.capacity", values["capacity"], int)
+    if capacity < 1:
+        raise SettingsError(f"replay_buffer_config.capacity: expected at least 1, found {capacity}")
+    return {**values, "capacity": capacity}
+
+
+def _complete_model(config: Any, given: Any) -> dict[str, Any]:
     """Check ``model_config`` and add RLlib's defaults."""
+    given = fit("model_config", given, dict)
     known = {row.name: row for row in dataclasses.fields(DefaultModelConfig)}
     hints = {
         name: typing.Optional[str] if name.endswith("_initializer") else hint  # noqa: UP045 - not a function
@@ -198,7 +240,7 @@ def _complete_model(config: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     for name in given:
         _require_known(name, known, "model_config argument")
     return {
-        name: fit(f"model_config.{name}", given[name], _hint(hints[name], own[name]))
+        name: fit(f"model_config.{name}", given[name], _hint(name, hints[name], own[name]))
         if name in given
         else _plain(own[name])
         for name in known
@@ -215,44 +257,3 @@ def _require_known(name: str, known: Iterable[str], what: str, others: Iterable[
     if name in _OF_THE_OLD_STACK:
         raise SettingsError(f"{name} cannot be set: it belongs to RLlib's old API stack, or bam-train takes care of it")
     raise SettingsError(f"Unknown {what} {name!r}. {closest(name, [*known, *others])}")
-
-
-_SHARES = ("gamma", "lambda_", "tau", "expectile")
-_POSITIVE = ("lr", "actor_lr", "critic_lr", "alpha_lr", "value_lr", "grad_clip", "clip_param", "vf_clip_param")
-_NOT_NEGATIVE = ("action_init_scale", "entropy_coeff", "vf_loss_coeff", "kl_coeff")
-_COUNTS = ("train_batch_size_per_learner", "minibatch_size", "num_epochs", "rollout_fragment_length", "num_atoms")
-
-
-def _check_ranges(values: Mapping[str, Any]) -> None:
-    """Refuse numbers that no algorithm can learn with; a schedule is its first value."""
-    for name, value in values.items():
-        number = _number(value)
-        if number is None:
-            if name == "rollout_fragment_length" and value != "auto":
-                raise SettingsError(f"{name}: expected {expected(int)} or 'auto', found {value!r}")
-            continue
-        if not math.isfinite(number):
-            raise SettingsError(f"{name}: expected a finite number, found {value!r}")
-        wanted = _complaint(name, number)
-        if wanted is not None:
-            raise SettingsError(f"{name}: expected {wanted}, found {value!r}")
-
-
-def _complaint(name: str, number: float) -> str | None:
-    """What was expected instead of `number`; None if it is in range."""
-    if name in _SHARES and not 0 <= number <= 1:
-        return "a number from 0 to 1"
-    if name in _POSITIVE and not number > 0:
-        return "a number above 0"
-    if name in _COUNTS and not number >= 1:
-        return "at least 1"
-    if name in _NOT_NEGATIVE and not number >= 0:
-        return "at least 0"
-    return None
-
-
-def _number(value: Any) -> float | None:
-    """The number that `value` is or, as a schedule ``[[step, value], ...]``, begins with; None if it is none."""
-    if isinstance(value, list) and value and isinstance(value[0], list) and len(value[0]) == 2:
-        return _number(value[0][1])
-    return None if isinstance(value, bool) or not isinstance(value, (int, float)) else float(value)

@@ -1,7 +1,8 @@
 """What RLlib's learners keep beside their state, and a resumed run would begin anew: numbers that adapt themselves.
 
-PPO's and APPO's KL coefficient, SAC's, TQC's and CQL's temperature, MARWIL's running mean of squared advantages, and
-when the target networks of DQN, its relatives and APPO were updated last. ``Learner.get_state`` of Ray 2.60 has none.
+PPO's and APPO's KL coefficient, SAC's, TQC's and CQL's temperature, MARWIL's running mean of squared advantages, where
+a schedule of the entropy's weight is, and when the target networks of DQN, its relatives and APPO were updated last.
+``Learner.get_state`` of Ray 2.60 has none.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
+from ray.rllib.utils.schedules.scheduler import Scheduler
 
 Extras = dict[str, dict[str, float]]
 
@@ -20,6 +22,7 @@ _NAMES = (
     "moving_avg_sqd_adv_norms_per_module",
     "last_update_ts_by_mid",
     "_last_update_ts_by_mid",
+    "entropy_coeff_schedulers_per_module",
 )
 
 
@@ -41,7 +44,9 @@ def _take(learner: Any) -> Extras:
 
 
 def _number(value: Any) -> float:
-    """A tensor of one number, or a number, as a number that JSON keeps exactly."""
+    """A tensor of one number, or a number, or what a schedule is at, as a number that JSON keeps exactly."""
+    if isinstance(value, Scheduler):
+        value = value.get_current_value()
     number: float = value.item() if isinstance(value, torch.Tensor) else value
     return number
 
@@ -50,7 +55,15 @@ def _give(learner: Any, extras: Mapping[str, Mapping[str, float]]) -> None:
     for name, numbers in extras.items():
         table = getattr(learner, name)
         for key, number in numbers.items():
-            if isinstance(table[key], torch.Tensor):
+            if isinstance(table[key], Scheduler):
+                _set_schedule(table[key], number)
+            elif isinstance(table[key], torch.Tensor):
                 table[key].data.fill_(number)  # in place: an optimiser may hold it
             else:
                 table[key] = number
+
+
+def _set_schedule(schedule: Scheduler, number: float) -> None:
+    """Where it is until the first update's end says so; a fixed number stays."""
+    if schedule.use_schedule:
+        schedule.get_current_value().data.fill_(number)

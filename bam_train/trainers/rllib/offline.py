@@ -17,6 +17,7 @@ from typing import Any
 
 import fsspec
 import numpy as np
+import pyarrow.compute
 import pyarrow.fs
 import pyarrow.parquet
 import torch
@@ -92,10 +93,19 @@ def load(data: str, observation_space: Space[Any], action_space: Space[Any], gam
 
     Returns:
         Columns (rows, ...): obs, new_obs, actions, rewards, terminateds, truncateds, value_targets, weights, n_step.
+
+    Raises:
+        SettingsError: There are no rows, or one has a value that is missing, not finite or not in its space.
     """
     path, filesystem = open_data(data)
     table = pyarrow.parquet.ParquetDataset(path, filesystem=filesystem).read(list(COLUMNS))
-    columns = {name: _column(table[name]) for name in COLUMNS if name != "eps_id"}
+    shapes = {"obs": observation_space.shape, "new_obs": observation_space.shape, "actions": action_space.shape}
+    columns = {
+        name: _sound(f"data: {data}: {name}", _column(table[name]), shapes.get(name) or ())
+        for name in COLUMNS
+        if name != "eps_id"
+    }
+    _require_choices(data, columns["actions"], action_space)
     rewards = columns["rewards"].astype(np.float32)
     episode = np.asarray(table["eps_id"].to_pylist())
     last = np.append(episode[1:] != episode[:-1], True) | columns["terminateds"] | columns["truncateds"]
@@ -127,16 +137,49 @@ def returns(rewards: Array, last: Array, gamma: float) -> NDArray[np.float32]:
     return targets
 
 
-def _column(column: Any) -> Array:
-    """A column as one array; that of (nested) lists has more axes."""
+def _column(column: Any) -> Array | None:
+    """A column as one array; that of (nested) lists has more axes. None if the lists differ in length."""
     shape: list[int] = []
     flat = column.combine_chunks()
     while pyarrow.types.is_list(flat.type) or pyarrow.types.is_fixed_size_list(flat.type):
-        outer = len(flat)
+        lengths = pyarrow.compute.unique(pyarrow.compute.list_value_length(flat)).to_pylist()
+        if len(lengths) > 1 or None in lengths:
+            return None
         flat = flat.flatten()
-        shape.append(len(flat) // max(1, outer))
+        shape.append(max(lengths, default=0))
     values: Array = flat.to_numpy(zero_copy_only=False)
     return values.reshape(-1, *shape) if shape else values
+
+
+def _sound(what: str, values: Array | None, shape: tuple[int, ...]) -> Array:
+    """The column, if all of its rows are whole.
+
+    Args:
+        what: As errors name it.
+        values: (rows, ...); None if its rows are of different lengths.
+        shape: Of a row.
+    """
+    if values is None or (len(values) and values.shape[1:] != shape):
+        found = "rows of different lengths" if values is None else f"shape {values.shape[1:]}"
+        raise SettingsError(f"{what}: expected rows of shape {shape}, found {found}")
+    if not len(values):
+        raise SettingsError(f"{what}: expected a row or more, found none")
+    if values.dtype.kind not in "biuf" or not np.isfinite(values).all():
+        raise SettingsError(f"{what}: expected finite numbers, found others or rows without one. Record it again")
+    return values
+
+
+def _require_choices(data: str, actions: Array, space: Space[Any]) -> None:
+    """Refuse choices that there are not."""
+    if isinstance(space, spaces.Discrete):
+        least, most = np.asarray(space.start), np.asarray(space.start + space.n - 1)
+    elif isinstance(space, spaces.MultiDiscrete):
+        least, most = space.start, space.start + space.nvec - 1
+    else:
+        return
+    wrong = actions[((actions < least) | (actions > most)).reshape(len(actions), -1).any(axis=1)]
+    if len(wrong):
+        raise SettingsError(f"data: {data}: actions: expected {least} to {most}, found {wrong[0]}")
 
 
 def as_module(actions: NDArray[Any], space: Space[Any]) -> NDArray[Any]:

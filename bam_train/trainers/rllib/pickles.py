@@ -3,11 +3,13 @@
 A pickle is a program for a small machine, and one of its instructions calls any function of any module. Here no such
 name is ever looked up. `read_state` knows a handful of names, for which it has functions of its own, and refuses every
 other: it gives arrays and plain values. `read_record` takes names of RLlib, Gymnasium and NumPy too, and puts an inert
-`Record` in the place of whatever would be made of them: it says what a file says, not what it would do.
+`Record` in the place of whatever would be made of them: it says what a file says, not what it would do. `read_outline`
+does so with every name.
 
-Before the machine starts, the instructions are counted and checked, so that a file can waste no more memory than its
-own size explains. The format: `pickletools` of the standard library. The file is long because it has a stand-in of its
-own for each of NumPy's functions that RLlib's files call, and is read best in one piece.
+Before the machine starts, the instructions are counted and checked, and what it made is measured, so that a file can
+waste no more memory and time than its own size explains. The format: `pickletools` of the standard library. The file is
+long because it has a stand-in of its own for each of NumPy's functions that RLlib's files call, and is read best in one
+piece.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from bam_train.trainers.rllib.freezing.parts import Array
 _MOST_BYTES = 2**31
 _MOST_INSTRUCTIONS = 5_000_000
 _MOST_NAMES = 10_000
+_MOST_VALUES = 10_000_000  # shared ones counted wherever they are: forty lists of the one before, twice, are 2**40
 _MOST_NPY = 2**30  # bytes of one array that is packed into text
 # Instructions that no file of RLlib's has: names from a registry, objects from outside, and the oldest forms.
 _REFUSED = frozenset(
@@ -82,7 +85,8 @@ class RefusedPickle(FormatError):  # noqa: N818 - reads as what happened
 
     def __init__(self, name: str) -> None:
         self.name = name
-        super().__init__(f"names {name}, which is not read without running it")
+        said = "".join(letter if letter.isprintable() else "?" for letter in name[:120])
+        super().__init__(f"names {said}, which is not read without running it")
 
 
 class Record:
@@ -154,6 +158,17 @@ def read_record(data: bytes) -> Any:
     return _read(data, _RecordReader)
 
 
+def read_outline(data: bytes) -> Any:
+    """Read what a pickle says of objects of any kind, as `Record`; nothing is looked up or called.
+
+    For what is asked for a few plain values among objects that do not matter, such as an algorithm's settings.
+
+    Raises:
+        FormatError: Truncated, damaged, made to exhaust its reader, or with arrays that are not of numbers.
+    """
+    return _read(data, _OutlineReader)
+
+
 def unpacked_array(text: str) -> Array:
     """Read an array that RLlib packed into text: base64 of zlib of npy. Python objects in it are refused.
 
@@ -174,12 +189,14 @@ def unpacked_array(text: str) -> Array:
 def _read(data: bytes, reader: Callable[[io.BytesIO], pickle.Unpickler]) -> Any:
     try:
         _require_sane(data)
-        return reader(io.BytesIO(data)).load()
+        value = reader(io.BytesIO(data)).load()
+        _require_small(value)
     except FormatError:
         raise
     except _DAMAGE as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise FormatError(f"is not a whole pickle of RLlib's: {reason:.160}") from error
+    return value
 
 
 def _require_sane(data: bytes) -> None:
@@ -193,6 +210,35 @@ def _require_sane(data: bytes) -> None:
             raise FormatError(f"has the instruction {instruction.name}, which RLlib does not write")
         if instruction.name in ("BINPUT", "LONG_BINPUT") and int(argument or 0) > count:
             raise FormatError(f"numbers a value {argument} after {count} instructions")
+
+
+def _require_small(value: Any) -> None:
+    """Refuse plain values that hold themselves, and those that are many more written out than they are in memory."""
+    sizes: dict[int, int] = {}
+    seen: set[int] = set()
+    roots = [value]
+    while roots:
+        _size(roots.pop(), sizes, seen, roots)
+
+
+def _size(value: Any, sizes: dict[int, int], seen: set[int], roots: list[Any]) -> int:
+    """How many values there are in one, written out; what is in a record is left in `roots`, measured by itself."""
+    if isinstance(value, Record):
+        if id(value) not in seen:
+            seen.add(id(value))
+            roots += [value.args, value.state, value.items, value.appended]
+        return 1
+    if not isinstance(value, (dict, list, tuple, set, frozenset)):
+        return 1
+    if id(value) not in sizes:
+        sizes[id(value)] = 0  # not yet known
+        parts = [*value, *value.values()] if isinstance(value, dict) else value
+        sizes[id(value)] = 1 + sum(_size(part, sizes, seen, roots) for part in parts)
+    elif not sizes[id(value)]:
+        raise FormatError(f"holds a {type(value).__name__} within itself")
+    if sizes[id(value)] > _MOST_VALUES:
+        raise FormatError(f"has more than {_MOST_VALUES} values")
+    return sizes[id(value)]
 
 
 class _StateReader(pickle.Unpickler):
@@ -222,11 +268,23 @@ class _RecordReader(_StateReader):
         known = _STATES.get((module, name))
         if known is not None:
             return known
-        if not (f"{module}.".startswith(_INERT) or (module, name) in _INERT_NAMES):
+        if not self.admits(module, name):
             raise RefusedPickle(f"{module}.{name}")
         if len(self.classes) > _MOST_NAMES:
             raise FormatError(f"has more than {_MOST_NAMES} names of classes and functions")
         return self.classes.setdefault(f"{module}.{name}", _class(f"{module}.{name}"))
+
+    def admits(self, module: str, name: str) -> bool:
+        """Whether a record may have this name."""
+        return f"{module}.".startswith(_INERT) or (module, name) in _INERT_NAMES
+
+
+class _OutlineReader(_RecordReader):
+    """Arrays, plain values and records of any name."""
+
+    def admits(self, module: str, name: str) -> bool:
+        """Any: nothing is looked up."""
+        return True
 
 
 def _class(name: str) -> type[Record]:
@@ -283,14 +341,21 @@ def _from_buffer(buffer: Any, dtype: Any, shape: Any, order: Any = "C", axis_ord
     """`numpy._core.numeric._frombuffer`."""
     if axis_order is not None:
         raise RefusedPickle("an array with its axes in another order")
-    array: Array = np.frombuffer(bytes(buffer), _dtype(dtype)).copy()
+    array: Array = np.frombuffer(_bytes(buffer), _dtype(dtype)).copy()
     return array.reshape(_shape(shape), order="F" if order == "F" else "C")
 
 
 def _scalar(dtype: Any, data: Any) -> Any:
     """`numpy._core.multiarray.scalar`."""
-    value: Any = np.frombuffer(bytes(data), _dtype(dtype))[0]
+    value: Any = np.frombuffer(_bytes(data), _dtype(dtype))[0]
     return value
+
+
+def _bytes(data: Any) -> bytes:
+    """Refuse a number, of which `bytes` would make so many zeros."""
+    if not isinstance(data, (bytes, bytearray)):
+        raise RefusedPickle(f"an array whose data are a {type(data).__name__}")
+    return bytes(data)
 
 
 class _Array(np.ndarray[Any, Any]):

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium import Space
+from gymnasium import Space, spaces
 from gymnasium.vector import VectorEnv
 from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.tune.trainable import trainable
@@ -31,7 +31,7 @@ from bam_train.environments import control_period, make_env, require_fit
 from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
-from bam_train.trainers.provenance import git_commit, now, versions
+from bam_train.trainers.manifest import manifest
 from bam_train.trainers.rllib import hyperparameters, state
 from bam_train.trainers.rllib.cluster.cluster import cluster
 from bam_train.trainers.rllib.cluster.fault_tolerance import RunnerWatch
@@ -97,6 +97,7 @@ class RLlibTrainer:
         _require_fitting(settings)
         seen = Seen.of(settings)
         algorithm.require_actions(settings.env, type(seen.action_space).__name__)
+        _require_no_bytes(settings.env, seen.observation_space)
         return dataclasses.replace(
             settings,
             hyperparameters=hyperparameters.complete(algorithm, settings.hyperparameters),
@@ -112,6 +113,7 @@ class RLlibTrainer:
         with trainer._or_close():
             state.start_actions(trainer.algorithm, values["log_std_init"], values["action_init_scale"])
             state.hand_out(trainer.algorithm)
+            trainer.freeze()  # what cannot be frozen is refused before it is trained
         return trainer
 
     @classmethod
@@ -245,23 +247,14 @@ class RLlibTrainer:
         return write_checkpoint(path, self._manifest(scores), members)
 
     def _manifest(self, scores: Mapping[str, Any]) -> dict[str, Any]:
-        return {
-            "env": self.settings.env,
-            "env_kwargs": self.settings.env_kwargs,
-            "observation_space": space_to_json(self._seen.observation_space),
-            "action_space": space_to_json(self._seen.action_space),
-            "signals": self._seen.signals,
-            "period": self._seen.period,
-            "algorithm": self.settings.algo,
-            "trainer": self.settings.trainer,
-            "settings": self.settings.to_mapping(),
-            "steps": self.steps,
-            "seed": self.settings.seed,
-            "scores": dict(scores),
-            "versions": versions(),
-            "git_commit": git_commit(),
-            "created": now(),
-        }
+        return manifest(
+            self.settings,
+            (self._seen.observation_space, self._seen.action_space),
+            signals=self._seen.signals,
+            period=self._seen.period,
+            steps=self.steps,
+            scores=scores,
+        )
 
     def freeze(self) -> FrozenPolicy:
         """The policy as it is now."""
@@ -321,6 +314,15 @@ def _require_fitting(settings: TrainSettings) -> None:
         raise SettingsError(f"data: {settings.algo} learns in the environment; leave it out, or use one of: {names}")
     if offline:
         _require_offline(settings)
+
+
+def _require_no_bytes(env: str, space: Space[Any]) -> None:
+    """Refuse images of whole numbers, which RLlib's networks fail on in the first update."""
+    if isinstance(space, spaces.Box) and len(space.shape) == 3 and not np.issubdtype(space.dtype, np.floating):
+        raise SettingsError(
+            f"{env}: the rllib trainer takes images of floats, found {space.dtype} of shape {space.shape}. Scale "
+            "them in the environment (gymnasium.wrappers.TransformObservation), or use --trainer sb3"
+        )
 
 
 def _require_offline(settings: TrainSettings) -> None:

@@ -2,54 +2,26 @@
 
 from __future__ import annotations
 
-import importlib
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
-from bam_train.errors import SettingsError
+from bam_train.trainers.algorithm import BOX, DISCRETE, AlgorithmRow
 
-BOX = ("Box",)
-DISCRETE = ("Discrete",)
 ANY = ("Box", "Discrete", "MultiDiscrete", "MultiBinary")
 
 
 @dataclass(frozen=True)
-class Algorithm:
+class Algorithm(AlgorithmRow):
     """One algorithm of stable-baselines3 or sb3-contrib."""
 
-    name: str
-    """As ``--algo`` takes it."""
-    reference: str
-    """``"module:Class"``."""
-    actions: tuple[str, ...]
-    """Kinds of action space that it can learn on."""
     on_policy: bool
     """Whether it learns from fresh rollouts; the others keep a replay buffer."""
     recurrent: bool = False
     """Whether its policy has a memory."""
 
-    def load(self) -> Any:
-        """The class; imports its library."""
-        module, _, name = self.reference.partition(":")
-        return getattr(importlib.import_module(module), name)
-
-    def require_actions(self, env: str, kind: str) -> None:
-        """Refuse an action space that this algorithm cannot learn on.
-
-        Args:
-            env: Environment id, as the error names it.
-            kind: Class name of its action space.
-
-        Raises:
-            SettingsError: Names the algorithms that can.
-        """
-        if kind in self.actions:
-            return
-        fitting = ", ".join(sorted(other.name for other in _ROWS if kind in other.actions))
-        remedy = f"Use one of: {fitting}." if fitting else "No algorithm here does."
-        raise SettingsError(
-            f"{self.name} does not fit {env}: it takes {' or '.join(self.actions)} actions, found {kind}. {remedy}"
-        )
+    def alternatives(self) -> Iterable[AlgorithmRow]:
+        """All of the table."""
+        return _ROWS
 
 
 _ROWS = (

@@ -10,8 +10,6 @@ recurrent policies ``state.<name>``; outputs are ``action`` and ``next_state.<na
 
 from __future__ import annotations
 
-import io
-import warnings
 from typing import Any
 
 import numpy as np
@@ -22,13 +20,11 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from bam_train.errors import PolicyError
-from bam_train.trainers.sb3.frozen_layers import Layer, encoder, head, leaves, network, torch_dtype
+from bam_train.trainers.freezing.layers import Layer, zeros
+from bam_train.trainers.freezing.onnx_export import onnx_file
+from bam_train.trainers.sb3.frozen_layers import encoder, head, leaves, network
 
 __all__ = ["FrozenModule", "freeze"]
-
-_OPSET = 17
-# The TorchScript exporter says that it will go; it is 20 times as fast as its successor and needs no onnxscript.
-_NOTICES = ("You are using the legacy TorchScript-based ONNX export", "The feature will be removed")
 
 
 def freeze(
@@ -50,23 +46,8 @@ def freeze(
     """
     module = FrozenModule(model, normaliser, observation_space, action_space)
     inputs = module.example_inputs()
-    names = list(inputs)
-    outputs = ["action", *(f"next_{name}" for name in names if name.startswith("state."))]
-    file = io.BytesIO()
-    with torch.no_grad(), warnings.catch_warnings():
-        for text in _NOTICES:
-            warnings.filterwarnings("ignore", text, DeprecationWarning)
-        torch.onnx.export(
-            module,
-            tuple(inputs.values()),
-            file,
-            dynamo=False,
-            opset_version=_OPSET,
-            input_names=names,
-            output_names=outputs,
-            dynamic_axes={name: {0: "n"} for name in [*names, *outputs]},
-        )
-    return file.getvalue()
+    outputs = ["action", *(f"next_{name}" for name in inputs if name.startswith("state."))]
+    return onnx_file(module, inputs, outputs)
 
 
 class FrozenModule(Layer):
@@ -97,12 +78,7 @@ class FrozenModule(Layer):
 
     def example_inputs(self) -> dict[str, torch.Tensor]:
         """Two rows of zeros for every input, by name."""
-        inputs = {
-            f"observation.{key}" if self.is_dict else "observation": torch.zeros(
-                (2, *space.shape), dtype=torch_dtype(space.dtype)
-            )
-            for key, space in self.raw.items()
-        }
+        inputs = zeros(self.raw, self.is_dict)
         for layer, size in enumerate(self.lstm.sizes if self.lstm is not None else []):
             inputs |= {f"state.{name}_{layer}": torch.zeros(2, size) for name in ("hidden", "cell")}
         return inputs

@@ -14,12 +14,9 @@ from stable_baselines3.common.preprocessing import is_image_space
 from torch import nn
 
 from bam_train.errors import PolicyError
+from bam_train.trainers.freezing.layers import Choice, Layer, OneHot, to
 
 _KINDS = "Box, Discrete, MultiDiscrete or MultiBinary"
-
-
-class Layer(nn.Module):  # type: ignore[misc]
-    """A torch module; torch has no types here."""
 
 
 # Observation
@@ -42,24 +39,9 @@ class _Numbers(Layer):
             x = x.permute(0, 3, 1, 2)
         if self.statistics is not None:
             mean, deviation, limit = self.statistics
-            x = ((_to(x, torch.float64) - mean) / deviation).clamp(-limit, limit)
-        x = _to(x, torch.float32)
+            x = ((to(x, torch.float64) - mean) / deviation).clamp(-limit, limit)
+        x = to(x, torch.float32)
         return x / 255.0 if self.pixels else x
-
-
-class _OneHot(Layer):
-    """A Discrete, (n,), or MultiDiscrete, (n, k): a one-hot code of each number, side by side."""
-
-    def __init__(self, counts: np.ndarray, starts: np.ndarray) -> None:
-        super().__init__()
-        columns = np.repeat(np.arange(len(counts)), counts)
-        values = np.concatenate([np.arange(count) + start for count, start in zip(counts, starts, strict=True)])
-        self.columns, self.values = torch.as_tensor(columns), torch.as_tensor(values)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        x = x.long()
-        x = x.unsqueeze(1) if x.ndim == 1 else x.flatten(1)
-        return (x.index_select(1, self.columns) == self.values).float()
 
 
 def encoder(
@@ -74,10 +56,8 @@ def encoder(
         statistics: Mean, standard deviation and limit of VecNormalize, or None.
         scale_images: Whether the policy divides images by 255.
     """
-    if isinstance(raw, spaces.Discrete):
-        return _OneHot(np.array([raw.n]), np.array([raw.start]))
-    if isinstance(raw, spaces.MultiDiscrete):
-        return _OneHot(raw.nvec.ravel(), raw.start.ravel())
+    if isinstance(raw, (spaces.Discrete, spaces.MultiDiscrete)):
+        return OneHot(raw)
     if not isinstance(raw, (spaces.Box, spaces.MultiBinary)):
         raise PolicyError(f"observation {key!r}: a {type(raw).__name__} cannot be frozen; expected {_KINDS}")
     channels_last = raw.shape != seen.shape
@@ -86,16 +66,6 @@ def encoder(
             f"observation {key!r}: the policy takes shape {seen.shape}, the environment gives {raw.shape}"
         )
     return _Numbers(statistics, channels_last, scale_images and is_image_space(seen))
-
-
-def _to(x: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
-    """Cast, without leaving a node in the graph where there is nothing to do."""
-    return x if x.dtype == dtype else x.to(dtype)
-
-
-def torch_dtype(dtype: Any) -> torch.dtype:
-    """Return torch's name for a NumPy dtype."""
-    return torch.as_tensor(np.zeros((), dtype)).dtype
 
 
 # Network
@@ -193,7 +163,7 @@ class _Continuous(Layer):
         x = torch.tanh(x) if self.tanh else x
         if len(self.shape) != 1:
             x = x.reshape(-1, *self.shape)
-        x = _to(x, self.dtype)
+        x = to(x, self.dtype)
         if self.scale:
             x = self.low + (0.5 * (x + 1.0) * (self.high - self.low))
         x = torch.minimum(x, self.high) if self.bounded[1] else x  # scaled ones too: they can round past a bound
@@ -201,26 +171,6 @@ class _Continuous(Layer):
 
     def margin(self, scores: torch.Tensor) -> torch.Tensor:
         return torch.ones(len(scores))
-
-
-class _Choice(Layer):
-    """The best of each group of scores, counted from ``starts``: Discrete gives (n,), MultiDiscrete (n, k)."""
-
-    def __init__(self, counts: list[int], starts: np.ndarray, dtype: torch.dtype) -> None:
-        super().__init__()
-        self.counts, self.starts, self.dtype = counts, torch.as_tensor(starts), dtype
-        self.single, self.shifted = np.ndim(starts) == 0, bool(np.any(starts))
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        if self.single:
-            best = x.argmax(1)
-        else:
-            best = torch.cat([group.argmax(1, keepdim=True) for group in x.split(self.counts, dim=1)], 1)
-        return _to(best + self.starts if self.shifted else best, self.dtype)
-
-    def margin(self, scores: torch.Tensor) -> torch.Tensor:
-        gaps = [group.topk(2)[0] for group in scores.split(self.counts, dim=1) if group.shape[1] > 1]
-        return torch.stack([gap[:, 0] - gap[:, 1] for gap in gaps]).amin(0) if gaps else torch.ones(len(scores))
 
 
 class _Switches(Layer):
@@ -237,10 +187,8 @@ def head(space: spaces.Space[Any], policy: BasePolicy) -> nn.Module:
     """Return what turns the network's output into an action of the environment's space."""
     if isinstance(space, spaces.Box):
         return _Continuous(space, _has_tanh(policy), policy.squash_output)
-    if isinstance(space, spaces.Discrete):
-        return _Choice([int(space.n)], np.asarray(space.start), torch.int64)
-    if isinstance(space, spaces.MultiDiscrete):
-        return _Choice(space.nvec.tolist(), space.start, torch_dtype(space.dtype))
+    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
+        return Choice(space)
     if isinstance(space, spaces.MultiBinary):
         return _Switches()
     raise PolicyError(f"action space {space}: expected {_KINDS}")

@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import torch
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize, VecTransposeImage, unwrap_vec_wrapper
 from torch import nn
 
-from bam_train.checkpoint import safetensors_file
+from bam_train.trainers.freezing.golden import affordable, clearest, draw_array, pack
 from bam_train.trainers.sb3.freeze import FrozenModule
 from bam_train.trainers.sb3.from_zero import less_start, plus_start
 from bam_train.trainers.sb3.frozen_layers import leaves
-
-_BUDGET = 200_000  # bytes of observations; images are random and do not pack
-_FAR = 1e6  # a bound beyond this says nothing about the values that occur
 
 
 def golden(
@@ -45,15 +40,13 @@ def golden(
         A safetensors file with ``observation`` (or ``observation.<key>``), (n, ...), and ``action``, (n, ...).
     """
     recurrent = hasattr(model.policy, "lstm_actor")
-    n = min(n, max(4, _BUDGET // _size(observation_space)))
+    n = affordable(leaves(observation_space).values(), n)
     rng = np.random.default_rng(seed)
     observations = draw(observation_space, n if recurrent else 2 * n, rng, normaliser)
     if not recurrent:
-        keep = _clearest(model, normaliser, observation_space, action_space, observations, n)
-        observations = {key: value[keep] for key, value in observations.items()}
+        observations = clearest(FrozenModule(model, normaliser, observation_space, action_space), observations, n)
     actions = trainer_actions(model, normaliser, observation_space, action_space, observations)
-    named = {f"observation.{key}" if key else "observation": value for key, value in observations.items()}
-    return safetensors_file.dump({**named, "action": actions})
+    return pack(observations, actions)
 
 
 def draw(
@@ -63,7 +56,7 @@ def draw(
 
     Normalised numbers are drawn about their running mean, so that few of them end at the normaliser's limits.
     """
-    return {key: _draw(leaf, n, rng, _moments(normaliser, key)) for key, leaf in leaves(space).items()}
+    return {key: draw_array(leaf, n, rng, _moments(normaliser, key)) for key, leaf in leaves(space).items()}
 
 
 def trainer_actions(
@@ -105,21 +98,6 @@ def _episode(model: BaseAlgorithm, observations: Any) -> np.ndarray:
     return np.stack(actions)
 
 
-def _clearest(
-    model: BaseAlgorithm,
-    normaliser: VecNormalize | None,
-    observation_space: spaces.Space[Any],
-    action_space: spaces.Space[Any],
-    observations: dict[str, np.ndarray],
-    n: int,
-) -> np.ndarray:
-    """Return the n rows whose choice is clearest: where two choices tie, rounding decides, and that proves nothing."""
-    module = FrozenModule(model, normaliser, observation_space, action_space)
-    with torch.no_grad():
-        margin = module.head.margin(module.scores(*map(torch.as_tensor, observations.values()))).numpy()
-    return np.sort(np.argsort(-margin, kind="stable")[:n])
-
-
 @contextlib.contextmanager
 def _evaluating(policy: nn.Module) -> Iterator[None]:
     """Undo the switch to evaluation mode that ``predict`` makes."""
@@ -131,33 +109,8 @@ def _evaluating(policy: nn.Module) -> Iterator[None]:
             module.training = training
 
 
-def _size(space: spaces.Space[Any]) -> int:
-    """Return the bytes of one observation."""
-    return sum(math.prod(leaf.shape) * np.dtype(leaf.dtype).itemsize for leaf in leaves(space).values()) or 1
-
-
 def _moments(normaliser: VecNormalize | None, key: str) -> Any:
     if normaliser is None or not normaliser.norm_obs or (key and key not in normaliser.norm_obs_keys):
         return None
     rms = normaliser.obs_rms[key] if key else normaliser.obs_rms
     return rms.mean, np.sqrt(rms.var + normaliser.epsilon)
-
-
-def _draw(space: Any, n: int, rng: np.random.Generator, moments: Any) -> np.ndarray:
-    shape = (n, *space.shape)
-    if isinstance(space, spaces.MultiBinary):
-        return rng.integers(2, size=shape, dtype=np.int8)
-    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
-        counts = space.n if isinstance(space, spaces.Discrete) else space.nvec
-        return np.asarray(space.start + rng.integers(counts, size=shape), space.dtype)
-    if np.issubdtype(space.dtype, np.integer):
-        return rng.integers(space.low, space.high, size=shape, dtype=space.dtype, endpoint=True)
-    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
-    values = rng.normal(size=shape)
-    if moments is not None:
-        values = moments[0] + 2.0 * moments[1] * values
-    else:
-        near = (low > -_FAR) & (high < _FAR)
-        start, stop = np.where(near, low, 0.0), np.where(near, high, 1.0)
-        values = np.where(near, start + (stop - start) * rng.random(shape), values)
-    return np.clip(values, low, high).astype(space.dtype)

@@ -26,7 +26,7 @@ from bam_train.environments import make_env, make_rows, require_fit
 from bam_train.errors import TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
-from bam_train.trainers.provenance import git_commit, now, versions
+from bam_train.trainers.manifest import manifest
 from bam_train.trainers.sb3 import hyperparameters, resume
 from bam_train.trainers.sb3.algorithms import ALGORITHMS
 from bam_train.trainers.sb3.freeze import freeze
@@ -194,24 +194,14 @@ class SB3Trainer:
         return write_checkpoint(path, self._manifest(scores), members)
 
     def _manifest(self, scores: Mapping[str, Any]) -> dict[str, Any]:
-        observation_space, action_space = self._spaces()
-        return {
-            "env": self.settings.env,
-            "env_kwargs": self.settings.env_kwargs,
-            "observation_space": space_to_json(observation_space),
-            "action_space": space_to_json(action_space),
-            "signals": self._signals,
-            "period": self._period,
-            "algorithm": self.settings.algo,
-            "trainer": self.settings.trainer,
-            "settings": self.settings.to_mapping(),
-            "steps": self.steps,
-            "seed": self.settings.seed,
-            "scores": dict(scores),
-            "versions": versions(),
-            "git_commit": git_commit(),
-            "created": now(),
-        }
+        return manifest(
+            self.settings,
+            self._spaces(),
+            signals=self._signals,
+            period=self._period,
+            steps=self.steps,
+            scores=scores,
+        )
 
     def _spaces(self) -> tuple[Any, Any]:
         """The environment's own, before normalisation, image transposition and counting from 0."""

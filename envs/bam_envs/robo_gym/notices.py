@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable
 
 _LOG = logging.getLogger(__name__)
 _SAID: set[str] = set()
@@ -13,6 +14,13 @@ def say_once(key: str, text: str) -> None:
     if key not in _SAID:
         _SAID.add(key)
         _LOG.warning("%s", text)
+
+
+def first_told(topic: str, names: Iterable[str]) -> list[str]:
+    """Those of `names` that are told of for the first time under `topic`."""
+    new = [name for name in names if f"{topic}: {name}" not in _SAID]
+    _SAID.update(f"{topic}: {name}" for name in new)
+    return new
 
 
 def forget() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from bam_envs import registry
 from bam_envs.errors import InvalidValue, UnknownName
-from bam_envs.robo_gym.notices import say_once
+from bam_envs.robo_gym.notices import first_told, say_once
 from bam_envs.robo_gym.table import RoboGymId
 from bam_envs.robot_env import render_modes
 from bam_envs.tasks.options import FLAGS, option_names, require_kinds
@@ -17,18 +17,25 @@ _MANAGER = ("ip", "lower_bound_port", "upper_bound_port", "server_manager_port")
 """Where robo-gym finds the Server Manager that starts Gazebo."""
 _WINDOWS = ("gui", "gazebo_gui", "rviz_gui")
 _SIMULATED = (*_MANAGER, *_WINDOWS)
+_OTHER_TARGETS = "give the target itself: ee_target_pose=[x, y, z, roll, pitch, yaw], here or to each reset"
 _OF_ENVIRONMENT = frozenset(inspect.signature(registry.make_env).parameters) | {"max_episode_steps"}
 _NOT_HERE = {
     "max_velocity_scale_factor": "the arm's speed belongs to the environment, which would be another one",
     "action_rate": "the rate belongs to the environment, which would be another one",
     "ee_rotation_matters": "bam/isaac-reach-v0 (IsaacReachURSim-v0) has targets with an orientation",
     "ee_rotation_threshold": "bam/isaac-reach-v0 (IsaacReachURSim-v0) has targets with an orientation",
-    "ee_distance_threshold": "success is within 0.1 m, as by default",
-    "ee_target_pose": "give it to reset: options={'ee_target_pose': [x, y, z, roll, pitch, yaw]}",
-    "ee_target_volume_bounding_box": "targets are drawn from the arm's workspace",
-    "randomize_start": "give it to reset: options={'randomize_start': True}",
+    "ee_distance_threshold": "it has no target of the flange",
+    "ee_target_pose": "it has no target of the flange",
+    "ee_target_volume_bounding_box": _OTHER_TARGETS,
+    "ee_rotation_pos_x_range": _OTHER_TARGETS,
+    "ee_rotation_pos_y_range": _OTHER_TARGETS,
+    "ee_rotation_pos_z_range": _OTHER_TARGETS,
+    "ee_rotation_roll_range": _OTHER_TARGETS,
+    "ee_rotation_pitch_range": _OTHER_TARGETS,
+    "ee_rotation_yaw_range": _OTHER_TARGETS,
+    "randomize_start": "give reset the start itself: options={'joint_positions': [...]}",
     "random_joint_offset": "give reset the start itself: options={'joint_positions': [...]}",
-    "continue_on_success": "give it to reset: options={'continue_on_success': True}",
+    "continue_on_success": "give reset the start itself: options={'joint_positions': [...]}",
     "continue_except_collision": "give reset the start itself: options={'joint_positions': [...]}",
 }
 """Options of robo-gym's modular environments that are none of ours, and what to do instead."""
@@ -52,8 +59,6 @@ def translate(entry: RoboGymId, given: Mapping[str, Any]) -> dict[str, Any]:
     else:
         _say_where_it_runs(given)
         options |= _window(given)
-    if options.get("parity") and entry.no_parity:
-        raise InvalidValue(f"parity=True: {entry.id} has none: {entry.no_parity}.")
     return options if options.get("transport") is not None else {**entry.defaults, **options}
 
 
@@ -105,7 +110,7 @@ def _live_address(entry: RoboGymId, given: Mapping[str, Any]) -> str | None:
     if robot is not None and address is not None:
         raise InvalidValue(f"rs_address={address!r} and robot={robot!r} name the same thing; leave one out.")
     if robot is not None or address is not None:
-        return robot or _rosbridge_address(address)
+        return _rosbridge_address(address) if robot is None else robot
     raise InvalidValue(
         f"{entry.id} is a live robot, and it has no address: give robot='ws://IP:PORT' of the rosbridge in front of "
         f"it (rs_address='IP:PORT' is the same), or use {entry.twin} for the simulated one."
@@ -118,7 +123,7 @@ def _rosbridge_address(address: Any) -> str:
     if text.startswith(("ws://", "wss://")):
         return text
     host, _, port = text.rpartition(":")
-    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+    if not host or set(host) & set(" /") or not port.isdecimal() or not 0 < int(port) < 65536:
         raise InvalidValue(f"rs_address must be 'IP:PORT', such as '10.0.0.5:9090', not {address!r}.")
     url = f"ws://{text}"
     say_once(
@@ -131,7 +136,7 @@ def _rosbridge_address(address: Any) -> str:
 
 def _say_what_is_live(entry: RoboGymId, given: Mapping[str, Any]) -> None:
     """Of options for a simulation, given with a robot: scripts pass the same to both."""
-    names = [name for name in _SIMULATED if given.get(name)]
+    names = first_told("live", [name for name in _SIMULATED if given.get(name)])
     if names:
         said = ", ".join(f"{name}={given[name]!r}" for name in names)
         say_once(
@@ -143,7 +148,7 @@ def _say_what_is_live(entry: RoboGymId, given: Mapping[str, Any]) -> None:
 
 def _say_where_it_runs(given: Mapping[str, Any]) -> None:
     """Of options for what is not there."""
-    names = [name for name in (*_MANAGER, "rviz_gui") if given.get(name)]
+    names = first_told("simulated", [name for name in (*_MANAGER, "rviz_gui") if given.get(name)])
     if names:
         said = ", ".join(f"{name}={given[name]!r}" for name in names)
         say_once(

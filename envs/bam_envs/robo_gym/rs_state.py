@@ -61,7 +61,10 @@ def read_mir_target(wire: Sequence[float]) -> Array:
 
 
 def _numbers(wire: Sequence[float]) -> Array:
-    row = np.asarray(wire, dtype=np.float64)
+    try:
+        row = np.asarray(wire, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InvalidValue(f"The wire state of a MiR100 must be {MIR_LENGTH} numbers: {error}.") from error
     if row.shape != (MIR_LENGTH,):
         raise InvalidValue(f"The wire state of a MiR100 has {MIR_LENGTH} numbers in a row; this has shape {row.shape}.")
     infinite = np.flatnonzero(np.isinf(row))

@@ -27,8 +27,6 @@ class RoboGymId:
     """Whether it is the ``Rob-v0`` of the two: the same environment, with a robot."""
     defaults: Mapping[str, Any] = field(default_factory=dict)
     """Task options that have other defaults there than here."""
-    no_parity: str = ""
-    """Why there is no ``parity=True``; empty where there is."""
 
     @property
     def id(self) -> str:
@@ -40,26 +38,27 @@ class RoboGymId:
         """The other id of the two."""
         return f"{self.stem}{'Sim' if self.is_live else 'Rob'}-v0"
 
+    @property
+    def variant(self) -> str:
+        """`stem`, if it differs from `env_id` by more than the arm and what is in the info; else empty."""
+        return self.stem if self.defaults.keys() - {"ur_model", "rs_state_to_info"} else ""
 
-_EE2 = (
-    "robo-gym's own has its target at (0, 0, 0) always, and no observation of the shape that it declares; "
-    "EndEffectorPositioningUR has parity=True"
-)
-_STEMS: tuple[tuple[str, str, Mapping[str, Any], str], ...] = (
-    ("NoObstacleNavigationMir100", "bam/mir100-navigation-v0", NOTHING, ""),
-    ("ObstacleAvoidanceMir100", "bam/mir100-avoidance-v0", NOTHING, ""),
-    ("EmptyEnvironmentUR", "bam/ur-empty-v0", _UR, ""),
-    ("EndEffectorPositioningUR", "bam/ur-reach-v0", _UR, ""),
-    ("BasicAvoidanceUR", "bam/ur-avoidance-v0", _UR, ""),
-    ("AvoidanceRaad2022UR", "bam/ur-track-v0", _UR, ""),
-    ("AvoidanceRaad2022TestUR", "bam/ur-track-v0", MappingProxyType({**_UR, "fixed_paths": True}), ""),
-    ("EmptyEnvironment2UR", "bam/ur-empty-v0", _UR_MODULAR, ""),
-    ("EndEffectorPositioning2UR", "bam/ur-reach-v0", _UR_MODULAR, _EE2),
-    ("IsaacReachUR", "bam/isaac-reach-v0", MappingProxyType({"rs_state_to_info": False}), ""),
+
+_STEMS: tuple[tuple[str, str, Mapping[str, Any]], ...] = (
+    ("NoObstacleNavigationMir100", "bam/mir100-navigation-v0", NOTHING),
+    ("ObstacleAvoidanceMir100", "bam/mir100-avoidance-v0", NOTHING),
+    ("EmptyEnvironmentUR", "bam/ur-empty-v0", _UR),
+    ("EndEffectorPositioningUR", "bam/ur-reach-v0", _UR),
+    ("BasicAvoidanceUR", "bam/ur-avoidance-v0", _UR),
+    ("AvoidanceRaad2022UR", "bam/ur-track-v0", _UR),
+    ("AvoidanceRaad2022TestUR", "bam/ur-track-v0", MappingProxyType({**_UR, "fixed_paths": True})),
+    ("EmptyEnvironment2UR", "bam/ur-empty-v0", _UR_MODULAR),
+    ("EndEffectorPositioning2UR", "bam/ur-reach-v0", MappingProxyType({**_UR_MODULAR, "modular": True})),
+    ("IsaacReachUR", "bam/isaac-reach-v0", MappingProxyType({"rs_state_to_info": False})),
 )
 ROBO_GYM: dict[str, RoboGymId] = {
     entry.id: entry
-    for stem, env_id, defaults, no_parity in _STEMS
-    for entry in (RoboGymId(stem, env_id, is_live, defaults, no_parity) for is_live in (False, True))
+    for stem, env_id, defaults in _STEMS
+    for entry in (RoboGymId(stem, env_id, is_live, defaults) for is_live in (False, True))
 }
 """By id, each ``Sim-v0`` followed by its ``Rob-v0``."""

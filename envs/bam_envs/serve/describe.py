@@ -9,6 +9,7 @@ import gymnasium as gym
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from bam_envs.errors import InvalidValue
+from bam_envs.robo_gym.table import ROBO_GYM
 from bam_envs.spaces import space_to_json
 from bam_envs.transports.transport import EnvSpecMessage
 
@@ -64,11 +65,21 @@ def _period(env: Env) -> float | None:
 def same_name(one: str, other: str) -> bool:
     """Whether two names are of one environment: namespace, version, case and punctuation do not count.
 
-    ``PickPlace``, ``pick-place``, ``bam/pick-place`` and ``bam/pick-place-v0`` are one.
+    ``PickPlace``, ``pick-place``, ``bam/pick-place`` and ``bam/pick-place-v0`` are one; so are robo-gym's names and
+    ours of one environment.
     """
     return _bare(one) == _bare(other)
 
 
 def _bare(name: str) -> str:
+    spelt = _spelt(name)
+    return _ROBO_GYM.get(spelt, spelt)
+
+
+def _spelt(name: str) -> str:
     last = re.split("[/:]", name)[-1]
     return re.sub("[^a-z0-9]", "", re.sub(r"-v\d+$", "", last).lower())
+
+
+_ROBO_GYM = {_spelt(theirs.id): _spelt(theirs.variant or theirs.env_id) for theirs in ROBO_GYM.values()}
+"""robo-gym's names -> ours of the same environment, or one name of what is a variant of it."""

@@ -79,6 +79,9 @@ class IsaacReachTask:
         parity: robo-gym's arithmetic.
         isaac_scale: With ``parity``, the joint angle of an action of 1 [rad].
         continue_except_collision: Whether episodes begin where the last one ended.
+        ee_distance_threshold: Distance that counts as success [m].
+        ee_rotation_threshold: Angle that counts as success, if it is less [rad].
+        ee_target_pose: What the reset option of that name is where a reset does not give it.
         rs_state_to_info: Whether infos have robo-gym's wire state.
     """
 
@@ -93,10 +96,21 @@ class IsaacReachTask:
         isaac_scale: float = 0.5,
         continue_except_collision: bool = True,
         rs_state_to_info: bool = False,
+        ee_distance_threshold: float = CLOSE,
+        ee_rotation_threshold: float = ALIGNED,
+        ee_target_pose: Sequence[float] | None = None,
     ) -> None:
         if not 0 < isaac_scale < np.inf:
             raise InvalidValue(f"isaac_scale must be a joint angle above 0 rad, not {isaac_scale!r}.")
+        for name, limit in (
+            ("ee_distance_threshold", ee_distance_threshold),
+            ("ee_rotation_threshold", ee_rotation_threshold),
+        ):
+            if not limit > 0:
+                raise InvalidValue(f"{name} must be above 0 {'m' if 'distance' in name else 'rad'}, not {limit!r}.")
         self.num_rows, self.parity, self.ends_by_itself = num_rows, parity, parity
+        self._close, self._aligned = ee_distance_threshold, ee_rotation_threshold
+        self._standing = _target({"ee_target_pose": ee_target_pose})
         self.continue_except_collision, self.rs_state_to_info = continue_except_collision, rs_state_to_info
         self.model = model_called(ur_model)
         self.control = UrControl(self.model, num_rows, RATE, VELOCITY_SCALE)
@@ -152,7 +166,7 @@ class IsaacReachTask:
         self.target[rows] = TARGETS[0] + draws[:, :3] * (TARGETS[1] - TARGETS[0])
         angles = np.stack([np.zeros(len(rows)), np.full(len(rows), PITCH), (2 * draws[:, 3] - 1) * np.pi], axis=1)
         self.quaternion[rows] = from_angles(angles)
-        pose = _target(options)
+        pose = self._standing if options.get("ee_target_pose") is None else _target(options)
         if pose is not None:
             self.target[rows], self.quaternion[rows] = pose[:3], pose[3:]
         joints = self._starts(rows, rngs)
@@ -204,7 +218,7 @@ class IsaacReachTask:
         angle = angle_between(quaternions(rotation), self.quaternion)
         self.steps = self.steps + 1
         collision = collisions(state)
-        success = (distance <= CLOSE) & (angle < ALIGNED) & ~collision
+        success = (distance <= self._close) & (angle < self._aligned) & ~collision
         last = (self.steps >= MAX_STEPS) & ~collision
         reward = np.where(collision, -1.0, np.where(success, 2.0, -0.005 * distance - 0.05 * angle))
         goes_on = (success | last)[:, None] & self.continue_except_collision

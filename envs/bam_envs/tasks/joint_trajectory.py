@@ -48,6 +48,8 @@ def load_trajectory(file: str | Path | None, limits: Array) -> JointTrajectory:
     Raises:
         InvalidValue: There is no such file, or no trajectory of six joints inside their limits in it.
     """
+    if not isinstance(file, (str, Path, type(None))):
+        raise InvalidValue(f"The trajectory must be the path of a JSON file, not {file!r}.")
     segments = _shipped() if file is None else _read(Path(file).expanduser())
     for number, segment in enumerate(segments):
         outside = (segment < limits[0]) | (segment > limits[1])

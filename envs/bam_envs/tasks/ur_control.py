@@ -147,8 +147,10 @@ def joint_option(options: Mapping[str, Any], name: str, default: Sequence[float]
     return joints
 
 
-def number_option(options: Mapping[str, Any], name: str, default: Sequence[float], size: int) -> Array:
-    """The numbers that a reset option gives, else `default`. Shape: (size,).
+def number_option(
+    options: Mapping[str, Any], name: str, default: Sequence[float], size: int, kind: str = "reset option"
+) -> Array:
+    """The numbers that an option of `kind` gives, else `default`. Shape: (size,).
 
     Raises:
         InvalidValue: They are not `size` finite numbers.
@@ -161,7 +163,7 @@ def number_option(options: Mapping[str, Any], name: str, default: Sequence[float
     except (TypeError, ValueError):
         numbers = np.array(np.nan)
     if numbers.shape != (size,) or not np.isfinite(numbers).all():
-        raise InvalidValue(f"The reset option {name} must be {size} finite numbers, not {given!r}.")
+        raise InvalidValue(f"The {kind} {name} must be {size} finite numbers, not {given!r}.")
     return numbers
 
 

@@ -103,7 +103,7 @@ class UrObstacleTask:
         self.model = model_called(ur_model)
         self.control = UrControl(self.model, num_rows, RATE, VELOCITY_SCALE, fixed)
         self.include_polar_to_elbow, self.rs_state_to_info = include_polar_to_elbow, rs_state_to_info
-        self._place = _place({"fixed_object_position": fixed_object_position})
+        self._place = _place({"fixed_object_position": fixed_object_position}, kind="option")
         self.action_labels = self.control.labels("joint target beside the reference", "rad", "1")
         self.observation_labels = self._labels()
         self.action_space: spaces.Box = labelled_box(self.action_labels)
@@ -217,8 +217,8 @@ class UrObstacleTask:
         self._sense = None
 
 
-def _place(options: Mapping[str, Any], default: Array | None = None) -> Array | None:
+def _place(options: Mapping[str, Any], default: Array | None = None, kind: str = "reset option") -> Array | None:
     """Where the obstacle stays [m], or None where nothing says so. Shape: (3,)."""
     if options.get("fixed_object_position") is None:
         return default
-    return number_option(options, "fixed_object_position", (), 3)
+    return number_option(options, "fixed_object_position", (), 3, kind)

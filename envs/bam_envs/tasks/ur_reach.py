@@ -89,6 +89,12 @@ class UrReachTask:
         restrict_wrist_1: The action of wrist 1 means -3.48 to 0.31 rad.
         rs_state_to_info: Put robo-gym's robot server state into info["rs_state"], a dict of floats.
         ee_distance_threshold: Distance that counts as success [m].
+        ee_target_pose: What the reset option of that name is where a reset does not give it. So are the next two.
+        randomize_start: See above.
+        continue_on_success: See above.
+        modular: Observations and infos of robo-gym's EndEffectorPositioning2UR: the last action is that of the joints
+            that move, and never an older one; the distance is `dist_coord` too. With `parity`, targets that are not
+            given are the origin.
     """
 
     reset_options = ("joint_positions", "ee_target_pose", "randomize_start", "continue_on_success")
@@ -108,6 +114,10 @@ class UrReachTask:
         restrict_wrist_1: bool = True,
         rs_state_to_info: bool = False,
         ee_distance_threshold: float = NEAR,
+        ee_target_pose: Sequence[float] | None = None,
+        randomize_start: bool = False,
+        continue_on_success: bool = False,
+        modular: bool = False,
     ) -> None:
         if not ee_distance_threshold > 0:
             raise InvalidValue(f"ee_distance_threshold must be above 0 m, not {ee_distance_threshold!r}.")
@@ -116,7 +126,9 @@ class UrReachTask:
         self._control = UrControl(self.model, num_rows, RATE, VELOCITY_SCALE, fixed)
         self._near, self._restrict, self._tells_wire = ee_distance_threshold, restrict_wrist_1, rs_state_to_info
         self.action_labels = self._control.labels("where the joint is to be", "rad", "/ its limit")
-        self.observation_labels = _parity_labels() if parity else _labels(self.model)
+        self.modular, self._seen = modular, self._control.free if modular else np.arange(6)  # whose actions are seen
+        told = _parity_labels(modular) if parity else _labels(self.model)
+        self.observation_labels = (*told[:-6], *(told[-6:][joint] for joint in self._seen))
         self.action_space: spaces.Box = labelled_box(self.action_labels)
         self.observation_space: spaces.Box = labelled_box(self.observation_labels)
         self.target = np.zeros((num_rows, 3))
@@ -125,6 +137,12 @@ class UrReachTask:
         """Steps since each episode began. Shape: (n,)."""
         self._held = np.zeros((num_rows, 6))  # normalised start, where fixed joints stay
         self._actions = np.zeros((2, num_rows, 6))  # the last one and the one before, of all joints
+        self._standing = {
+            "ee_target_pose": ee_target_pose,
+            "randomize_start": randomize_start,
+            "continue_on_success": continue_on_success,
+        }
+        self._target_option(self._standing)
         self._continues = np.zeros(num_rows, dtype=bool)  # whether the last episode was a success, which ended ...
         self._last_end = np.tile(START, (num_rows, 1))  # ... here
 
@@ -132,9 +150,11 @@ class UrReachTask:
         self, rows: Rows, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] | None = None
     ) -> Initial:
         """The start pose, or what the options say; a target in the workspace."""
-        options = options or {}
+        options = self._standing | {name: value for name, value in (options or {}).items() if value is not None}
         joints = np.tile(joint_option(options, "joint_positions", START, self.model), (len(rows), 1))
         target = self._target_option(options)
+        if target is None and self.modular and self.parity:
+            target = np.zeros(3)  # robo-gym's sampler forgets the place
         randomize = flag_option(options, "randomize_start")
         for k, (row, rng) in enumerate(zip(rows, rngs, strict=True)):
             if randomize:
@@ -168,15 +188,17 @@ class UrReachTask:
         self._actions[:, rows], self.elapsed[rows] = 0.0, 0
 
     def observe(self, state: RobotState) -> Floats:
-        """See `observation_labels`. Shape: (n, 27) float32."""
+        """See `observation_labels`. Shape: (n, 27) float32; (n, 21 + free joints) if `modular`."""
         joints, velocity = state.signals["joint_position"], state.signals["joint_velocity"]
         place, axes = self.model.geometry.flange_pose(joints)
         seen, shares = in_frame(self.target, place, axes), normalised(self.model, joints)
         if self.parity:
-            columns = [spherical(seen), shares, velocity, self.target, place, self._actions[1]]
+            columns = [spherical(seen), shares, velocity, self.target, place]
+            columns.append(self._actions[0 if self.modular else 1][:, self._seen])
             return np.concatenate(columns, axis=1).astype(np.float32)
         radius, speed = self.model.workspace_radius, VELOCITY_SCALE * self.model.max_velocity
-        columns = [seen / radius, shares, velocity / speed, self.target / radius, place / radius, self._actions[0]]
+        columns = [seen / radius, shares, velocity / speed, self.target / radius, place / radius]
+        columns.append(self._actions[0][:, self._seen])
         observation = np.concatenate(columns, axis=1).astype(np.float32)
         return np.clip(observation, self.observation_space.low, self.observation_space.high)
 
@@ -214,6 +236,8 @@ class UrReachTask:
             "final_status": status,
             "target_coord": self.target.copy(),
         }
+        if self.modular:
+            info["dist_coord"] = distance.copy()
         if self._tells_wire:
             info["rs_state"] = as_objects(self.rs_state(state))
         return Score(reward, success | collided | late, success, info)
@@ -267,8 +291,8 @@ def _labels(model: UrModel) -> tuple[Label, ...]:
     )
 
 
-def _parity_labels() -> tuple[Label, ...]:
-    far = (-np.inf, np.inf)
+def _parity_labels(modular: bool) -> tuple[Label, ...]:
+    far, (age, most) = (-np.inf, np.inf), ("last action", 1.0) if modular else ("the action before the last one", 1.01)
     return (
         Label("target_r", "target as the flange sees it, distance", "m", "1", *far),
         Label("target_polar", "target as the flange sees it, angle from its axis", "rad", "1", *far),
@@ -277,8 +301,5 @@ def _parity_labels() -> tuple[Label, ...]:
         *(Label(f"speed_{one}", "joint velocity", "rad/s", "1", *far) for one in JOINTS),
         *(Label(f"target_{one}", f"target, {one}", "m", "1", *far) for one in "xyz"),
         *(Label(f"flange_{one}", f"flange, {one}", "m", "1", *far) for one in "xyz"),
-        *(
-            Label(f"action_{one}", "the action before the last one", "rad", "/ its limit", -1.01, 1.01)
-            for one in JOINTS
-        ),
+        *(Label(f"action_{one}", age, "rad", "/ its limit", -most, most) for one in JOINTS),
     )

@@ -22,6 +22,21 @@ MODES = {
 }
 
 
+SIZES = {
+    "NoObstacleNavigationMir100": (4, 2, 500),
+    "ObstacleAvoidanceMir100": (20, 2, 500),
+    "EmptyEnvironmentUR": (12, 5, 300),
+    "EndEffectorPositioningUR": (27, 5, 300),
+    "BasicAvoidanceUR": (18, 5, 1000),
+    "AvoidanceRaad2022UR": (25, 5, 1000),
+    "AvoidanceRaad2022TestUR": (25, 5, 1000),
+    "EmptyEnvironment2UR": (12, 5, 300),
+    "EndEffectorPositioning2UR": (26, 5, 300),
+    "IsaacReachUR": (25, 6, 600),
+}
+"""robo-gym's numbers of observation and action, and its steps."""
+
+
 def make(name, **options):
     return gym.make(name, disable_env_checker=True, **options)
 
@@ -44,12 +59,20 @@ def test_it_is_the_same_environment(name):
 
 
 @pytest.mark.parametrize("name", SIMULATED)
+@pytest.mark.parametrize("parity", [False, True])
+def test_sizes_are_robo_gyms(name, parity):
+    env = make(name, parity=parity)
+    observation, action, steps = SIZES[ROBO_GYM[name].stem]
+    assert (env.observation_space.shape, env.action_space.shape) == ((observation,), (action,))
+    assert bam_envs.ENVIRONMENTS[ROBO_GYM[name].env_id].max_episode_steps == steps
+
+
+@pytest.mark.parametrize("name", SIMULATED)
 def test_the_time_limit(name):
     entry = ROBO_GYM[name]
     env = make(name)
     assert env.get_wrapper_attr("_max_episode_steps") == bam_envs.ENVIRONMENTS[entry.env_id].max_episode_steps
-    if not entry.no_parity:
-        assert "TimeLimit" not in str(make(name, parity=True))
+    assert "TimeLimit" not in str(make(name, parity=True))
 
 
 @pytest.mark.parametrize("name", SIMULATED)
@@ -160,3 +183,8 @@ def test_reset_options():
     wire = arm.unwrapped.get_rs_state()
     assert [wire[f"{name}_joint_position"] for name in ("base", "shoulder", "elbow", "wrist_1")] == joints[:4]
     assert [wire[f"object_0_to_ref_translation_{axis}"] for axis in "xyz"] == [0.3, 0.2, 0.4]
+
+
+def test_a_robot_without_an_address_is_none():
+    with pytest.raises(InvalidValue, match="A live robot's address is ws://host:port"):
+        make("EndEffectorPositioningURRob-v0", robot="")

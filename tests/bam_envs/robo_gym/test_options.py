@@ -55,6 +55,21 @@ def test_a_server_manager_is_said_once_not_to_be_there(told):
     ]
 
 
+def test_an_option_is_said_once_whatever_else_is_given(told):
+    """Of the second call only what is new is said; with a robot it means another thing, which is said too."""
+    options.translate(SIM, {"ip": "127.0.0.1"})
+    options.translate(ROBO_GYM["IsaacReachURSim-v0"], {"ip": "127.0.0.1", "server_manager_port": 50100})
+    options.translate(SIM, {"ip": "127.0.0.2", "server_manager_port": 50100})
+    options.translate(ROB, {"robot": "ws://a:1", "ip": "127.0.0.1"})
+    options.translate(ROB, {"robot": "ws://a:1", "ip": "127.0.0.1", "gui": True})
+    assert [text.partition(": accepted")[0] for text in told()] == [
+        "ip='127.0.0.1'",
+        "server_manager_port=50100",
+        "ip='127.0.0.1'",
+        "gui=True",
+    ]
+
+
 @pytest.mark.parametrize("name", ["gui", "gazebo_gui"])
 def test_gui_is_a_window(name, told, monkeypatch):
     monkeypatch.setattr(options, "render_modes", lambda: ["rgb_array", "human"])
@@ -95,6 +110,12 @@ def test_the_address_of_a_robot(told):
         ),
         (ROB, {"rs_address": "10.0.0.5"}, "rs_address must be 'IP:PORT', such as '10.0.0.5:9090', not '10.0.0.5'."),
         (ROB, {"rs_address": ":9090"}, "rs_address must be 'IP:PORT', such as '10.0.0.5:9090', not ':9090'."),
+        (
+            ROB,
+            {"rs_address": "http://a:1"},
+            "rs_address must be 'IP:PORT', such as '10.0.0.5:9090', not 'http://a:1'.",
+        ),
+        (ROB, {"rs_address": "a b:1"}, "rs_address must be 'IP:PORT', such as '10.0.0.5:9090', not 'a b:1'."),
         (ROB, {"rs_address": "a:70000"}, "rs_address must be 'IP:PORT', such as '10.0.0.5:9090', not 'a:70000'."),
         (SIM, {"gui": "no"}, "gui= of EndEffectorPositioningURSim-v0 must be True or False, not 'no'."),
         (ROB, {"rviz_gui": 1}, "rviz_gui= of EndEffectorPositioningURRob-v0 must be True or False, not 1."),
@@ -122,16 +143,21 @@ def test_the_address_of_a_robot(told):
             "which would be another one.",
         ),
         (
-            SIM,
+            ROBO_GYM["EmptyEnvironment2URSim-v0"],
             {"randomize_start": True},
-            "randomize_start= of EndEffectorPositioningURSim-v0: there is none here; give it to reset: "
-            "options={'randomize_start': True}.",
+            "randomize_start= of EmptyEnvironment2URSim-v0: there is none here; give reset the start itself: "
+            "options={'joint_positions': [...]}.",
         ),
         (
-            ROBO_GYM["EndEffectorPositioning2URSim-v0"],
-            {"parity": True},
-            "parity=True: EndEffectorPositioning2URSim-v0 has none: robo-gym's own has its target at (0, 0, 0) always, "
-            "and no observation of the shape that it declares; EndEffectorPositioningUR has parity=True.",
+            ROBO_GYM["IsaacReachURSim-v0"],
+            {"ee_rotation_yaw_range": [0, 1]},
+            "ee_rotation_yaw_range= of IsaacReachURSim-v0: there is none here; give the target itself: "
+            "ee_target_pose=[x, y, z, roll, pitch, yaw], here or to each reset.",
+        ),
+        (
+            SIM,
+            {"randomize_start": 1},
+            "randomize_start= of EndEffectorPositioningURSim-v0 must be True or False, not 1.",
         ),
     ],
 )

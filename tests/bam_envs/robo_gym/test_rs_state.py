@@ -93,6 +93,7 @@ def test_an_object_and_its_quaternion():
     ("wire", "text"),
     [
         ([0.0] * 1029, "The wire state of a MiR100 has 1030 numbers in a row; this has shape (1029,)."),
+        (["far"], "The wire state of a MiR100 must be 1030 numbers: could not convert string to float: 'far'."),
         ([], "The wire state of a MiR100 has 1030 numbers in a row; this has shape (0,)."),
         (
             [0.0] * 8 + [float("inf")] + [0.0] * 1021,

@@ -5,7 +5,7 @@ import gymnasium as gym
 import pytest
 
 from bam_envs import ENVIRONMENTS
-from bam_envs.registry import entry_of, resolve_id
+from bam_envs.registry import are_same, entry_of, resolve_id
 from bam_envs.robo_gym.table import ROBO_GYM
 
 STEMS = {
@@ -57,3 +57,14 @@ print(sorted(name for name in sys.modules if name.startswith("bam_envs.")))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     modules = ["bam_envs.errors", "bam_envs.registry", "bam_envs.robo_gym", "bam_envs.robo_gym.table"]
     assert done.stdout.strip() == str(modules)
+
+
+def test_two_names_of_one_environment_are_the_same():
+    assert are_same("bam/mir100-navigation-v0", "NoObstacleNavigationMir100Sim-v0")
+    assert are_same("EndEffectorPositioningURRob-v0", "EndEffectorPositioningURSim-v0")
+    assert are_same("CartPole-v1", "CartPole-v1")
+    assert not are_same("CartPole-v1", "Pendulum-v1")
+    assert not are_same("bam/mir100-navigation-v0", "bam/mir100-avoidance-v0")
+    assert not are_same("AvoidanceRaad2022URSim-v0", "AvoidanceRaad2022TestURSim-v0")
+    assert are_same("AvoidanceRaad2022TestURRob-v0", "AvoidanceRaad2022TestURSim-v0")
+    assert not are_same("EndEffectorPositioning2URSim-v0", "bam/ur-reach-v0")

@@ -120,6 +120,36 @@ def test_8_the_time_limit_terminates_and_has_a_status(name, steps, status, optio
     assert info["final_status"] == status
 
 
+@pytest.mark.parametrize(
+    ("name", "steps", "status"),
+    [
+        ("EmptyEnvironmentURSim-v0", 300, "max_steps_exceeded"),
+        ("EndEffectorPositioningURSim-v0", 300, "max_steps_exceeded"),
+        ("BasicAvoidanceURSim-v0", 1000, "success"),
+        ("NoObstacleNavigationMir100Sim-v0", 500, "max_steps_exceeded"),
+    ],
+)
+def test_8_by_default_it_truncates_and_says_so(name, steps, status):
+    options = {"ee_target_pose": [0.0, -0.4, 0.6, 0, 0, 0]} if name.startswith("EndEff") else {}
+    options |= {"fixed_object_position": [0.5, 0.6, 0.9]} if name.startswith("Basic") else {}
+    env = gym.make(name, disable_env_checker=True, rs_state_to_info=False)
+    rows = gym.make_vec(name, num_envs=2, rs_state_to_info=False)
+    env.reset(seed=0, options=options)
+    rows.reset(seed=0, options=options)
+    action = np.zeros(env.action_space.shape, np.float32)
+    if name.startswith("E"):
+        action = (joints(env.unwrapped) / ur_model("ur5").joint_limits[1])[:5].astype(np.float32)
+        action[3] = 2 * (-1.5 + 3.48) / (0.31 + 3.48) - 1 if name.startswith("EndEff") else action[3]
+    for step in range(1, steps + 1):
+        _, _, terminated, truncated, info = env.step(action)
+        *_, ended, infos = rows.step(np.stack([action, action]))
+        assert (terminated, truncated, ended.tolist()) == (False, step == steps, [step == steps] * 2)
+        assert ("final_status" in info) == (step == steps)
+    assert info["final_status"] == status
+    assert infos["final_info"]["final_status"].tolist() == [status] * 2
+    assert infos["final_info"]["_final_status"].tolist() == [True, True]
+
+
 def test_9_actions_of_avoidances_are_offsets_in_radians():
     env = make("BasicAvoidanceURSim-v0")
     env.reset(seed=0)

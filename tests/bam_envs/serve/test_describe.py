@@ -74,3 +74,18 @@ def test_names_that_are_not(name):
 
 def test_gymnasium_ids_with_a_module():
     assert same_name("ale_py:ALE/Pong-v5", "Pong")
+
+
+@pytest.mark.parametrize(
+    "name", ["NoObstacleNavigationMir100Sim-v0", "NoObstacleNavigationMir100Rob", "mir100-navigation"]
+)
+def test_robo_gyms_names_of_ours(name):
+    assert same_name(name, "bam/mir100-navigation-v0")
+    assert same_name(name, "NoObstacleNavigationMir100Sim-v0")
+    assert not same_name(name, "ObstacleAvoidanceMir100Sim-v0")
+
+
+def test_robo_gyms_variants_of_ours():
+    assert not same_name("AvoidanceRaad2022TestURSim-v0", "bam/ur-track-v0")
+    assert same_name("AvoidanceRaad2022TestURSim-v0", "AvoidanceRaad2022TestURRob")
+    assert not same_name("EndEffectorPositioning2URSim-v0", "EndEffectorPositioningURSim-v0")

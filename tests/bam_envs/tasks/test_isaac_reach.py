@@ -293,3 +293,35 @@ def test_the_arm_gets_there(make):
         if terminated or truncated:
             break
     assert (reward, terminated, truncated, info["final_status"], info["is_success"]) == (2.0, True, False, "success", 1)
+
+
+def test_what_counts_as_success():
+    near = np.add(DEFAULT, [0.0, 0.0, 0.0, 0.0, 0.0, 0.1])  # the same place, turned by 0.1 rad
+    given = {"ee_target_pose": facing(DEFAULT)}
+    for options, success in (
+        ({}, False),
+        ({"ee_rotation_threshold": 0.2}, True),
+        ({"ee_rotation_threshold": 0.09}, False),
+    ):
+        task = IsaacReachTask(**options)
+        task.begin(ROW, [np.random.default_rng(0)], given)
+        assert task.score(state(near), QUIET).success[0] == success
+    for options, success in (({}, False), ({"ee_distance_threshold": 0.11}, True)):
+        task = IsaacReachTask(**options)
+        task.begin(ROW, [np.random.default_rng(0)], {"ee_target_pose": facing(DEFAULT, 0.1)})
+        assert task.score(state(np.array(DEFAULT)), QUIET).success[0] == success
+    with pytest.raises(InvalidValue, match="ee_rotation_threshold must be above 0 rad, not 0"):
+        IsaacReachTask(ee_rotation_threshold=0)
+
+
+def test_a_target_may_stand():
+    task, pose = IsaacReachTask(2, ee_target_pose=[0.5, 0.1, 0.3, 0.0, math.pi / 2, 1.0]), [0.4, 0.0, 0.2, 0, 0, 0]
+    rows, rngs = np.arange(2), [np.random.default_rng(seed) for seed in (0, 1)]
+    task.begin(rows, rngs)
+    np.testing.assert_array_equal(task.target, [[0.5, 0.1, 0.3]] * 2)
+    task.begin(rows, rngs, {"ee_target_pose": pose})
+    np.testing.assert_array_equal(task.target, [pose[:3]] * 2)
+    task.begin(rows, rngs, {"ee_target_pose": None})
+    np.testing.assert_array_equal(task.target, [[0.5, 0.1, 0.3]] * 2)
+    with pytest.raises(InvalidValue, match="ee_target_pose must be 6 finite numbers"):
+        IsaacReachTask(ee_target_pose=[1, 2, 3])

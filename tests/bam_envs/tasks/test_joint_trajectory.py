@@ -81,6 +81,13 @@ def test_files_that_are_none(tmp_path, content, text):
     assert str(caught.value) == text.format(path=path)
 
 
+@pytest.mark.parametrize("file", [5, True, b"track.json", ["track.json"]])
+def test_no_path(file):
+    with pytest.raises(InvalidValue) as caught:
+        load_trajectory(file, LIMITS)
+    assert str(caught.value) == f"The trajectory must be the path of a JSON file, not {file!r}."
+
+
 def test_no_file(tmp_path):
     path = tmp_path / "none.json"
     with pytest.raises(InvalidValue) as caught:

@@ -166,7 +166,7 @@ def test_driving_into_a_box_ends_the_episode(make):
 
 
 def test_a_start_in_a_wall(make):
-    with pytest.raises(InvalidValue, match=r"base_pose must be free .* at \[2.8, 0.0, 0.0\]"):
+    with pytest.raises(InvalidValue, match=r"The base cannot start at \[2.8, 0.0, 0.0\]"):
         make(ENV).reset(options={"start_pose": [2.8, 0.0, 0.0]})
 
 

@@ -237,7 +237,7 @@ def test_options():
         UrAvoidanceTask(fix_base=True, fix_shoulder=True, fix_elbow=True, fix_wrist_1=True, fix_wrist_2=True)
     with pytest.raises(UnknownName, match="Did you mean 'ur5'"):
         UrAvoidanceTask(ur_model="urr5")
-    with pytest.raises(InvalidValue, match="fixed_object_position must be 3 finite numbers, not 'here'"):
+    with pytest.raises(InvalidValue, match=r"^The option fixed_object_position must be 3 finite numbers, not 'here'"):
         UrAvoidanceTask(fixed_object_position="here")
 
 

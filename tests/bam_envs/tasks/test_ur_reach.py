@@ -304,3 +304,53 @@ def test_the_joints_of_a_place_bring_the_flange_there(make_rows, name):
             assert set(infos["final_info"]["final_status"][won]) == {"success"}
         succeeded |= terminated
     assert succeeded.all()
+
+
+@pytest.mark.parametrize("parity", [False, True])
+def test_modular_observations_end_with_the_last_action_of_the_joints_that_move(make, parity):
+    env = make("bam/ur-reach-v0", parity=parity, modular=True, fix_base=True)
+    env.reset(options={"ee_target_pose": far_pose()})
+    plain = make("bam/ur-reach-v0", parity=parity, fix_base=True)
+    plain.reset(options={"ee_target_pose": far_pose()})
+    for k in range(1, 4):
+        action = np.full(4, 0.1 * k, np.float32)
+        observation, reward, *_, info = env.step(action)
+        other, same, *_ = plain.step(action)
+        np.testing.assert_array_equal(observation[:21], other[:21])
+        np.testing.assert_array_equal(observation[21:], action)
+        assert (reward, info["dist_coord"]) == (same, info["distance"])
+    assert [label.name for label in env.unwrapped.task.observation_labels[21:]] == [
+        f"action_{one}_joint" for one in ("shoulder_lift", "elbow", "wrist_1", "wrist_2")
+    ]
+    assert env.observation_space.high[21:].tolist() == [1.0] * 4
+
+
+def test_modular_targets_are_the_origin_in_parity():
+    task = UrReachTask(modular=True, parity=True)
+    task.begin(np.arange(1), [np.random.default_rng(0)])
+    assert task.target.tolist() == [[0.0, 0.0, 0.0]]
+    task.begin(np.arange(1), [np.random.default_rng(0)], {"ee_target_pose": far_pose()})
+    np.testing.assert_array_equal(task.target[0], far_pose()[:3])
+    task = UrReachTask(modular=True)
+    task.begin(np.arange(1), [np.random.default_rng(0)])
+    np.testing.assert_array_equal(task.target[0], workspace_point(UR5, np.random.default_rng(0)))
+
+
+def test_reset_options_may_stand():
+    """RLlib and vectors of environments reset without options."""
+    rows, rngs = np.arange(2), [np.random.default_rng(seed) for seed in (0, 1)]
+    task = UrReachTask(2, ee_target_pose=tuple(far_pose()), randomize_start=True)
+    joints = task.begin(rows, rngs).signals["joint_position"]
+    np.testing.assert_array_equal(task.target, [far_pose()[:3]] * 2)
+    assert (joints[0] != joints[1]).all()
+    joints = task.begin(rows, rngs, {"randomize_start": False, "ee_target_pose": None}).signals["joint_position"]
+    np.testing.assert_array_equal(joints, [START] * 2)
+    np.testing.assert_array_equal(task.target, [far_pose()[:3]] * 2)
+    goes_on = UrReachTask(continue_on_success=True)
+    goes_on.begin(np.arange(1), rngs[:1])
+    joints = np.array(START) + 0.1
+    goes_on.target[0] = UR5.geometry.tool_position(joints[None])[0]
+    goes_on.score(state_at(joints), ONES[None])
+    np.testing.assert_array_equal(goes_on.begin(np.arange(1), rngs[:1]).signals["joint_position"][0], joints)
+    with pytest.raises(InvalidValue, match=r"ee_target_pose must be 6 finite numbers, not \[1\]"):
+        UrReachTask(ee_target_pose=[1])

@@ -305,6 +305,15 @@ def test_another_environment_is_refused(path: Path):
         checkpoint.requires_env("bam/reach-v0")
 
 
+def test_robo_gyms_name_of_its_environment_is_no_other(path: Path):
+    write_checkpoint(path, {**FIELDS, "env": "bam/mir100-navigation-v0"}, MEMBERS)
+    checkpoint = Checkpoint.open(path)
+    for name in ("NoObstacleNavigationMir100Sim-v0", "NoObstacleNavigationMir100Rob-v0"):
+        checkpoint.requires_env(name)
+    with pytest.raises(CheckpointMismatch, match="not on ObstacleAvoidanceMir100Sim-v0"):
+        checkpoint.requires_env("ObstacleAvoidanceMir100Sim-v0")
+
+
 @pytest.mark.parametrize(
     ("fields", "text"),
     [

@@ -78,6 +78,15 @@ def test_details_of_ours(run):
     assert [line.split()[0] for line in actions[1:]] == ["dx", "dy", "dz", "dyaw", "grip"]
 
 
+def test_rays_that_differ_by_their_number_are_one_line(run):
+    out = run(main, "bam/mir100-avoidance")[1]
+    assert "  f_scan_0 to f_scan_500  0       29     m\n" in out
+    assert "  b_scan_0 to b_scan_510  0       29     m\n" in out
+    assert "front_7" in out
+    assert len(out.splitlines()) < 50
+    assert len(json.loads(run(main, "bam/mir100-avoidance", "--json")[1])["signals"]["state"]) == 1017
+
+
 def test_details_as_json(run):
     facts = json.loads(run(main, "bam/pick", "--json")[1])
     assert facts["id"] == "bam/pick-v0"

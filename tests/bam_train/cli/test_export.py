@@ -1,4 +1,5 @@
 import json
+import pickle
 import shutil
 import subprocess
 import sys
@@ -160,6 +161,60 @@ def test_another_environment(rllib_directories, refused):
     assert refused(root, "--env", "CartPole-v1") == f"{root}: {text}; {remedy}"
     assert refused(root, "--env", "bam/pik").startswith("Unknown environment 'bam/pik'")
     assert refused(root, "--algo", "sac") == f"{root}: was trained by ppo, not by sac; leave --algo out"
+
+
+class SAC:
+    """Stands for RLlib's."""
+
+
+def settings(root, **config):
+    """Other settings in the algorithm's own file."""
+    given = {"class": SAC, "ctor_args_and_kwargs": ([config], {})}
+    (root / "class_and_ctor_args.pkl").write_bytes(pickle.dumps(given))
+    return root
+
+
+def test_as_tune_saves_it(rllib_directories, run):
+    _, out, err = run(main, rllib_directories / "tuned", "--out", "policy.zip")
+    assert (out.startswith("policy.zip: sac on Pendulum-v1, out of "), err) == (True, "")
+
+
+def test_arguments_of_the_environment(rllib_directories, run, refused, folder):
+    root = shutil.copytree(rllib_directories / "sac", folder / "sac")
+    settings(root, env="Pendulum-v1", env_config={"g": np.float64(9.5)})
+    for given in ((), ("--env", "Pendulum-v1")):
+        assert run(main, root, *given, "--out", "a.zip", "--force")[2] == ""
+        assert Checkpoint.open("a.zip").manifest.env_kwargs == {"g": 9.5}
+    settings(root, env="theirs", env_config={"g": 9.5})
+    text = "bam-export: warning: the env_config of its own environment (g) is not given to Pendulum-v1\n"
+    assert run(main, root, "--env", "Pendulum-v1", "--out", "b.zip")[2] == text
+    settings(root, env="Pendulum-v1", env_config={"g": {1, 2}})
+    assert refused(root).startswith(f"{root}: its env_config holds more than plain values (g), which cannot be kept")
+
+
+def test_arguments_by_another_name_of_the_environment(rllib_directories, refused, folder):
+    root = shutil.copytree(rllib_directories / "sac", folder / "sac")
+    settings(root, env="bam/mir100-navigation", env_config={"no_such": 1})
+    assert refused(root, "--env", "NoObstacleNavigationMir100Sim-v0").startswith("Unknown argument of ")
+
+
+def test_a_module_that_a_directory_names_is_not_imported(rllib_directories, run, refused, folder, monkeypatch):
+    monkeypatch.syspath_prepend(folder)
+    (folder / "theirs.py").write_text("from pathlib import Path\nPath('mark').touch()\n")
+    root = settings(shutil.copytree(rllib_directories / "sac", folder / "sac"), env="theirs:Pendulum-v1")
+    text = "was trained on 'theirs:Pendulum-v1', and importing 'theirs' runs its code. If you trust it, give --env "
+    assert refused(root) == f"{root}: {text}'theirs:Pendulum-v1'"
+    assert run(main, root, "--env", "Pendulum-v1", "--out", "a.zip")[0] == 0
+    assert not (folder / "mark").exists()
+    assert run(main, root, "--env", "theirs:Pendulum-v1", "--out", "b.zip")[0] == 0
+    assert (folder / "mark").exists()
+
+
+def test_algorithms_by_name(rllib_directories, run, refused, folder):
+    alone = shutil.copytree(rllib_directories / "sac" / NEW, folder / "alone")
+    assert refused(alone, "--env", "Pendulum-v1", "--algo", "sacc") == "Unknown algorithm 'sacc'. Did you mean 'sac'?"
+    assert run(main, alone, "--env", "Pendulum-v1", "--algo", "SAC", "--out", "a.zip")[0] == 0
+    assert Checkpoint.open("a.zip").manifest.algorithm == "sac"
 
 
 def test_an_environment_that_is_not_known_here(rllib_directories, refused):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import signal
 import subprocess
@@ -13,7 +14,7 @@ import pytest
 
 from bam_envs.errors import MissingExtra, UnknownName
 from bam_train.cli.console import count, duration, number, percent
-from bam_train.cli.program import guarded, run_program, usage_error
+from bam_train.cli.program import Terminated, guarded, run_program, usage_error
 from bam_train.errors import OutputError
 
 
@@ -169,6 +170,46 @@ def test_sigterm_is_one_line_and_its_status(capsys):
 
     assert ended([], main) == 143
     assert capsys.readouterr().err == "prog: ended by SIGTERM\n"
+
+
+def test_a_signal_can_travel():
+    """Ray and concurrent.futures make exceptions anew out of their arguments."""
+    assert copy.copy(Terminated(signal.SIGTERM)).signal == signal.SIGTERM
+
+
+def test_a_signal_that_comes_twice_at_once_does_not_interrupt_the_closing(capsys):
+    closed = []
+
+    def main(flags):
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        finally:
+            signal.raise_signal(signal.SIGTERM)  # timeout: to the process, and then to its group
+            closed.append(True)
+
+    assert ended([], main) == 143
+    assert closed == [True]
+    assert capsys.readouterr().err == "prog: ended by SIGTERM\n"
+
+
+def test_a_signal_that_ray_makes_a_ctrl_c_of_is_still_what_it_was(capsys):
+    def main(flags):
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt:  # it waits in C++, and tells this kind alone
+            raise KeyboardInterrupt from None
+
+    assert ended([], main) == 143
+    assert capsys.readouterr().err == "prog: ended by SIGTERM\n"
+
+
+def test_ctrl_c_while_the_command_line_is_read_is_one_line(monkeypatch, capsys):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tyro.cli", interrupted)
+    assert ended([]) == 130
+    assert capsys.readouterr().err == "prog: interrupted\n"
 
 
 def test_the_box_of_a_terminal_without_unicode_is_one_line_too():

@@ -150,7 +150,7 @@ def start():
     """Starts the program in a process group of its own, as a shell does, with its standard error piped."""
     with contextlib.ExitStack() as stack:
 
-        def start(*arguments):
+        def start(*arguments, folder=None):
             command = [sys.executable, "-m", "bam_train.cli.train", "--env", "bam/reach", "--algo", "ppo"]
             command += ["--trainer", "rllib", "--num-env-runners", "1", "--steps", "100000000"]
             for setting in SMALL:
@@ -163,6 +163,7 @@ def start():
                     text=True,
                     env=environment(),
                     start_new_session=True,
+                    cwd=folder,
                 )
             )
             stack.callback(process.kill)  # Ray's own processes end with it
@@ -194,22 +195,34 @@ def as_timeout_does(group, number):
     os.killpg(group, number)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("number", "send", "status"),
-    [
-        (signal.SIGINT, os.killpg, 130),
-        (signal.SIGTERM, os.kill, 143),
-        (signal.SIGTERM, as_timeout_does, 143),
-        (signal.SIGHUP, os.killpg, 129),
-    ],
+def folders_of(processes):
+    """Folders of the Ray that these processes are of."""
+    return {found for one in processes for found in re.findall(r"/\S*bam-ray-\w+", " ".join(one.cmdline()))}
+
+
+SENT = (
+    ((signal.SIGINT, os.killpg, 130), (signal.SIGTERM, os.kill, 143)),
+    ((signal.SIGTERM, as_timeout_does, 143), (signal.SIGHUP, os.killpg, 129)),
 )
-def test_a_signal_saves_and_leaves_no_process(here, start, number, send, status):
-    process = start("--eval-every", "100000000")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sent", SENT, ids=["ctrl-c-and-kill", "timeout-and-hang-up"])
+def test_a_signal_saves_and_leaves_no_process(here, start, sent):
+    """Two runs at once, each with a Ray of its own: together they are ready nearly as soon as one is alone."""
+    folders = [here / str(place) for place in range(len(sent))]
+    for folder in folders:
+        folder.mkdir()
+    processes = [start("--eval-every", "100000000", folder=folder) for folder in folders]
+    for process, folder, (number, send, status) in zip(processes, folders, sent, strict=True):
+        require_saved_and_gone(process, folder, number, send, status)
+
+
+def require_saved_and_gone(process, here, number, send, status):
     wait_for(process, "steps/s")
     processes = psutil.Process(process.pid).children(recursive=True)
     assert len(processes) > 5
-    folders = {found for one in processes for found in re.findall(r"/\S*bam-ray-\w+", " ".join(one.cmdline()))}
+    folders = folders_of(processes)
     send(process.pid, number)  # a terminal sends Ctrl-C, and SIGHUP at its end, to the whole group
     _, err = process.communicate(timeout=120)
     assert process.returncode == status, err
@@ -243,11 +256,14 @@ def test_two_signals_quit_at_once_and_leave_no_process(start):
     wait_for(process, "ppo on bam/reach-v0, seed 0")
     time.sleep(3.0)  # into the first update, which takes minutes
     processes = psutil.Process(process.pid).children(recursive=True)
+    folders = folders_of(processes)
     os.killpg(process.pid, signal.SIGINT)
     wait_for(process, "finishing the update")
     os.killpg(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=20)
     assert process.returncode == 130
     assert err == "bam-train: quit at once; no checkpoint had been saved yet\n"
-    _, alive = psutil.wait_procs(processes, timeout=90)  # the last two look now and then whether their parent is there
+    _, alive = psutil.wait_procs(processes, timeout=10)  # less than Ray's agents take to see that nobody is left
     assert not alive
+    assert len(folders) == 1
+    assert not any(map(os.path.exists, folders))

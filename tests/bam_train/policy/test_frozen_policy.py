@@ -79,6 +79,18 @@ def test_an_action_is_computed_and_belongs_to_the_caller():
     np.testing.assert_array_equal(policy.act(np.zeros(3, np.float32)), [0, 0])
 
 
+def test_an_observation_of_one_number():
+    nodes = [
+        node("Unsqueeze", ["observation", "axis"], ["h"]),
+        node("Gemm", ["h", "w"], ["action"]),
+    ]
+    constants = {"axis": np.array([1]), "w": np.array([[2.0, -1.0]], np.float32)}
+    graph = onnx_of(nodes, {"observation": ("float32", [])}, {"action": ("float32", [2])}, **constants)
+    policy = FrozenPolicy.from_graph(graph, {**BOX3, "shape": [], "high": "inf"}, BOX2)
+    for number in (np.float32(0.5), np.array(0.5, np.float32), 0.5):
+        np.testing.assert_array_equal(policy.act(number), np.array([1, -0.5], np.float32))
+
+
 def test_batches_are_the_rows_one_by_one(policy: FrozenPolicy):
     observations = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)
     batch = policy.act_batch(observations)

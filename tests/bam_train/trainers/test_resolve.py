@@ -88,6 +88,8 @@ def test_names_are_completed_and_unknown_ones_refused():
         resolve({"env": "bam/pik", "algo": "ppo"})
     with pytest.raises(SettingsError, match=r"^Unknown algorithm 'sacc'\. Did you mean 'sac'\?$"):
         resolve({"env": "bam/pick", "algo": "sacc"})
+    with pytest.raises(SettingsError, match=r"^Unknown algorithm 'a2c'\. It is one of sb3's; those of rllib are: appo"):
+        resolve({"env": "bam/pick", "algo": "a2c", "trainer": "rllib"})
     with pytest.raises(
         SettingsError, match=r"^sac does not fit CartPole-v1: it takes Box actions, found Discrete\. Use one of: "
     ):

@@ -20,6 +20,7 @@ REACH_TIMEOUT = 13.0
 """How long the whole way into a cluster may take then [s]; about 2 s are usual."""
 
 _AUTO = "auto"
+_VARIABLE = "RAY_ADDRESS"
 _STAGES = ("there", "known", "joined")
 
 _PROBE = """
@@ -46,17 +47,19 @@ def find(address: str) -> str:
         SettingsError: It is no address of a cluster.
         TrainingFailed: ``auto``, and no cluster was started on this computer.
     """
-    place = address
-    if address == _AUTO:
-        place = os.environ.get("RAY_ADDRESS") or _started_here()
+    place, name = address, "address"
+    if address == _AUTO and (said := os.environ.get(_VARIABLE)):
+        place, name = said, _VARIABLE
+    if place == _AUTO:
+        place = _started_here()
     if place.startswith("ray://"):
         raise SettingsError(
-            f"address: expected auto or host:port, such as 10.0.0.5:6379, found {place!r}, which is for Ray's client. "
+            f"{name}: expected auto or host:port, such as 10.0.0.5:6379, found {place!r}, which is for Ray's client. "
             "Run bam-train on a computer of the cluster and give --address auto"
         )
     parts = re.fullmatch(r"(\[[0-9a-fA-F:.]+\]|[^\s:/]+):(\d{1,5})", place)
     if parts is None or not 0 < int(parts[2]) < 2**16:
-        raise SettingsError(f"address: expected auto or host:port, such as 10.0.0.5:6379, found {place!r}")
+        raise SettingsError(f"{name}: expected auto or host:port, such as 10.0.0.5:6379, found {place!r}")
     return place
 
 

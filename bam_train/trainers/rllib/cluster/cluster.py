@@ -12,6 +12,7 @@ import importlib
 import logging
 import os
 import secrets
+import shutil
 import signal
 import sys
 import threading
@@ -24,6 +25,7 @@ import ray.rllib  # sets up its loggers
 
 from bam_train.errors import TrainingFailed
 from bam_train.settings import TrainSettings
+from bam_train.trainers.at_quit import at_quit
 from bam_train.trainers.rllib.cluster.address import find, reach
 from bam_train.trainers.rllib.cluster.descendants import Descendants
 from bam_train.trainers.rllib.cluster.fault_tolerance import fault_tolerance
@@ -71,15 +73,22 @@ def cluster(settings: TrainSettings) -> Iterator[None]:
 def _own(settings: TrainSettings) -> Iterator[None]:
     """A Ray of the run's own, on this computer alone."""
     descendants = Descendants()
-    with own_folder() as folder, _private_token():
+    with own_folder() as folder, at_quit(lambda: _abandon(descendants, folder)), _private_token():
         try:
             _start(folder, gpus(settings))
             yield
         finally:
-            descendants.watch()
-            with contextlib.suppress(Exception):  # whatever it says about its end, nothing of it must be left
-                ray.shutdown(wait_for_processes=True)
-            descendants.end()
+            with _undisturbed():
+                descendants.watch()
+                with contextlib.suppress(Exception):  # whatever it says about its end, nothing of it must be left
+                    _shut_down(wait_for_processes=True)
+                descendants.end()
+
+
+def _abandon(descendants: Descendants, folder: Path) -> None:
+    """What `_own` does at its end, without waiting for anything; two of Ray's processes would go on for a minute."""
+    descendants.kill()
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _start(folder: Path, num_gpus: int) -> None:
@@ -183,7 +192,7 @@ def _quiet() -> Iterator[None]:
     loggers = [logging.getLogger(name) for name in _LOGGERS]
     before = [(logger, logger.handlers[:], logger.propagate) for logger in loggers]
     said = worker.print_to_stdstream
-    worker.print_to_stdstream = _say_nothing  # prints dead processes on standard output, whatever `ray.init` is given
+    worker.print_to_stdstream = _nothing  # prints dead processes on standard output, whatever `ray.init` is given
     _hush()
     try:
         yield
@@ -216,26 +225,38 @@ def _hush() -> None:
         logger.handlers[:], logger.propagate = [logging.NullHandler()], False
 
 
-def _say_nothing(*_: object, **__: object) -> None:
+def _nothing(*_: object, **__: object) -> None:
     return
 
 
 @contextlib.contextmanager
 def _own_signals() -> Iterator[None]:
-    """Keeps the handler of SIGTERM, which `ray.init` replaces; signals wait until the end: Ray's C++ would abort."""
+    """Signals wait until the end, as Ray's C++ would abort; `ray.init` may not take SIGTERM, to exit with status 15."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+    from ray._private import utils
+
     came: list[int] = []
-    numbers = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) is not None]
-    before = [(number, signal.signal(number, lambda number, _: came.append(number))) for number in numbers]
+    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    heard = [number for number in numbers if signal.getsignal(number) is not None]
+    before = [(number, signal.signal(number, lambda number, _: came.append(number))) for number in heard]
+    rays, utils.set_sigterm_handler = utils.set_sigterm_handler, _nothing
     try:
         yield
     finally:
+        utils.set_sigterm_handler = rays
         for number, handler in before:
             signal.signal(number, handler)
     if came:
         signal.raise_signal(came[0])
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Another Ctrl-C waits until Ray is gone: half of it would be left. A handler that quits at once is let do so."""
+    with _own_signals() if signal.getsignal(signal.SIGINT) is signal.default_int_handler else contextlib.nullcontext():
+        yield
 
 
 @contextlib.contextmanager
@@ -248,4 +269,30 @@ def _joined(address: str) -> Iterator[None]:
             ray.init(address=place, log_to_driver=False, configure_logging=False)
         yield
     finally:
-        ray.shutdown()
+        _shut_down()
+
+
+def _shut_down(**given: bool) -> None:
+    """Ray's C++ leaves SIGTERM to kill the process, and Python does not know: a robot would no longer be halted."""
+    from ray._private import worker
+
+    node: Any = worker._global_node
+    if node is not None:
+        rays = node.kill_all_processes
+
+        def kill_all(**how: bool) -> None:
+            _hear_sigterm()
+            rays(**how)
+
+        node.kill_all_processes = kill_all  # comes after the C++, and takes seconds
+    try:
+        ray.shutdown(**given)
+    finally:
+        _hear_sigterm()
+
+
+def _hear_sigterm() -> None:
+    """The handler that Python knows of, again."""
+    handler = signal.getsignal(signal.SIGTERM)
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)

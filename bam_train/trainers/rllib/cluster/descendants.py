@@ -39,6 +39,13 @@ class Descendants:
                 process.kill()
         psutil.wait_procs(alive, timeout=GRACE)
 
+    def kill(self) -> None:
+        """End all of them here and now, and wait for none."""
+        self.watch()
+        for process in self._watched:
+            with contextlib.suppress(psutil.Error):
+                process.kill()
+
     def _children(self) -> list[Any]:
         children: list[Any] = psutil.Process().children()
         return children

@@ -13,7 +13,7 @@ from typing import Any
 
 from ray.exceptions import RayError
 
-from bam_train.errors import ProcessesLost, TrainingFailed
+from bam_train.errors import ProcessesLost, SettingsError, TrainingFailed
 from bam_train.trainers.rllib.cluster import faults
 
 SAMPLE_TIMEOUT = 60.0
@@ -95,6 +95,8 @@ class RunnerWatch:
         try:
             result: dict[str, Any] = self._algorithm.train()
         except RayError as error:
+            if isinstance(cause := getattr(error, "cause", None), SettingsError):  # of recorded episodes, in a learner
+                raise cause from error
             why = " ".join(str(error).split())
             raise TrainingFailed(f"a process of the cluster that training needs is gone ({why:.300})") from error
         self._look()

@@ -18,7 +18,18 @@ LONGEST = 500
 
 
 class FaultReporting:
-    """Beside a runner class, before it: what goes wrong in `sample` is reported, and raised as it was."""
+    """Beside a runner class, before it: what goes wrong in `sample` is reported, and raised as it was.
+
+    So is what goes wrong while it is made, such as its environment on a computer that lacks something.
+    """
+
+    def __init__(self, **named: Any) -> None:
+        try:
+            super().__init__(**named)
+        except Exception as error:
+            if index := int(named.get("worker_index") or 0):
+                report(index, _own_cause(error))
+            raise
 
     def sample(self, *arguments: Any, **named: Any) -> Any:
         """Collect samples as the runner does."""
@@ -54,6 +65,14 @@ def take(index: int) -> str | None:
     if text is not None:
         internal_kv._internal_kv_del(_key(index))
     return None if text is None else text.decode(errors="replace")
+
+
+def take_first(number: int) -> str | None:
+    """Why the first that died of runners 1 to `number` did, as far as one could say."""
+    if not internal_kv._internal_kv_initialized():
+        return None
+    said = ((index, take(index)) for index in range(1, number + 1))
+    return next((f"env runner {index} died ({why})" for index, why in said if why), None)
 
 
 def _key(index: int) -> bytes:

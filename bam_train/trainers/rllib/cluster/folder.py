@@ -18,7 +18,7 @@ try:
 except ImportError:  # Windows: folders that were left stay
     fcntl = None  # type: ignore[assignment]
 
-_PREFIX, _LOCK = "bam-ray-", "in-use"
+_PREFIX, _LOCK, _NEW = "bam-ray-", "in-use", "new"
 
 
 @contextlib.contextmanager
@@ -31,9 +31,10 @@ def own_folder(root: str | None = None) -> Iterator[Path]:
     root = root or ("/tmp" if os.path.isdir("/tmp") else tempfile.gettempdir())
     _take_away_left(Path(root))
     folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=root))
-    lock = os.open(folder / _LOCK, os.O_CREAT | os.O_RDWR, 0o600)
+    lock = os.open(folder / _NEW, os.O_CREAT | os.O_RDWR, 0o600)
     try:
-        _locked(lock)
+        if _locked(lock):
+            os.rename(folder / _NEW, folder / _LOCK)  # under this name others try it, and it is locked by now
         yield folder
     finally:
         os.close(lock)

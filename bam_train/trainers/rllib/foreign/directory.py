@@ -5,17 +5,20 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import stat
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from bam_train.errors import AlteredCheckpoint, CheckpointMismatch, FormatError, NotACheckpoint
-from bam_train.trainers.rllib.pickles import RefusedPickle, read_record, read_state
+from bam_train.trainers.rllib.pickles import RefusedPickle, read_outline, read_record, read_state
 
 STATE, MODULE, ARGUMENTS = "policy_state.pkl", "module_state.pkl", "class_and_ctor_args.pkl"
 _MODULES = ("learner_group/learner/rl_module", "learner/rl_module", "rl_module")
 _VERSIONS = ("1.0", "1.1", "2.0", "2.1")
+_MSGPACK = "was written as msgpack; expected pickles. Save it again without use_msgpack"
+_MOST_BYTES = {".json": 2**20}  # of others: what `pickles` reads
 _AGAIN = "Copy it again from its source"
 _TRUST = "If you trust its maker, add --trust-pickle, which runs what is in it"
 
@@ -52,6 +55,10 @@ class Directory:
         """Read what a file says of RLlib's objects, without making them."""
         return self._read(path, read_record)
 
+    def outline(self, path: Path) -> Any:
+        """Read what a file says of objects of any kind; whatever they are, they are not made."""
+        return self._read(path, read_outline)
+
     def member(self, path: Path) -> str:
         """A file's name as errors say it."""
         above = self.folder if path.is_relative_to(self.folder) else self.root
@@ -83,11 +90,23 @@ class Directory:
 
     def _bytes(self, path: Path) -> bytes:
         try:
-            return path.read_bytes()
+            return _content(path)
         except FileNotFoundError as error:
+            if any(path.with_suffix(suffix).exists() for suffix in (".msgpack", ".msgpck")):
+                raise NotACheckpoint(self.given, _MSGPACK) from error
             raise self.altered(path, f"is missing. {_AGAIN}, whole") from error
         except OSError as error:
             raise self.altered(path, f"cannot be read: {error.strerror or error}") from error
+
+
+def _content(path: Path) -> bytes:
+    """Read a file; a pipe or a device, which may never end, is refused unopened."""
+    found, most = path.stat(), _MOST_BYTES.get(path.suffix, 2**31)
+    if not stat.S_ISREG(found.st_mode):
+        raise OSError(None, "it is not a file")
+    if found.st_size > most:
+        raise OSError(None, f"it has {found.st_size} bytes, expected at most {most}")
+    return path.read_bytes()
 
 
 def find_policy(
@@ -114,16 +133,21 @@ def find_policy(
     chosen = _chosen(given, policies, name)
     facts = (_facts(root) if root else {}) or _facts(policies[chosen])
     _require_version(given, facts)
-    made_by = str(facts.get("ray_version", ""))
+    made_by = _version(facts.get("ray_version", ""))
     return Directory(given, folder, root, policies[chosen], chosen, old, made_by, trust=trust, warn=warn)
 
 
 def _require_version(given: Path, facts: Mapping[str, Any]) -> None:
-    version = str(facts.get("checkpoint_version", _VERSIONS[-1]))
+    version = _version(facts.get("checkpoint_version", _VERSIONS[-1]))
     if version not in _VERSIONS:
-        by = f" by Ray {facts['ray_version']}" if facts.get("ray_version") else ""
+        by = f" by Ray {_version(facts['ray_version'])}" if facts.get("ray_version") else ""
         text = f"was written{by} in checkpoint version {version}; expected one of {', '.join(_VERSIONS)}"
         raise CheckpointMismatch(given, f"{text}. Load it and save it again with Ray 2.60")
+
+
+def _version(value: Any) -> str:
+    """A version as a file says it, which may be anything: one short word."""
+    return "".join(letter for letter in str(value) if letter.isprintable() and letter != " ")[:40]
 
 
 def _policies(given: Path) -> tuple[Path | None, dict[str, Path], bool]:
@@ -135,7 +159,7 @@ def _policies(given: Path) -> tuple[Path | None, dict[str, Path], bool]:
         return given, {one.name: one for one in sorted((given / "policies").iterdir()) if one.is_dir()}, True
     for below in _MODULES:
         if (given / below).is_dir():
-            return _root_of(given / below), _modules(given / below), False
+            return _root_of(given / below), _modules(given / below) or _alone(given / below), False
     if (given / MODULE).is_file() or (given / ARGUMENTS).is_file():
         several = _modules(given)
         return _root_of(given if several else given.parent), several or _alone(given), False
@@ -144,9 +168,14 @@ def _policies(given: Path) -> tuple[Path | None, dict[str, Path], bool]:
 
 def _modules(folder: Path) -> dict[str, Path]:
     """The folders of modules in the folder of a MultiRLModule."""
-    return {
-        one.name: one for one in sorted(folder.iterdir()) if (one / ARGUMENTS).is_file() or (one / MODULE).is_file()
-    }
+    return {one.name: one for one in sorted(folder.iterdir()) if _is_module(one)}
+
+
+def _is_module(folder: Path) -> bool:
+    """Whether it is a module's, even one whose weights are missing; connectors and learners have a ``state``."""
+    if (folder / MODULE).is_file():
+        return True
+    return (folder / ARGUMENTS).is_file() and not any(folder.glob("state.*"))
 
 
 def _alone(folder: Path) -> dict[str, Path]:
@@ -180,13 +209,15 @@ def _facts(folder: Path) -> dict[str, Any]:
         if not path.is_file():
             continue
         try:
-            facts = json.loads(path.read_bytes())
-        except (OSError, ValueError, RecursionError) as error:
+            facts = json.loads(_content(path))
+        except OSError as error:
+            raise AlteredCheckpoint(folder, name, f"{name} cannot be read: {error.strerror or error}") from error
+        except (ValueError, RecursionError) as error:
             raise AlteredCheckpoint(folder, name, f"{name} is not JSON ({error}). {_AGAIN}") from error
         if not isinstance(facts, dict):
             raise AlteredCheckpoint(folder, name, f"{name} holds a {type(facts).__name__}, expected an object")
         if facts.get("format") == "msgpack":
-            raise NotACheckpoint(folder, "was written as msgpack; expected pickles. Save it again without use_msgpack")
+            raise NotACheckpoint(folder, _MSGPACK)
         return facts
     return {}
 
@@ -209,8 +240,9 @@ def _not_rllib(given: Path) -> str:
     inside = sorted(one.name for one in given.glob("checkpoint_*") if one.is_dir())
     if inside:
         return f"is a folder of {len(inside)} checkpoints; give one of them, such as {given / inside[-1]}"
-    if any(given.rglob("*.msgpack")) or any(given.rglob("*.msgpck")):
-        return "was written as msgpack; expected pickles. Save it again without use_msgpack"
+    below = [given, *(given / name for name in ("learner_group", "policies", "env_runner"))]  # not all, which may be /
+    if any(any(folder.glob("*.msgp*ck")) for folder in below):
+        return _MSGPACK
     if any(given.glob("checkpoint-[0-9]*")):
         return "was written by a Ray before 2.1; load and save it with a newer one"
     if (given / "rllib_checkpoint.json").is_file() or (given / "algorithm_state.pkl").is_file():

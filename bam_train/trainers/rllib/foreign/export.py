@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib import metadata
@@ -18,7 +19,7 @@ import numpy as np
 from gymnasium import spaces
 
 from bam_envs.errors import UnknownName
-from bam_envs.registry import resolve_id
+from bam_envs.registry import are_same, resolve_id
 from bam_envs.spaces import space_to_json
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, safetensors_file, write_checkpoint
 from bam_train.environments import control_period, first_difference, make_env
@@ -26,15 +27,18 @@ from bam_train.errors import CheckpointMismatch, PolicyError
 from bam_train.policy import FrozenPolicy
 from bam_train.policy.golden import TOLERANCE, worst_difference
 from bam_train.policy.spaces import leaf, leaves
-from bam_train.trainers.provenance import git_commit, now, versions
+from bam_train.trainers.freezing.golden import pack
+from bam_train.trainers.manifest import origin
 from bam_train.trainers.rllib.foreign.directory import Directory, find_policy
 from bam_train.trainers.rllib.foreign.parts import ForeignPolicy
 from bam_train.trainers.rllib.foreign.reading import read_policy
 from bam_train.trainers.rllib.freezing.by_hand import actions_by_hand
 from bam_train.trainers.rllib.freezing.freeze import freeze
-from bam_train.trainers.rllib.freezing.golden import clear_observations, pack
+from bam_train.trainers.rllib.freezing.golden import clear_observations
 from bam_train.trainers.rllib.freezing.parts import AnySpace, Array, PolicyParts, leaf_spaces
+from bam_train.trainers.rllib_algorithms import ALGORITHMS
 
+_OWN_MODULES = ("bam_envs", "bam_train", "gymnasium")
 EXPORTED = "exported"
 """Setting of the manifest that says where an exported checkpoint comes from; a run's own has none of this name."""
 
@@ -87,9 +91,7 @@ class Exported:
             "steps": self.steps,
             "seed": 0,
             "scores": {},
-            "versions": versions(),
-            "git_commit": git_commit(),
-            "created": now(),
+            **origin(),
         }
         return write_checkpoint(path, fields, {POLICY: self.graph, GOLDEN: self.golden})
 
@@ -118,7 +120,7 @@ def export(
     Raises:
         CheckpointError: The directory cannot be used.
         PolicyError: Its policy cannot be frozen.
-        UnknownName: No environment is called `env`.
+        UnknownName: No environment is called `env`, or no algorithm `algo`.
         SettingsError: The environment cannot be made.
     """
     directory = find_policy(given, policy, trust=trust, warn=warn)
@@ -148,7 +150,10 @@ def _spaces(parts: PolicyParts) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def _algorithm(directory: Directory, foreign: ForeignPolicy, asked: str | None) -> str:
-    found = foreign.parts.algorithm
+    found = foreign.parts.algorithm if re.fullmatch(r"\w{1,40}", foreign.parts.algorithm, re.ASCII) else ""
+    asked = None if asked is None else asked.lower()  # PPO, as RLlib says it
+    if asked is not None and asked not in ALGORITHMS:
+        raise UnknownName("algorithm", asked, ALGORITHMS)
     if asked is None and not found:
         raise CheckpointMismatch(directory.given, "does not say which algorithm trained it; give --algo NAME")
     if asked is not None and found and asked != found and foreign.algorithm_known:
@@ -158,27 +163,52 @@ def _algorithm(directory: Directory, foreign: ForeignPolicy, asked: str | None) 
 
 def _environment(directory: Directory, foreign: ForeignPolicy, asked: str | None) -> tuple[str, dict[str, Any]]:
     """Id and keyword arguments of the environment: what was asked for, else what the directory says."""
-    own = None
-    if foreign.env is not None:
-        try:
-            own = resolve_id(foreign.env)
-        except UnknownName as error:
-            if asked is None:
-                text = f"was trained on {foreign.env!r}, which is not known here; give --env ID, or --env module:ID"
-                raise CheckpointMismatch(directory.given, text) from error
+    own = _own_environment(directory, foreign.env, asked)
     if asked is None and own is None:
         raise CheckpointMismatch(directory.given, "does not say on which environment it was trained; give --env ID")
     env = resolve_id(asked) if asked is not None else str(own)
-    return env, _plain(directory, foreign.env_kwargs, asked) if env == own else {}
+    if own is not None and are_same(env, own):
+        return env, _plain(directory, foreign.env_kwargs)
+    if foreign.env_kwargs:
+        names = ", ".join(map(str, foreign.env_kwargs))
+        directory.warn(f"the env_config of its own environment ({names:.200}) is not given to {env}")
+    return env, {}
 
 
-def _plain(directory: Directory, kwargs: Mapping[str, Any], asked: str | None) -> dict[str, Any]:
-    """Keyword arguments as JSON values."""
+def _own_environment(directory: Directory, name: str | None, asked: str | None) -> str | None:
+    """The environment that the directory names, if it is known here; its module is imported only if the user says so.
+
+    Raises:
+        CheckpointMismatch: It is not known, and no other was asked for.
+    """
+    module = (name or "").rpartition(":")[0]
+    if name is None or (asked is not None and module and asked != name):
+        return None
+    if module and asked is None and not directory.trust and module.split(".")[0] not in _OWN_MODULES:
+        text = f"was trained on {name!r}, and importing {module!r} runs its code. If you trust it, give --env {name!r}"
+        raise CheckpointMismatch(directory.given, text)
     try:
-        return dict(json.loads(json.dumps(dict(kwargs), allow_nan=False)))
+        return resolve_id(name)
+    except UnknownName as error:
+        if asked is not None:
+            return None
+        text = f"was trained on {name!r}, which is not known here; give --env ID, or --env module:ID"
+        raise CheckpointMismatch(directory.given, text) from error
+
+
+def _plain(directory: Directory, kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """Keyword arguments as JSON values; NumPy's numbers and arrays as Python's."""
+    try:
+        return dict(json.loads(json.dumps(dict(kwargs), allow_nan=False, default=_of_numpy)))
     except (TypeError, ValueError, RecursionError) as error:
         text = f"its env_config holds more than plain values ({', '.join(map(str, kwargs))}), which cannot be kept"
         raise CheckpointMismatch(directory.given, f"{text}; train with plain ones") from error
+
+
+def _of_numpy(value: Any) -> Any:
+    if not isinstance(value, (np.ndarray, np.generic)):
+        raise TypeError(type(value).__name__)
+    return value.tolist()
 
 
 def _fitted(

@@ -54,7 +54,7 @@ def _new_policy(directory: Directory) -> ForeignPolicy:
     name = class_name(own_class)
     weights = read_weights(directory, directory.policy / MODULE, directory.state(directory.policy / MODULE))
     config = _config(directory)
-    pipelines = None if directory.root is None else _pipelines(directory)
+    pipelines = _pipelines(directory)
     seen = _spaces(directory, given)
     fields: dict[str, Any] = {"observation_space": seen[0], "action_space": seen[1], **(pipelines or {})}
     parts = PolicyParts(
@@ -70,8 +70,12 @@ def _new_policy(directory: Directory) -> ForeignPolicy:
 
 
 def _arguments(directory: Directory, path: Any) -> tuple[Any, tuple[Any, ...], dict[str, Any]]:
+    return _constructor(directory, path, directory.record(path))
+
+
+def _constructor(directory: Directory, path: Any, value: Any) -> tuple[Any, tuple[Any, ...], dict[str, Any]]:
     try:
-        return constructor(directory.record(path))
+        return constructor(value)
     except FormatError as error:
         raise directory.altered(path, str(error)) from error
 
@@ -125,7 +129,7 @@ def _config(directory: Directory) -> _Config:
     if path is None or not path.is_file():
         return _Config()
     try:
-        kind, args, kwargs = _arguments(directory, path)
+        kind, args, kwargs = _constructor(directory, path, directory.outline(path))
     except AlteredCheckpoint as error:
         directory.warn(f"{error.member} says more than names and numbers, and is left out")
         return _Config()

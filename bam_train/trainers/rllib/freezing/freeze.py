@@ -9,26 +9,23 @@ the first axis is the batch.
 from __future__ import annotations
 
 import copy
-import io
-import warnings
 from typing import Any
 
 import torch
 from gymnasium import spaces
 
 from bam_train.errors import PolicyError
-from bam_train.trainers.rllib.freezing.layers import Layer, encoder, head, outputs_of, torch_dtype
+from bam_train.trainers.freezing.layers import Layer, zeros
+from bam_train.trainers.freezing.onnx_export import onnx_file
+from bam_train.trainers.rllib.freezing.layers import encoder, head, outputs_of
 from bam_train.trainers.rllib.freezing.network import network
 from bam_train.trainers.rllib.freezing.parts import PolicyParts, leaf_spaces
 
 __all__ = ["FrozenModule", "freeze"]
 
-_OPSET = 17
-# The TorchScript exporter says that it will go; it is 20 times as fast as its successor and needs no onnxscript.
-_NOTICES = {
-    "You are using the legacy TorchScript-based ONNX export": DeprecationWarning,
-    "The feature will be removed": DeprecationWarning,
+_SAYS_NOTHING = {
     "Constant folding - Only steps=1 can be constant folded": UserWarning,  # of the padding of images
+    "": torch.jit.TracerWarning,  # whether outputs are cut off never changes
 }
 
 
@@ -39,23 +36,7 @@ def freeze(parts: PolicyParts) -> bytes:
         PolicyError: The network, a connector or a space is of a kind that cannot be frozen.
     """
     module = FrozenModule(parts)
-    inputs = module.example_inputs()
-    file = io.BytesIO()
-    with torch.no_grad(), warnings.catch_warnings():
-        for text, kind in _NOTICES.items():
-            warnings.filterwarnings("ignore", text, kind)
-        warnings.simplefilter("ignore", torch.jit.TracerWarning)  # whether outputs are cut off never changes
-        torch.onnx.export(
-            module,
-            tuple(inputs.values()),
-            file,
-            dynamo=False,
-            opset_version=_OPSET,
-            input_names=list(inputs),
-            output_names=["action"],
-            dynamic_axes={name: {0: "n"} for name in [*inputs, "action"]},
-        )
-    return file.getvalue()
+    return onnx_file(module, module.example_inputs(), ["action"], _SAYS_NOTHING)
 
 
 class FrozenModule(Layer):
@@ -74,12 +55,7 @@ class FrozenModule(Layer):
 
     def example_inputs(self) -> dict[str, torch.Tensor]:
         """Two rows of zeros for every input, by name."""
-        return {
-            f"observation.{key}" if self.is_dict else "observation": torch.zeros(
-                (2, *(space.shape or ())), dtype=torch_dtype(space.dtype)
-            )
-            for key, space in self.raw.items()
-        }
+        return zeros(self.raw, self.is_dict)
 
     def scores(self, *observation: torch.Tensor) -> torch.Tensor:
         """Return what the action is made of, (n, k) float32: means, logits or values."""

@@ -11,12 +11,8 @@ from gymnasium import spaces
 from torch import nn
 
 from bam_train.errors import PolicyError
-from bam_train.trainers.rllib.freezing.parts import Array, Filter, PolicyParts, leaf_spaces
-
-
-class Layer(nn.Module):  # type: ignore[misc]
-    """A torch module; torch has no types here."""
-
+from bam_train.trainers.freezing.layers import Choice, Layer, OneHot, to
+from bam_train.trainers.rllib.freezing.parts import Filter, PolicyParts, leaf_spaces
 
 # Observation
 
@@ -65,31 +61,14 @@ class _Numbers(Layer):
         return to(x, torch.float32)
 
 
-class _OneHot(Layer):
-    """A Discrete, (n,), or MultiDiscrete, (n, k): a one-hot code of each number, side by side."""
-
-    def __init__(self, counts: Array, starts: Array) -> None:
-        super().__init__()
-        self.columns = torch.as_tensor(np.repeat(np.arange(len(counts)), counts))
-        values = [np.arange(count) + start for count, start in zip(counts, starts, strict=True)]
-        self.values = torch.as_tensor(np.concatenate(values))
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        x = x.long()
-        x = x.unsqueeze(1) if x.ndim == 1 else x.flatten(1)
-        return (x.index_select(1, self.columns) == self.values).float()
-
-
 def encoder(parts: PolicyParts) -> nn.Module:
     """Return what turns the tuple of raw arrays into what RLlib's network takes, (n, ...) float32."""
     return _Observation(parts)
 
 
 def _leaf(space: Any) -> nn.Module:
-    if isinstance(space, spaces.Discrete):
-        return _OneHot(np.array([space.n]), np.array([space.start]))
-    if isinstance(space, spaces.MultiDiscrete):
-        return _OneHot(space.nvec.ravel(), space.start.ravel())
+    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
+        return OneHot(space)
     return _Numbers(len(space.shape))
 
 
@@ -107,16 +86,6 @@ def _require_flat(parts: PolicyParts, leaves: dict[str, Any]) -> None:
     early = parts.filter is not None and (parts.filter_first or not parts.flatten)
     if early and not (single and floats):
         raise PolicyError("observation: MeanStdFilter of anything but a Box of floats cannot be frozen")
-
-
-def to(x: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
-    """Cast, without leaving a node in the graph where there is nothing to do."""
-    return x if x.dtype == dtype else x.to(dtype)
-
-
-def torch_dtype(dtype: Any) -> torch.dtype:
-    """Return torch's name for a NumPy dtype."""
-    return torch.as_tensor(np.zeros((), dtype)).dtype
 
 
 # Action
@@ -146,35 +115,13 @@ class _Continuous(Layer):
         return torch.ones(len(scores))
 
 
-class _Choice(Layer):
-    """The best of each group of scores, counted from ``starts``: Discrete gives (n,), MultiDiscrete (n, k)."""
-
-    def __init__(self, counts: list[int], starts: Array, dtype: torch.dtype) -> None:
-        super().__init__()
-        self.counts, self.starts, self.dtype = counts, torch.as_tensor(starts), dtype
-        self.single, self.shifted = np.ndim(starts) == 0, bool(np.any(starts))
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        if self.single:
-            best = x.argmax(1)
-        else:
-            best = torch.cat([group.argmax(1, keepdim=True) for group in x.split(self.counts, dim=1)], 1)
-        return to(best + self.starts if self.shifted else best, self.dtype)
-
-    def margin(self, scores: torch.Tensor) -> torch.Tensor:
-        gaps = [group.topk(2)[0] for group in scores.split(self.counts, dim=1) if group.shape[1] > 1]
-        return torch.stack([gap[:, 0] - gap[:, 1] for gap in gaps]).amin(0) if gaps else torch.ones(len(scores))
-
-
 def head(parts: PolicyParts) -> nn.Module:
     """Return what turns the network's output into an action of the environment's space."""
     space = parts.action_space
     if isinstance(space, spaces.Box) and len(space.shape) == 1 and np.issubdtype(space.dtype, np.floating):
         return _Continuous(space, parts)
-    if isinstance(space, spaces.Discrete):
-        return _Choice([int(space.n)], np.asarray(space.start), torch.int64)
-    if isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim == 1:
-        return _Choice(space.nvec.tolist(), space.start, torch_dtype(space.dtype))
+    if isinstance(space, spaces.Discrete) or (isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim == 1):
+        return Choice(space)
     expected = "a Box of floats with one axis, a Discrete or a MultiDiscrete"
     raise PolicyError(f"action space {space} cannot be frozen; expected {expected}")
 

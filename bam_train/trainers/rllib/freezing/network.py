@@ -16,7 +16,8 @@ import torch
 from torch import nn
 
 from bam_train.errors import PolicyError
-from bam_train.trainers.rllib.freezing.layers import Layer, outputs_of
+from bam_train.trainers.freezing.layers import Layer
+from bam_train.trainers.rllib.freezing.layers import outputs_of
 from bam_train.trainers.rllib.freezing.parts import Array, PolicyParts, leaf_spaces
 
 _EPSILON = 1e-3  # of RLlib's layer norms

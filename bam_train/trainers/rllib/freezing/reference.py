@@ -26,6 +26,7 @@ from ray.rllib.utils.filter import RunningStat
 from bam_train.errors import PolicyError
 from bam_train.trainers.rllib.freezing.golden import rows, shifted
 from bam_train.trainers.rllib.freezing.parts import Array, Filter, PolicyParts
+from bam_train.trainers.sb3.from_zero import less_start
 
 _OWN = re.compile(r"(ray\.rllib\.algorithms\.\w+\.torch\.default_\w+_torch_rl_module)\.(Default\w+TorchRLModule)")
 
@@ -34,7 +35,7 @@ def rllib_actions(
     parts: PolicyParts, module: Any, env_to_module: Any, config: Any, observations: dict[str, Array]
 ) -> Array:
     """Return RLlib's own deterministic actions for raw observations, in the environment's action space, (n, ...)."""
-    each = rows(observations)
+    each = [less_start(parts.observation_space, one) for one in rows(observations)]  # RLlib counts from 0
     episodes = [
         SingleAgentEpisode(
             observations=[one], observation_space=parts.observation_space, action_space=parts.action_space

@@ -48,7 +48,7 @@ def live_robot(
             what `spec` names.
         UnknownName: There is no such profile, or no such way of sending commands.
     """
-    _require_robot_address(url)
+    require_robot_address(url)
     require_tls(url, ca_file)
     chosen = _profile(profile, spec)
     robot = RosbridgeRobot(
@@ -71,7 +71,12 @@ def _profile(profile: RobotProfile | str | Path | None, spec: RobotSpec | None) 
     return load_profile(DEFAULT_PROFILE) if spec is None else profile_for(spec)
 
 
-def _require_robot_address(url: str) -> None:
+def require_robot_address(url: str) -> None:
+    """Refuse what is no address of a live robot, by its form alone.
+
+    Raises:
+        InvalidValue: Says what was expected.
+    """
     scheme, separator, _ = url.partition("://")
     if separator and scheme in ("ws", "wss"):
         return

@@ -41,6 +41,8 @@ class Source:
     """How many numbers of `field` to leave out at the beginning and at the end."""
     missing: float | None = None
     """What null, NaN and infinities in `field` mean; None: they are errors."""
+    within: tuple[float, float] | None = None
+    """Least and greatest that its numbers can be, as they travel: what is beyond is cut. None: as they come."""
     max_age: float | None = None
     """Oldest that is acted on [s]; None: the profile's."""
     optional: bool = False

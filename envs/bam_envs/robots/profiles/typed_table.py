@@ -99,6 +99,11 @@ def _pair(value: Any) -> Any:
     return values if values is not _MISFIT and len(values) == 2 else _MISFIT
 
 
+def _range(value: Any) -> Any:
+    values = _several(_number)(value)
+    return values if values is not _MISFIT and len(values) == 2 and values[0] <= values[1] else _MISFIT
+
+
 def _named(read: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """Reads a table of what `read` reads."""
 
@@ -119,6 +124,7 @@ _READERS: dict[str, tuple[str, Callable[[Any], Any]]] = {
     str(tuple[str, ...]): ("a list of texts", _several(_text)),
     str(tuple[float, ...]): ("a list of finite numbers", _several(_number)),
     str(tuple[int, int]): ("two counts", _pair),
+    str(tuple[float, float] | None): ("two finite numbers, the least first", _range),
     str(Mapping[str, float]): ("a table of finite numbers", _named(_number)),
     str(Mapping[str, str]): ("a table of texts", _named(_text)),
 }

@@ -107,8 +107,8 @@ class SimulatedBase(Drawn):
         if len(touching):
             where = np.round(pose[touching[0]], 3).tolist()
             raise InvalidValue(
-                f"base_pose must be free for the base to stand; at {where} (x, y [m], yaw [rad]) it touches a wall or "
-                f"a box.{_inside(self.room)}"
+                f"The base cannot start at {where} (x, y [m], yaw [rad]): it touches a wall or a box there."
+                f"{_inside(self.room)}"
             )
 
     def step(self, command: Array) -> RobotState:

@@ -128,7 +128,7 @@ def decode_source(source: Source, message: object, size: int) -> Array:
         raw = _by_name(source, content, where)
     else:
         raw = _in_order(source, content, where, size)
-    return _to_si(source, raw)
+    return _to_si(source, raw if source.within is None else np.clip(raw, *source.within))
 
 
 def _in_order(source: Source, message: Message, where: str, size: int) -> Array:

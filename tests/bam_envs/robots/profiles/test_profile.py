@@ -276,6 +276,11 @@ ignore: [finger_joint, elbow_joint]
             "FILE: state[0]: scale must have 1 or 1 values, not 2.",
         ),
         ("scale = 0.001\n\n[[commands", "skip = 3\n\n[[commands", "FILE: state[0]: skip must be two counts, not 3."),
+        (
+            "scale = 0.001\n\n[[commands",
+            "within = [2, 1]\n\n[[commands",
+            "FILE: state[0]: within must be two finite numbers, the least first, not [2, 1].",
+        ),
         ("scale = 0.001\n\n[[commands", "max_age = 0\n\n[[commands", "FILE: state[0]: max_age must be above 0, not 0."),
         (
             "scale = 0.001\n\n[[commands",

@@ -151,8 +151,8 @@ def test_a_start_where_something_is(pose):
     with pytest.raises(InvalidValue) as caught:
         started(pose, boxes=[(0.5, 0.0, 0.0)])
     assert str(caught.value) == (
-        f"base_pose must be free for the base to stand; at {list(pose)} (x, y [m], yaw [rad]) it touches a wall or a "
-        "box. The walls are at x -2.877 and 2.823 m, y -3.836 and 3.864 m."
+        f"The base cannot start at {list(pose)} (x, y [m], yaw [rad]): it touches a wall or a box there. "
+        "The walls are at x -2.877 and 2.823 m, y -3.836 and 3.864 m."
     )
 
 

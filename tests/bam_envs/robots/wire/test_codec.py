@@ -30,7 +30,8 @@ FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64)
 
 
 def state_of(profile, rng, rows=1):
-    signals = {one.name: rng.uniform(-1, 1, (rows, len(one.labels))) for one in profile.signals}
+    lows = {one.name: 0.1 if "scan" in one.name else -1.0 for one in profile.signals}  # what is nearer is cut
+    signals = {one.name: rng.uniform(lows[one.name], 1, (rows, len(one.labels))) for one in profile.signals}
     return RobotState(signals, np.zeros(rows), np.zeros((rows, len(profile.command.labels))))
 
 
@@ -188,6 +189,13 @@ def test_rays_that_see_nothing():
     ranges[40] = "far"
     assert complaint({"ranges": ranges}, "f_scan", BASE) == "/f_scan: ranges[40] must be a finite number, not 'far'."
     assert complaint({"ranges": "far"}, "f_scan", BASE) == "/f_scan: ranges must be a list of numbers, not 'far'."
+
+
+def test_rays_nearer_and_farther_than_a_scanner_measures():
+    """As robo-gym's robot server has them, and simulated scanners."""
+    ranges = [0.0] * 30 + [0.0, 0.01, 30.0, 1e9] + [1.0] * 497 + [0.0] * 10
+    decoded = decode_state(BASE, {"f_scan": {"ranges": ranges}})["f_scan"]
+    np.testing.assert_array_equal(decoded, [0.05, 0.05, 29.0, 29.0] + [1.0] * 497)
 
 
 @pytest.mark.parametrize(

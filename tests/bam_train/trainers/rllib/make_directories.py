@@ -1,16 +1,20 @@
-"""Run with a folder as argument: RLlib writes checkpoint directories into it, and its own actions beside them.
+"""Run with a folder and an API, new or old: RLlib writes checkpoint directories, and its own actions beside them.
 
 In a process of its own, so that the tests neither start Ray nor import RLlib for them. ``NAME.npz`` holds observations
 and what RLlib's own restoring (`RLModule.from_checkpoint`, `Policy.from_checkpoint`) does on them.
 """
 
+import shutil
 import sys
 import tempfile
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import ray
 import torch
+from ray import cloudpickle
+from ray.actor import _modify_class
 from ray.rllib.algorithms.dqn import DQNConfig
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.algorithms.sac import SACConfig
@@ -100,6 +104,14 @@ def new_actions(folder):
     return observations, actions
 
 
+def tuned(folder, copy):
+    """The same as Ray Tune saves it: it runs an algorithm as an actor, whose class is pickled with all its code."""
+    shutil.copytree(folder, copy)
+    path = Path(copy, "class_and_ctor_args.pkl")
+    given = cloudpickle.loads(path.read_bytes())
+    path.write_bytes(cloudpickle.dumps({**given, "class": _modify_class(given["class"])}))
+
+
 def old(folder, config, env, *, steps=0, **runners):
     """An algorithm of the old API, with RLlib's actions."""
     config = (
@@ -134,21 +146,26 @@ def write(folder, observations, actions):
     np.savez(f"{folder}.npz", **arrays, action=np.stack(actions))
 
 
-def main(root):
-    ray.init("local", include_dashboard=False, log_to_driver=False, logging_level="error", num_cpus=1)
-    ppo = {"minibatch_size": 50, "num_epochs": 1}
+PPO = {"minibatch_size": 50, "num_epochs": 1}
+
+
+def all_new(root):
     batch = {"train_batch_size_per_learner": 100}
-    new(f"{root}/ppo", PPOConfig().training(**ppo, **batch), "Pendulum-v1", steps=100, pieces=[MeanStdFilter])
+    new(f"{root}/ppo", PPOConfig().training(**PPO, **batch), "Pendulum-v1", steps=100, pieces=[MeanStdFilter])
     pieces = [FlattenObservations, MeanStdFilter]
-    new(f"{root}/several", PPOConfig().training(**ppo, **batch), Several, steps=100, pieces=pieces)
+    new(f"{root}/several", PPOConfig().training(**PPO, **batch), Several, steps=100, pieces=pieces)
     new(f"{root}/sac", SACConfig(), "Pendulum-v1")
+    tuned(f"{root}/sac", f"{root}/tuned")
     new(f"{root}/dqn", DQNConfig(), "CartPole-v1")
     new(f"{root}/own", PPOConfig(), "Pendulum-v1", spec=RLModuleSpec(module_class=OwnModule))
+
+
+def all_old(root):
     model = {"fcnet_hiddens": [16, 16]}
     filtered = {"observation_filter": "MeanStdFilter", "rollout_fragment_length": 100}
     old(
         f"{root}/ppo-old",
-        PPOConfig().training(**ppo, train_batch_size=100, model=model),
+        PPOConfig().training(**PPO, train_batch_size=100, model=model),
         "Pendulum-v1",
         steps=1,
         **filtered,
@@ -157,10 +174,11 @@ def main(root):
     old(f"{root}/sac-old", SACConfig().training(replay_buffer_config=dict(BUFFER), **sac), "Pendulum-v1")
     dqn = {"model": model, "hiddens": [16]}
     old(f"{root}/dqn-old", DQNConfig().training(replay_buffer_config=dict(BUFFER), **dqn), "CartPole-v1")
-    ray.shutdown()
 
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as folder:
         trainable.DEFAULT_STORAGE_PATH = folder  # else ~/ray_results
-        main(sys.argv[1])
+        ray.init("local", include_dashboard=False, log_to_driver=False, logging_level="error", num_cpus=1)
+        {"new": all_new, "old": all_old}[sys.argv[2]](sys.argv[1])
+        ray.shutdown()

@@ -15,7 +15,15 @@ from gymnasium import spaces
 
 from bam_train.errors import FormatError
 from bam_train.trainers.rllib.foreign.records import class_name, space_of
-from bam_train.trainers.rllib.pickles import Record, RefusedPickle, dtype_of, read_record, read_state, unpacked_array
+from bam_train.trainers.rllib.pickles import (
+    Record,
+    RefusedPickle,
+    dtype_of,
+    read_outline,
+    read_record,
+    read_state,
+    unpacked_array,
+)
 
 READERS = [read_state, read_record]
 
@@ -177,6 +185,54 @@ def test_an_array_takes_no_more_memory_than_its_file():
             reader(dumped(call))
         with pytest.raises(FormatError):
             reader(dumped(np.zeros(3)).replace(b"K\x03\x85", b"K\x7f\x85"))
+
+
+DTYPE = b"cnumpy\ndtype\nX\x02\x00\x00\x00u1K\x00K\x01\x87R"
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"\x80\x04cnumpy._core.numeric\n_frombuffer\n(J\xff\xff\xff\x7f"
+        + DTYPE
+        + b"J\xff\xff\xff\x7f\x85X\x01\x00\x00\x00CtR.",
+        b"\x80\x04cnumpy._core.multiarray\nscalar\n" + DTYPE + b"J\xff\xff\xff\x7f\x86R.",
+    ],
+    ids=["array", "number"],
+)
+@pytest.mark.parametrize("reader", READERS)
+def test_a_number_does_not_become_so_many_zeros(reader, data):
+    with pytest.raises(RefusedPickle, match=r"^names an array whose data are a int, which is not read"):
+        reader(data)
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_lists_that_are_many_more_written_out(reader):
+    value, itself = ["a"], []
+    for _ in range(40):
+        value = [value, value]
+    itself.append([itself])
+    with pytest.raises(FormatError, match=r"^has more than 10000000 values$"):
+        reader(dumped({"a": value}))
+    with pytest.raises(FormatError, match=r"^holds a list within itself$"):
+        reader(dumped({"a": itself}))
+
+
+def test_an_outline_takes_any_name_and_calls_none(tmp_path):
+    mark = tmp_path / "mark"
+    found = read_outline(dumped({"class": range(3), "env": "Pendulum-v1", "more": Call(os.system, f"touch {mark}")}))
+    assert (found["env"], found["class"].name, found["more"].name) == ("Pendulum-v1", "builtins.range", "posix.system")
+    assert not mark.exists()
+    value = ["a"]
+    for _ in range(40):
+        value = [value, value]
+    with pytest.raises(FormatError, match=r"^has more than 10000000 values$"):
+        read_outline(dumped(Call(os.system, value)))
+
+
+def test_names_are_said_in_letters():
+    with pytest.raises(RefusedPickle, match=r"^names evil\?line\.A\?\[31m, which is not read"):
+        read_record(b"\x80\x04\x8c\x09evil\nline\x8c\x06A\x1b[31m\x93.")
 
 
 def test_functions_of_the_reader_keep_their_state():

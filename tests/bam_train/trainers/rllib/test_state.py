@@ -57,14 +57,15 @@ def trained(path, algo="ppo", hyper=ON_POLICY, **given):
     ("algo", "hyper", "name", "start"),
     [
         ("ppo", ON_POLICY, "curr_kl_coeffs_per_module", 0.2),
+        ("ppo", {**ON_POLICY, "entropy_coeff": [[0, 0.1], [500, 0.0]]}, "entropy_coeff_schedulers_per_module", 0.1),
         ("sac", OFF_POLICY, "curr_log_alpha", 0.0),
         ("tqc", OFF_POLICY, "curr_log_alpha", 0.0),
     ],
 )
 @pytest.mark.parametrize("learners", [0, 1])
 def test_what_adapts_itself_goes_on(tmp_path, algo, hyper, name, start, learners):
-    if learners and algo == "tqc":
-        pytest.skip("as sac")
+    if learners and (algo == "tqc" or "entropy_coeff" in hyper):
+        pytest.skip("as sac, and as ppo's other number")
     checkpoint, extras = trained(tmp_path / "a.zip", algo, hyper, num_learners=learners)
     assert extras[name][MODULE] != pytest.approx(start, abs=1e-6)
     again = RLlibTrainer.load(Checkpoint.open(checkpoint.path))

@@ -5,15 +5,17 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.spaces import Box, Dict, Discrete, Tuple
 
 pytest.importorskip("ray")
 
 import ray
 
 from bam_train.checkpoint import Checkpoint
-from bam_train.errors import CheckpointMismatch, SettingsError
+from bam_train.errors import BamTrainError, CheckpointMismatch, SettingsError
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.resolve import resolve, resolve_resumed
@@ -138,6 +140,68 @@ def test_a_foreign_environment_of_this_process_reaches_the_runners(corridor):
     trainer.close()
 
 
+class Sampled(gym.Env):
+    """Draws observations of any space, and takes any action."""
+
+    def __init__(self, observed, acted=None):
+        self.observation_space, self.action_space = observed, acted or Discrete(2, start=-1)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        return self.observation_space.sample(), 1.0, bool(self.np_random.random() < 0.1), False, {}
+
+
+@pytest.fixture
+def sampled():
+    """Registers an environment of these spaces for one test; its id."""
+
+    def make(*spaces):
+        gym.register("test/Sampled-v0", entry_point=lambda: Sampled(*spaces))
+        return "test/Sampled-v0"
+
+    yield make
+    gym.registry.pop("test/Sampled-v0", None)
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+@pytest.mark.parametrize(
+    "space",
+    [Box(0, 9, (3,), np.int32), Box(-1, 1, (3, 2)), Box(-1, 1, (), np.float64), Discrete(3, start=5)],
+    ids=["whole numbers", "two axes", "one number", "start"],
+)
+def test_observations_that_rllib_takes_as_a_vector_alone(space, normalize, sampled, tmp_path):
+    trainer = RLlibTrainer.create(settled(env=sampled(space), steps=128, normalize=normalize))
+    trainer.train(128, lambda progress: True)
+    trainer.save(tmp_path / "a.zip", {}, {"best": None})
+    assert FrozenPolicy.load(tmp_path / "a.zip").act(space.sample()) in (-1, 0)
+    assert trainer.exploring().act(space.sample()) in (-1, 0)
+    trainer.close()
+
+
+@pytest.mark.parametrize(
+    ("spaces", "hyper", "text"),
+    [
+        (
+            [Box(0, 255, (42, 42, 3), np.uint8)],
+            {},
+            "test/Sampled-v0: the rllib trainer takes images of floats, found uint8",
+        ),
+        ([Dict(a=Dict(b=Discrete(2)))], {}, "observation 'a': a Dict cannot be frozen"),
+        ([Tuple((Discrete(2),))], {}, "a Tuple cannot be frozen"),
+        ([Discrete(2), Box(-1, 1, (2, 2))], {}, "cannot be set up: Action space has multiple dimensions"),
+        ([Discrete(2)], {"use_lstm": True}, "a recurrent network of RLlib cannot be frozen; train without use_lstm"),
+    ],
+)
+def test_what_cannot_be_frozen_is_refused_before_training(spaces, hyper, text, sampled):
+    with pytest.raises(BamTrainError) as caught:
+        RLlibTrainer.create(settled(env=sampled(*spaces), hyper={**PPO, "model_config": {**SMALL, **hyper}}))
+    assert text in str(caught.value)
+
+
 @pytest.mark.parametrize(
     ("given", "text"),
     [
@@ -170,6 +234,47 @@ def test_a_foreign_environment_of_this_process_reaches_the_runners(corridor):
             "lr: expected a number or a schedule [[step, value], ...], found 'fast' (text)",
         ),
         ({"hyperparameters": {"lr": -1}}, "lr: expected a number above 0, found -1"),
+        *(
+            (
+                {"hyperparameters": {name: schedule}},
+                f"{name}: expected a number or a schedule [[0, value], [step, value]",
+            )
+            for name in ("lr", "entropy_coeff")
+            for schedule in ([], [[0, 1e-3]], [[5, 1e-3], [9, 0.0]], [[0, 1e-3], [9, 0.0], [8, 0.0]], [[0, 1e-3], [9]])
+        ),
+        ({"hyperparameters": {"lr": [[0, 1e-3], [9, -1]]}}, "lr: expected at least 0, found [[0, 0.001], [9, -1]]"),
+        ({"hyperparameters": {"gamma": None}}, "gamma: expected a number, found None"),
+        ({"hyperparameters": {"num_epochs": None}}, "num_epochs: expected an int, found None"),
+        ({"hyperparameters": {"model_config": 5}}, "model_config: expected a table, found 5 (an int)"),
+        *(
+            (
+                {"hyperparameters": {"model_config": {"fcnet_hiddens": sizes}}},
+                "model_config.fcnet_hiddens: expected one",
+            )
+            for sizes in ([], [0], [8, -3])
+        ),
+        (
+            {"hyperparameters": {"model_config": {"head_fcnet_hiddens": [0]}}},
+            "model_config.head_fcnet_hiddens: expected",
+        ),
+        ({"algo": "sac", "hyperparameters": {"n_step": 0}}, "n_step: expected at least 1, found 0"),
+        (
+            {"algo": "sac", "hyperparameters": {"target_entropy": "x"}},
+            "target_entropy: expected a number or 'auto', found",
+        ),
+        ({"algo": "sac", "hyperparameters": {"n_step": [3, 1]}}, "n_step: expected [least, most] of at least 1, found"),
+        (
+            {"algo": "sac", "hyperparameters": {"initial_alpha": -1}},
+            "initial_alpha: expected a number above 0, found -1",
+        ),
+        *(
+            ({"algo": "sac", "hyperparameters": {"replay_buffer_config": buffer}}, f"replay_buffer_config{text}")
+            for buffer, text in (
+                ({"capacty": 9}, " argument 'capacty'. Did you mean 'capacity'?"),
+                ({"capacity": 0}, ".capacity: expected at least 1, found 0"),
+                ({"type": "Foo"}, ".type: expected EpisodeReplayBuffer or PrioritizedEpisodeReplayBuffer, found 'Foo'"),
+            )
+        ),
         ({"hyperparameters": {"model_config": {"fcnet_hidden": []}}}, "Unknown model_config argument 'fcnet_hidden'"),
         ({"algo": "dqn"}, "dqn does not fit bam/reach-v0: it takes Discrete actions, found Box"),
         ({"algo": "bc"}, "data: bc learns from recorded episodes, found none"),
@@ -188,6 +293,21 @@ def test_settings_are_refused(given, text):
 def test_settings_of_rllib_are_refused_with_sb3():
     with pytest.raises(SettingsError, match="num_env_runners: the sb3 trainer has no use for it"):
         resolve({"env": "bam/reach", "algo": "ppo", "num_env_runners": 2})
+
+
+@pytest.mark.parametrize(
+    ("algo", "given"),
+    [
+        ("ppo", {"lr": [[0, 1e-3], [900, 0.0]], "entropy_coeff": [[0, 0.1], [900, 0.0]], "grad_clip": None}),
+        ("ppo", {"model_config": {"head_fcnet_hiddens": []}, "minibatch_size": None}),
+        ("sac", {"n_step": [1, 3], "target_entropy": -2.0, "actor_lr": [[0, 1e-3], [900, 0.0]]}),
+        ("sac", {"replay_buffer_config": {"type": "EpisodeReplayBuffer", "capacity": 1e4}}),
+    ],
+)
+def test_settings_that_look_odd_and_are_not(algo, given):
+    values = hyperparameters.complete(ALGORITHMS[algo], given)
+    for name in given.keys() - {"model_config", "replay_buffer_config"}:
+        assert values[name] == given[name]
 
 
 @pytest.mark.parametrize("name", sorted(ALGORITHMS))
@@ -261,3 +381,56 @@ def test_data_that_is_not_there_or_not_like_this(tmp_path):
     for data, text in ((tmp_path / "no", "does not exist"), (tmp_path, "has no .parquet file in it")):
         with pytest.raises(SettingsError, match=text):
             RLlibTrainer.create(settled("bc", hyper={}, data=str(data)))
+
+
+def recorded(folder, **columns):
+    """Six steps of two episodes of `test/Sampled-v0`, but for some columns."""
+    import pyarrow
+    import pyarrow.parquet
+
+    observed = [[0.1 * k, 0.5] for k in range(6)]
+    rows = {
+        "eps_id": ["a"] * 3 + ["b"] * 3,
+        "obs": observed,
+        "actions": [-1, 0] * 3,
+        "rewards": [1.0] * 6,
+        "new_obs": observed,
+        "terminateds": [False, False, True] * 2,
+        "truncateds": [False] * 6,
+    }
+    pyarrow.parquet.write_table(pyarrow.table(rows | columns), folder / "a.parquet")
+    return str(folder)
+
+
+@pytest.mark.parametrize("learners", [0, 1])
+@pytest.mark.parametrize(
+    ("columns", "text"),
+    [
+        ({"actions": [-1, 0, 7, 0, 0, 0]}, "actions: expected -1 to 0, found 7"),
+        ({"actions": ["x"] * 6}, "actions: expected finite numbers, found others"),
+        ({"rewards": [1.0, None, 1.0, 1.0, 1.0, 1.0]}, "rewards: expected finite numbers, found others"),
+        ({"obs": [[float("nan"), 0.0]] * 6}, "obs: expected finite numbers, found others"),
+        (
+            {"obs": [[0.0, 0.0], [1.0], [0.0, 1.0, 2.0]] * 2},
+            "obs: expected rows of shape (2,), found rows of different",
+        ),
+        (
+            {name: [] for name in ("eps_id", "obs", "actions", "rewards", "new_obs", "terminateds", "truncateds")},
+            "found none",
+        ),
+    ],
+    ids=["choice", "text", "null", "nan", "ragged", "empty"],
+)
+def test_recorded_rows_that_are_not_whole(columns, text, learners, sampled, tmp_path):
+    if learners and "7" not in text:
+        pytest.skip("as the first")
+    hyper = {"train_batch_size_per_learner": 8, "model_config": SMALL}
+    env = sampled(Box(-1, 1, (2,)))
+    trainer = RLlibTrainer.create(
+        settled("bc", env, hyper, data=recorded(tmp_path, **columns), steps=64, num_learners=learners)
+    )
+    with pytest.raises(SettingsError) as caught:
+        trainer.train(64, lambda progress: True)
+    trainer.close()
+    assert text in str(caught.value)
+    assert "\n" not in str(caught.value)

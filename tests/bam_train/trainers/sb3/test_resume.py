@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
@@ -151,16 +152,24 @@ print(trainer.steps, hashlib.sha256(b"".join(model)).hexdigest())
 """
 
 
-def in_a_new_process(given, first, total, path):
+@contextlib.contextmanager
+def a_new_process(given, first, total, path):
+    """Within, the program runs; what it gives is called for what it printed."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, json.dumps(given), str(first), str(total), str(path)],
-        capture_output=True,
-        text=True,
-        env=environment,
-        check=True,
-    )
-    return done.stdout.split()
+    command = [sys.executable, "-c", PROGRAM, json.dumps(given), str(first), str(total), str(path)]
+
+    def printed():
+        out, err = process.communicate(timeout=300)
+        assert process.returncode == 0, err
+        return out.split()
+
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        try:
+            yield printed
+        finally:
+            process.kill()
 
 
 @pytest.mark.slow
@@ -173,12 +182,12 @@ def in_a_new_process(given, first, total, path):
 )
 def test_2k_steps_saved_and_2k_more_in_a_new_process_are_4k(tmp_path, algo, hyperparameters):
     given = {"env": "bam/pick-v0", "algo": algo, "steps": 4000, "num_envs": 8, "hyperparameters": hyperparameters}
-    whole = in_a_new_process(given, 4000, 4000, tmp_path / "whole.zip")
-    half = in_a_new_process(given, 2000, 4000, tmp_path / "half.zip")
-    rest = in_a_new_process(given, 4000, 4000, tmp_path / "half.zip")
-    assert half[0] == "2000"
-    assert rest == whole
-    assert whole[0] == "4000"
+    with a_new_process(given, 4000, 4000, tmp_path / "whole.zip") as whole:
+        with a_new_process(given, 2000, 4000, tmp_path / "half.zip") as half:
+            assert half()[0] == "2000"
+        with a_new_process(given, 4000, 4000, tmp_path / "half.zip") as rest:
+            assert rest() == (expected := whole())
+    assert expected[0] == "4000"
 
 
 def test_a_foreign_environment_begins_new_episodes_and_says_so(corridor, tmp_path):

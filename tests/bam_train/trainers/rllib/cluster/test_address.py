@@ -40,6 +40,16 @@ def test_auto_is_the_cluster_of_this_computer(monkeypatch):
     assert find("auto") == "10.0.0.6:6379"
 
 
+def test_what_the_variable_says_may_be_auto_too_and_is_named_if_it_is_wrong(monkeypatch):
+    monkeypatch.setattr("ray._private.utils.read_ray_address", lambda: "10.0.0.6:6380")
+    monkeypatch.setenv("RAY_ADDRESS", "auto")
+    assert find("auto") == "10.0.0.6:6380"
+    monkeypatch.setenv("RAY_ADDRESS", "local")
+    with pytest.raises(SettingsError, match=r"^RAY_ADDRESS: expected auto or host:port, .* found 'local'$"):
+        find("auto")
+    assert find("10.0.0.5:6379") == "10.0.0.5:6379"
+
+
 def test_auto_without_a_cluster(monkeypatch):
     monkeypatch.setattr(ray_utils, "read_ray_address", lambda: None)
     with pytest.raises(TrainingFailed) as caught:

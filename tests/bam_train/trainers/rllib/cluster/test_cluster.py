@@ -17,6 +17,7 @@ pytest.importorskip("ray.rllib")
 
 import psutil
 import ray
+from ray._private import utils
 
 from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.settings import TrainSettings
@@ -102,6 +103,75 @@ def test_it_is_gone_after_an_exception():
         interrupted()
     assert processes
     assert not any(process.is_running() for process in processes)
+
+
+def test_sigterm_is_heard_afterwards():
+    came = []
+    before = signal.signal(signal.SIGTERM, lambda number, _: came.append(number))
+    try:
+        with cluster(settings()):
+            pass
+        assert is_caught(signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)
+        assert came == [signal.SIGTERM]
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def is_caught(number):
+    """Whether the process has a handler for a signal; Python does not know what C++ did to it."""
+    status = Path("/proc/self/status")
+    if not status.exists():  # not on Linux
+        return True
+    mask = re.search(r"SigCgt:\s+(\w+)", status.read_text())[1]
+    return bool(int(mask, 16) >> (number - 1) & 1)
+
+
+def test_another_ctrl_c_at_the_end_leaves_nothing_either(monkeypatch):
+    processes, found, shutdown = [], [], ray.shutdown
+
+    def disturbed(**given):
+        signal.raise_signal(signal.SIGINT)
+        shutdown(**given)
+
+    def interrupted():
+        with monkeypatch.context() as patch, cluster(settings()):
+            processes.extend(started())
+            found.extend(folders(processes))
+            patch.setattr(ray, "shutdown", disturbed)
+            raise SystemExit
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert not ray.is_initialized()
+    assert processes
+    assert not any(process.is_running() for process in processes)
+    assert len(found) == 1
+    assert not Path(found[0]).exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_while_it_starts_is_our_own(number, monkeypatch):
+    class Came(BaseException):
+        pass
+
+    def came(*_):
+        raise Came
+
+    def start(**_):
+        utils.set_sigterm_handler(lambda *_: pytest.fail("Ray's handler"))  # as `ray.init` does
+        signal.raise_signal(number)
+        ended.append(True)
+
+    ended, before = [], signal.signal(number, came)
+    monkeypatch.setattr(ray, "init", start)
+    try:
+        with pytest.raises(Came), cluster(settings()):
+            pass
+        assert signal.getsignal(number) is came
+    finally:
+        signal.signal(number, before)
+    assert ended == [True]
 
 
 def test_one_that_runs_in_this_process_is_used_and_stays():

@@ -15,7 +15,7 @@ import ray
 from ray.cluster_utils import Cluster
 
 from bam_train.checkpoint import Checkpoint
-from bam_train.errors import ProcessesLost
+from bam_train.errors import ProcessesLost, SettingsError
 from bam_train.trainers.resolve import resolve
 from bam_train.trainers.rllib.cluster.cluster import loopback_only
 from bam_train.trainers.rllib.trainer import RLlibTrainer
@@ -175,3 +175,31 @@ def test_a_runner_that_dies_again_and_again(tmp_path, monkeypatch):
         assert str(caught.value).endswith(" updates (ConnectionError: the simulator is gone)")
         assert trainer.steps >= BATCH
         assert Checkpoint.open(trainer.save(tmp_path / "one.zip", {}, {}).path).manifest.steps == trainer.steps
+
+
+BLIND = """
+import gymnasium as gym, numpy as np, ray
+
+class Blind(gym.Env):
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self):
+        if ray.is_initialized():
+            raise ConnectionError("no display here")
+
+gym.register("test/Blind-v0", entry_point=Blind)
+"""
+
+
+def test_an_environment_that_no_runner_can_make(tmp_path, monkeypatch):
+    (tmp_path / "blind.py").write_text(BLIND)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    settings = train_settings(None, env="blind:test/Blind-v0", num_envs=1, num_env_runners=1)
+    with pytest.raises(SettingsError) as caught:
+        RLlibTrainer.create(settings)
+    assert str(caught.value) == (
+        "ppo on blind:test/Blind-v0 cannot be set up: env runner 1 died (ConnectionError: no display here)"
+    )
+    assert not ray.is_initialized()

@@ -10,6 +10,7 @@ import pytest
 pytest.importorskip("fcntl")
 pytest.importorskip("ray")
 
+from bam_train.trainers.rllib.cluster import folder as module
 from bam_train.trainers.rllib.cluster.folder import own_folder
 
 
@@ -25,6 +26,19 @@ def test_it_goes_away_and_takes_those_that_were_left_with_it(tmp_path):
             assert second.is_dir()
         assert sorted(tmp_path.iterdir()) == sorted([other, first])
     assert list(tmp_path.iterdir()) == [other]
+
+
+def test_one_that_is_just_being_made_is_left_alone(tmp_path, monkeypatch):
+    real = module._locked
+
+    def another_run_comes_first(lock):
+        module._take_away_left(tmp_path)
+        return real(lock)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(module, "_locked", another_run_comes_first)
+        with own_folder(str(tmp_path)) as folder:
+            assert folder.is_dir()
 
 
 def test_the_lock_ends_with_its_process(tmp_path):

@@ -57,7 +57,8 @@ def test_actions_are_those_of_rllibs_own_restoring(rllib_directories, name):
         ("ppo", "ppo", "Pendulum-v1", 100),
         ("sac", "sac", "Pendulum-v1", 0),
         ("dqn", "dqn", "CartPole-v1", 0),
-        ("several", "ppo", None, 100),
+        ("several", "ppo", None, 100),  # its environment is a class
+        ("tuned", "sac", "Pendulum-v1", 0),
         ("ppo-old", "ppo", "Pendulum-v1", 100),
         ("sac-old", "sac", "Pendulum-v1", 0),
         ("dqn-old", "dqn", "CartPole-v1", 0),
@@ -66,7 +67,7 @@ def test_actions_are_those_of_rllibs_own_restoring(rllib_directories, name):
 def test_what_a_directory_says(rllib_directories, name, algorithm, env, steps):
     found = read(rllib_directories / name)
     assert (found.parts.algorithm, found.env, found.env_kwargs, found.steps) == (algorithm, env, {}, steps)
-    assert (found.whole, found.algorithm_known) == (True, name != "several")  # whose config has the code of its class
+    assert (found.whole, found.algorithm_known) == (True, True)
     assert found.parts.old_stack == name.endswith("-old")
     assert find_policy(rllib_directories / name).ray_version.startswith("2.")
 
@@ -198,6 +199,56 @@ def test_a_missing_file_and_a_cut_one(copied):
     with pytest.raises(AlteredCheckpoint) as error:
         read(root)
     assert str(error.value) == f"{root}: {NEW}/module_state.pkl is missing. Copy it again from its source, whole"
+
+
+@pytest.mark.parametrize("member", [f"{NEW}/module_state.pkl", "env_runner/module_to_env_connector/{}"])
+def test_what_never_ends_is_not_read(copied, member):
+    root = copied("ppo")
+    path = root / member.format("class_and_ctor_args.pkl")
+    path.unlink()
+    os.mkfifo(path)
+    assert str(error_of(root)) == f"{root}: {path.relative_to(root)} cannot be read: it is not a file"
+    path.unlink()
+    path.symlink_to("/dev/zero")
+    assert str(error_of(root)).endswith(" cannot be read: it is not a file")
+    path.unlink()
+    with path.open("wb") as file:
+        file.truncate(2**40)
+    assert str(error_of(root)).endswith(" cannot be read: it has 1099511627776 bytes, expected at most 2147483648")
+
+
+def test_a_large_text(copied):
+    root = copied("ppo")
+    os.truncate(root / "rllib_checkpoint.json", 2**40)
+    text = "rllib_checkpoint.json cannot be read: it has 1099511627776 bytes, expected at most 1048576"
+    assert str(error_of(root)) == f"{root}: {text}"
+
+
+@pytest.mark.parametrize(
+    ("said", "version"),
+    [('"2.60\\u001b[31m\\nx"', "2.60[31mx"), ('{"a": 1}', "{'a':1}"), (f'"{"9" * 9999}"', "9" * 40)],
+)
+def test_a_version_is_one_short_word(copied, said, version):
+    root = copied("ppo")
+    (root / "rllib_checkpoint.json").write_text(f'{{"ray_version": {said}}}')
+    assert find_policy(root).ray_version == version
+
+
+def test_the_folder_of_an_env_runner(copied, tmp_path):
+    root = copied("ppo")
+    with pytest.raises(NotACheckpoint, match="is no checkpoint directory of RLlib"):
+        find_policy(root / "env_runner")
+    shutil.copytree(root / NEW, root / "env_runner" / "rl_module")  # as the runner's own save_to_path has it
+    found = read(shutil.move(root / "env_runner", tmp_path / "runner"))
+    assert (found.whole, found.parts.filter.count > 99) == (True, True)
+
+
+def test_msgpack_of_a_whole_algorithm(copied):
+    root = copied("ppo")
+    for path in list(root.rglob("*state.pkl")):
+        path.rename(path.with_suffix(".msgpack"))
+    with pytest.raises(NotACheckpoint, match=r"was written as msgpack; expected pickles\. Save it again without use_"):
+        read(root)
 
 
 def test_no_directories_of_rllib(rllib_directories, tmp_path):

@@ -286,6 +286,8 @@ def test_starts_of_whole_numbers():
     policy = FrozenPolicy.from_graph(freeze(parts), *map(space_to_json, (parts.observation_space, parts.action_space)))
     found = policy.act_batch(np.arange(5, 9))
     np.testing.assert_array_equal(found, live.actions({"": np.arange(4)}) - 1)
+    arrays = safetensors_file.parse(golden(parts, live.module, live.before, live.config, n=50))
+    np.testing.assert_array_equal(arrays["action"], policy.act_batch(arrays["observation"]))
 
 
 def test_spaces_that_do_not_fit_the_weights():
