@@ -98,9 +98,11 @@ class RLlibTrainer:
         seen = Seen.of(settings)
         algorithm.require_actions(settings.env, type(seen.action_space).__name__)
         _require_no_bytes(settings.env, seen.observation_space)
+        values = hyperparameters.complete(algorithm, settings.hyperparameters)
+        _require_two_critics(values, seen.action_space)
         return dataclasses.replace(
             settings,
-            hyperparameters=hyperparameters.complete(algorithm, settings.hyperparameters),
+            hyperparameters=values,
             normalize=hyperparameters.complete_normalize(settings.normalize),
             eval_every=settings.eval_every or max(1000, settings.steps // 20),
         )
@@ -323,6 +325,12 @@ def _require_no_bytes(env: str, space: Space[Any]) -> None:
             f"{env}: the rllib trainer takes images of floats, found {space.dtype} of shape {space.shape}. Scale "
             "them in the environment (gymnasium.wrappers.TransformObservation), or use --trainer sb3"
         )
+
+
+def _require_two_critics(values: Mapping[str, Any], space: Space[Any]) -> None:
+    """Refuse one critic of choices, which RLlib 2.60's SAC fails on in the first update."""
+    if isinstance(space, spaces.Discrete) and values.get("twin_q") is False:
+        raise SettingsError("twin_q: expected true, as actions are choices, found false. Leave it out")
 
 
 def _require_offline(settings: TrainSettings) -> None:

@@ -211,6 +211,10 @@ def test_what_cannot_be_frozen_is_refused_before_training(spaces, hyper, text, s
             {"hyperparameters": {"train_batch_size": 9}},
             "train_batch_size is not a hyperparameter here: use train_batch",
         ),
+        (
+            {"env": "CartPole-v1", "algo": "sac", "hyperparameters": {"twin_q": False}},
+            "twin_q: expected true, as actions are choices, found false. Leave it out",
+        ),
         *(
             ({"hyperparameters": {old: 1}}, f"{old} is not a hyperparameter here: use {now}")
             for old, now in (
