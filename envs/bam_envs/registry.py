@@ -300,9 +300,7 @@ def limited(env: RobotEnv, entry: EnvEntry) -> gym.Env[Any, Any]:
     """`env` with the time limit that Gymnasium does not put around it."""
     if not entry.parity or getattr(env.task, "ends_by_itself", False) or _gymnasium_limits():
         return env
-    from bam_envs.robot_env import StatedTimeLimit
-
-    return StatedTimeLimit(env, entry.max_episode_steps)
+    return gym.wrappers.TimeLimit(env, entry.max_episode_steps)
 
 
 def _gymnasium_limits() -> bool:

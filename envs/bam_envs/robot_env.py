@@ -11,7 +11,7 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import Any, SupportsFloat
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -25,9 +25,6 @@ from bam_envs.robots.robot import Robot, RobotState, Rows
 from bam_envs.tasks.task import Label, Score, Task
 
 RENDER_MODES = ["rgb_array", "human"]
-
-TIME_IS_OVER = "max_steps_exceeded"
-"""What ``info["final_status"]`` says of an episode that was cut, in robo-gym's words."""
 
 
 def render_modes() -> list[str]:
@@ -202,14 +199,6 @@ def _said(value: NDArray[Any]) -> NDArray[np.bool_]:
     return np.array([not _is_empty(one) for one in value]) if value.dtype.kind == "O" else np.ones(len(value), bool)
 
 
-def _stated(info: Mapping[str, NDArray[Any]], truncated: NDArray[np.bool_]) -> Mapping[str, NDArray[Any]]:
-    """`info` with the time limit where a `final_status` says nothing of an end."""
-    if "final_status" not in info or not truncated.any():
-        return info
-    status = info["final_status"]
-    return {**info, "final_status": np.where(truncated & (status == ""), TIME_IS_OVER, status)}
-
-
 def _plain(value: Any) -> Any:
     """Text as str, one number as float, several as an array of their own, objects as they are."""
     if isinstance(value, str):
@@ -217,17 +206,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return value.tolist() if value.dtype.kind in "US" else value.copy()
     return float(value) if isinstance(value, np.generic) else value
-
-
-class StatedTimeLimit(gym.wrappers.TimeLimit[Any, Any]):
-    """A time limit whose end has a `final_status` in its info, as every other end of the task has."""
-
-    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Step; the episode is truncated when its time is over."""
-        observation, reward, terminated, truncated, info = super().step(action)
-        if truncated:
-            info.setdefault("final_status", TIME_IS_OVER)
-        return observation, reward, terminated, truncated, info
 
 
 class RobotVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
@@ -326,7 +304,7 @@ class RobotVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.float3
         self.elapsed += 1
         truncated = self._truncated(score)
         infos = {"is_success": score.success, "_is_success": self._all.copy()}
-        for key, value in _stated(score.info, truncated).items():
+        for key, value in score.info.items():
             infos[key], infos["_" + key] = value, _said(value)
         ended = score.terminated | truncated
         if ended.any():

@@ -68,7 +68,8 @@ class IsaacReachTask:
 
     Info:
         `dist_coord` [m] (also as `distance`), `dist_rot` [rad], `target_coord` [m], `target_rot` as x, y, z, w,
-        `rs_state` where it is asked for, and at the end `final_status`: "success" or "collision".
+        `rs_state` where it is asked for, and at the end `final_status`: "success", "collision"
+        or "max_steps_exceeded".
 
     With ``parity=True`` nothing is scaled, an action is in units of 0.5 rad and as large as the joints' limits let
     it be, and 600 steps terminate as "max_steps_exceeded", as in robo-gym: so policies of Isaac Lab fit.
@@ -223,9 +224,8 @@ class IsaacReachTask:
         reward = np.where(collision, -1.0, np.where(success, 2.0, -0.005 * distance - 0.05 * angle))
         goes_on = (success | last)[:, None] & self.continue_except_collision
         self._ended = np.where(goes_on, state.signals["joint_position"], np.nan)
-        status = np.where(success, "success", "")
-        if self.parity:
-            status = np.where(last, "max_steps_exceeded", status)  # also of an arrival in the last step
+        late = last & (self.parity | ~success)  # there, also of an arrival in the last step
+        status = np.where(late, "max_steps_exceeded", np.where(success, "success", ""))
         info: dict[str, Any] = {
             "final_status": np.where(collision, "collision", status),
             "distance": distance,

@@ -61,8 +61,8 @@ class Mir100AvoidanceTask(DriveTask):
         Terminated at success and at a collision: a ray shorter than 15 cm, or, in simulation, a touch.
 
     Info:
-        `distance` of the target [m], `target_coord` (x, y [m], yaw [rad]), at the end `final_status`: "success" or
-        "collision".
+        `distance` of the target [m], `target_coord` (x, y [m], yaw [rad]), at the end `final_status`: "success",
+        "collision" or "max_steps_exceeded".
 
     With ``parity=True`` observation, reward and end are those of robo-gym's `ObstacleAvoidanceMir100`: metres and
     radians, 16 single rays, the way at a hundred times this reward but none for that of the first step, 100 at

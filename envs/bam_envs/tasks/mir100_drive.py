@@ -200,10 +200,9 @@ class DriveTask:
     def _ended(self, state: RobotState, reward: Array, failed: Flags, success: Flags, distance: Array) -> Score:
         code = np.where(failed, _FAILED, _RUNNING)
         code[success] = _SUCCEEDED
-        terminated = failed | success
+        terminated, overtime = failed | success, self.elapsed >= MAX_STEPS
+        code[overtime if self.parity else overtime & ~terminated] = _OVERTIME  # there, whatever else happened then
         if self.parity:
-            overtime = self.elapsed >= MAX_STEPS
-            code[overtime] = _OVERTIME  # what else happened in that step is not told
             terminated |= overtime
         words = np.array(["", self.failure, "success", "max_steps_exceeded"])
         info: dict[str, Any] = {"distance": distance, "final_status": words[code], "target_coord": self.target.copy()}

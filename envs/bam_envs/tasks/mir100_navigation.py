@@ -36,8 +36,8 @@ class Mir100NavigationTask(DriveTask):
         Terminated at success, and outside the floor of 20 x 20 m about the origin.
 
     Info:
-        `distance` of the target [m], `target_coord` (x, y [m], yaw [rad]), at the end `final_status`: "success" or
-        "out of boundary".
+        `distance` of the target [m], `target_coord` (x, y [m], yaw [rad]), at the end `final_status`: "success",
+        "out of boundary" or "max_steps_exceeded".
 
     With ``parity=True`` observation, reward and end are those of robo-gym's `NoObstacleNavigationMir100`: metres and
     radians, the way at a hundred times this reward but none for that of the first step, 200 at success, -200 outside,

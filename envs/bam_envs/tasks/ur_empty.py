@@ -42,7 +42,7 @@ class UrEmptyTask:
         Terminated at a collision of the arm with itself, the table or the ground.
 
     Info:
-        `final_status` at the end: "collision".
+        `final_status` at the end: "collision" or "max_steps_exceeded".
 
     With ``parity=True`` joint velocities are in rad/s, and after 300 steps an episode is terminated as "success".
 
@@ -116,8 +116,10 @@ class UrEmptyTask:
     def score(self, state: RobotState, action: Floats) -> Score:
         """Nothing is better than anything else; a collision ends it."""
         collided = collisions(state)
-        success = self.parity & (self.elapsed >= MAX_STEPS) & ~collided
-        status = np.where(collided, "collision", np.where(success, "success", ""))
+        late = self.elapsed >= MAX_STEPS
+        success = self.parity & late & ~collided
+        ended = np.where(late, "success" if self.parity else "max_steps_exceeded", "")
+        status = np.where(collided, "collision", ended)
         info: dict[str, NDArray[Any]] = {"final_status": status}
         if self._tells_wire:
             info["rs_state"] = as_objects(self.rs_state(state))

@@ -71,7 +71,7 @@ class UrReachTask:
         Terminated at success and at a collision: of the arm with itself, the table or the ground.
 
     Info:
-        `target_coord` [m], `distance` [m], at the end `final_status`: "success" or "collision".
+        `target_coord` [m], `distance` [m], at the end `final_status`: "success", "collision" or "max_steps_exceeded".
 
     With ``parity=True`` observations are robo-gym's numbers, in its units; the last six are the action before the last
     one; and after 300 steps an episode is terminated as "max_steps_exceeded".
@@ -226,9 +226,9 @@ class UrReachTask:
         distance = np.sqrt(x * x + y * y + z * z)
         collided = collisions(state)
         success = (distance <= self._near) & ~collided
-        late = self.parity & (self.elapsed >= MAX_STEPS)
+        late = self.elapsed >= MAX_STEPS
         reward = np.where(collided, -1.0, np.where(success, 2.0, -0.005 * distance))
-        ended = np.where(late, "max_steps_exceeded", np.where(success, "success", ""))
+        ended = np.where(late & (self.parity | ~success), "max_steps_exceeded", np.where(success, "success", ""))
         status = np.where(collided, "collision", ended)
         self._note(status == "success", joints)
         info: dict[str, NDArray[Any]] = {
@@ -240,7 +240,7 @@ class UrReachTask:
             info["dist_coord"] = distance.copy()
         if self._tells_wire:
             info["rs_state"] = as_objects(self.rs_state(state))
-        return Score(reward, success | collided | late, success, info)
+        return Score(reward, success | collided | (late & self.parity), success, info)
 
     def _note(self, success: NDArray[np.bool_], joints: Array) -> None:
         """Remember where a success ended."""
