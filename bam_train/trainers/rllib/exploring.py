@@ -12,9 +12,9 @@ from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
 from bam_train.errors import SettingsError
+from bam_train.trainers.from_zero import less_start
 from bam_train.trainers.rllib.freezing.golden import shifted
 from bam_train.trainers.rllib.freezing.parts import PolicyParts
-from bam_train.trainers.sb3.from_zero import less_start
 
 
 class ExploringPolicy:

@@ -16,7 +16,7 @@ import gymnasium as gym
 import bam_envs  # noqa: F401 - registers our environments with Gymnasium
 from bam_envs.errors import InvalidValue
 from bam_envs.registry import ENVIRONMENTS
-from bam_train.trainers.sb3.from_zero import from_zero
+from bam_train.trainers.from_zero import from_zero
 
 try:
     from ray.tune.registry import register_env

@@ -17,8 +17,8 @@ from bam_train.checkpoint.zip_members import open_zip
 from bam_train.environments import make_env
 from bam_train.errors import CheckpointMismatch, NotACheckpoint
 from bam_train.policy import FrozenPolicy
+from bam_train.trainers.from_zero import from_zero
 from bam_train.trainers.sb3.algorithms import ALGORITHMS
-from bam_train.trainers.sb3.from_zero import from_zero
 
 # What SB3's load lets out for a file of another algorithm or another version, then what it does for a damaged one.
 _MISFIT = (ValueError, TypeError, KeyError, AttributeError, RuntimeError, AssertionError, ImportError)

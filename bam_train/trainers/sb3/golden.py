@@ -13,8 +13,8 @@ from stable_baselines3.common.vec_env import VecNormalize, VecTransposeImage, un
 from torch import nn
 
 from bam_train.trainers.freezing.golden import affordable, clearest, draw_array, pack
+from bam_train.trainers.from_zero import less_start, plus_start
 from bam_train.trainers.sb3.freeze import FrozenModule
-from bam_train.trainers.sb3.from_zero import less_start, plus_start
 from bam_train.trainers.sb3.frozen_layers import leaves
 
 

@@ -18,9 +18,9 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeI
 from bam_train.environments import control_period
 from bam_train.errors import SettingsError
 from bam_train.settings import TrainSettings
+from bam_train.trainers.from_zero import FromZero
 from bam_train.trainers.sb3 import hyperparameters
 from bam_train.trainers.sb3.algorithms import ALGORITHMS
-from bam_train.trainers.sb3.from_zero import FromZero
 from bam_train.trainers.sb3.frozen_layers import leaves
 from bam_train.trainers.sb3.vec_env import RowsVecEnv
 

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from bam_train.environments import is_batched, make_env, make_rows
 from bam_train.errors import SettingsError
 from bam_train.place import HERE, Place
-from bam_train.trainers.sb3.from_zero import from_zero
+from bam_train.trainers.from_zero import from_zero
 
 Observations = Any
 """An array (n, …), or a mapping of them."""

@@ -24,9 +24,9 @@ from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.utils.filter import RunningStat
 
 from bam_train.errors import PolicyError
+from bam_train.trainers.from_zero import less_start
 from bam_train.trainers.rllib.freezing.golden import rows, shifted
 from bam_train.trainers.rllib.freezing.parts import Array, Filter, PolicyParts
-from bam_train.trainers.sb3.from_zero import less_start
 
 _OWN = re.compile(r"(ray\.rllib\.algorithms\.\w+\.torch\.default_\w+_torch_rl_module)\.(Default\w+TorchRLModule)")
 

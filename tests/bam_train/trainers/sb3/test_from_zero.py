@@ -6,13 +6,12 @@ import pytest
 from gymnasium import spaces
 from stable_baselines3 import PPO
 
-from bam_train.environments import make_env
 from bam_train.errors import CheckpointMismatch
 from bam_train.evaluation import evaluate
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
+from bam_train.trainers.from_zero import FromZero
 from bam_train.trainers.sb3.foreign import load_trusted
-from bam_train.trainers.sb3.from_zero import FromZero, from_zero
 from bam_train.trainers.sb3.trainer import SB3Trainer
 
 ID = "test/Shifted-v0"
@@ -60,45 +59,6 @@ def test_what_is_trained_is_what_is_deployed(shifted, tmp_path, algo, hyperparam
     policy = FrozenPolicy.load(tmp_path / "shifted.zip")
     assert [int(policy.act(np.int64(seen))) for seen in (3, 4, 5)] == [2, 3, 4]
     assert evaluate(policy, shifted, episodes=5).return_mean == 10.0
-
-
-class Parts(gym.Env):
-    """Tells back the action that it was given, and what it counts."""
-
-    observation_space = spaces.Dict(
-        told=spaces.MultiDiscrete([3, 4], dtype=np.int8, start=[5, -2]),
-        mode=spaces.Discrete(5, start=2),
-        x=spaces.Box(-1, 1, (2,)),
-    )
-    action_space = spaces.MultiDiscrete([3, 4], dtype=np.int8, start=[5, -2])
-
-    def look(self, told):
-        return {"told": told, "mode": np.int64(6), "x": np.ones(2, np.float32)}
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return self.look(np.array([5, -2], np.int8)), {}
-
-    def step(self, action):
-        assert self.action_space.contains(action)
-        return self.look(action), 0.0, False, False, {}
-
-
-def test_leaves_of_a_dict_and_several_choices():
-    env = from_zero(Parts())
-    assert env.action_space == spaces.MultiDiscrete([3, 4], dtype=np.int8)
-    assert env.observation_space["mode"] == spaces.Discrete(5)
-    first, _ = env.reset(seed=0)
-    second, *_ = env.step(np.array([2, 3], np.int64))
-    assert [first["told"].tolist(), second["told"].tolist()] == [[0, 0], [2, 3]]
-    assert second["mode"] == 4
-    assert second["x"].tolist() == [1.0, 1.0]
-    assert env.observation_space.contains(second)
-
-
-def test_what_counts_from_zero_stays_as_it_is(corridor):
-    env = make_env(corridor)
-    assert from_zero(env) is env
 
 
 def test_a_plain_file_is_trusted_only_if_it_counted_from_zero(shifted, tmp_path):

@@ -1,4 +1,4 @@
-"""Spaces that count from another number than 0, as stable-baselines3 takes them: it ignores ``start``."""
+"""Spaces that count from another number than 0, as learning libraries take them: these ignore ``start``."""
 
 from __future__ import annotations
 
