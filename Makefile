@@ -1,11 +1,12 @@
-# Two commands: `make demo` trains, evaluates and deploys; `make test` runs the whole test suite. Both install what they need in .venv.
+# `make demo` trains, evaluates and deploys; `make test` runs the whole test suite, `make quick` the quick part. They install what they need in .venv.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 DEMO := build/demo
+WORKERS := -n 2 --no-loadscope-reorder
 
-.PHONY: demo test peers lint format docs clean
+.PHONY: demo test quick peers lint format docs clean
 
 demo: $(VENV)/.run
 	$(BIN)/bam-train --env bam/pick --algo ppo --out $(DEMO)/pick-ppo.zip --runs $(DEMO)/runs --force
@@ -13,7 +14,11 @@ demo: $(VENV)/.run
 	$(BIN)/bam-deploy $(DEMO)/pick-ppo.zip
 
 test: $(VENV)/.dev peers
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(WORKERS)
+
+# Without what needs Ray or ROS 2 or trains.
+quick: $(VENV)/.dev
+	$(BIN)/python -m pytest $(WORKERS) -m "not (slow or ray or peers or training)"
 
 # ROS 2, a rosbridge server and roslibjs for tests/peers; where they cannot be installed, those tests are skipped.
 peers:

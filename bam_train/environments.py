@@ -2,23 +2,110 @@
 
 from __future__ import annotations
 
+import contextlib
+import inspect
 import json
 import math
 from collections.abc import Callable, Mapping
+from importlib import metadata
 from typing import Any, TypeVar
 
 import gymnasium as gym
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 import bam_envs  # noqa: F401 - registers our environments with Gymnasium
-from bam_envs.registry import entry_of
+from bam_envs import registry
+from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.registry import entry_of, resolve_id
+from bam_envs.robo_gym.options import constructor_options, require_values
+from bam_envs.robo_gym.table import ROBO_GYM
 from bam_envs.spaces import space_to_json
+from bam_envs.tasks.options import in_our_words, option_names, require_kinds
 from bam_train.checkpoint import Checkpoint
+from bam_train.checkpoint.manifest import WHERE
 from bam_train.errors import CheckpointMismatch, SettingsError
 from bam_train.place import HERE, Place
+from bam_train.values import closest
+
+_OWN = ("bam_envs", "bam_train", "gymnasium")
+
+ENTRY_POINTS = "bam_train.environments"
+"""Group of entry points whose modules a checkpoint may name: whoever installed the package trusts it."""
 
 T = TypeVar("T")
 AnyEnv = gym.Env[Any, Any] | VectorEnv[Any, Any, Any]
+
+
+def environment_of(
+    checkpoint: Checkpoint, named: str | None = None, *, elsewhere: bool = False
+) -> tuple[str, dict[str, Any]]:
+    """The environment that a checkpoint belongs to, and its arguments; a file alone makes nothing be imported.
+
+    Args:
+        checkpoint: May come from a stranger.
+        named: What a person says that it was trained on; its module is imported.
+        elsewhere: It runs on another computer, and nothing is imported here.
+
+    Raises:
+        CheckpointMismatch: It was trained on another than `named`, or in a module that nobody named or installed.
+        SettingsError: Nothing is called what the manifest says, or it does not take these arguments.
+        UnknownName: Nothing is called `named`.
+    """
+    env_id, env_kwargs = checkpoint.manifest.env, checkpoint.manifest.env_kwargs
+    module = env_id.rpartition(":")[0]
+    if named is not None:
+        asked = resolve_id(named)
+        checkpoint.requires_env(asked)
+        env_id = asked if module else env_id
+    elif must_be_named(env_id) and not elsewhere:
+        raise CheckpointMismatch(
+            checkpoint.path,
+            f"was trained on {env_id}, and the module {module!r} is imported only where somebody names it: "
+            f"if you trust it, add --env {env_id}",
+        )
+    try:
+        if not (module or elsewhere):
+            resolve_id(env_id)
+        require_env_kwargs(env_id, env_kwargs)
+    except (UnknownName, SettingsError) as error:
+        raise SettingsError(f"{checkpoint.path}: its manifest: {error}") from error
+    return env_id, dict(env_kwargs)
+
+
+def must_be_named(env_id: str) -> bool:
+    """Whether an id has a module that no installed package names: it is imported only because a person says so."""
+    module = env_id.rpartition(":")[0]
+    installed = {point.module for point in metadata.entry_points(group=ENTRY_POINTS)}
+    return bool(module) and module.partition(".")[0] not in _OWN and module not in installed
+
+
+def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
+    """Refuse an argument that one of our environments does not have; others are asked when they are made.
+
+    Raises:
+        SettingsError: Carries the closest match of what can be had; or a value is of the wrong kind.
+    """
+    limit = given.get("max_episode_steps")  # Gymnasium's: None for the usual one, -1 for none
+    if limit not in (None, -1) and (isinstance(limit, bool) or not isinstance(limit, int) or limit < 1):
+        raise SettingsError(f"env_kwargs.max_episode_steps: expected a whole number from 1 on, found {limit!r}")
+    entry = entry_of(env)
+    if entry is None or not given:
+        return
+    task, theirs = registry.resolve(entry.task), ROBO_GYM.get(env.rpartition(":")[2])
+    taken, refused = constructor_options(theirs) if theirs else (frozenset(), frozenset())
+    own = set(inspect.signature(registry.make_env).parameters) - _NO_SETTINGS
+    known = own | taken | option_names(task) | {"max_episode_steps"}
+    for name in given:
+        if name not in known | refused:  # making it says why it is refused
+            raise SettingsError(f"env_kwargs: unknown setting {name!r} of {env}. {closest(in_our_words(name), known)}")
+    try:
+        require_values(theirs, given) if theirs else require_kinds(env, task, given)
+    except InvalidValue as error:
+        raise SettingsError(f"env_kwargs: {error}") from error
+
+
+_NO_SETTINGS = frozenset({"env_id", "render_mode", "task_options", "timeout"}) | WHERE
+"""Arguments of `make_env` that are no settings, or say where the environment runs, which has settings of its own."""
 
 
 def is_batched(env_id: str) -> bool:
@@ -52,6 +139,36 @@ def make_env(
     kwargs = given if place.robot is None else place.robot_kwargs(env_id, given)
     rendering = {} if render_mode is None else {"render_mode": render_mode}
     return _made(env_id, lambda: gym.make(env_id, disable_env_checker=True, **{**kwargs, **rendering}))
+
+
+def parity_if_needed(
+    env_id: str, env_kwargs: Mapping[str, Any], use: Callable[[dict[str, Any]], T], tell: Callable[[str], None]
+) -> tuple[dict[str, Any], T]:
+    """`use` of `env_kwargs`, or of them with ``parity=True`` where only so `env_id` has the spaces of a foreign policy.
+
+    robo-gym's own checkpoints do not say it.
+
+    Args:
+        env_id: An environment.
+        env_kwargs: Its keyword arguments, as far as they are known.
+        use: Makes it with keyword arguments, and raises `CheckpointMismatch` where the policy does not fit it.
+        tell: Told when it is tried and fits.
+
+    Returns:
+        The keyword arguments that fit, and what `use` returned.
+    """
+    given = dict(env_kwargs)
+    try:
+        return given, use(given)
+    except CheckpointMismatch:
+        entry = entry_of(env_id)
+        if entry is None or not entry.parity or "parity" in given:
+            raise
+        with contextlib.suppress(CheckpointMismatch):
+            found = use({**given, "parity": True})
+            tell(f"its spaces are robo-gym's own: {env_id} is made with parity=True")
+            return {**given, "parity": True}, found
+        raise
 
 
 def require_one(transports: tuple[str, ...]) -> str:

@@ -19,6 +19,7 @@
     │   ├── WiringError            an agent reads what no agent writes
     │   ├── RemoteAgentError       an agent in another process failed, or its process ended
     │   └── AgentInUse             an agent is called by two threads at once
+    ├── EnvironmentFailed          an environment gave NaN or infinity
     ├── TrainingFailed             training cannot go on (a NaN loss); the last good checkpoint is kept
     │   └── ProcessesLost          other processes that it needs are gone; what was learnt so far is good
     └── OutputError                no space, no permission, or a file that is in the way
@@ -141,6 +142,10 @@ class RemoteAgentError(LoopError):
 
 class AgentInUse(LoopError):  # noqa: N818
     """An agent is called by two threads at once."""
+
+
+class EnvironmentFailed(BamTrainError):  # noqa: N818
+    """An environment gave an observation or a reward that is NaN or infinite."""
 
 
 class TrainingFailed(BamTrainError):  # noqa: N818

@@ -19,6 +19,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 from bam_train.environments import is_batched, make_rows
 from bam_train.errors import SettingsError
+from bam_train.finite import FiniteRows
 from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, VecGymAgent, Workspace
 from bam_train.loop.film_agent import FilmAgent
 from bam_train.loop.gym.observations import names
@@ -149,6 +150,7 @@ def evaluate(
     Raises:
         SettingsError: `episodes`, `seed` or `num_envs` out of range.
         PolicyError: An action that is not finite.
+        EnvironmentFailed: An observation or a reward that is not finite.
     """
     require_range(episodes, seed, num_envs)
     with _rows(env_id, env_kwargs, num_envs, episodes, env) as rows:
@@ -253,9 +255,9 @@ def _rows(
     if env is not None:
         if env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
             raise SettingsError(f"env: expected autoreset mode SAME_STEP, found {env.metadata.get('autoreset_mode')}")
-        yield env
+        yield FiniteRows(env, env_id)
         return
-    own = make_rows(env_id, env_kwargs, num_envs or default_rows(env_id, episodes))
+    own = FiniteRows(make_rows(env_id, env_kwargs, num_envs or default_rows(env_id, episodes)), env_id)
     try:
         yield own
     finally:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 import re
 import sys
 import typing
@@ -36,7 +37,7 @@ class TrainSettings:
     seed: int = 0
     """Seed of weights, exploration and environments (row i gets seed + i)."""
     num_envs: int = 1
-    """Environments stepped side by side."""
+    """Environments stepped side by side, in all: RLlib's runners share them."""
     device: str = "auto"
     """cpu, cuda, cuda:1, …; auto is the GPU for images if there is one, else the CPU."""
     threads: int = 1
@@ -58,7 +59,7 @@ class TrainSettings:
     token_file: str | None = None
     """File with the token that the servers at `transport` ask for."""
     num_env_runners: int = 0
-    """RLlib's processes that collect samples, each with num_envs environments; 0 collects in the trainer's own."""
+    """RLlib's processes that collect samples, each with its share of num_envs; 0 collects in the trainer's own."""
     num_learners: int = 0
     """RLlib's processes that update the weights; 0 updates in the trainer's own."""
     num_gpus: int | None = None
@@ -116,6 +117,11 @@ def check_names(values: Mapping[str, Any], source: str) -> None:
             raise SettingsError(f"{source}: unknown setting {name!r}. {closest(name, HINTS)}")
 
 
+_MOST = {"num_envs": 100_000, "threads": 1024, "num_env_runners": 10_000, "num_learners": 1000, "num_gpus": 1000}
+_MOST |= {"eval_episodes": 1_000_000}
+"""Of settings that ask for memory, processes or hours, what no run has more of."""
+
+
 def check_ranges(settings: TrainSettings) -> None:
     """Refuse numbers that cannot be."""
     least = {"steps": 1, "seed": 0, "num_envs": 1, "threads": 1, "eval_every": 1, "eval_episodes": 1}
@@ -124,10 +130,26 @@ def check_ranges(settings: TrainSettings) -> None:
         value = getattr(settings, name)
         if value is not None and value < lowest:
             raise SettingsError(f"{name}: expected at least {lowest}, found {value}")
+        if value is not None and value > _MOST.get(name, 10**15):
+            raise SettingsError(f"{name}: expected at most {_MOST.get(name, 10**15)}, found {value}")
     settings.place.require_sane()
     share = settings.until_success
     if share is not None and not 0 < share <= 1:
         raise SettingsError(f"until_success: expected a share above 0 and at most 1, such as 0.99, found {share}")
+    for name in sorted(TABLES):
+        _require_finite(name, getattr(settings, name))
+
+
+def _require_finite(name: str, value: Any) -> None:
+    """Refuse NaN and infinity, which JSON, and so a checkpoint, cannot hold."""
+    if isinstance(value, dict):
+        for key, one in value.items():
+            _require_finite(f"{name}.{key}", one)
+    elif isinstance(value, list):
+        for index, one in enumerate(value):
+            _require_finite(f"{name}[{index}]", one)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise SettingsError(f"{name}: expected a finite number, found {value}")
 
 
 def merge(*layers: Mapping[str, Any]) -> dict[str, Any]:
@@ -150,6 +172,22 @@ def read_assignments(texts: Iterable[str]) -> dict[str, Any]:
         path, value = parse_assignment(text)
         layer = merge(layer, _nest(path if path[0] in HINTS else ["hyperparameters", *path], value, text))
     return layer
+
+
+def read_env_kwargs(texts: Iterable[str]) -> dict[str, Any]:
+    """Arguments of an environment out of ``--set env_kwargs.NAME=VALUE`` texts, where nothing else can be set.
+
+    Raises:
+        SettingsError: One of them sets something else.
+    """
+    layer: dict[str, Any] = {"env_kwargs": {}}
+    for text in texts:
+        path, value = parse_assignment(text, "env_kwargs.NAME=VALUE")
+        if path[0] != "env_kwargs" or len(path) == 1:
+            raise SettingsError(f"--set {text}: expected env_kwargs.NAME=VALUE, such as env_kwargs.parity=true")
+        layer = merge(layer, _nest(path, value, text))
+    found: dict[str, Any] = layer["env_kwargs"]
+    return found
 
 
 def _nest(path: list[str], value: Any, text: str) -> dict[str, Any]:

@@ -32,8 +32,12 @@ def parse_value(text: str) -> Any:
         return text
 
 
-def parse_assignment(text: str) -> tuple[list[str], Any]:
+def parse_assignment(text: str, example: str = "learning_rate=3e-4") -> tuple[list[str], Any]:
     """Split ``name.of.it=value`` into the parts of its name and its typed value.
+
+    Args:
+        text: What was typed after ``--set``.
+        example: What may be typed there, for the error.
 
     Raises:
         SettingsError: There is no ``=``, or no name before it.
@@ -41,7 +45,7 @@ def parse_assignment(text: str) -> tuple[list[str], Any]:
     name, equals, value = text.partition("=")
     path = name.strip().split(".")
     if not equals or not all(path):
-        raise SettingsError(f"--set {text}: expected name=value, such as --set learning_rate=3e-4, found {text!r}")
+        raise SettingsError(f"--set {text}: expected name=value, such as --set {example}, found {text!r}")
     return path, parse_value(value.strip())
 
 

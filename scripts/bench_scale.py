@@ -85,7 +85,7 @@ def rllib_settings(options: argparse.Namespace, runners: int) -> dict[str, Any]:
     return {
         "trainer": "rllib",
         "num_env_runners": runners,
-        "num_envs": options.num_envs // max(1, runners),
+        "num_envs": options.num_envs,
         "hyperparameters": {
             "train_batch_size_per_learner": options.batch,
             "minibatch_size": options.minibatch,

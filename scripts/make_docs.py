@@ -155,6 +155,9 @@ def topics_of(name: str) -> str:
         text = f"{source.signal} [{units}]" if units else source.signal
         published.setdefault((source.topic, source.type), []).append(text)
     rows = [[f"`{topic}`", f"`{kind}`", "from the robot", ", ".join(what)] for (topic, kind), what in published.items()]
+    rows += [
+        [f"`{one.topic}`", f"`{one.type}`", "from the robot, if it has it", "readiness"] for one in profile.readiness
+    ]
     for way, sinks in profile.commands.items():
         for sink in sinks:
             unit_of = dict(zip(profile.command.labels, profile.command.units, strict=True))

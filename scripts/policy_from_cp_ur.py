@@ -11,7 +11,6 @@ Examples:
 """
 
 import argparse
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -21,17 +20,19 @@ import numpy as np
 
 from bam_envs.registry import resolve_id
 from bam_train.checkpoint import Checkpoint
+from bam_train.cli.console import say, tell
 from bam_train.cli.experiment import ScriptParser, open_env, whole
 from bam_train.cli.program import guarded
 from bam_train.evaluation import FIRST_SEED
 from bam_train.policy import FrozenPolicy
+from bam_train.settings import read_env_kwargs
 
 ENV = "bam/ur-reach-v0"  # of a directory that does not say on which it was trained
 ROBOT = "ur"  # how the names of such robots begin
 NAME = Path(__file__).stem
 
 
-def open_checkpoint(path: Path, env: str | None, trust: bool, folder: str) -> Checkpoint:
+def open_checkpoint(path: Path, env: str | None, env_kwargs: dict[str, Any], trust: bool, folder: str) -> Checkpoint:
     """The checkpoint at `path`; one out of a directory of RLlib is written into `folder`."""
     if not path.is_dir():
         checkpoint = Checkpoint.open(path)
@@ -41,22 +42,24 @@ def open_checkpoint(path: Path, env: str | None, trust: bool, folder: str) -> Ch
     from bam_train.trainers.rllib.foreign.export import export
 
     def warn(text: str) -> None:
-        print(f"{NAME}: warning: {text}", file=sys.stderr, flush=True)
+        say(f"{NAME}: warning: {text}")
 
-    exported = export(path, env=env, otherwise=ENV, trust=trust, warn=warn)
+    exported = export(path, env=env, env_kwargs=env_kwargs, otherwise=ENV, trust=trust, warn=warn)
     return exported.write(Path(folder) / "policy.zip")
 
 
 def play(env: gym.Env[Any, Any], policy: FrozenPolicy, seed: int) -> tuple[float, bool, int, int]:
     """One episode: its return, whether it succeeded, its clipped actions, and how many there were."""
-    space: Any = env.action_space
+    space = env.action_space
     observation, _ = env.reset(seed=seed)
     policy.reset()
     total, clipped, steps, ended = 0.0, 0, 0, False
     while not ended:  # on a live robot, each step waits for the end of its period
-        action = np.clip(policy.act(observation), space.low, space.high)
-        # A frozen policy clips by itself, as RLlib does: a number is then exactly at its bound.
-        clipped += bool(((action <= space.low) | (action >= space.high)).any())
+        action = policy.act(observation)
+        if isinstance(space, gym.spaces.Box):
+            action = np.clip(action, space.low, space.high)
+            # A frozen policy clips by itself, as RLlib does: a number is then exactly at its bound.
+            clipped += bool(((action <= space.low) | (action >= space.high)).any())
         observation, reward, terminated, truncated, info = env.step(action)
         total, steps, ended = total + float(reward), steps + 1, terminated or truncated
     return total, bool(info.get("is_success")), clipped, steps
@@ -64,20 +67,23 @@ def play(env: gym.Env[Any, Any], policy: FrozenPolicy, seed: int) -> tuple[float
 
 def main(args: argparse.Namespace) -> None:
     """Run the episodes, in a simulation or on a live robot."""
+    given = read_env_kwargs(args.set)
     with tempfile.TemporaryDirectory() as folder:
-        checkpoint = open_checkpoint(args.checkpoint.expanduser(), args.env, args.trust_pickle, folder)
+        checkpoint = open_checkpoint(args.checkpoint.expanduser(), args.env, given, args.trust_pickle, folder)
         policy = FrozenPolicy.from_checkpoint(checkpoint)
-        with open_env(checkpoint, args.robot, who=NAME, episodes=args.num_episodes, yes=args.yes) as env:
-            robot = env.unwrapped.robot.spec.name  # type: ignore[attr-defined]
-            if not robot.startswith(ROBOT):
-                print(f"{NAME}: note: {checkpoint.manifest.env} moves a {robot}", file=sys.stderr, flush=True)
+        more = {"yes": args.yes, "render": args.render, "env_kwargs": given}
+        with open_env(checkpoint, args.robot, who=NAME, episodes=args.num_episodes, **more) as env:
+            moved = getattr(env.unwrapped, "robot", None)
+            robot = f"a {moved.spec.name}" if moved is not None else "no robot of ours"
+            if not robot.startswith(f"a {ROBOT}"):
+                say(f"{NAME}: note: {checkpoint.manifest.env} moves {robot}")
             successes = 0
             for k in range(args.num_episodes):
                 total, success, clipped, steps = play(env, policy, args.seed + k)
                 successes += success
                 how = "success" if success else "no success"
                 print(f"episode {k + 1}: return {total:.2f}, {how}, clipped {clipped} of {steps} actions", flush=True)
-            print(f"success in {successes} of {args.num_episodes} episodes on {checkpoint.manifest.env}")
+            tell(f"success in {successes} of {args.num_episodes} episodes on {checkpoint.manifest.env}")
 
 
 def parse() -> argparse.Namespace:
@@ -86,11 +92,12 @@ def parse() -> argparse.Namespace:
     add = parser.add_argument
     add("checkpoint", type=Path, metavar="CHECKPOINT", help="checkpoint.zip, or a directory that RLlib wrote")
     add("--env", metavar="ID", help=f"of a directory that does not say where it was trained (default {ENV})")
+    text = "an argument of the environment, any number of times; it wins over the checkpoint's"
+    add("--set", action="append", default=[], metavar="env_kwargs.NAME=VALUE", help=text)
     add("--num-episodes", type=whole(1), default=5, metavar="N", help="how many (default 5)")
     add("--seed", type=whole(0), default=FIRST_SEED, metavar="N", help=f"of the first episode (default {FIRST_SEED})")
-    add("--robot", metavar="URL", help="use the policy on a live robot behind rosbridge, such as ws://10.0.0.5:9090")
-    add("--yes", action="store_true", help="do not ask before a real robot moves")
     add("--trust-pickle", action="store_true", help="unpickle what cannot be read otherwise, which runs what is in it")
+    parser.add_robot()
     args: argparse.Namespace = parser.parse_args()
     return args
 

@@ -20,7 +20,7 @@ import numpy as np
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.experiment import ScriptParser, whole
 from bam_train.cli.program import guarded
-from bam_train.environments import make_rows
+from bam_train.environments import environment_of, make_rows
 from bam_train.errors import OutputError
 from bam_train.policy import FrozenPolicy
 
@@ -36,8 +36,7 @@ def main() -> None:
     checkpoint = Checkpoint.open(options.checkpoint.expanduser())
     policy = FrozenPolicy.from_checkpoint(checkpoint)
     folder = make_folder(options.out.expanduser())
-    kwargs = checkpoint.manifest.env_kwargs
-    rows = make_rows(checkpoint.manifest.env, kwargs, min(options.num_envs, options.episodes))
+    rows = make_rows(*environment_of(checkpoint, options.env), min(options.num_envs, options.episodes))
     episodes = record(rows, policy, options.episodes, options.seed, options.noise)
     rows.close()
     files = write(episodes, folder)
@@ -54,6 +53,7 @@ def parse() -> argparse.Namespace:
     parser = ScriptParser(__file__, __doc__)
     add = parser.add_argument
     add("checkpoint", type=Path, metavar="CHECKPOINT", help="checkpoint.zip of the policy")
+    add("--env", metavar="ID", help="environment it was trained on; needed for some_module:Env-v0")
     add("--out", type=Path, required=True, metavar="DIR", help="folder for the files, without any so far")
     add("--episodes", type=whole(1), default=100, metavar="N", help="how many (default 100)")
     add("--seed", type=whole(0), default=0, metavar="N", help="of the environments and the noise (default 0)")

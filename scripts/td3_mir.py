@@ -1,10 +1,11 @@
 """Train a MiR100 to drive to a place with TD3 of stable-baselines3; save, load, and run the policy.
 
-The checkpoint.zip is a stable-baselines3 file too: TD3.load("checkpoints/mir100-navigation-td3.zip") opens it.
+The checkpoint.zip is a stable-baselines3 file too: TD3.load("checkpoints/mir100-navigation-td3.zip") opens it. It is
+saved twenty times in a run; Ctrl-C and SIGTERM end training after the update that is running, saved.
 
 Examples:
   python scripts/td3_mir.py                             train, then ten episodes in a new environment
-  python scripts/td3_mir.py --steps 2000 --episodes 3   a quick look
+  python scripts/td3_mir.py --steps 2000 --render       a quick look, in a window
   python scripts/td3_mir.py --robot ws://10.0.0.5:9090  train, then drive a real one
 """
 
@@ -13,8 +14,9 @@ import contextlib
 from pathlib import Path
 
 from bam_train.checkpoint import Checkpoint
+from bam_train.cli import experiment
 from bam_train.cli.console import number
-from bam_train.cli.experiment import ScriptParser, ctrl_c_asks, open_env, require_address, whole
+from bam_train.cli.experiment import ScriptParser, open_env, whole
 from bam_train.cli.program import guarded
 from bam_train.evaluation import FIRST_SEED
 from bam_train.policy import FrozenPolicy
@@ -26,33 +28,34 @@ from bam_train.trainers.trainer import Progress
 ENV, NAME = "bam/mir100-navigation-v0", Path(__file__).stem
 
 
-def train(steps: int, seed: int) -> Checkpoint:
-    """Train until all steps are done or Ctrl-C; save."""
-    settings = resolve({"env": ENV, "trainer": "sb3", "algo": "td3", "steps": steps, "seed": seed})
-    output, shown = choose_output(settings, None, False, None), 0
+def train(args: argparse.Namespace) -> Checkpoint:
+    """Train until all steps are done or a signal comes; save twenty times on the way."""
+    given = {**experiment.environment_of(args, ENV, {}), "trainer": "sb3", "algo": "td3"}
+    settings = resolve({**given, "steps": args.steps, "seed": args.seed})
+    experiment.require_place(settings.env, args.robot, args.render)
+    output, shown = choose_output(settings, args.out, False, None), 0
 
     def goes_on(progress: Progress) -> bool:
         nonlocal shown
-        if progress.steps >= min(shown + steps / 20, steps):
+        if asked() or progress.steps >= min(shown + args.steps / 20, args.steps):
             shown, mean = progress.steps, progress.statistics().return_mean
+            trainer.save(output.path, {}, {})
             print(f"{progress.steps:>9,} steps, mean total reward {number(mean)}", flush=True)
-        return not interrupted()
+        return not asked()
 
-    with contextlib.closing(load_trainer("sb3").create(settings)) as trainer, ctrl_c_asks() as interrupted:
-        trainer.train(steps, goes_on)
-        checkpoint = trainer.save(output.path, {}, {})
-    print(f"saved {checkpoint.path}", flush=True)
-    if interrupted():
-        raise KeyboardInterrupt
-    return checkpoint
+    with contextlib.closing(load_trainer("sb3").create(settings)) as trainer:
+        print(f"saving to {output.path} twenty times", flush=True)
+        with experiment.signals_ask() as asked:
+            trainer.train(args.steps, goes_on)
+    return Checkpoint.open(output.path)
 
 
 def main(args: argparse.Namespace) -> None:
     """Train, save, load, run."""
-    require_address(args.robot)
-    checkpoint = train(args.steps, args.seed)
+    checkpoint = train(args)
     policy = FrozenPolicy.load(checkpoint.path)
-    with open_env(checkpoint, args.robot, who=NAME, episodes=args.episodes, yes=args.yes) as env:
+    watched = {"yes": args.yes, "render": args.render}
+    with open_env(checkpoint, args.robot, who=NAME, episodes=args.episodes, **watched) as env:
         for k in range(args.episodes):
             observation, _ = env.reset(seed=FIRST_SEED + args.seed + k)
             policy.reset()
@@ -71,9 +74,9 @@ def parse() -> argparse.Namespace:
     add = parser.add_argument
     add("--steps", type=whole(1), default=15_000, metavar="N", help="steps of training (default 15000)")
     add("--episodes", type=whole(1), default=10, metavar="N", help="episodes afterwards (default 10)")
-    add("--robot", metavar="URL", help="use the policy on a live robot behind rosbridge, such as ws://10.0.0.5:9090")
-    add("--yes", action="store_true", help="do not ask before a real robot moves")
     add("--seed", type=whole(0), default=0, metavar="N", help="of weights, samples and episodes (default 0)")
+    parser.add_environment(ENV)
+    parser.add_robot()
     args: argparse.Namespace = parser.parse_args()
     return args
 

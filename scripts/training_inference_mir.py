@@ -1,26 +1,30 @@
 """Train a MiR100 to drive to a place with RLlib, save checkpoint.zip, and use it in a new environment.
 
-Training ends at the first of --stop-iters, --stop-timesteps and --stop-reward. Ctrl-C ends it after the iteration that
-is running; the checkpoint is saved then too. RLLIB_NUM_GPUS=1 learns on a GPU. An iteration of PPO, which is tuned
-for this, has 4,096 steps; the others have RLlib's own settings: in one process 200 of SAC, 50 of APPO and IMPALA.
+Training ends at the first of --stop-iters, --stop-timesteps and --stop-reward. The checkpoint is saved after every
+iteration, so whatever ends the program leaves the last one, and bam-train --resume goes on from it; Ctrl-C and SIGTERM
+wait for the end of an iteration. RLLIB_NUM_GPUS=1 learns on a GPU. An iteration of PPO, which is tuned for this, has
+4,096 steps; the others have RLlib's own settings: in one process 200 of SAC, 50 of APPO and IMPALA.
 
 Examples:
   python scripts/training_inference_mir.py                                     PPO, in this process
   python scripts/training_inference_mir.py --num-cpus 3 --stop-reward 2.5      two other processes run the episodes
   python scripts/training_inference_mir.py --run SAC --stop-iters 50 --seed 1  another algorithm
+  python scripts/training_inference_mir.py --env NoObstacleNavigationMir100Sim-v0 --parity --render
   python scripts/training_inference_mir.py --robot ws://10.0.0.5:9090          train here, then drive a real MiR100
 """
 
 import argparse
 import contextlib
+import math
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 
 from bam_train.checkpoint import Checkpoint
+from bam_train.cli import experiment
 from bam_train.cli.console import number
-from bam_train.cli.experiment import ScriptParser, ctrl_c_asks, open_env, require_address, require_cpus, whole
+from bam_train.cli.experiment import ScriptParser, open_env, whole
 from bam_train.cli.program import guarded
 from bam_train.evaluation import FIRST_SEED
 from bam_train.policy import FrozenPolicy
@@ -29,36 +33,36 @@ from bam_train.trainers.output import choose_output
 from bam_train.trainers.resolve import resolve
 from bam_train.trainers.trainer import Progress
 
-ENV = "bam/mir100-navigation-v0"  # robo-gym's own id works too: NoObstacleNavigationMir100Sim-v0
+ENV = "bam/mir100-navigation-v0"
 ENV_KWARGS: dict[str, Any] = {}
-ENOUGH, MOST = 2.4, 200_000  # mean total reward at which almost every episode succeeds; steps
+ENOUGH, MOST, ITERATIONS = 2.4, 200_000, 200  # mean total reward at which almost every episode succeeds; steps
 NAME = Path(__file__).stem
 
 
 def train(args: argparse.Namespace) -> tuple[Checkpoint, Any]:
-    """Train until something says stop; the checkpoint, and the policy to go on with."""
-    given = {"env": ENV, "env_kwargs": ENV_KWARGS, "trainer": "rllib", "algo": args.run.lower(), "seed": args.seed}
-    settings = resolve({**given, "steps": args.stop_timesteps, "num_env_runners": max(0, args.num_cpus - 1)})
-    require_cpus(args.num_cpus)
-    require_address(args.robot)
-    output, iterations = choose_output(settings, None, False, None), 0
+    """Train until something says stop, saving after every iteration; the checkpoint, and the policy to go on with."""
+    given = {**experiment.environment_of(args, ENV, ENV_KWARGS), "trainer": "rllib", "algo": args.run.lower()}
+    runners = max(0, args.num_cpus - 1)
+    settings = resolve({**given, "seed": args.seed, "steps": args.stop_timesteps, "num_env_runners": runners})
+    experiment.require_cpus(args.num_cpus)
+    experiment.require_place(settings.env, args.robot, args.render)
+    output, iterations = choose_output(settings, args.out, False, None), 0
 
     def goes_on(progress: Progress) -> bool:
         nonlocal iterations
         iterations, mean = iterations + 1, progress.statistics().return_mean
+        trainer.save(output.path, {}, {})
         print(f"iteration {iterations}: {progress.steps:,} steps, mean total reward {number(mean)}", flush=True)
         reached = mean is not None and mean >= args.stop_reward
-        return not (reached or iterations >= args.stop_iters or interrupted())
+        return not (reached or iterations >= args.stop_iters or asked())
 
     trainer: Any = load_trainer("rllib").create(settings)
     with contextlib.closing(trainer):
-        with ctrl_c_asks() as interrupted:
+        print(f"saving to {output.path} after every iteration", flush=True)
+        with experiment.signals_ask() as asked:
             trainer.train(settings.steps, goes_on)
-            checkpoint = trainer.save(output.path, {}, {})
-        print(f"saved {checkpoint.path}", flush=True)
-        if interrupted():
-            raise KeyboardInterrupt
-        return checkpoint, trainer.exploring() if args.explore_during_inference else FrozenPolicy.load(checkpoint.path)
+        checkpoint = Checkpoint.open(output.path)
+        return checkpoint, trainer.exploring() if args.explore_during_inference else FrozenPolicy.load(output.path)
 
 
 def infer(env: gym.Env[Any, Any], policy: Any, episodes: int, seed: int) -> None:
@@ -77,7 +81,8 @@ def main(args: argparse.Namespace) -> None:
     """Train, then infer in an environment of its own: simulated, or a live robot's."""
     checkpoint, policy = train(args)
     episodes = args.num_episodes_during_inference
-    with open_env(checkpoint, args.robot, who=NAME, episodes=episodes, yes=args.yes) as env:
+    watched = {"yes": args.yes, "render": args.render}
+    with open_env(checkpoint, args.robot, who=NAME, episodes=episodes, **watched) as env:
         infer(env, policy, episodes, FIRST_SEED + args.seed)
 
 
@@ -90,19 +95,19 @@ def parse() -> argparse.Namespace:
         "--num-cpus", type=whole(0), default=0, metavar="N", help="one learns, the others run episodes (default 0: one)"
     )
     add("--framework", default="torch", metavar="NAME", help="torch; RLlib has no other any more")
-    add("--stop-iters", type=whole(1), default=200, metavar="N", help="iterations to end after (default 200)")
+    add("--stop-iters", type=whole(1), default=ITERATIONS, metavar="N", help=f"iterations (default {ITERATIONS})")
     add("--stop-timesteps", type=whole(1), default=MOST, metavar="N", help=f"steps to end after (default {MOST})")
-    add(
-        "--stop-reward", type=float, default=ENOUGH, metavar="R", help=f"mean total reward to end at (default {ENOUGH})"
-    )
+    add("--stop-reward", type=float, metavar="R", help=f"mean total reward to end at (default {ENOUGH} on {ENV})")
     add("--explore-during-inference", action="store_true", help="draw actions as in training, not the best ones")
     add(
         "--num-episodes-during-inference", type=whole(1), default=10, metavar="N", help="episodes after it (default 10)"
     )
-    add("--robot", metavar="URL", help="use the policy on a live robot behind rosbridge, such as ws://10.0.0.5:9090")
-    add("--yes", action="store_true", help="do not ask before a real robot moves")
     add("--seed", type=whole(0), default=0, metavar="N", help="of weights, samples and episodes (default 0)")
+    parser.add_environment(ENV)
+    parser.add_robot()
     args: argparse.Namespace = parser.parse_args()
+    if args.stop_reward is None:  # rewards of other environments are of another size
+        args.stop_reward = math.inf if args.env or args.parity else ENOUGH
     if args.framework.lower() != "torch":
         parser.error(f"--framework {args.framework}: RLlib has nothing but torch any more; leave it out")
     if args.explore_during_inference and args.robot is not None:

@@ -1,8 +1,70 @@
-"""What the whole suite needs: signals are heard, also where the shell that started it ignores them."""
+"""What the whole suite needs: signals that are heard, and which tests two worker processes may run side by side.
 
+`make test` runs ``pytest -n 2``. The tests of one file stay in one worker, with what the file sets up once; so
+do all of Ray, whose processes fill a machine, and all of the ROS 2 peers, which share their servers. The longest come
+first, so that both workers end at about the same time.
+"""
+
+import os
 import signal
+from typing import Any
 
-signal.signal(signal.SIGINT, signal.default_int_handler)
+import pytest
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the shell that started it ignores them
 for name in ("SIGTERM", "SIGHUP"):
     if hasattr(signal, name):
         signal.signal(getattr(signal, name), signal.SIG_DFL)
+
+KINDS = {
+    "ray": (
+        "bam_train/trainers/rllib",
+        "bam_train/cli/test_train_rllib.py",
+        "bam_train/cli/test_export.py",
+        "scripts/test_bench_scale.py",
+        "scripts/test_policy_from_cp.py",
+        "scripts/test_training_inference.py",
+    ),
+    "peers": ("peers",),
+    "training": ("scripts", "bam_train/trainers/sb3", "bam_train/cli/test_train.py", "bam_train/cli/test_elsewhere.py"),
+}
+"""Marker to the folders and files whose tests have it, the longest first; `make quick` leaves them all out."""
+
+
+def kind_of(file: str) -> str | None:
+    """The marker of a test file, whose path begins with ``tests/``."""
+    name = file.partition("tests/")[2]
+    return next((kind for kind, places in KINDS.items() if any(f"{name}/".startswith(f"{p}/") for p in places)), None)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark tests by where they are, and sort them for the workers."""
+    for item in items:
+        kind = kind_of(item.nodeid)
+        if kind is not None:
+            item.add_marker(kind)
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        kinds = [*KINDS, None]
+        items.sort(key=lambda item: kinds.index(kind_of(item.nodeid)))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Hand out whole files, and all files of Ray or of the peers as one."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByFile(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = nodeid.partition("::")[0]
+            kind = kind_of(file)
+            return kind if kind in ("ray", "peers") else file
+
+    return ByFile(config, log)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say at the end why the tests with peers did not run, if they did not."""
+    told = {str(report.longrepr[2]) for report in terminalreporter.stats.get("skipped", ())}
+    for reason in sorted(one.partition("no peers: ")[2] for one in told if "no peers: " in one):
+        terminalreporter.write_line(f"tests/peers did not run: {reason}")

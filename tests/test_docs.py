@@ -233,6 +233,7 @@ def test_the_picture_is_small_and_moves():
 WITH_PROGRAMS = [page for page in PAGES if blocks(page, "python") and page.name != "adding.md"]
 
 
+@pytest.mark.training
 @pytest.mark.parametrize("page", WITH_PROGRAMS, ids=name_of)
 def test_python_examples_run(page, tmp_path):
     """The blocks of `adding.md` are files, which are tested below."""
@@ -284,6 +285,7 @@ def test_added_contracts_hold(added, name):
 ADDED = [words for words in commands(ROOT / "docs" / "adding.md") if words[0] in ("bam-train", "python")]
 
 
+@pytest.mark.training
 @pytest.mark.parametrize("words", ADDED, ids=" ".join)
 def test_added_things_train_and_deploy(added, words):
     """The commands of the page, over one rollout."""
@@ -291,7 +293,8 @@ def test_added_things_train_and_deploy(added, words):
     arguments = words[1:] if words[0] == "bam-train" else words[2:]
     out = f"{arguments[1].replace(':', '-').replace('/', '-')}.zip"
     python(*program, *arguments, "--steps", "4096", "--eval-episodes", "2", "--out", out, folder=added)
-    text = python("-m", "bam_train.cli.deploy", out, "--episodes", "1", "--fast", folder=added)
+    named = ["--env", arguments[1]]
+    text = python("-m", "bam_train.cli.deploy", out, *named, "--episodes", "1", "--fast", folder=added)
     assert text.startswith("episodes done: 1 of 1 episodes")
 
 

@@ -81,6 +81,7 @@ def test_the_base_install_is_small(metadata):
         "cbor2",
         "gymnasium",
         "msgpack",
+        "msgspec",
         "numpy",
         "onnxruntime",
         "pyyaml",

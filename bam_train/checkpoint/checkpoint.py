@@ -17,8 +17,8 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import os
-import tempfile
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -29,10 +29,13 @@ import numpy as np
 
 from bam_train.checkpoint import safetensors_file
 from bam_train.checkpoint.manifest import AGAIN, MANIFEST, Manifest, manifest_bytes, parse_manifest
+from bam_train.checkpoint.temporary import temporary_file
 from bam_train.checkpoint.zip_members import (
     CHUNK,
+    RESUME,
     digest,
     list_members,
+    most_bytes,
     open_zip,
     require_digest,
     require_same_members,
@@ -46,7 +49,7 @@ GOLDEN = "bam/golden.safetensors"
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint.zip whose members were all verified when it was opened."""
+    """A checkpoint.zip; what deployment uses was verified when it was opened, the rest is when it is read."""
 
     path: Path
     """The file."""
@@ -55,15 +58,15 @@ class Checkpoint:
 
     @classmethod
     def open(cls, path: str | Path) -> Checkpoint:
-        """Verify every member against the manifest.
+        """Verify the manifest, the list of members, and every member but those below ``bam/resume/``.
 
         Args:
             path: The file; ``~`` is expanded.
 
         Raises:
-            NotACheckpoint: No such file, not a zip, truncated, or no manifest in it.
+            NotACheckpoint: No such file, not a zip, truncated, too large, or no manifest in it.
             NewerFormat: Written by a newer bam-train.
-            AlteredCheckpoint: A member was changed, is missing or was added.
+            AlteredCheckpoint: A member was changed, is missing, was added or is too large.
         """
         path = Path(path).expanduser()
         with open_zip(path) as archive:
@@ -71,7 +74,8 @@ class Checkpoint:
             manifest = parse_manifest(path, unpack(path, archive, infos[MANIFEST]))
             require_same_members(path, set(infos) - {MANIFEST}, set(manifest.sha256))
             for name, expected in manifest.sha256.items():
-                require_digest(path, name, expected, digest(path, archive, infos[name]))
+                if not name.startswith(RESUME):  # may have gigabytes, and is verified when it is read
+                    require_digest(path, name, expected, digest(path, archive, infos[name]))
         return cls(path, manifest)
 
     def has(self, member: str) -> bool:
@@ -86,6 +90,7 @@ class Checkpoint:
         with open_zip(self.path) as archive:
             infos = list_members(self.path, archive)
             require_same_members(self.path, set(infos) - {MANIFEST}, set(self.manifest.sha256))
+            _require_memory(self.path, infos[member])
             data = unpack(self.path, archive, infos[member])
         require_digest(self.path, member, self.manifest.sha256[member], hashlib.sha256(data).hexdigest())
         return data
@@ -156,26 +161,32 @@ def next_free_path(path: str | Path) -> Path:
     return free
 
 
+def _require_memory(path: Path, info: zipfile.ZipInfo) -> None:
+    """Refuse a member that this computer's memory cannot hold, before it is unpacked."""
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else math.inf
+    if info.file_size > memory / 2:
+        text = f"{info.filename} has {info.file_size} bytes, more than half of this computer's memory ({memory})"
+        raise CheckpointError(path, f"{text}. Go on with it on a larger one")
+
+
 def _require_names(path: Path, members: Mapping[str, bytes]) -> None:
-    """Refuse names that would break the file: SB3 reads every ``.pth`` at any depth and would choke on ours."""
-    for name in members:
+    """Refuse names that would break the file, as SB3 reads every ``.pth`` at any depth, and what could not be read."""
+    for name, data in members.items():
+        if len(data) > most_bytes(name):
+            text = f"member {name!r} has {len(data)} bytes, expected at most {most_bytes(name)}"
+            raise CheckpointError(path, f"cannot be written: {text}")
         if name == MANIFEST or not name or (name.startswith("bam/") and name.endswith(".pth")):
             raise CheckpointError(path, f"member {name!r} cannot be written: the name is reserved")
 
 
 def _write_then_replace(target: Path, members: Mapping[str, bytes]) -> None:
-    descriptor, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".tmp")
-    try:
-        with os.fdopen(descriptor, "wb") as file:
+    with temporary_file(target) as temporary:
+        with temporary.open("wb") as file:
             _write_zip(file, members)
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(temporary, 0o666 & ~_umask())  # mkstemp makes it private
+        temporary.chmod(0o666 & ~_umask())
         os.replace(temporary, target)
-    except BaseException:  # an interrupt too must leave nothing behind
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-        raise
     _sync_folder(target.parent)
 
 

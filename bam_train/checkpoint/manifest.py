@@ -1,19 +1,32 @@
-"""`bam/manifest.json`: what a checkpoint is, and the sha256 of every other member."""
+"""`bam/manifest.json`: what a checkpoint is, and the sha256 of every other member.
+
+It is read against one schema before anything is done with it: a checkpoint may come from a stranger.
+"""
 
 from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta, Struct
 
 from bam_train.errors import AlteredCheckpoint, CheckpointError, NewerFormat
 
 FORMAT = 1
 MANIFEST = "bam/manifest.json"
 AGAIN = "Copy it again from its source, or train again"
+MOST_MANIFEST = 8 * 2**20
+"""Bytes of a manifest at most; it is read before anything vouches for it."""
+MOST_NUMBERS = 2**26
+"""Numbers of an observation or action at most; a colour picture of 3840 x 2160 pixels has 25 million."""
+WHERE = frozenset({"robot", "transport", "profile", "ca_file", "token_file", "rs_address"})
+"""Arguments of an environment that say where it runs; only a person says that, never a file."""
 
 
 @dataclass(frozen=True)
@@ -56,15 +69,66 @@ class Manifest:
     """Hex digest of every other member."""
 
 
-_TYPES: dict[str, tuple[type, ...]] = {
-    "int": (int,),
-    "str": (str,),
-    "float | None": (int, float, type(None)),
-    "str | None": (str, type(None)),
-    "dict[str, Any]": (dict,),
-    "dict[str, str]": (dict,),
-}
-_FIELDS = {field.name: str(field.type) for field in fields(Manifest)}
+_Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+_Number = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
+_Bound = float | Literal["inf", "-inf"] | list[Any]
+_Shape = Annotated[list[_Count], Meta(max_length=32)]
+_DType = Literal[
+    "bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float16", "float32", "float64"
+]
+
+
+class _Box(Struct, tag_field="type", tag="Box"):
+    shape: _Shape
+    dtype: _DType
+    low: _Bound
+    high: _Bound
+
+
+class _Discrete(Struct, tag_field="type", tag="Discrete"):
+    n: Annotated[int, Meta(ge=1, le=2**63 - 1)]
+    start: _Number
+    dtype: _DType
+
+
+class _MultiDiscrete(Struct, tag_field="type", tag="MultiDiscrete"):
+    nvec: list[Any]
+    start: list[Any]
+    dtype: _DType
+
+
+class _MultiBinary(Struct, tag_field="type", tag="MultiBinary"):
+    n: _Shape
+
+
+class _Dict(Struct, tag_field="type", tag="Dict"):
+    spaces: Annotated[dict[str, _Box | _Discrete | _MultiDiscrete | _MultiBinary], Meta(max_length=1000)]
+
+
+_Space = _Box | _Discrete | _MultiDiscrete | _MultiBinary | _Dict
+
+
+class _Scores(Struct):
+    success_interval: tuple[float, float] | None = None
+    episodes: _Count | None = None
+
+
+class _Contents(Struct):
+    """What the types of `Manifest` do not say."""
+
+    format: Literal[1]
+    observation_space: _Space
+    action_space: _Space
+    signals: dict[str, list[dict[str, Any]]]
+    period: Annotated[float, Meta(gt=0)] | None
+    steps: _Count
+    seed: _Count
+    scores: _Scores
+    sha256: dict[str, Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]]
+
+
+class _Head(Struct):
+    format: Any
 
 
 def parse_manifest(path: Path, data: bytes) -> Manifest:
@@ -76,22 +140,18 @@ def parse_manifest(path: Path, data: bytes) -> Manifest:
 
     Raises:
         NewerFormat: Written by a newer bam-train.
-        AlteredCheckpoint: Not JSON, or a field is missing or of the wrong type.
+        AlteredCheckpoint: Not JSON, or a field is missing, of the wrong type or not to be had from a file.
     """
     try:
-        values = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise _altered(path, f"is not JSON ({error})") from error
-    if not isinstance(values, dict):
-        raise _altered(path, f"holds a {type(values).__name__}, expected an object")
-    found = values.get("format")
-    if type(found) is int and found > FORMAT:
-        text = f"has format {found}; this bam-train reads up to {FORMAT}. Run: pip install --upgrade bam-train"
-        raise NewerFormat(path, text)
-    fault = _fault(values)
-    if fault:
-        raise _altered(path, fault)
-    return Manifest(**{name: values[name] for name in _FIELDS})
+        manifest = _parse(path, data)
+    except (msgspec.MsgspecError, RecursionError, ValueError) as error:
+        raise AlteredCheckpoint(path, MANIFEST, f"{MANIFEST}: {error}. {AGAIN}") from error
+    try:
+        require_no_place(manifest.env_kwargs)
+    except ValueError as error:  # a copy of it would say the same
+        remedy = "Ask whoever made it, or train again"
+        raise AlteredCheckpoint(path, MANIFEST, f"{MANIFEST}: {error}. {remedy}") from error
+    return manifest
 
 
 def manifest_bytes(path: Path, values: Mapping[str, Any]) -> bytes:
@@ -104,34 +164,52 @@ def manifest_bytes(path: Path, values: Mapping[str, Any]) -> bytes:
     Raises:
         CheckpointError: A field is missing, unknown, of the wrong type or not JSON.
     """
+    known = [field.name for field in fields(Manifest)]
     values = {"format": FORMAT, **values}
-    unknown = sorted(set(values) - set(_FIELDS))
-    fault = f"has no field {unknown[0]!r}" if unknown else _fault(values)
-    if fault:
-        raise CheckpointError(path, f"cannot be written: {MANIFEST} {fault}")
     try:
-        return json.dumps({name: values[name] for name in _FIELDS}, indent=2, allow_nan=False).encode()
-    except (TypeError, ValueError, RecursionError) as error:
-        raise CheckpointError(path, f"cannot be written: {MANIFEST} cannot hold these fields: {error}") from error
+        if unknown := sorted(set(values) - set(known)):
+            raise ValueError(f"there is no field {unknown[0]!r}")
+        ordered = {name: values[name] for name in known if name in values}
+        data = json.dumps(ordered, indent=2, allow_nan=False).encode()
+        require_no_place(_parse(path, data).env_kwargs)
+    except (msgspec.MsgspecError, TypeError, RecursionError, ValueError) as error:
+        raise CheckpointError(path, f"cannot be written: {MANIFEST}: {error}") from error
+    return data
 
 
-def _altered(path: Path, fault: str) -> AlteredCheckpoint:
-    return AlteredCheckpoint(path, MANIFEST, f"{MANIFEST} {fault}. {AGAIN}")
+def require_no_place(env_kwargs: Mapping[str, Any]) -> None:
+    """Refuse arguments that say where an environment runs, or which one it is.
+
+    Raises:
+        ValueError: Names the first.
+    """
+    for name in sorted(env_kwargs.keys() & (WHERE | {"env_id", "id"})):
+        what = "where the environment runs" if name in WHERE else "which environment it is"
+        raise ValueError(f"env_kwargs.{name} says {what}: flags such as --robot say that, never a file")
 
 
-def _fault(values: Mapping[str, Any]) -> str | None:
-    """Say what is wrong with a manifest's fields, if anything is."""
-    for name, kind in _FIELDS.items():
-        if name not in values:
-            return f"lacks the field {name!r}"
-        value = values[name]
-        if not isinstance(value, _TYPES[kind]) or isinstance(value, bool):
-            return f"field {name!r} is {value!r:.60}, expected {kind}"
-    if values["format"] != FORMAT:
-        return f"field 'format' is {values['format']}, expected {FORMAT}"
-    if not all(isinstance(digest, str) for digest in values["sha256"].values()):
-        return "field 'sha256' holds something else than text"
-    period = values["period"]
-    if period is not None and not (math.isfinite(period) and period > 0):
-        return f"field 'period' is {period} s, expected more than 0 s"
-    return None
+def _parse(path: Path, data: bytes) -> Manifest:
+    if len(data) > MOST_MANIFEST:
+        raise ValueError(f"{len(data)} bytes, expected at most {MOST_MANIFEST}")
+    found = msgspec.json.decode(data, type=_Head).format
+    if type(found) is int and found > FORMAT:
+        text = f"has format {found}; this bam-train reads up to {FORMAT}. Run: pip install --upgrade bam-train"
+        raise NewerFormat(path, text)
+    manifest = msgspec.json.decode(data, type=Manifest)
+    contents = msgspec.json.decode(data, type=_Contents)
+    if not re.fullmatch(r"([\w.]+:)?[^:]+", manifest.env):
+        raise ValueError(f"env {manifest.env!r} is no environment id, such as bam/pick-v0 or module:Env-v0")
+    for name in ("observation_space", "action_space"):
+        _require_reasonable(name, getattr(contents, name))
+    return manifest
+
+
+def _require_reasonable(name: str, space: _Space) -> None:
+    """Refuse a space of more numbers than a policy can take."""
+    if isinstance(space, _Dict):
+        for key, inner in space.spaces.items():
+            _require_reasonable(f"{name}.{key}", inner)
+        return
+    shape = space.n if isinstance(space, _MultiBinary) else space.shape if isinstance(space, _Box) else []
+    if math.prod(shape) > MOST_NUMBERS:
+        raise ValueError(f"{name} has shape {shape}, {math.prod(shape)} numbers; expected at most {MOST_NUMBERS}")

@@ -32,7 +32,7 @@ _DTYPES = {
 _CODES = {np.dtype(text): code for code, text in _DTYPES.items()}
 # The library lays arrays out by falling dtype, in this order, then by name.
 _ORDER = ["U64", "I64", "F64", "F32", "U32", "I32", "F16", "U16", "I16", "I8", "U8", "BOOL"]
-_HEADER_LIMIT = 100_000_000  # bytes, as in the library
+_HEADER_LIMIT = 2**23  # bytes; JSON takes many times as much once it is read
 
 
 def dump(arrays: Mapping[str, np.ndarray]) -> bytes:

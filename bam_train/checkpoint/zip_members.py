@@ -10,12 +10,24 @@ import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from bam_train.checkpoint.manifest import AGAIN, MANIFEST
+from bam_train.checkpoint.manifest import AGAIN, MANIFEST, MOST_MANIFEST
 from bam_train.errors import AlteredCheckpoint, NotACheckpoint
 
 CHUNK = 2**20  # bytes read at once
-_MANIFEST_LIMIT = 64 * 2**20  # bytes; it is read before anything vouches for it
-_TOTAL_LIMIT = 64 * 2**30  # bytes, unpacked: the largest replay buffers are a tenth of this
+MOST_MEMBERS = 10_000
+RESUME = "bam/resume/"
+"""Beginning of the names of members that only going on with training needs."""
+_MOST_DIRECTORY = 4 * 2**20  # bytes of the zip's own list of members
+_MOST_BYTES = {
+    MANIFEST: MOST_MANIFEST,
+    "bam/policy.onnx": 2**28,
+    "bam/golden.safetensors": 2**26,
+    RESUME: 64 * 2**30,  # the largest replay buffers are a tenth of this
+    "": 2**29,
+}
+"""Bytes of a member at most, unpacked, by the beginning of its name; the first that fits."""
+_MOST_JSON = 2**24
+"""Bytes at most of a JSON member, which is many times as large once it is read."""
 # What zipfile lets out for damaged headers and streams; NotImplementedError and RecursionError are RuntimeErrors.
 _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError, KeyError, OverflowError, struct.error)
 
@@ -29,6 +41,7 @@ def open_zip(path: Path) -> Iterator[zipfile.ZipFile]:
                 path,
                 "is a folder, expected a checkpoint.zip. Give the file in it; bam-export makes one of RLlib's folders",
             )
+        _require_short_directory(path)
         with zipfile.ZipFile(path) as archive:
             yield archive
     except FileNotFoundError as error:
@@ -105,16 +118,36 @@ def _chunks(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Iter
         raise AlteredCheckpoint(path, name, f"{name} has {found} bytes, expected {info.file_size}. {AGAIN}")
 
 
+def _require_short_directory(path: Path) -> None:
+    """Refuse a list of members that takes long to read; zipfile reads it whole."""
+    with path.open("rb") as file:
+        record = zipfile._EndRecData(file)  # type: ignore[attr-defined]  # there is no public way to ask first
+    if record and record[zipfile._ECD_SIZE] > _MOST_DIRECTORY:  # type: ignore[attr-defined]
+        found = record[zipfile._ECD_SIZE]  # type: ignore[attr-defined]
+        raise NotACheckpoint(path, f"lists members in {found} bytes, expected at most {_MOST_DIRECTORY}. {AGAIN}")
+
+
+def most_bytes(name: str) -> int:
+    """How many bytes a member of this name may have at most, unpacked."""
+    most = next(most for start, most in _MOST_BYTES.items() if name.startswith(start))
+    return min(most, _MOST_JSON) if name.endswith(".json") else most
+
+
 def _require_sane_sizes(path: Path, infos: Mapping[str, zipfile.ZipInfo]) -> None:
-    """Refuse overlapping members and unpacked sizes that only an attack has: a zip bomb costs time, never memory."""
+    """Refuse overlapping members, and sizes that only an attack has, before anything is unpacked."""
+    if len(infos) > MOST_MEMBERS:
+        raise NotACheckpoint(path, f"has {len(infos)} members, expected at most {MOST_MEMBERS}. {AGAIN}")
     size = path.stat().st_size
     packed = sum(info.compress_size for info in infos.values())
     if packed > size:
         raise NotACheckpoint(path, f"claims {packed} bytes of members in a file of {size}. {AGAIN}")
-    unpacked = sum(info.file_size for info in infos.values())
-    if unpacked > _TOTAL_LIMIT:
-        raise NotACheckpoint(path, f"would unpack to {unpacked} bytes, expected at most {_TOTAL_LIMIT}. {AGAIN}")
-    found = infos[MANIFEST].file_size
-    if found > _MANIFEST_LIMIT:
-        text = f"{MANIFEST} has {found} bytes, expected at most {_MANIFEST_LIMIT}. {AGAIN}"
-        raise AlteredCheckpoint(path, MANIFEST, text)
+    for name, info in infos.items():
+        if info.file_size > most_bytes(name):
+            text = f"{name} has {info.file_size} bytes, expected at most {most_bytes(name)}. {AGAIN}"
+            raise AlteredCheckpoint(path, name, text)
+    for resumed in (False, True):
+        group = [info.file_size for name, info in infos.items() if name.startswith(RESUME) is resumed]
+        most = most_bytes(RESUME if resumed else "")
+        if sum(group) > most:
+            what = "for --resume" if resumed else "beside those for --resume"
+            raise NotACheckpoint(path, f"has {sum(group)} bytes of members {what}, expected at most {most}. {AGAIN}")

@@ -54,16 +54,20 @@ def require_consent(env: Any, who: str, *, yes: bool, plan: Sequence[str] = ()) 
         plan: Lines that say what it will do.
 
     Raises:
-        SettingsError: The answer is not yes, or there is nobody to ask.
+        SettingsError: The robot says that it cannot move now, the answer is not yes, or there is nobody to ask.
     """
     from bam_train.errors import SettingsError
 
-    info = getattr(getattr(env.unwrapped, "robot", None), "info", None)
-    if info is None or info.simulated:
+    robot = getattr(env.unwrapped, "robot", None)
+    info = getattr(robot, "info", None)
+    if robot is None or info is None or info.simulated:
         return
     what = [f"{who} will move {info.text}:", *plan, "within"] if plan else [f"{who} will move {info.text}, within"]
     for line in (*what, *limit_lines(guards_of(env))):
         say(line)
+    why = robot.not_ready()
+    if why is not None:
+        raise SettingsError(f"not ready: {why}; nothing has moved")
     if yes:
         return
     if not sys.stdin.isatty():

@@ -1,9 +1,17 @@
-"""Standard error as the programs use it: a rich console on a terminal, plain lines elsewhere; and numbers to read."""
+"""Where the programs print: lines on standard output and error, a rich console on a terminal; and numbers to read.
+
+What is printed may come from a file or from the network. So every text passes `shown`, here and nowhere else.
+"""
 
 from __future__ import annotations
 
+import logging
 import sys
-from typing import TYPE_CHECKING
+import traceback
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from bam_train.shown import shown
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -18,12 +26,41 @@ def make_console() -> Console:
     """A rich console on standard error; standard output is kept for results that programs read."""
     from rich.console import Console
 
-    return Console(stderr=True, highlight=False)
+    return Console(stderr=True, highlight=False, markup=False, emoji=False)
 
 
 def say(text: str = "") -> None:
     """Print one plain line on standard error."""
-    print(text, file=sys.stderr, flush=True)
+    print(shown(text), file=sys.stderr, flush=True)
+
+
+def tell(*lines: str) -> None:
+    """Print the results of a program on standard output, line by line."""
+    print("\n".join(map(shown, lines)), flush=True)
+
+
+class ShownFormatter(logging.Formatter):
+    """Shows what is logged as everything else."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - logging's name
+        """One line."""
+        return shown(super().formatMessage(record))
+
+    def formatException(self, ei: Any) -> str:  # noqa: N802
+        """The lines of a traceback."""
+        return "\n".join(map(shown, super().formatException(ei).split("\n")))
+
+
+def show_logs_and_tracebacks() -> None:
+    """Show what Python itself prints of a program: logs that nobody handles, and the traceback of a mistake of ours."""
+    if logging.lastResort is not None:
+        logging.lastResort.setFormatter(ShownFormatter())
+    sys.excepthook = _say_traceback
+
+
+def _say_traceback(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    for line in "".join(traceback.format_exception(kind, error, trace)).rstrip("\n").split("\n"):
+        say(line)
 
 
 def count(number: float) -> str:

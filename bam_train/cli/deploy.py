@@ -1,4 +1,8 @@
-"""`bam-deploy`: drive a robot with a checkpoint's frozen policy, at the environment's own rate, without torch."""
+"""`bam-deploy`: drive a robot with a checkpoint's frozen policy, at the environment's own rate, without torch.
+
+A signal ends it at any moment, so nothing else is imported before signals are answered; and one whose exception Python
+discarded, as it does in the callbacks of an import, is seen again before anything moves.
+"""
 
 from __future__ import annotations
 
@@ -8,20 +12,20 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import tyro
+from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.consent import guards_of, plan_lines, require_consent
-from bam_train.cli.console import is_terminal, make_console, say
-from bam_train.cli.program import run_program
+from bam_train.cli.console import is_terminal, make_console, say, tell
+from bam_train.cli.program import guarded, parse, prepare
+from bam_train.cli.signal_memory import SignalMemory
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import gymnasium as gym
 
     from bam_train.checkpoint import Checkpoint
+    from bam_train.cli.deploy_config import DeployConfig
     from bam_train.deploy.agents import Watcher
     from bam_train.deploy.journal import Journal
     from bam_train.deploy.loop import Deployment
@@ -29,42 +33,8 @@ if TYPE_CHECKING:
     from bam_train.place import Place
 
 
-@dataclass(frozen=True)
-class DeployConfig:
-    """Run the frozen policy of a checkpoint on a robot, simulated here or live, at the rate it was made for."""
-
-    checkpoint: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CHECKPOINT")]
-    """The checkpoint.zip that bam-train wrote."""
-    episodes: int = 5
-    """How many episodes."""
-    seed: int = 1_000_000
-    """Seed of the first episode; episode k gets seed + k, as in bam-eval."""
-    robot: Annotated[str | None, tyro.conf.arg(metavar="URL")] = None
-    """Live robot behind rosbridge, such as ws://10.0.0.5:9090; by default the simulated one here."""
-    transport: Annotated[str | None, tyro.conf.arg(metavar="URL")] = None
-    """Whole environment that runs elsewhere: ws://10.0.0.5:9090/bam_001 (GymAPI), tcp://10.0.0.5:9091."""
-    profile: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """What the live robot's topics are: a shipped name, or a .toml or .yaml file."""
-    ca_file: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Certificates that wss:// trusts instead of the system's."""
-    token_file: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """File with the token that the server asks for."""
-    timeout: Annotated[float | None, tyro.conf.arg(metavar="S")] = None
-    """Longest that an answer of --transport is waited for [s]; 30 by default."""
-    yes: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Do not ask before a real robot moves."""
-    rate: Annotated[float | None, tyro.conf.arg(metavar="HZ")] = None
-    """Actions a second [Hz]; by default the environment's own."""
-    fast: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Do not wait for deadlines: as fast as it goes."""
-    render: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Show the robot in a window."""
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Print one JSON report on standard output instead of a few lines."""
-
-
-def deploy_checkpoint(config: DeployConfig) -> int:
-    """The program, with its arguments read."""
+def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
+    """The program, with its arguments read; a signal that came and was lost ends it before the robot moves."""
     from bam_train.deploy.journal import Journal, Startup
 
     startup = Startup()
@@ -73,29 +43,32 @@ def deploy_checkpoint(config: DeployConfig) -> int:
     from bam_train.checkpoint import Checkpoint
     from bam_train.deploy.loop import Deployment
     from bam_train.deploy.pacer import Pacer
-    from bam_train.environments import make_env, require_fit
+    from bam_train.environments import environment_of, make_env, require_fit
     from bam_train.policy import FrozenPolicy
 
     startup.mark("imports")
+    signals.raise_again()
     checkpoint = Checkpoint.open(config.checkpoint)
     policy = FrozenPolicy.from_checkpoint(checkpoint)
     startup.mark("policy")
-    manifest = checkpoint.manifest
     place = place_of(config)
-    env = make_env(manifest.env, manifest.env_kwargs, render_mode="human" if config.render else None, place=place)
+    env_id, env_kwargs = environment_of(checkpoint, config.env, elsewhere=bool(place.transport))
+    env = make_env(env_id, env_kwargs, render_mode="human" if config.render else None, place=place)
     try:
         require_fit(checkpoint, env, place)
         pacer = Pacer(period_of(config, checkpoint, env))
         journal = Journal(config.episodes, startup)
         deployment = Deployment(env, policy, pacer, journal)
+        signals.raise_again()
         deployment.connect()
-        plan = plan_lines(env, manifest.env, place.text, config.episodes)
+        signals.raise_again()
+        plan = plan_lines(env, env_id, place.text, config.episodes)
         require_consent(env, f"bam-deploy: {config.checkpoint}", yes=config.yes, plan=plan)
     except BaseException:
         env.close()  # type: ignore[no-untyped-call]
         raise
     startup.mark("environment")
-    return _run(config, checkpoint, env, deployment, pacer, journal)
+    return _run(config, checkpoint, env, deployment, pacer, journal, signals)
 
 
 def _run(
@@ -105,11 +78,13 @@ def _run(
     deployment: Deployment,
     pacer: Pacer,
     journal: Journal,
+    signals: SignalMemory,
 ) -> int:
     from bam_train.deploy.report import DeployReport
     from bam_train.deploy.signals import stop_signals
 
-    with stop_signals():  # a second Ctrl-C must not lose the report
+    with stop_signals() as switch:  # a second Ctrl-C must not lose the report
+        switch.waiting += signals.came  # one that was lost: the deployment ends before it begins
         place = place_of(config).text
         title = f"{checkpoint.path} on {checkpoint.manifest.env}{place and f' at {place}'}"
         with _display(title, env, journal) as watcher:
@@ -119,8 +94,9 @@ def _run(
             say(f"bam-deploy: {ending.reason}")
         guards = guards_of(env)
         report = DeployReport(checkpoint, config.seed, ending, journal, pacer, place or "simulated here", guards)
-        text = json_module.dumps(report.to_json(), allow_nan=False) if config.json else "\n".join(report.lines())
-        print(text, flush=True)
+        for warning in report.warnings():
+            say(f"bam-deploy: warning: {warning}")
+        tell(*([json_module.dumps(report.to_json(), allow_nan=False)] if config.json else report.lines()))
     return ending.status
 
 
@@ -153,11 +129,23 @@ def _require_sane(config: DeployConfig) -> None:
         raise SettingsError(
             "a live robot is driven at the rate that its policy was made for; leave out --rate and --fast"
         )
-    if config.render and place_of(config).is_remote:
+    if config.render:
+        require_screen(remote=place_of(config).is_remote)
+
+
+def require_screen(*, remote: bool) -> None:
+    """Refuse ``--render`` where there is nothing to show, or nowhere to show it.
+
+    Raises:
+        SettingsError: The robot is elsewhere, or there is no screen.
+    """
+    from bam_train.errors import SettingsError
+
+    if remote:
         raise SettingsError(
             "--render shows the simulation here, and there is none with --robot or --transport; leave it out"
         )
-    if config.render and sys.platform == "linux" and not (os.environ.keys() & {"DISPLAY", "WAYLAND_DISPLAY"}):
+    if sys.platform == "linux" and not (os.environ.keys() & {"DISPLAY", "WAYLAND_DISPLAY"}):
         raise SettingsError(
             "--render needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set; "
             "leave it out, or make a film: bam-eval CHECKPOINT --video film.gif"
@@ -197,9 +185,16 @@ def period_of(config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, An
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the console script."""
-    run_program(
-        deploy_checkpoint, DeployConfig, prog="bam-deploy", description=DeployConfig.__doc__ or "", arguments=arguments
-    )
+    prepare()
+    sys.exit(guarded(lambda: _main(arguments), "bam-deploy"))
+
+
+def _main(arguments: Sequence[str] | None) -> int:
+    with SignalMemory() as signals:
+        from bam_train.cli.deploy_config import DeployConfig
+
+        config = parse(DeployConfig, "bam-deploy", DeployConfig.__doc__ or "", arguments)
+        return deploy_checkpoint(config, signals)
 
 
 if __name__ == "__main__":

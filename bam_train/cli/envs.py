@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from bam_train.cli.console import tell
 from bam_train.cli.program import run_program
 
 
@@ -17,7 +18,7 @@ from bam_train.cli.program import run_program
 class EnvsConfig:
     """List our environments, or describe one (any Gymnasium id): spaces, rate, name and unit of every number."""
 
-    env: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="ID")] = None
+    env: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="[ID]")] = None
     """The environment to describe, e.g. bam/pick; without it, all of ours are listed."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print JSON."""
@@ -27,11 +28,14 @@ def show_environments(config: EnvsConfig) -> None:
     """The program, with its arguments read."""
     if config.env is None:
         rows = overview()
-        print(json_module.dumps(rows, indent=2) if config.json else "\n".join(overview_lines(rows)), flush=True)
+        _tell(rows, overview_lines(rows), as_json=config.json)
         return
     facts = details(config.env)
-    text = json_module.dumps(facts, indent=2, allow_nan=False) if config.json else "\n".join(detail_lines(facts))
-    print(text, flush=True)
+    _tell(facts, detail_lines(facts), as_json=config.json)
+
+
+def _tell(facts: Any, lines: list[str], *, as_json: bool) -> None:
+    tell(*(json_module.dumps(facts, indent=2, allow_nan=False).split("\n") if as_json else lines))
 
 
 def overview() -> list[dict[str, Any]]:

@@ -3,46 +3,21 @@
 from __future__ import annotations
 
 import json as json_module
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import tyro
-
-from bam_train.cli.console import say
-from bam_train.cli.program import run_program
+from bam_train.cli.console import say, tell
+from bam_train.cli.program import guarded, run_program
 
 if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
+    from bam_train.cli.eval_config import EvalConfig
     from bam_train.evaluation import EvaluationReport
     from bam_train.policy import FrozenPolicy
-
-
-@dataclass(frozen=True)
-class EvalConfig:
-    """Evaluate the frozen policy of a checkpoint over seeded episodes."""
-
-    checkpoint: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CHECKPOINT")]
-    """The checkpoint.zip that bam-train wrote."""
-    episodes: int = 100
-    """How many episodes."""
-    seed: int = 1_000_000
-    """Seed of the first episode; episode k gets seed + k. The default is far from the seeds that training uses."""
-    env: Annotated[str | None, tyro.conf.arg(metavar="ID")] = None
-    """Refuse the checkpoint unless it was trained on this environment; needed for a plain stable-baselines3 zip."""
-    algo: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Refuse the checkpoint unless it was trained by this algorithm; needed for a plain stable-baselines3 zip."""
-    num_envs: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Environments stepped side by side; by default as many as is quick."""
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Print one JSON object on standard output instead of a table."""
-    video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Film the first episodes into this .gif or .mp4 file."""
-    video_episodes: int = 3
-    """How many episodes the film shows."""
-    trust_pickle: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Load a plain stable-baselines3 zip, which runs whatever code is in it."""
 
 
 @dataclass(frozen=True)
@@ -93,25 +68,32 @@ def _subject(config: EvalConfig) -> Subject:
 
 def _own(config: EvalConfig, path: Path) -> Subject:
     """One of our checkpoints: nothing is unpickled, and torch is not imported."""
-    from bam_envs.registry import resolve_id
     from bam_train.checkpoint import Checkpoint
+    from bam_train.environments import environment_of, require_env_kwargs
     from bam_train.errors import CheckpointMismatch
     from bam_train.policy import FrozenPolicy
+    from bam_train.settings import read_env_kwargs
 
     checkpoint = Checkpoint.open(path)
-    manifest = checkpoint.manifest
-    if config.env is not None:
-        checkpoint.requires_env(resolve_id(config.env))
+    manifest, asked = checkpoint.manifest, read_env_kwargs(config.set)
+    env_id, env_kwargs = environment_of(checkpoint, config.env)
     if config.algo not in (None, manifest.algorithm):
         raise CheckpointMismatch(path, f"was trained by {manifest.algorithm}, not by {config.algo}")
-    facts = {"checkpoint": str(path), "algorithm": manifest.algorithm, "steps": manifest.steps}
-    return Subject(FrozenPolicy.from_checkpoint(checkpoint), manifest.env, dict(manifest.env_kwargs), facts, checkpoint)
+    require_env_kwargs(env_id, asked)
+    facts = _facts(path, manifest.algorithm, manifest.steps, asked)
+    return Subject(FrozenPolicy.from_checkpoint(checkpoint), env_id, {**env_kwargs, **asked}, facts, checkpoint)
+
+
+def _facts(path: Path, algorithm: str, steps: int, asked: dict[str, Any]) -> dict[str, Any]:
+    return {"checkpoint": str(path), "algorithm": algorithm, "steps": steps, **({"env_kwargs": asked} if asked else {})}
 
 
 def _foreign(config: EvalConfig, path: Path) -> Subject:
     """A plain stable-baselines3 zip, if the user trusts its maker."""
     from bam_envs.registry import resolve_id
+    from bam_train.environments import parity_if_needed, require_env_kwargs
     from bam_train.errors import NotACheckpoint, SettingsError
+    from bam_train.settings import read_env_kwargs
     from bam_train.trainers import require_algorithm
     from bam_train.trainers.sb3.foreign import load_trusted
 
@@ -124,27 +106,31 @@ def _foreign(config: EvalConfig, path: Path) -> Subject:
     if config.env is None or config.algo is None:
         raise SettingsError(f"{path}: a plain stable-baselines3 file does not say what it is; give --env and --algo")
     require_algorithm("sb3", config.algo)
-    env = resolve_id(config.env)
+    env, env_kwargs = resolve_id(config.env), read_env_kwargs(config.set)
+    require_env_kwargs(env, env_kwargs)
     say(
         f"bam-eval: warning: loading {path} runs whatever code is in it (--trust-pickle). If its run normalised "
         f"observations, these figures are wrong: the normaliser is not in such a file."
     )
-    model = load_trusted(path, config.algo, env)
-    facts = {"checkpoint": str(path), "algorithm": config.algo, "steps": model.steps}
-    return Subject(model.policy, env, {}, facts, None)
+    load = partial(load_trusted, path, config.algo, env)
+    env_kwargs, model = parity_if_needed(env, env_kwargs, load, lambda text: say(f"bam-eval: {text}"))
+    facts = _facts(path, config.algo, model.steps, env_kwargs)
+    return Subject(model.policy, env, env_kwargs, facts, None)
 
 
 def _show(report: EvaluationReport, facts: dict[str, Any], *, as_json: bool) -> None:
     if as_json:
-        print(json_module.dumps({**report.to_json(), **facts}, allow_nan=False), flush=True)
+        tell(json_module.dumps({**report.to_json(), **facts}, allow_nan=False))
         return
-    print("\n".join(table(report, facts)), flush=True)
+    tell(*table(report, facts))
 
 
 def table(report: EvaluationReport, facts: dict[str, Any]) -> list[str]:
     """The report for people, line by line."""
+    given = ", ".join(f"{name}={value!r}" for name, value in facts.get("env_kwargs", {}).items())
     return [
-        f"{facts['checkpoint']} ({facts['algorithm']}, {facts['steps']:,} steps) on {report.env}",
+        f"{facts['checkpoint']} ({facts['algorithm']}, {facts['steps']:,} steps) on {report.env}"
+        + (f" with {given}" if given else ""),
         f"  success   {_success(report)}",
         f"  return    {_spread(report.return_mean, report.return_std)}, {_range(report)}",
         f"  length    {_spread(report.length_mean, report.length_std)} steps",
@@ -205,6 +191,12 @@ def _progress(done: int, episodes: int) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the console script."""
+    sys.exit(guarded(lambda: _main(arguments), "bam-eval"))
+
+
+def _main(arguments: Sequence[str] | None) -> None:
+    from bam_train.cli.eval_config import EvalConfig
+
     run_program(
         evaluate_checkpoint, EvalConfig, prog="bam-eval", description=EvalConfig.__doc__ or "", arguments=arguments
     )

@@ -6,11 +6,16 @@ import argparse
 import contextlib
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from bam_train.cli.consent import plan_lines, require_consent
+from bam_train.cli.program import TOGETHER, Terminated
+from bam_train.cli.signal_memory import SignalMemory
+from bam_train.cli.stop_signals import StopSignals
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -45,6 +50,24 @@ class ScriptParser(argparse.ArgumentParser):
             options = [text for action in self._actions for text in action.option_strings]
             self.error(f"unknown option {rest[0]!r}. {closest(rest[0].partition('=')[0], options)}")
         return known
+
+    def add_environment(self, own: str) -> None:
+        """Add ``--env``, ``--parity`` and ``--out``, what is trained on and where it goes."""
+        self.add_argument("--env", metavar="ID", help=f"environment, any that bam-train takes (default {own})")
+        self.add_argument("--parity", action="store_true", help="robo-gym's own arithmetic: env_kwargs.parity=true")
+        self.add_argument(
+            "--out", type=Path, metavar="FILE", help="checkpoint (default checkpoints/NAME.zip, or a numbered one)"
+        )
+
+    def add_robot(self) -> None:
+        """Add ``--robot``, ``--yes`` and ``--render``, where the policy acts and who watches."""
+        self.add_argument(
+            "--robot",
+            metavar="URL",
+            help="use the policy on a live robot behind rosbridge, such as ws://10.0.0.5:9090",
+        )
+        self.add_argument("--yes", action="store_true", help="do not ask before a real robot moves")
+        self.add_argument("--render", action="store_true", help="show the policy's episodes in a window")
 
     def error(self, message: str) -> NoReturn:
         """End the program with one line on standard error."""
@@ -82,39 +105,79 @@ def require_cpus(number: int) -> None:
         )
 
 
-def require_address(robot: str | None) -> None:
-    """Refuse a ``--robot`` that is no address before anything is trained for it; nothing is connected.
+def environment_of(args: argparse.Namespace, own: str, own_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings ``env`` and ``env_kwargs`` of ``--env`` and ``--parity``; without ``--env`` the script's own."""
+    kwargs = dict(own_kwargs) if args.env is None else {}
+    return {"env": args.env or own, "env_kwargs": kwargs | ({"parity": True} if args.parity else {})}
+
+
+def require_place(env_id: str, robot: str | None, render: bool) -> None:
+    """Refuse a ``--robot`` that cannot be and a ``--render`` without a screen; nothing is made or connected.
 
     Raises:
-        InvalidValue: Says what was expected.
+        InvalidValue: Says what address was expected.
+        SettingsError: The environment has no robot, or there is nothing to show, or no screen.
     """
     if robot is not None:
         from bam_envs.robots.live.building import require_robot_address
+        from bam_train.place import Place
 
         require_robot_address(robot)
+        Place(robot).robot_kwargs(env_id, {})
+    if render:
+        from bam_train.cli.deploy import require_screen
+
+        require_screen(remote=robot is not None)
 
 
 @contextlib.contextmanager
-def ctrl_c_asks() -> Iterator[Callable[[], bool]]:
-    """Within, the first Ctrl-C interrupts nothing, and what this gives says that it came; the second interrupts."""
-    asked = False
+def signals_ask() -> Iterator[Callable[[], bool]]:
+    """Within, the first Ctrl-C, SIGTERM or SIGHUP interrupts nothing, and what this gives says that it came.
 
-    def ask(*_: object) -> None:
-        nonlocal asked
-        asked = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        print("finishing the update and saving; Ctrl-C again quits at once", file=sys.stderr, flush=True)
+    A second one interrupts, and leaving raises what the first one asked for.
 
-    before = signal.signal(signal.SIGINT, ask)
+    Raises:
+        KeyboardInterrupt: A signal came; of SIGTERM and SIGHUP, `Terminated`.
+    """
+    came: list[int] = []
+    first = 0.0
+
+    def hear(number: int, frame: FrameType | None) -> None:
+        nonlocal first
+        if came and number == came[0] != signal.SIGINT and time.monotonic() < first + TOGETHER:
+            return
+        if came:
+            _raise(number)
+        came.append(number)
+        first = time.monotonic()
+        again = "Ctrl-C again" if number == signal.SIGINT else "another signal"
+        print(f"finishing the update and saving; {again} quits at once", file=sys.stderr, flush=True)
+
+    heard = [number for number in StopSignals.SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+    before = [(number, signal.signal(number, hear)) for number in heard]
     try:
-        yield lambda: asked
+        yield lambda: bool(came)
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before:
+            signal.signal(number, handler)
+    if came:
+        _raise(came[0])
+
+
+def _raise(number: int) -> NoReturn:
+    raise KeyboardInterrupt if number == signal.SIGINT else Terminated(number)
 
 
 @contextlib.contextmanager
 def open_env(
-    checkpoint: Checkpoint, robot: str | None = None, *, who: str, episodes: int, yes: bool = False
+    checkpoint: Checkpoint,
+    robot: str | None = None,
+    *,
+    who: str,
+    episodes: int,
+    yes: bool = False,
+    render: bool = False,
+    env_kwargs: Mapping[str, Any] | None = None,
 ) -> Iterator[gym.Env[Any, Any]]:
     """The environment that a checkpoint was trained in, fresh; within, a live robot is connected and may be moved.
 
@@ -127,19 +190,25 @@ def open_env(
         who: What will move it, as the question to a person begins.
         episodes: How many are planned, for the same question.
         yes: Do not ask before a real robot moves.
+        render: Show the simulation in a window.
+        env_kwargs: Arguments of the environment; they win over the checkpoint's.
 
     Raises:
         CheckpointMismatch: The environment is another than the checkpoint was trained in.
-        SettingsError: It cannot be made, or nobody says that the real robot may move.
+        SettingsError: It cannot be made or shown, or nobody says that the real robot may move.
     """
-    from bam_train.environments import make_env, require_fit
+    from bam_train.environments import environment_of, make_env, require_fit
     from bam_train.place import Place
 
-    manifest, place = checkpoint.manifest, Place(robot=robot)
-    with contextlib.closing(make_env(manifest.env, manifest.env_kwargs, place=place)) as env:
+    place = Place(robot=robot)
+    env_id, own = environment_of(checkpoint)
+    require_place(env_id, robot, render)
+    mode, kwargs = "human" if render else None, {**own, **(env_kwargs or {})}
+    with SignalMemory() as signals, contextlib.closing(make_env(env_id, kwargs, render_mode=mode, place=place)) as env:
         require_fit(checkpoint, env, place)
         if robot is not None:
             env.unwrapped.robot.connect()  # type: ignore[attr-defined]
-            plan = plan_lines(env, manifest.env, place.text, episodes)
+            plan = plan_lines(env, env_id, place.text, episodes)
             require_consent(env, f"{who}: {checkpoint.path}", yes=yes, plan=plan)
+        signals.raise_again()  # one whose exception Python discarded: nothing may move after it
         yield env

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from bam_train.cli.console import say
+from bam_train.cli.console import say, tell
 from bam_train.cli.program import run_program
 
 if TYPE_CHECKING:
@@ -32,6 +32,8 @@ class ExportConfig:
     """Algorithm that trained it; by default what the directory says."""
     policy: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Which policy, where the directory has several."""
+    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    """env_kwargs.NAME=VALUE: an argument of the environment, any number of times; it wins over the directory's."""
     trust_pickle: tyro.conf.FlagCreatePairsOff[bool] = False
     """Unpickle files that cannot be read otherwise, which runs whatever code is in them."""
     force: bool = False
@@ -40,11 +42,13 @@ class ExportConfig:
 
 def export_directory(config: ExportConfig) -> int:
     """The program, with its arguments read."""
+    from bam_train.settings import read_env_kwargs
     from bam_train.trainers.rllib.foreign.export import export
 
     exported = export(
         config.directory,
         env=config.env,
+        env_kwargs=read_env_kwargs(config.set),
         algo=config.algo,
         policy=config.policy,
         trust=config.trust_pickle,
@@ -54,7 +58,7 @@ def export_directory(config: ExportConfig) -> int:
     for notice in output.notices:
         say(f"bam-export: {notice}")
     checkpoint = exported.write(output.path)
-    print("\n".join(_summary(exported, checkpoint)), flush=True)
+    tell(*_summary(exported, checkpoint))
     return 0
 
 
@@ -67,14 +71,19 @@ def _output(config: ExportConfig, exported: Exported) -> Output:
 
 
 def _summary(exported: Exported, checkpoint: Checkpoint) -> list[str]:
+    from bam_train.environments import must_be_named
+
     path, parts = checkpoint.path, exported.parts
+    named = f" --env {exported.env}" if must_be_named(exported.env) else ""
     made_by = f" of Ray {exported.directory.ray_version}" if exported.directory.ray_version else ""
     steps = f", {exported.steps:,} steps" if exported.steps else ""
     return [
         f"{path}: {parts.algorithm} on {exported.env}{steps}, out of {exported.directory.given}{made_by}",
         f"  checked   against the actions of {exported.checked_by}: they differ by {exported.difference:.1e} at most",
-        f"  next      bam-eval {path}, bam-deploy {path}",
-        "  it holds the policy alone: bam-train --resume cannot go on from it",
+        f"  next      bam-eval {path}{named}, bam-deploy {path}{named}",
+        f"            bam-train --resume {path}{named} --steps N"
+        if not isinstance(exported.training, str)
+        else f"  bam-train --resume cannot go on from it: {exported.training}",
     ]
 
 

@@ -19,6 +19,8 @@ from collections.abc import Callable, Iterator, Sequence
 from types import FrameType
 from typing import TextIO, TypeVar
 
+from bam_train.cli.console import say, show_logs_and_tracebacks
+
 Config = TypeVar("Config")
 
 EXTRAS = {
@@ -39,6 +41,9 @@ EXTRAS = {
 TOGETHER = 0.5
 """A signal of a program that comes again within this time is the same one [s]: ``timeout`` sends SIGTERM to the process
 and then to its group. Ctrl-C is a person's, and counts each time."""
+
+LONGEST = 2000
+"""Characters of an error line; a file or a server may bring a name of millions."""
 
 INTERRUPTED = 130
 """Exit status of a program that Ctrl-C ended (128 + SIGINT)."""
@@ -64,8 +69,14 @@ def run_program(
     Raises:
         SystemExit: Always.
     """
-    sys.path.append(os.getcwd())  # --env my_module:Env-v0, as with python -m; last, so that it hides nothing
+    prepare()
     sys.exit(guarded(lambda: main(parse(config, prog, description, arguments)), prog))
+
+
+def prepare() -> None:
+    """What comes before everything: where modules of the user are found, and how Python's own texts are shown."""
+    sys.path.append(os.getcwd())  # --env my_module:Env-v0, as with python -m; last, so that it hides nothing
+    show_logs_and_tracebacks()
 
 
 def parse(config: type[Config], prog: str, description: str, arguments: Sequence[str] | None) -> Config:
@@ -121,6 +132,9 @@ def guarded(main: Callable[[], int | None], prog: str) -> int:
         return 1
     except ModuleNotFoundError as error:
         _complain(prog, missing_extra(error))
+        return 1
+    except MemoryError as error:
+        _complain(prog, f"not enough memory: {error}" if str(error) else "not enough memory")
         return 1
     except OSError as error:
         if error.errno != errno.ENOSPC or is_expected(error):
@@ -211,4 +225,5 @@ def missing_extra(error: ModuleNotFoundError) -> str:
 
 
 def _complain(prog: str, text: str) -> None:
-    print(f"{prog}: {' '.join(text.split())}", file=sys.stderr, flush=True)
+    line = " ".join(text.split())
+    say(f"{prog}: {line if len(line) <= LONGEST else f'{line[:LONGEST]} ... ({len(line)} characters)'}")

@@ -5,14 +5,13 @@ It is stopped by signals only, at any moment, so nothing else is imported before
 
 from __future__ import annotations
 
-import signal
 import sys
 import threading
 from collections.abc import Sequence
-from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from bam_train.cli.program import Terminated, guarded, run_program
+from bam_train.cli.program import guarded, run_program
+from bam_train.cli.signal_memory import SignalMemory
 
 if TYPE_CHECKING:
     from bam_envs.serve.describe import Env
@@ -40,8 +39,11 @@ def serve(config: ServeConfig) -> int:
     config.serving.require_sane()
     with SignalMemory() as signals:
         from bam_envs.serve.program import ServedEnvironment
+        from bam_train.cli.console import ShownFormatter
 
-        logging.basicConfig(level=logging.WARNING, format="bam-serve: %(message)s")
+        handler = logging.StreamHandler()
+        handler.setFormatter(ShownFormatter("bam-serve: %(message)s"))
+        logging.basicConfig(level=logging.WARNING, handlers=[handler])
         with ServedEnvironment(consented_env(config), config.serving, _tell) as served:
             for line in served.endpoints:
                 _tell(line)
@@ -50,35 +52,6 @@ def serve(config: ServeConfig) -> int:
                 signals.raise_again()
                 served.require_running()
     return 0
-
-
-class SignalMemory:
-    """Within this, a signal is remembered: what its handler raises is lost where Python ignores it, as in `__del__`."""
-
-    def __init__(self) -> None:
-        self._came: list[int] = []
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> SignalMemory:
-        if threading.current_thread() is threading.main_thread():
-            handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-            self._before = {number: handler for number, handler in handlers.items() if callable(handler)}
-            for number in self._before:
-                signal.signal(number, self._handle)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        self._came.append(number)
-        self._before[number](number, frame)
-
-    def raise_again(self) -> None:
-        """What a signal raised that came before now, if one did."""
-        if self._came:
-            raise KeyboardInterrupt if self._came[0] == signal.SIGINT else Terminated(self._came[0])
 
 
 def _tell(line: str) -> None:
@@ -131,7 +104,7 @@ def _require_known(env_id: str, kwargs: dict[str, Any]) -> None:
     from inspect import signature
 
     from bam_envs.registry import make_env
-    from bam_train.trainers.resolve import require_env_kwargs
+    from bam_train.environments import require_env_kwargs
 
     anywhere = signature(make_env).parameters
     require_env_kwargs(env_id, {name: value for name, value in kwargs.items() if name not in anywhere})
@@ -148,7 +121,7 @@ def env_kwargs(assignments: Sequence[str]) -> dict[str, Any]:
 
     kwargs = {}
     for text in assignments:
-        path, value = parse_assignment(text)
+        path, value = parse_assignment(text, "randomize=true")
         if len(path) > 1:
             raise SettingsError(f"--set {text}: expected the name of an argument, found one with a dot")
         kwargs[path[0]] = value

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from bam_train.cli.console import count
+from bam_train.cli.console import count, tell
 from bam_train.cli.program import run_program
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ class TrainConfig:
     seed: Whole = None
     """Seed of weights, exploration and environments."""
     num_envs: Whole = None
-    """Environments stepped side by side; of rllib: in each runner."""
+    """Environments stepped side by side, in all: the runners of rllib share them."""
     num_env_runners: Whole = None
     """Processes of rllib that collect samples (default 0: the trainer's own does)."""
     num_learners: Whole = None
@@ -113,7 +113,7 @@ def train(config: TrainConfig) -> int:
     checkpoint = None if config.resume is None else Checkpoint.open(config.resume)
     settings = _settings(config, checkpoint)
     if config.print_config:
-        print(json.dumps(settings.to_mapping(), indent=2))
+        tell(*json.dumps(settings.to_mapping(), indent=2).split("\n"))
         return 0
     return _train(config, settings, checkpoint)
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, TextIO
 
 from bam_train.cli.console import count, duration, is_terminal, make_console, number, percent, say
+from bam_train.shown import rich_text
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -136,9 +137,7 @@ class LiveDisplay(PlainDisplay):
 
     def note(self, text: str) -> None:
         """Say something above the panel."""
-        from rich.text import Text
-
-        self._console.print(Text(text), soft_wrap=True)
+        self._console.print(rich_text(text), soft_wrap=True)
 
 
 def evaluation_line(steps: int, report: EvaluationReport, best: bool) -> str:
@@ -180,4 +179,4 @@ def _panel(title: str, progress: Progress, statistics: Statistics, rate: float, 
     outer = Table.grid(expand=True)
     outer.add_row(ProgressBar(total=progress.total, completed=min(progress.steps, progress.total)))
     outer.add_row(grid)
-    return Panel(outer, title=title, title_align="left")
+    return Panel(outer, title=rich_text(title), title_align="left")

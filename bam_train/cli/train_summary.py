@@ -67,16 +67,17 @@ def _score_text(outcome: Outcome) -> str:
 
 
 def _next_commands(settings: TrainSettings, outcome: Outcome) -> list[str]:
-    from bam_train.environments import is_batched
+    from bam_train.environments import is_batched, must_be_named
 
     commands = []
     usable = outcome.checkpoint or outcome.last
+    named = f" --env {shlex.quote(settings.env)}" if must_be_named(settings.env) else ""
     if usable is not None:
-        commands.append(f"bam-eval {_short(usable)}")
+        commands.append(f"bam-eval {_short(usable)}{named}")
         if is_batched(settings.env):
-            commands.append(f"bam-deploy {_short(usable)}")
+            commands.append(f"bam-deploy {_short(usable)}{named}")
     if outcome.reason == "stopped" and outcome.last is not None:
-        commands.append(f"bam-train --resume {_short(outcome.last)}")
+        commands.append(f"bam-train --resume {_short(outcome.last)}{named}")
     return commands
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from bam_train.deploy.journal import EpisodeRecord, Journal
 from bam_train.deploy.pacer import Pacer
 from bam_train.deploy.report import lateness_text, rate_text
+from bam_train.shown import rich_text
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -81,17 +82,17 @@ class LiveDisplay:
 
     def ended(self, record: EpisodeRecord, pacer: Pacer) -> None:
         """Write how the episode went above the panel."""
-        self._live.console.print(episode_line(self._journal.begun, self._journal.wanted, record))
+        line = episode_line(self._journal.begun, self._journal.wanted, record)
+        self._live.console.print(rich_text(line))
 
     def _panel(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> RenderableType:
         from rich.console import Group
         from rich.table import Table
-        from rich.text import Text
 
         table = Table.grid(padding=(0, 2))
         for name, text in self.rows(record, action, pacer):
-            table.add_row(Text(name, style="dim"), Text(text, no_wrap=True, overflow="ellipsis"))
-        return Group(Text(self._title, style="bold"), table)
+            table.add_row(rich_text(name, "dim"), rich_text(text, no_wrap=True, overflow="ellipsis"))
+        return Group(rich_text(self._title, "bold"), table)
 
     def rows(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> Iterator[tuple[str, str]]:
         """What the panel says, line by line: a name and a text; few enough for a screen of 24 lines."""

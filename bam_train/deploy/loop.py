@@ -69,8 +69,10 @@ class Deployment:
     ) -> None:
         self._robot, self._journal = RobotAgent(env), journal
         self._workspace = Workspace(window=window, sink=None if sink is None else _once_broken_silent(sink))
+        self._signals = _SignalAgent()
         self._loop = _Loop(
             Agents(
+                self._signals,
                 self._robot,
                 JournalAgent(journal, pacer),
                 PacerAgent(pacer),
@@ -92,10 +94,10 @@ class Deployment:
             seed: Seed of the first episode.
         """
         with stop_signals() as switch:
-            self._loop.switch = switch
+            self._loop.switch = self._signals.switch = switch
             try:
                 try:
-                    switch.armed = True
+                    switch.arm()
                     self._episodes(watcher, seed)
                 finally:  # inside the outer try: a signal that comes before this line is still caught
                     switch.armed = False
@@ -154,6 +156,19 @@ def _once_broken_silent(sink: Sink) -> Sink:
             broken = False
 
     return guarded
+
+
+class _SignalAgent(Agent):
+    """Ends the loop for a signal that was lost. Stands before the robot, so that it is sent nothing more."""
+
+    reads = ()
+    writes = ()
+    switch: StopSwitch | None = None
+
+    def forward(self, **kwargs: Any) -> None:
+        """Nothing but after a signal."""
+        if self.switch is not None:
+            self.switch.raise_again()
 
 
 class _Loop(TemporalAgent):

@@ -12,6 +12,9 @@ from bam_train.deploy.journal import Journal
 from bam_train.deploy.loop import Ending
 from bam_train.deploy.pacer import Lateness, Pacer
 
+MISSED_SHARE = 0.05
+"""More missed ticks than this share are worth a warning."""
+
 
 @dataclass(frozen=True)
 class DeployReport:
@@ -40,6 +43,7 @@ class DeployReport:
             "target_rate_hz": None if self.pacer.period is None else round(1 / self.pacer.period, 3),
             "lateness_ms": _milliseconds(self.pacer.lateness),
             "missed_ticks": self.pacer.missed,
+            "warnings": self.warnings(),
             "startup_cpu_s": _startup(journal),
             "seed": self.seed,
             "env": manifest.env,
@@ -49,6 +53,17 @@ class DeployReport:
             "guards": {name: _finite(row) for name, row in self.guards.items()},
             "per_episode": [record.to_json() for record in journal.records],
         }
+
+    def warnings(self) -> list[str]:
+        """What a person should know of a deployment that ended well, too."""
+        missed, period = self.pacer.missed, self.pacer.period
+        planned = self.pacer.ticks + missed
+        if period is None or missed <= MISSED_SHARE * planned:
+            return []
+        return [
+            f"{missed} of {planned} ticks were missed: policy and robot take longer than the {1e3 * period:g} ms that "
+            "the policy was made for; use a faster computer, or stop what else runs on it"
+        ]
 
     def lines(self) -> list[str]:
         """The same for people, a few lines."""
@@ -82,9 +97,13 @@ def lateness_text(pacer: Pacer) -> str:
 
 
 def guards_text(guards: Mapping[str, Mapping[str, Any]]) -> str:
-    """Such as ``guards changed the command: joint speed in 3 ticks``."""
-    altered = [f"{name} in {row['altered']} ticks" for name, row in guards.items() if row.get("altered")]
-    return f"guards changed the command: {', '.join(altered)}" if altered else "no guard changed a command"
+    """Such as ``guards changed the command: joint speed in 3 ticks; held the robot: state age in 2 ticks``."""
+    altered, held = (
+        ", ".join(f"{name} in {row[what]} ticks" for name, row in guards.items() if row.get(what))
+        for what in ("altered", "held")
+    )
+    changed = f"guards changed the command: {altered}" if altered else "no guard changed a command"
+    return f"{changed}; held the robot: {held}" if held else changed
 
 
 def startup_text(journal: Journal) -> str:

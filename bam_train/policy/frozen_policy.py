@@ -15,7 +15,7 @@ from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint
 from bam_train.errors import FormatError, PolicyError
 from bam_train.policy import onnx_file
 from bam_train.policy.golden import TOLERANCE, worst_difference
-from bam_train.policy.onnx_mlp import MlpRunner, UnsupportedGraph
+from bam_train.policy.onnx_mlp import MlpRunner, UnsupportedGraph, require_known
 from bam_train.policy.spaces import Leaf, leaf, leaves
 
 _STATE = "state."
@@ -92,6 +92,7 @@ class FrozenPolicy:
         """
         try:
             graph = onnx_file.parse(onnx)
+            require_known(graph)
             _require_fit(graph, leaves(observation_space))
             return cls(graph, _runner(graph, onnx), observation_space, action_space)
         except FormatError as error:

@@ -12,6 +12,8 @@ from bam_train.policy.spaces import Leaf
 
 TOLERANCE = 1e-5
 """Largest difference from the trainer's own action; a Box wider than 2 is measured in half its range."""
+MOST_ROWS = 1024
+"""Recorded observations at most; a few hundred are written."""
 _SINGLE = 8  # rows that are acted on one by one too
 
 
@@ -70,6 +72,8 @@ def _expected(observation: list[Leaf], action: Leaf, arrays: Mapping[str, np.nda
     if len(set(rows.values())) != 1 or rows["action"] in ((), (0,)):
         raise PolicyError(f"expected as many rows in each array, found {rows}")
     expected = arrays["action"]
+    if len(expected) > MOST_ROWS:
+        raise PolicyError(f"expected at most {MOST_ROWS} rows, found {len(expected)}")
     if expected.shape[1:] != action.shape:
         raise PolicyError(f"action: expected shape {action.shape}, found {expected.shape[1:]}")
     return expected.astype(np.float64)

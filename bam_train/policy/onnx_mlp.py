@@ -7,6 +7,7 @@ time. An array that cannot be written to is a constant. Most of the file is the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
@@ -19,6 +20,10 @@ from bam_train.policy.onnx_file import DTYPES, Graph, Node
 
 class UnsupportedGraph(FormatError):  # noqa: N818 - not an error: the graph is for onnxruntime
     """The graph has something else than dense layers; the text says what."""
+
+
+MOST_WORK = 10**8
+"""Numbers that one row may take, and products of numbers: a tenth of a second; a policy of 256 x 256 takes 10^5."""
 
 
 class MlpRunner:
@@ -67,6 +72,7 @@ class Plan:
         self.n = n
         self.inputs = {value.name: _input(value.name, value.shape, value.dtype, n) for value in graph.inputs}
         self.calls: list[Callable[[], Any]] = []
+        self._left = n * MOST_WORK
         self._arrays: dict[str, np.ndarray] = {**graph.constants, **self.inputs}
         for node in graph.nodes:
             self._add(node)
@@ -80,6 +86,22 @@ class Plan:
         for call in self.calls:
             call()
 
+    def empty(self, shape: tuple[int, ...], dtype: Any, products: int = 1) -> np.ndarray:
+        """Return a new array.
+
+        Args:
+            shape: Its shape.
+            dtype: Its type.
+            products: That each of its numbers takes.
+
+        Raises:
+            FormatError: The graph takes more memory or time than a policy does.
+        """
+        self._left -= math.prod(shape) * products
+        if self._left < 0:
+            raise FormatError(f"it computes more than {MOST_WORK} numbers for one action, which no policy does")
+        return np.empty(shape, dtype)
+
     def constant(self, name: str) -> np.ndarray:
         """Return an array that must not depend on the inputs."""
         if self._arrays[name].flags.writeable:
@@ -89,7 +111,7 @@ class Plan:
     def elementwise(self, function: np.ufunc, *arrays: np.ndarray) -> np.ndarray:
         """Call a ufunc; the result's type is that of the arrays, or bool of a comparison."""
         shape = np.broadcast_shapes(*(array.shape for array in arrays))
-        out = np.empty(shape, bool if function in (np.equal, np.greater) else arrays[0].dtype)
+        out = self.empty(shape, bool if function in (np.equal, np.greater) else arrays[0].dtype)
         operands = [_row(array, shape) for array in arrays]
         if any(operand is None for operand in operands):
             self.calls.append(partial(function, *arrays, out=out))
@@ -106,7 +128,7 @@ class Plan:
         """Return the same memory in another shape, or a copy where strides forbid that."""
         shaped = array.reshape(shape)
         if not np.shares_memory(shaped, array):
-            shaped = self.copy(array, np.empty(array.shape, array.dtype)).reshape(shape)
+            shaped = self.copy(array, self.empty(array.shape, array.dtype)).reshape(shape)
         return shaped
 
     def _add(self, node: Node) -> None:
@@ -190,7 +212,7 @@ def _dot(plan: Plan, x: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return x @ weight; one row is a matrix times a vector, which BLAS does faster than a matrix times a matrix."""
     if x.ndim != 2 or weight.ndim != 2:
         raise UnsupportedGraph(f"a product of shapes {x.shape} and {weight.shape}")
-    out = np.empty((len(x), weight.shape[1]), x.dtype)
+    out = plan.empty((len(x), weight.shape[1]), x.dtype, products=len(weight))
     if len(x) == 1:
         plan.calls.append(partial(np.ascontiguousarray(weight.T).dot, x[0], out[0]))
     else:
@@ -237,7 +259,7 @@ def _clip(plan: Plan, node: Node, arrays: _Arrays) -> _Arrays:
 
 def _cast(plan: Plan, node: Node, arrays: _Arrays) -> _Arrays:
     dtype = np.dtype(DTYPES[node.attributes["to"]])
-    return [arrays[0] if dtype == arrays[0].dtype else plan.copy(arrays[0], np.empty(arrays[0].shape, dtype))]
+    return [arrays[0] if dtype == arrays[0].dtype else plan.copy(arrays[0], plan.empty(arrays[0].shape, dtype))]
 
 
 def _flatten(plan: Plan, node: Node, arrays: _Arrays) -> _Arrays:
@@ -261,6 +283,7 @@ def _transpose(plan: Plan, node: Node, arrays: _Arrays) -> _Arrays:
 
 def _concat(plan: Plan, node: Node, arrays: _Arrays) -> _Arrays:
     axis = node.attributes["axis"]
+    plan.empty((sum(array.size for array in arrays),), arrays[0].dtype)
     out = np.concatenate(arrays, axis)
     ends = np.cumsum([array.shape[axis] for array in arrays])[:-1]
     for part, array in zip(np.split(out, ends, axis), arrays, strict=True):
@@ -276,6 +299,7 @@ def _split(plan: Plan, node: Node, arrays: _Arrays) -> _Arrays:
 
 def _gather(plan: Plan, node: Node, arrays: _Arrays) -> _Arrays:
     axis, chosen = node.attributes.get("axis", 0), plan.constant(node.inputs[1])
+    plan.empty((arrays[0].size, chosen.size), arrays[0].dtype)
     out = np.take(arrays[0], chosen, axis)  # raises for an index that is not there
     plan.calls.append(partial(arrays[0].take, chosen % arrays[0].shape[axis], axis, out, "clip"))
     return [out]
@@ -319,3 +343,28 @@ OPERATIONS: dict[str, _Operation] = {
     "Transpose": _transpose,
     "Unsqueeze": _unsqueeze,
 }
+
+OF_ONNXRUNTIME = frozenset(
+    """Abs AveragePool BatchNormalization Celu ConstantOfShape Conv Cos Erf Exp GlobalAveragePool HardSigmoid HardSwish
+    LayerNormalization Less Log LogSoftmax MaxPool Mish Neg Or Pad Pow ReduceMean ReduceSum Selu Sin Slice Softmax
+    Softplus Softsign Sqrt Squeeze Where""".split()  # noqa: SIM905 - a list of literals has one a line
+)
+"""Further operations that exported policies have; none repeats others, chooses among graphs or opens a file."""
+_SIZES = {"ConstantOfShape": 0, "Pad": 1, "Reshape": 1, "Slice": 1}
+"""Operations of which an input, this one or a later one, says how large the result is."""
+
+
+def require_known(graph: Graph) -> None:
+    """Refuse operations that no exported policy has, and results whose size depends on what is observed.
+
+    Raises:
+        FormatError: Names the operation.
+    """
+    varying = {value.name for value in graph.inputs}
+    for node in graph.nodes:
+        if node.op not in OPERATIONS and node.op not in OF_ONNXRUNTIME:
+            raise FormatError(f"operation {node.op!r} is none of a policy's")
+        if varying.intersection(node.inputs[_SIZES.get(node.op, len(node.inputs)) :]):
+            raise FormatError(f"operation {node.op}: the size of its result depends on the observation")
+        if varying.intersection(node.inputs):
+            varying.update(node.outputs)

@@ -79,7 +79,7 @@ def leaf(name: str, space: Mapping[str, Any]) -> Leaf:
         )
     try:
         return _leaf(name, str(kind), space)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise PolicyError(f"{name}: its space cannot be read ({type(error).__name__}: {error}): {space}") from error
 
 

@@ -6,9 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
+from msgspec import Struct
+
 from bam_train.checkpoint import Checkpoint, next_free_path
-from bam_train.errors import CheckpointError, OutputError
-from bam_train.settings import TrainSettings, file_stem
+from bam_train.checkpoint.manifest import AGAIN
+from bam_train.checkpoint.temporary import remove_orphans
+from bam_train.errors import AlteredCheckpoint, CheckpointError, OutputError, SettingsError
+from bam_train.settings import TrainSettings, file_stem, read_config
 from bam_train.trainers.resolve import CHANGEABLE
 from bam_train.trainers.run import Best
 from bam_train.trainers.run_folder import require_writable
@@ -31,6 +36,8 @@ class Output:
 def choose_output(settings: TrainSettings, out: Path | None, force: bool, resumed: Checkpoint | None) -> Output:
     """Choose where the best checkpoint goes, and find out whether it can be written there.
 
+    What killed runs left half written there is removed.
+
     Args:
         settings: Of the run.
         out: What was asked for, if anything.
@@ -40,12 +47,13 @@ def choose_output(settings: TrainSettings, out: Path | None, force: bool, resume
     Raises:
         OutputError: It cannot be written there.
     """
-    own = None if resumed is None else _own_best(resumed, settings)
+    own = None if resumed is None else _own_best(resumed)
     usual = FOLDER / f"{file_stem(settings.env, settings.algo, settings.trainer)}.zip"
     wanted = (out or (own.path if own else usual)).expanduser()
     if wanted.suffix != ".zip" and not wanted.is_dir():
         raise OutputError(f"{wanted}: expected a file name that ends in .zip. Choose another one with --out")
     require_writable(wanted)
+    remove_orphans(wanted.resolve())
     if own is not None and wanted.resolve() == own.path:
         return Output(wanted, own.best)
     if force or not wanted.exists():
@@ -54,21 +62,58 @@ def choose_output(settings: TrainSettings, out: Path | None, force: bool, resume
     return Output(free, None, (f"{wanted} exists: the checkpoint goes to {free} (--force overwrites)",))
 
 
-def _own_best(resumed: Checkpoint, settings: TrainSettings) -> Output | None:
-    """The best checkpoint of the same run, if it is still there."""
-    noted: Any = resumed.json(NOTES).get("best") if resumed.has(NOTES) else None
+class _Noted(Struct):
+    """What a run noted of its best evaluation."""
+
+    steps: int
+    success_rate: float | None
+    return_mean: float | None
+    path: str
+
+
+class _Notes(Struct):
+    best: _Noted | None = None
+
+
+def _own_best(resumed: Checkpoint) -> Output | None:
+    """The best checkpoint of the same run, if it is still there and this computer made it.
+
+    Raises:
+        AlteredCheckpoint: The notes are not as they are written.
+    """
+    noted = _notes(resumed).best
     if noted is None:
         return None
-    path = Path(noted["path"])
+    path = Path(noted.path)
+    if noted.path != str(resumed.path.resolve()) and not _is_in_own_folder(resumed):
+        return None
     try:
         there = Checkpoint.open(path).manifest
-    except CheckpointError:
+    except (CheckpointError, ValueError):  # such as a null byte in its name
         return None
-    if there.steps != noted["steps"] or _what(there.settings) != _what(resumed.manifest.settings):
+    if there.steps != noted.steps or _what(there.settings) != _what(resumed.manifest.settings):
         return None
     interval: Any = there.scores.get("success_interval")
-    known = noted["steps"], noted["success_rate"], noted["return_mean"], interval and tuple(interval)
+    known = noted.steps, noted.success_rate, noted.return_mean, interval and tuple(interval)
     return Output(path.resolve(), Best(*known, there.scores.get("episodes")))
+
+
+def _notes(resumed: Checkpoint) -> _Notes:
+    if not resumed.has(NOTES):
+        return _Notes()
+    try:
+        return msgspec.convert(resumed.json(NOTES), _Notes)
+    except msgspec.ValidationError as error:
+        raise AlteredCheckpoint(resumed.path, NOTES, f"{NOTES}: {error}. {AGAIN}") from error
+
+
+def _is_in_own_folder(resumed: Checkpoint) -> bool:
+    """Whether the file lies where a run here made it: a file from a stranger may note any path as its best."""
+    try:
+        settings = read_config(resumed.path.parent / "config.json")
+    except SettingsError:
+        return False
+    return _what(settings) == _what(resumed.manifest.settings)
 
 
 def _what(settings: dict[str, Any]) -> dict[str, Any]:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
 from bam_train.checkpoint import Checkpoint
+from bam_train.checkpoint.manifest import require_no_place
+from bam_train.environments import environment_of, require_env_kwargs
 from bam_train.errors import CheckpointMismatch, SettingsError
 from bam_train.settings import TrainSettings, check_names, differences, merge
 from bam_train.trainers import load_trainer, require_algorithm
 from bam_train.trainers.presets import read_preset
-from bam_train.values import closest
 
 CHANGEABLE = frozenset(
     {"steps", "until_success", "eval_every", "eval_episodes", "device", "threads", "transport", "ca_file", "token_file"}
@@ -24,14 +24,8 @@ environment runs; not what to learn."""
 OF_RLLIB = ("num_env_runners", "num_learners", "num_gpus", "address", "data")
 """Settings that the rllib trainer alone has a use for."""
 
-_NOT_OF_THE_ENVIRONMENT = frozenset({"env_id", "render_mode", "task_options"}) | {
-    "robot",
-    "transport",
-    "profile",
-    "ca_file",
-    "token_file",
-}
-"""Arguments of `make_env` that are no settings, or say where the environment runs, which has settings of its own."""
+NOWHERE: dict[str, Any] = {"transport": [], "ca_file": None, "token_file": None, "address": None}
+"""Settings that say where a run computes, as they are where it computes here."""
 
 
 def resolve(given: Mapping[str, Any]) -> TrainSettings:
@@ -51,7 +45,7 @@ def resolve(given: Mapping[str, Any]) -> TrainSettings:
     preset = read_preset(_tuned_as(env), given["algo"], trainer)
     settings = TrainSettings.from_mapping(merge(preset, given, {"env": env}))
     _require_of_trainer(settings)
-    require_env_kwargs(env, settings.env_kwargs)
+    _require_env_kwargs(env, settings.env_kwargs)
     _require_own(given, settings)
     completed = load_trainer(settings.trainer).complete(settings)
     if given.get("num_envs") not in (None, completed.num_envs):
@@ -68,6 +62,15 @@ def _require_of_trainer(settings: TrainSettings) -> None:
             raise SettingsError(f"{name}: the sb3 trainer has no use for it; leave it out, or add --trainer rllib")
 
 
+def _require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
+    """Refuse arguments that an environment does not take, and those that no checkpoint may hold."""
+    require_env_kwargs(env, given)
+    try:
+        require_no_place(given)
+    except ValueError as error:
+        raise SettingsError(f"{error}; leave it out") from error
+
+
 def _require_own(given: Mapping[str, Any], settings: TrainSettings) -> None:
     """Refuse arguments of an environment that is made elsewhere."""
     if settings.transport and given.get("env_kwargs"):
@@ -75,6 +78,45 @@ def _require_own(given: Mapping[str, Any], settings: TrainSettings) -> None:
         raise SettingsError(
             f"env_kwargs: {names}: the environment runs at {settings.place.text}; give its arguments to bam-serve there"
         )
+
+
+def own_settings(checkpoint: Checkpoint, env: str | None = None, *, elsewhere: bool = False) -> dict[str, Any]:
+    """Settings that a checkpoint's run had, but for where it computed, which no file says.
+
+    Args:
+        checkpoint: May come from a stranger.
+        env: The environment, if somebody named it.
+        elsewhere: It runs on another computer.
+
+    Raises:
+        CheckpointMismatch: See `environment_of`.
+    """
+    manifest = checkpoint.manifest
+    module = manifest.env.rpartition(":")[0]
+    env_id, env_kwargs = environment_of(checkpoint, env if module and not elsewhere else None, elsewhere=elsewhere)
+    what = {"env": env_id, "env_kwargs": env_kwargs, "algo": manifest.algorithm, "trainer": manifest.trainer}
+    own = {
+        name: value for name, value in manifest.settings.items() if name != "exported"
+    }  # out of a directory of RLlib
+    return {**own, **NOWHERE, **what}
+
+
+def _require_place(checkpoint: Checkpoint, given: Mapping[str, Any]) -> None:
+    """Ask again where a run computes that did not compute here."""
+    settings = checkpoint.manifest.settings
+    for name, flag, here in (
+        ("transport", "--transport", "--transport '' to go on in the simulation here"),
+        ("address", "--address", "--set address=null to go on here"),
+        ("data", "--data", ""),
+    ):
+        own = settings.get(name)
+        remote = "://" in str(own) if name == "data" else bool(own)
+        if remote and name not in given:
+            raise CheckpointMismatch(
+                checkpoint.path,
+                f"was trained with {flag} {own!r}, and an address is never read from a file: "
+                f"give {flag} again{here and f', or {here}'}",
+            )
 
 
 def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSettings:
@@ -85,12 +127,11 @@ def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSe
         SettingsError: An unknown setting, or the run has all its steps already.
     """
     check_names(given, "settings")
-    own = dict(checkpoint.manifest.settings)
-    if "exported" in own:
+    if set(checkpoint.manifest.settings) == {"exported"}:
         text = "was exported from a directory of RLlib and holds the policy alone: training cannot go on from it"
         raise CheckpointMismatch(checkpoint.path, f"{text}. Train anew, or go on with RLlib from its own directory")
-    if given.get("transport") == []:  # from there to here, where there is no link
-        own |= {"ca_file": None, "token_file": None}
+    _require_place(checkpoint, given)
+    own = own_settings(checkpoint, given.get("env"), elsewhere=bool(given.get("transport")))
     asked = dict(given)
     if given.get("env") is not None:
         asked["env"] = resolve_env(given["env"], elsewhere=bool(given.get("transport")))
@@ -137,35 +178,6 @@ def _tuned_as(env: str) -> str:
 
     entry = entry_of(env)
     return env if entry is None else entry.id
-
-
-def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
-    """Refuse an argument that one of our environments does not have; others are asked when they are made.
-
-    Raises:
-        SettingsError: Carries the closest match of what can be had; or a value is of the wrong kind.
-    """
-    from bam_envs.errors import InvalidValue
-    from bam_envs.registry import entry_of, make_env
-    from bam_envs.registry import resolve as resolve_reference
-    from bam_envs.robo_gym.options import constructor_options, require_values
-    from bam_envs.robo_gym.table import ROBO_GYM
-    from bam_envs.tasks.options import option_names, require_kinds
-
-    entry = entry_of(env)
-    if entry is None or not given:
-        return
-    task, theirs = resolve_reference(entry.task), ROBO_GYM.get(env.rpartition(":")[2])
-    taken, refused = constructor_options(theirs) if theirs else (frozenset(), frozenset())
-    own = set(inspect.signature(make_env).parameters) - _NOT_OF_THE_ENVIRONMENT
-    known = own | taken | option_names(task) | {"max_episode_steps"}
-    for name in given:
-        if name not in known | refused:  # making it says why it is refused
-            raise SettingsError(f"env_kwargs: unknown setting {name!r} of {env}. {closest(name, known)}")
-    try:
-        require_values(theirs, given) if theirs else require_kinds(env, task, given)
-    except InvalidValue as error:
-        raise SettingsError(f"env_kwargs: {error}") from error
 
 
 def _require_same(asked: Mapping[str, Any], own: Mapping[str, Any], checkpoint: Checkpoint) -> None:

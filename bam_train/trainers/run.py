@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from bam_envs.errors import RobotFault
-from bam_train.errors import OutputError, ProcessesLost, TrainingFailed
+from bam_train.errors import EnvironmentFailed, OutputError, ProcessesLost, TrainingFailed
 from bam_train.evaluation import EvaluationReport
 from bam_train.settings import TrainSettings
 from bam_train.trainers.copies import Copies
@@ -153,8 +153,8 @@ class TrainingRun:
         """Train to the end.
 
         Raises:
-            TrainingFailed: The loss or a weight is no longer finite, or the robot or its link failed; its text names
-                the last good checkpoint.
+            TrainingFailed: The loss, a weight or what the environment gave is not finite, or the robot or its link
+                failed; its text names the last good checkpoint.
         """
         try:
             self.trainer.train(self.settings.steps, self._between)
@@ -164,8 +164,9 @@ class TrainingRun:
             self._save_last()
             raise TrainingFailed(f"at step {self.trainer.steps}: {error}. {self._learnt}") from error
         except TrainingFailed as error:
-            kept = f"the last good checkpoint is {self.last}" if self.last else "no checkpoint had been saved yet"
-            raise TrainingFailed(f"{error}; {kept}") from error
+            raise TrainingFailed(f"{error}; {self._last_good}") from error
+        except EnvironmentFailed as error:  # in the middle of an update, which is not saved
+            raise TrainingFailed(f"at step {self.trainer.steps}: {error}; {self._last_good}") from error
         except RobotFault as error:  # what was learnt so far is not lost with the link
             self._save_last()
             raise TrainingFailed(f"at step {self.trainer.steps}: {error} {self._learnt}") from error
@@ -177,6 +178,10 @@ class TrainingRun:
             self._copy()  # what was in the way may be gone
         self.done = True
         return self._outcome()
+
+    @property
+    def _last_good(self) -> str:
+        return f"the last good checkpoint is {self.last}" if self.last else "no checkpoint had been saved yet"
 
     @property
     def _learnt(self) -> str:

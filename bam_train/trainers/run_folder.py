@@ -19,6 +19,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from bam_train.checkpoint.temporary import remove_orphans
 from bam_train.errors import OutputError
 
 LEAST_FREE = 20_000_000
@@ -100,7 +101,10 @@ def unwritable(path: Path, error: Exception, flag: str) -> OutputError:
 
 
 def _make_folder(root: Path, name: str) -> Path:
-    """Make the first folder of name, name-2, name-3, … that is not there; two programs never get the same one."""
+    """Make the first folder of name, name-2, name-3, … that is not there; two programs never get the same one.
+
+    From those that are there, what killed runs left half written is removed.
+    """
     with _writing(root):
         root.mkdir(parents=True, exist_ok=True)
     number = 1
@@ -112,6 +116,8 @@ def _make_folder(root: Path, name: str) -> Path:
         except OutputError as error:
             if not isinstance(error.__cause__, FileExistsError):
                 raise
+            for checkpoint in ("last.zip", "best.zip"):
+                remove_orphans(path / checkpoint)
             number += 1
             continue
         return path

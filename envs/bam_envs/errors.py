@@ -15,6 +15,7 @@
         ├── ProtocolError      the other end said what it must not: which field, expected, found
         ├── RemoteError        the other end refused or failed; carries its own text
         │   └── NotInCommand   another client is in command there
+        ├── NotReady           the robot says that it cannot move now: a protective stop, a paused program
         ├── StartNotReached    the start pose was not reached in time; carries the joints
         └── SafetyStop         a guard stopped the robot; latched until a person resumes; carries the guard
 
@@ -46,6 +47,7 @@ class UnknownName(BamEnvsError, ValueError):  # noqa: N818 - reads as what happe
         choices: See above.
         examples: What to suggest when nothing is similar; every choice by default.
         similar: How similar a choice must be to be suggested, from 0 to 1.
+        meant: The name in the table's own words, for the most similar choice; by default as it was given.
     """
 
     def __init__(
@@ -55,9 +57,10 @@ class UnknownName(BamEnvsError, ValueError):  # noqa: N818 - reads as what happe
         choices: Iterable[str],
         examples: Iterable[str] | None = None,
         similar: float = 0.65,
+        meant: str | None = None,
     ) -> None:
         self.kind, self.name, self.choices = kind, name, sorted(choices)
-        matches = difflib.get_close_matches(str(name), self.choices, n=1, cutoff=similar)
+        matches = difflib.get_close_matches(str(meant or name), self.choices, n=1, cutoff=similar)
         self.closest = matches[0] if matches else None
         some = ", ".join(self.choices if examples is None else examples)
         rest = f"Choose from: {some}." if some else "There are none."
@@ -133,6 +136,10 @@ class RemoteError(RobotFault):
 
 class NotInCommand(RemoteError):  # noqa: N818
     """Another client is in command of what was asked for."""
+
+
+class NotReady(RobotFault):
+    """The robot says of itself that it cannot move now; the text says why."""
 
 
 class StartNotReached(RobotFault):

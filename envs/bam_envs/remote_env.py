@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium import Space
 
+from bam_envs.at_exit import close_at_exit
 from bam_envs.errors import InvalidValue, ResetNeeded
 from bam_envs.remote_vector_env import RemoteVectorEnv
 from bam_envs.transports.opening import open_transport
@@ -23,7 +24,7 @@ class RemoteEnv(gym.Env[Any, Any]):
     """One environment behind a transport. Spaces, period and labels are those of the other end.
 
     It connects when something of the other end is first needed. `LinkLost` and the other faults of the transport go
-    through: a lost link is no end of an episode. The next `reset` connects again.
+    through: a lost link is no end of an episode. The next `reset` connects again. It is closed when Python ends.
 
     Args:
         transport: Not connected yet, or connected.
@@ -35,6 +36,7 @@ class RemoteEnv(gym.Env[Any, Any]):
         self._there: EnvSpecMessage | None = None
         self._running = False
         self._steps, self._told = 0, False
+        close_at_exit(self)
 
     def connect(self) -> EnvSpecMessage:
         """What is there.

@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space, iterate
 from numpy.typing import NDArray
 
+from bam_envs.at_exit import close_at_exit
 from bam_envs.errors import InvalidValue, ResetNeeded
 from bam_envs.spaces import space_to_json
 from bam_envs.transports.rack import Rack, ResetOrder, Seeds
@@ -31,7 +32,8 @@ class RemoteVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     n rows of one transport are one request. A row whose episode ends starts the next one in the same step
     (`AutoresetMode.SAME_STEP`), as in `RobotVectorEnv`. The arms of a rack that is not ours have one reset: when an
     episode of one ends, those of its others are truncated. It connects when something of the other end is first
-    needed. Faults go through, once every transport has answered; a `reset` is needed then.
+    needed. Faults go through, once every transport has answered; a `reset` is needed then. It is closed when Python
+    ends.
 
     Args:
         transports: One, or several with the same spaces.
@@ -49,6 +51,7 @@ class RemoteVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self._batched: tuple[Space[Any], Space[Any]] | None = None
         if not self.transports:
             raise InvalidValue("There must be at least one transport.")
+        close_at_exit(self)
 
     def connect(self) -> list[EnvSpecMessage]:
         """What is there, for each transport.

@@ -98,7 +98,7 @@ def test_a_command_means_something_for_two_periods_at_least():
 
 def test_the_guards_know_the_kinematics_of_the_model(make):
     live = make("bam/ur-reach-v0", robot="ws://127.0.0.1:9", ur_model="ur10e")
-    guard = next(guard for guard in live.unwrapped.robot.guards if isinstance(guard, ToolSpeed))
+    guard = next(guard for guard in live.unwrapped.robot._guards if isinstance(guard, ToolSpeed))
     joints = np.array([[0.1, -1.0, 1.0, 0.3, 0.2, 0.0]])
     position, axes = UR_MODELS["ur10e"].geometry.flange_pose(joints)
     np.testing.assert_allclose(guard._tool(joints), position + 0.15 * axes[:, :, 2], atol=1e-12)

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import json
+import math
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import gymnasium as gym
@@ -12,7 +16,7 @@ import numpy as np
 import pytest
 
 from bam_envs.spaces import space_to_json
-from bam_train.checkpoint import GOLDEN, POLICY, safetensors_file, write_checkpoint
+from bam_train.checkpoint import GOLDEN, MANIFEST, POLICY, safetensors_file, write_checkpoint
 
 
 class Corridor(gym.Env):
@@ -51,6 +55,41 @@ def corridor():
     gym.register("test/Corridor-v0", entry_point=Corridor, max_episode_steps=10)
     yield "test/Corridor-v0"
     del gym.registry["test/Corridor-v0"]
+
+
+class Spoilt(gym.Env):
+    """Episodes of 5 steps in which one number, at step `at`, is `value`; two zeros are observed, and a Dict of them."""
+
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, signal="observation", value=math.nan, at=3, nested=False):
+        box = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self.observation_space = gym.spaces.Dict({"a": box, "b": box}) if nested else box
+        self.signal, self.value, self.at, self.nested = signal, float(value), at, nested
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self.look(), {}
+
+    def look(self):
+        seen = np.zeros(2, np.float32)
+        if self.signal == "observation" and self.steps == self.at:
+            seen[1] = self.value
+        return {"a": np.zeros(2, np.float32), "b": seen} if self.nested else seen
+
+    def step(self, action):
+        self.steps += 1
+        reward = self.value if self.signal == "reward" and self.steps == self.at else 0.0
+        return self.look(), reward, self.steps == 5, False, {}
+
+
+@pytest.fixture
+def spoilt():
+    """Registers ``test/Spoilt-v0`` for one test; its id."""
+    gym.register("test/Spoilt-v0", entry_point=Spoilt)
+    yield "test/Spoilt-v0"
+    del gym.registry["test/Spoilt-v0"]
 
 
 def starting_cell(seed: int) -> int:
@@ -92,6 +131,23 @@ def corridor_checkpoint(corridor, tmp_path):
         return write_checkpoint(tmp_path / name, manifest, members).path
 
     return make
+
+
+@pytest.fixture(name="forge")
+def forge_fixture():
+    return forge
+
+
+def forge(path, members=None, **fields):
+    """Make the checkpoint.zip at `path` what a stranger could send: any manifest, with the digests of any members."""
+    with zipfile.ZipFile(path) as archive:
+        found = {name: archive.read(name) for name in archive.namelist()} | (members or {})
+    digests = {name: hashlib.sha256(data).hexdigest() for name, data in found.items() if name != MANIFEST}
+    found[MANIFEST] = json.dumps({**json.loads(found[MANIFEST]), "sha256": digests, **fields}).encode()
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in found.items():
+            archive.writestr(name, data)
+    return path
 
 
 def always_right(numbers: int) -> bytes:

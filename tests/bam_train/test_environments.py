@@ -1,4 +1,6 @@
 import json
+import sys
+from importlib import metadata
 
 import gymnasium as gym
 import numpy as np
@@ -9,7 +11,16 @@ from bam_envs.registry import ENVIRONMENTS
 from bam_envs.robo_gym.table import ROBO_GYM
 from bam_envs.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint
-from bam_train.environments import control_period, first_difference, is_batched, make_env, make_rows, require_fit
+from bam_train.environments import (
+    ENTRY_POINTS,
+    control_period,
+    environment_of,
+    first_difference,
+    is_batched,
+    make_env,
+    make_rows,
+    require_fit,
+)
 from bam_train.errors import CheckpointMismatch, SettingsError
 
 
@@ -135,6 +146,87 @@ def test_every_environment_of_ours_fits_what_it_says_of_itself(corridor_checkpoi
     require_fit(checkpoint, rows)
     env.close()
     rows.close()
+
+
+STRANGE = """import gymnasium as gym, pathlib
+pathlib.Path(__file__).with_name("was-imported").touch()
+class Env(gym.Env):
+    observation_space, action_space = gym.spaces.Discrete(2), gym.spaces.Discrete(2)
+if "strange/Env-v0" not in gym.registry:
+    gym.register("strange/Env-v0", entry_point=Env)
+"""
+
+
+@pytest.fixture
+def strange(tmp_path, monkeypatch):
+    """A module in the working folder; the file that tells that it was imported."""
+    (tmp_path / "strange_module.py").write_text(STRANGE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield tmp_path / "was-imported"
+    sys.modules.pop("strange_module", None)
+    gym.registry.pop("strange/Env-v0", None)
+
+
+@pytest.mark.parametrize("name", ["strange/Env-v0", "bam/pick-v0", "nothing-v0"])
+def test_no_module_is_imported_because_a_file_says_so(strange, corridor_checkpoint, name):
+    checkpoint = Checkpoint.open(corridor_checkpoint(env=f"strange_module:{name}"))
+    with pytest.raises(CheckpointMismatch) as caught:
+        environment_of(checkpoint)
+    assert str(caught.value) == (
+        f"{checkpoint.path}: was trained on strange_module:{name}, and the module 'strange_module' is imported only "
+        f"where somebody names it: if you trust it, add --env strange_module:{name}"
+    )
+    assert environment_of(checkpoint, elsewhere=True) == (f"strange_module:{name}", {})
+    assert not strange.exists()
+
+
+def test_a_module_is_imported_that_somebody_names_or_installed(strange, corridor_checkpoint, monkeypatch):
+    checkpoint = Checkpoint.open(corridor_checkpoint(env="strange_module:strange/Env-v0"))
+    point = metadata.EntryPoint("strange", "strange_module", ENTRY_POINTS)
+    with monkeypatch.context() as installed:
+        installed.setattr(metadata, "entry_points", lambda group: [point] if group == ENTRY_POINTS else [])
+        assert environment_of(checkpoint) == ("strange_module:strange/Env-v0", {})
+        assert not strange.exists()
+    assert environment_of(checkpoint, "strange_module:strange/Env") == ("strange_module:strange/Env-v0", {})
+    assert strange.exists()
+
+
+def test_the_module_that_is_imported_is_the_one_that_was_named(strange, corridor_checkpoint):
+    """``module:bam/pick-v0`` is ``bam/pick-v0`` of that module, so that both names are of one environment."""
+    checkpoint = Checkpoint.open(corridor_checkpoint(env="strange_module:bam/pick-v0"))
+    assert environment_of(checkpoint, "bam/pick") == ("bam/pick-v0", {})
+    assert not strange.exists()
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"randomise": True}, "env_kwargs: unknown setting 'randomise' of bam/pick-v0. Did you mean 'randomize'?"),
+        ({"randomize": "\x1b[2J"}, "env_kwargs: randomize= of bam/pick-v0 must be True or False, not"),
+        ({"task_options": {}}, "env_kwargs: unknown setting 'task_options' of bam/pick-v0."),
+        ({"render_mode": "human"}, "env_kwargs: unknown setting 'render_mode' of bam/pick-v0."),
+        (
+            {"timeout": 5.0},
+            "env_kwargs: unknown setting 'timeout' of bam/pick-v0. Choose from: max_episode_steps, randomize.",
+        ),
+        ({"max_episode_steps": "x"}, "env_kwargs.max_episode_steps: expected a whole number from 1 on, found 'x'"),
+        ({"max_episode_steps": 0}, "env_kwargs.max_episode_steps: expected a whole number from 1 on, found 0"),
+    ],
+)
+def test_arguments_that_an_environment_of_ours_does_not_take(corridor_checkpoint, kwargs, message):
+    path = corridor_checkpoint(env="bam/pick-v0", env_kwargs=kwargs)
+    with pytest.raises(SettingsError) as caught:
+        environment_of(Checkpoint.open(path))
+    assert str(caught.value).startswith(f"{path}: its manifest: {message}")
+
+
+def test_an_environment_that_only_the_manifest_knows(corridor_checkpoint):
+    path = corridor_checkpoint(env="bam/pik-v0")
+    with pytest.raises(SettingsError) as caught:
+        environment_of(Checkpoint.open(path))
+    text = "Unknown environment 'bam/pik-v0'. Did you mean 'bam/pick-v0'?"
+    assert str(caught.value) == f"{path}: its manifest: {text}"
 
 
 def test_rows_fit_as_one_environment_does(corridor, corridor_checkpoint):

@@ -37,6 +37,9 @@ def test_settings_share_nothing_with_what_they_are_made_from():
         ({"seed": -1}, "seed: expected at least 0, found -1"),
         ({"until_success": 1.5}, "until_success: expected a share above 0 and at most 1, such as 0.99, found 1.5"),
         ({"normalize": 3}, "normalize: expected true or false or a table, found 3 (an int)"),
+        ({"env_kwargs": {"value": float("nan")}}, "env_kwargs.value: expected a finite number, found nan"),
+        ({"env_kwargs": {"a": [{"b": 1e400}]}}, "env_kwargs.a[0].b: expected a finite number, found inf"),
+        ({"hyperparameters": {"gamma": float("nan")}}, "hyperparameters.gamma: expected a finite number, found nan"),
         ({"env": None}, "env: expected a name, found nothing. Give --env NAME"),
     ],
 )

@@ -46,11 +46,6 @@ def peers() -> Path:
     return PEERS
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    if reason := missing():
-        terminalreporter.write_line(f"tests/peers did not run: {reason}")
-
-
 def joined(group: str = "239.255.0.1") -> set[str]:
     """The interfaces on which somebody on this machine has joined the multicast `group`; that of DDS by default."""
     number = bytes(map(int, group.split(".")))[::-1].hex().upper()
@@ -176,11 +171,11 @@ def free_port() -> int:
 class Rosbridge:
     """A rosbridge server that is not ours, in ROS 2, at one address from its start to its end."""
 
-    def __init__(self, env: dict[str, str]) -> None:
+    def __init__(self, env: dict[str, str], *options: str) -> None:
         program = next((ROS / "lib").glob("python3.*/site-packages/rosbridge_server_rs/rosbridge_server_rs_jazzy"))
         self.port = free_port()
         self.url = f"ws://127.0.0.1:{self.port}"
-        self._command = [program, "--bind", f"127.0.0.1:{self.port}", "--no-rosapi", "--log-ansi=false"]
+        self._command = [program, "--bind", f"127.0.0.1:{self.port}", "--no-rosapi", "--log-ansi=false", *options]
         # The wheels leave CPython's symbols to the program that loads them.
         self._env = {**env, "LD_PRELOAD": str(ROS / "lib" / "libpython3.11.so.1.0")}
         self._peer: Peer | None = None
@@ -216,12 +211,32 @@ class Rosbridge:
 
 
 @pytest.fixture(scope="session")
+def make_rosbridge() -> type[Rosbridge]:
+    """Makes a server of the environment variables of its process."""
+    return Rosbridge
+
+
+@pytest.fixture(scope="session")
 def rosbridge(ros2: dict[str, str]) -> Iterator[Rosbridge]:
     """The server, in the graph of `robot_node`."""
     server = Rosbridge(ros2)
     with contextlib.closing(server):
         server.start()
         yield server
+
+
+@pytest.fixture
+def new_rosbridge() -> Iterator[Callable[..., Rosbridge]]:
+    """Starts a server with environment variables and options of its own."""
+    with contextlib.ExitStack() as started:
+
+        def start(env: dict[str, str], *options: str) -> Rosbridge:
+            server = Rosbridge(env, *options)
+            started.callback(server.close)
+            server.start()
+            return server
+
+        yield start
 
 
 @pytest.fixture

@@ -1,8 +1,8 @@
 """A UR5e as a ROS 2 node, in rclpy alone: publishes its state at 100 Hz, follows commands, holds when they stop.
 
 It shares no code with the project. Ready, it prints one line; a line on its standard input is answered by one line of
-JSON: ``report`` for what it received, ``forget`` to begin a new report, ``stop`` to end. Numbers that are not finite
-are written as text.
+JSON: ``report`` for what it received, ``forget`` to begin a new report, ``pause`` and ``play`` for its program,
+``stop`` to end. Numbers that are not finite are written as text.
 """
 
 import contextlib
@@ -15,8 +15,9 @@ import time
 import rclpy
 from geometry_msgs.msg import PoseStamped
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Empty, Float64MultiArray, String
+from std_msgs.msg import Bool, Empty, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
@@ -56,6 +57,9 @@ class Robot:
         self.joint_states = node.create_publisher(JointState, "/joint_states", 10)
         self.gripper_states = node.create_publisher(JointState, "/gripper/joint_states", 10)
         self.objects = node.create_publisher(PoseStamped, "/object_pose", 10)
+        kept = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.running = node.create_publisher(Bool, "/io_and_status_controller/robot_program_running", kept)
+        self.running.publish(Bool(data=True))
         self.pong = node.create_publisher(String, "/pong", 10)
         for kind, topic, callback in (
             (Float64MultiArray, "/forward_position_controller/commands", self.on_positions),
@@ -125,7 +129,7 @@ class Robot:
         joints.position = [self.position[i] for i in PUBLISHED]
         joints.velocity = [self.velocity[i] for i in PUBLISHED]
         fingers.name, fingers.position = ["gripper_width"], [self.gripper]
-        cube.header.frame_id = "base"
+        cube.header.frame_id = "base_link"
         cube.pose.position.x, cube.pose.position.y, cube.pose.position.z = 0.5, 0.1, 0.02
         cube.pose.orientation.w = 1.0
         self.joint_states.publish(joints)
@@ -147,6 +151,14 @@ class Robot:
             self.received, self.holds, self.halts = [], 0, 0
         return {}
 
+    def pause(self):
+        self.running.publish(Bool(data=False))
+        return {}
+
+    def play(self):
+        self.running.publish(Bool(data=True))
+        return {}
+
 
 def spin(executor):
     with contextlib.suppress(ExternalShutdownException):
@@ -165,7 +177,7 @@ def main():
     for line in sys.stdin:
         if line.strip() == "stop":
             break
-        print(json.dumps({"report": robot.report, "forget": robot.forget}[line.strip()]()), flush=True)
+        print(json.dumps(getattr(robot, line.strip())()), flush=True)
     executor.shutdown()
     rclpy.try_shutdown()
     thread.join(timeout=5)

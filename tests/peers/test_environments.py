@@ -87,6 +87,12 @@ def test_through_the_other_server(channel, served, rosbridge, running_robot, her
     closely(played(f"{rosbridge.url}/via_{channel}", channel=channel), here, 1e-6)
 
 
+LEAVES = """
+from bam_envs.remote_env import make_remote_env
+env = make_remote_env("", "ros2://native", name="leaver", channel="service")
+env.reset(seed=1)
+env.step(env.action_space.sample())
+"""
 SUCCESS, FAILURE = {"value": 1}, {"value": 2}
 
 
@@ -119,3 +125,7 @@ def test_as_a_ros_2_node(ros_python, rosbridge, running_robot, here):
         client = ros_python(HERE / "play.py", "ros2://native", f"channel={channel}")
         closely(json.loads(client.line("[", limit=60.0)), here, 1e-6)
         assert client.wait() == 0
+    left = ros_python("-c", LEAVES)
+    assert (left.wait(), left.output) == (0, [])
+    node.line("bam-serve: leaver")
+    assert node.line("bam-serve: leaver").endswith(" is no longer in command")

@@ -78,6 +78,14 @@ def test_services(rosbridge, robot_node):
             link.call("/robot/slow", "std_srvs/Trigger", {}, 0.2)
 
 
+def test_a_call_may_take_as_long_as_it_says(ros2, new_rosbridge, robot_node):
+    """The server itself ends calls sooner, as bridges do; the time goes with each call."""
+    server = new_rosbridge(ros2, "--service-timeout", "0.3")
+    server.wait_for_robot()
+    with link_to(server) as link:
+        assert link.call("/robot/slow", "std_srvs/Trigger", {}, 10.0)["success"]
+
+
 def test_what_we_offer_is_called_through_it(rosbridge, robot_node):
     with link_to(rosbridge) as provider, link_to(rosbridge) as client:
         provider.serve("/link/flip", "std_srvs/SetBool", lambda request, _: {"success": not request["data"]})

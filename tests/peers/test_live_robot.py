@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bam_envs.errors import LinkLost, NoServer, SafetyStop, StaleState
+from bam_envs.errors import LinkLost, NoServer, NotReady, SafetyStop, StaleState
 from bam_envs.robots.live.building import live_robot, profile_limits
 from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.robots.robot import Initial
@@ -96,7 +96,7 @@ def test_halt_stops_the_node(rosbridge, robot_node, wait_until):
 def test_a_hundred_commands_a_second_arrive(rosbridge, robot_node, wait_until):
     """On a busy machine a state may be late and ROS may drop a command: neither is what is tested here."""
     count = 300
-    patient = replace(profile_limits(load_profile("ur5e")), max_age=5.0)
+    patient = replace(profile_limits(load_profile("ur5e")), max_age=1.0)
     with live(rosbridge, replace(SPEC, period=0.01), limits=patient) as robot:
         command = start(robot).command
         robot_node.ask("forget")
@@ -126,6 +126,33 @@ def test_the_server_dies_and_comes_back(mortal_rosbridge, robot_node):
         assert robot_node.ask("report")["received"] == []
         np.testing.assert_allclose(start(robot).signals["joint_position"], HOME, atol=0.02)
         robot.step(command)
+
+
+PROGRAM = "/io_and_status_controller/robot_program_running"
+
+
+def test_a_paused_program_is_named(rosbridge, robot_node, wait_until):
+    """Said once, before we came; the server knows none of the other topics, and two of their types."""
+    robot_node.ask("pause")
+    paused = f"the external control program is not running ({PROGRAM})"
+    try:
+        with live(rosbridge) as robot:
+            assert robot.not_ready() == paused
+            with pytest.raises(NotReady, match="not ready: the external control program is not running"):
+                start(robot)
+            robot_node.ask("play")
+            wait_until(robot.not_ready, None)
+            command = start(robot).command
+            robot.step(command)
+            assert robot.info.text.endswith(
+                "; it does not say safety_mode, robot_mode, speed_scaling, list_controllers)"
+            )
+            robot_node.ask("pause")
+            wait_until(robot.not_ready, paused)
+            with pytest.raises(NotReady):
+                robot.step(command)
+    finally:
+        robot_node.ask("play")
 
 
 def test_nobody_there(mortal_rosbridge):

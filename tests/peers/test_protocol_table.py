@@ -71,7 +71,7 @@ TABLE = {
     "set_level": ({"op": "set_level", "level": "error"}, NOTHING, Answer(text="unknown operation")),
     "two objects in one frame": (
         json.dumps(call("/robot/set", args={"data": True})) * 2,
-        done('"set"'),
+        Answer(text="expected one in a frame"),
         Answer(text="trailing characters"),
     ),
     "JSON in a binary frame": (

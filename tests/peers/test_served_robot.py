@@ -1,11 +1,13 @@
 """The simulated robot of `bam-serve` in a ROS graph: through a rosbridge server that is not ours, and as a node."""
 
 import contextlib
+import re
 import runpy
 import threading
 from pathlib import Path
 
 import gymnasium as gym
+import numpy as np
 import pytest
 
 import bam_envs  # noqa: F401 - registers the environments
@@ -43,6 +45,65 @@ def test_the_policy_picks_with_it(served):
     with contextlib.closing(gym.make("bam/pick-v0", robot=served("fast"))) as env:
         episodes = [player["play_one"](env, seed, policy.act, 200) for seed in player["POLICY_SEEDS"]]
     assert [episode[-1]["success"] for episode in episodes] == [True, True, True]
+
+
+@pytest.fixture
+def bridge_without(ros2, new_rosbridge, tmp_path):
+    """A server that finds no message package of those names."""
+
+    def start(*packages):
+        whole = ros2["AMENT_PREFIX_PATH"]
+        for folder in ("share", "lib"):
+            (tmp_path / folder).mkdir()
+            for one in (Path(whole) / folder).iterdir():
+                if one.name not in packages and one.name.partition("__")[0].removeprefix("lib") not in packages:
+                    (tmp_path / folder / one.name).symlink_to(one)
+        libraries = ros2["LD_LIBRARY_PATH"].replace(f"{whole}/lib:", f"{tmp_path}/lib:")
+        return new_rosbridge({**ros2, "AMENT_PREFIX_PATH": str(tmp_path), "LD_LIBRARY_PATH": libraries})
+
+    return start
+
+
+def test_a_server_without_bam_msgs(bridge_without, python):
+    """Its answer is waited for: what it does not carry is said, and not announced."""
+    url = bridge_without("bam_msgs").url
+    program = python("-m", "bam_train.cli.serve", "--env", "CartPole-v1", "--via", url)
+    assert program.line("bam-serve: ").startswith(
+        f"bam-serve: {url} does not carry /gym_env/gym_api_request (bam_msgs/GymAPI): load message definition "
+    )
+    assert program.line("bam-serve: ") == (
+        f'bam-serve: CartPole-v1 on {url}, fast: /gym_env/request and reply (channel="topics")'
+    )
+
+
+def test_a_server_that_carries_nothing_of_use(bridge_without, python):
+    url = bridge_without("bam_msgs", "std_msgs").url
+    program = python("-m", "bam_train.cli.serve", "--env", "CartPole-v1", "--via", url)
+    assert program.wait() == 1
+    assert program.output[-1] == f"bam-serve: {url} carries nothing of use of what is served here."
+
+
+def test_a_watcher_of_the_graph_does_not_drive_it(served):
+    """All senders come through one bridge: what tells them apart is the key that only the driver was given."""
+    url, action = served("fast"), [0.3, -0.4, 0.4, 0.1, -0.2]
+    heard, came = [], threading.Event()
+    with contextlib.closing(gym.make("bam/pick-v0", robot=url)) as env, contextlib.closing(RosbridgeLink(url)) as thief:
+        env.reset(seed=1)
+        thief.connect()
+        joints = thief.namespace + POSITIONS
+        thief.advertise(joints, ARRAY)
+        thief.subscribe(joints, ARRAY, lambda message, _: (heard.append(message), came.set()))
+        while not came.is_set():
+            env.step(np.float32(action))
+        (dimension, *_), data = heard[0]["layout"]["dim"], [value + 1.0 for value in heard[0]["data"]]
+        ahead = {**dimension, "label": re.sub(r" q=\d+ ", " q=1000000 ", dimension["label"])}
+        for label in (dimension, ahead, {**ahead, "label": ahead["label"].partition(" m=")[0]}):
+            for _ in range(5):
+                thief.publish(joints, {"layout": {"dim": [label], "data_offset": 0}, "data": data})
+                thief.publish(joints, heard[0])
+                env.step(np.float32(action))
+                state = env.unwrapped.state.signals["joint_position"][0]
+                assert np.abs(state - np.array(heard[0]["data"])).max() < 0.6
 
 
 class Watch:

@@ -93,6 +93,25 @@ def test_a_directory_of_rllib_acts_the_same(run_script, run, checkpoint, directo
     assert list(tmp_path.iterdir()) == []
 
 
+def test_checkpoints_of_robo_gyms(run, tmp_path):
+    """The example of its help, on one that robo-gym's own script left; `--set` is an argument of the environment."""
+    theirs = ROOT / "tests" / "bam_train" / "robo_gym" / "NoObstacleNavigationMir100Sim-v0" / "policies"
+    arguments = (theirs / "default_policy", "--env", "NoObstacleNavigationMir100Sim-v0", "--num-episodes", 1)
+    status, expected, err = run(*arguments)
+    said = "its spaces are robo-gym's own: NoObstacleNavigationMir100Sim-v0 is made with parity=True"
+    assert (status, err) == (0, f"policy_from_cp_mir: warning: {said}\n")
+    assert expected.splitlines()[-1] == "success in 0 of 1 episodes on NoObstacleNavigationMir100Sim-v0"
+    assert run(*arguments, "--set", "env_kwargs.parity=true") == (0, expected, "")
+
+
+def test_arguments_win_over_a_checkpoints(run, checkpoint):
+    status, _, err = run(checkpoint, "--set", "env_kwargs.parity=true")
+    assert (status, err.count("\n")) == (1, 1)
+    assert 'observation_space.high[0] is 6.0 in the checkpoint and "inf" in bam/mir100-navigation-v0' in err
+    text = "--set parity=true: expected env_kwargs.NAME=VALUE, such as env_kwargs.parity=true"
+    assert run(checkpoint, "--set", "parity=true") == (1, "", f"policy_from_cp_mir: {text}\n")
+
+
 class Payload:
     """Writes into a file when it is unpickled."""
 

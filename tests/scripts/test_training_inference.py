@@ -29,6 +29,10 @@ OPTIONS = (
     "--num-episodes-during-inference",
     "--robot",
     "--seed",
+    "--env",
+    "--parity",
+    "--out",
+    "--render",
 )
 
 
@@ -66,6 +70,13 @@ WRONG = [
     (["--stop-iters", "0"], 2, "--stop-iters: expected a whole number from 1, found '0'"),
     (["--stop-reward", "high"], 2, "--stop-reward: invalid float value: 'high'"),
     (["--run", "PPOO"], 1, "Unknown algorithm 'ppoo'. Did you mean 'ppo'?"),
+    (["--env", "bam/pik"], 1, "Unknown environment 'bam/pik'. Did you mean 'bam/pick-v0'?"),
+    (["--env", "bam/pick", "--parity"], 1, "env_kwargs: unknown setting 'parity' of bam/pick-v0. "),
+    (
+        ["--run", "BC"],
+        1,
+        "data: bc learns from recorded episodes, found none. Give a folder of Parquet files with bam-",
+    ),
     (["--run", "DQN"], 1, "dqn does not fit bam/mir100-navigation-v0: it takes Discrete actions, found Box. "),
     (["--num-cpus", "1000"], 1, "--num-cpus: expected at most "),
     (["--robot", "nonsense"], 1, "A live robot's address is ws://host:port or wss://host:port, not 'nonsense'. "),
@@ -117,8 +128,8 @@ def test_without_ray(run_script, environment, tmp_path):
 def test_it_trains_saves_and_explores_in_a_new_environment(trained):
     folder, done = trained
     lines = done.stdout.splitlines()
-    assert lines[0].startswith("iteration 1: 4,096 steps, mean total reward ")
-    assert lines[1] == "saved checkpoints/mir100-navigation-rllib-ppo.zip"
+    assert lines[0] == "saving to checkpoints/mir100-navigation-rllib-ppo.zip after every iteration"
+    assert lines[1].startswith("iteration 1: 4,096 steps, mean total reward ")
     assert [re.sub(r"reward -?\d+\.\d\d(, success)?$", "reward R", line) for line in lines[2:]] == [
         "episode 1: total reward R",
         "episode 2: total reward R",
@@ -128,28 +139,29 @@ def test_it_trains_saves_and_explores_in_a_new_environment(trained):
     assert Checkpoint.open(path).manifest.steps == 4096
 
 
-def test_ctrl_c_saves_and_leaves_no_process(environment, tmp_path):
-    command = [sys.executable, "-u", str(SCRIPTS / "training_inference_ur.py"), "--num-cpus", "2"]
+def test_sigterm_saves_and_leaves_no_process(environment, tmp_path):
+    command = [sys.executable, "-u", str(SCRIPTS / "training_inference_ur.py"), "--num-cpus", "2", "--parity"]
     process = subprocess.Popen(
         command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
+    saved = tmp_path / "checkpoints" / "ur-reach-rllib-ppo.zip"
     try:
-        assert process.stdout.readline().startswith("iteration 1: ")
+        assert process.stdout.readline() == "saving to checkpoints/ur-reach-rllib-ppo.zip after every iteration\n"
+        assert process.stdout.readline().startswith("iteration 1: 4,096 steps")
+        assert Checkpoint.open(saved).manifest.steps >= 4096  # whatever happens now
         rays = psutil.Process(process.pid).children(recursive=True)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGTERM)
         out, err = process.communicate(timeout=120)
     finally:
         process.kill()
         process.communicate()
-    assert process.returncode == 130, err
-    assert out.splitlines()[-1] == "saved checkpoints/ur-reach-rllib-ppo.zip"
+    assert process.returncode == 143, err
+    assert out.splitlines()[-1].startswith("iteration ")
     assert err.splitlines() == [
-        "finishing the update and saving; Ctrl-C again quits at once",
-        "training_inference_ur: interrupted",
+        "finishing the update and saving; another signal quits at once",
+        "training_inference_ur: ended by SIGTERM",
     ]
-    assert Checkpoint.open(tmp_path / "checkpoints" / "ur-reach-rllib-ppo.zip").manifest.env_kwargs == {
-        "ur_model": "ur5"
-    }
+    assert Checkpoint.open(saved).manifest.env_kwargs == {"ur_model": "ur5", "parity": True}
     assert rays
     assert psutil.wait_procs(rays, timeout=10)[1] == []
 
@@ -161,7 +173,7 @@ def test_td3_trains_saves_and_runs_and_overwrites_nothing(run_script, tmp_path):
     done = run_script("td3_mir", "--steps", 300, "--episodes", 1, "--seed", 3, folder=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     lines = done.stdout.splitlines()
-    assert lines[-3].startswith("      300 steps, mean total reward ")
-    assert lines[-2] == "saved checkpoints/mir100-navigation-td3-2.zip"
+    assert lines[0] == "saving to checkpoints/mir100-navigation-td3-2.zip twenty times"
+    assert lines[-2].startswith("      300 steps, mean total reward ")
     assert re.fullmatch(r"episode 1: total reward -?\d+\.\d\d(, success)?", lines[-1])
     assert taken.read_text() == "somebody's"

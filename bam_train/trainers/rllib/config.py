@@ -52,7 +52,7 @@ def make_config(settings: TrainSettings, observation_space: Space[Any], action_s
     config.environment(name, env_config=dict(settings.env_kwargs), disable_env_checking=True)
     config.env_runners(
         num_env_runners=settings.num_env_runners,
-        num_envs_per_env_runner=settings.num_envs,
+        num_envs_per_env_runner=envs_each(settings),
         rollout_fragment_length=values["rollout_fragment_length"],
         env_to_module_connector=functools.partial(connectors, observation_space, settings.normalize),
     )
@@ -61,6 +61,11 @@ def make_config(settings: TrainSettings, observation_space: Space[Any], action_s
     else:
         config.callbacks(NotesEnds)
     return fault_tolerance(config)
+
+
+def envs_each(settings: TrainSettings) -> int:
+    """Environments of each runner: an equal share of `num_envs`, to the nearest whole number from 1."""
+    return max(1, round(settings.num_envs / max(1, settings.num_env_runners)))
 
 
 def runs_batched(settings: TrainSettings, observation_space: Space[Any]) -> bool:
@@ -73,13 +78,13 @@ def connectors(
     observation_space: Space[Any], normalize: bool | Mapping[str, Any], env: Any, spaces: Any, device: Any
 ) -> list[Any]:
     """What lies between environment and module: one vector out of several inputs, normalised if asked for."""
-    pieces: list[Any] = [] if _is_plain(observation_space) else [FlattenObservations()]
+    pieces: list[Any] = [] if is_plain(observation_space) else [FlattenObservations()]
     if normalize:
         pieces.append(MeanStdFilter(**({} if normalize is True else normalize)))
     return pieces
 
 
-def _is_plain(space: Space[Any]) -> bool:
+def is_plain(space: Space[Any]) -> bool:
     """Whether RLlib's networks take it as it is: a vector or an image, of floats."""
     floats = isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating)
     return floats and len(space.shape or ()) in (1, 3)
@@ -125,7 +130,7 @@ class NotesEnds(RLlibCallback):  # type: ignore[misc]
         self, *, episode: Any, prev_episode_chunks: Any = (), metrics_logger: Any, **kwargs: Any
     ) -> None:
         """Note one."""
-        pieces = [*prev_episode_chunks, episode]
         success = episode.get_infos(-1).get("is_success")
-        total, length = sum(piece.get_return() for piece in pieces), sum(map(len, pieces))
+        total = sum(piece.get_return() for piece in (*prev_episode_chunks, episode))
+        length = episode.t  # PPO's learner has lengthened the earlier pieces by a step without a reward
         log_end(metrics_logger, End(length, float(total), None if success is None else bool(success)))

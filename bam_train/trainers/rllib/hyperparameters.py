@@ -42,8 +42,8 @@ ELSEWHERE = {
     "observation_filter": "normalize=true",
     "num_workers": "--num-env-runners",
     "num_rollout_workers": "--num-env-runners",
-    "num_envs_per_worker": "--num-envs",
-    "num_envs_per_env_runner": "--num-envs",
+    "num_envs_per_worker": "--num-envs, which is of all runners together",
+    "num_envs_per_env_runner": "--num-envs, which is of all runners together",
     "seed": "--seed",
 }
 """Arguments of RLlib's old stack, or of other methods, and what to use instead."""

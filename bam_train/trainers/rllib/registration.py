@@ -16,6 +16,7 @@ import gymnasium as gym
 import bam_envs  # noqa: F401 - registers our environments with Gymnasium
 from bam_envs.errors import InvalidValue
 from bam_envs.registry import ENVIRONMENTS
+from bam_train.finite import FiniteEnv
 from bam_train.trainers.from_zero import from_zero
 
 try:
@@ -68,8 +69,8 @@ def create(env_id: str, context: Mapping[str, Any]) -> gym.Env[Any, Any]:
             "the same. Use .env_runners(env_runner_cls=bam_train.trainers.rllib.RobotEnvRunner), which steps all rows "
             "at once, and leave gym_env_vectorize_mode out."
         )
-    return gym.make(env_id, disable_env_checker=True, **kwargs)
+    return FiniteEnv(gym.make(env_id, disable_env_checker=True, **kwargs), env_id)
 
 
 def _create_foreign(spec: gym.envs.registration.EnvSpec, context: Mapping[str, Any]) -> gym.Env[Any, Any]:
-    return from_zero(gym.make(spec, disable_env_checker=True, **dict(context)))
+    return from_zero(FiniteEnv(gym.make(spec, disable_env_checker=True, **dict(context)), spec.id))

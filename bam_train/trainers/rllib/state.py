@@ -25,7 +25,7 @@ from bam_train.trainers.rllib.learner_extras import extras_of, set_extras
 from bam_train.trainers.rllib.pickles import read_state
 
 FOLDER, NOTES, EXTRAS = "bam/resume/rllib/", "bam/resume/notes.json", "bam/resume/learner.json"
-_STATES = ("state.pkl", "algorithm_state.pkl", "module_state.pkl", "policy_state.pkl")
+STATES = ("state.pkl", "algorithm_state.pkl", "module_state.pkl", "policy_state.pkl")
 
 
 def members(algorithm: Any, notes: Mapping[str, Any]) -> dict[str, bytes]:
@@ -91,7 +91,7 @@ def read(checkpoint: Checkpoint) -> dict[str, Any]:
     tree: dict[str, Any] = {}
     for name in sorted(checkpoint.manifest.sha256):
         path = PurePosixPath(name)
-        if not name.startswith(FOLDER) or path.name not in _STATES:
+        if not name.startswith(FOLDER) or path.name not in STATES:
             continue
         inner = tree
         for part in path.parent.relative_to(FOLDER).parts:

@@ -32,10 +32,11 @@ from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.manifest import manifest
+from bam_train.trainers.resolve import own_settings
 from bam_train.trainers.rllib import hyperparameters, state
 from bam_train.trainers.rllib.cluster.cluster import cluster
 from bam_train.trainers.rllib.cluster.fault_tolerance import RunnerWatch
-from bam_train.trainers.rllib.config import make_config, refusals
+from bam_train.trainers.rllib.config import envs_each, make_config, refusals
 from bam_train.trainers.rllib.exploring import ExploringPolicy
 from bam_train.trainers.rllib.freezing.freeze import freeze
 from bam_train.trainers.rllib.freezing.golden import golden
@@ -73,7 +74,7 @@ class RLlibTrainer:
 
     def __init__(self, settings: TrainSettings, seen: Seen, seed: int) -> None:
         self.settings, self._seen = settings, seen
-        self.notices: list[str] = []
+        self.notices = _shares(settings)
         self._ends = {name: deque[float](maxlen=_EPISODES) for name in ("return", "length", "success")}
         self._result: dict[str, Any] = {}
         self._steps = 0
@@ -121,7 +122,7 @@ class RLlibTrainer:
     @classmethod
     def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None) -> RLlibTrainer:
         """Set up a run that goes on from a checkpoint, with its settings or with these."""
-        settings = settings or TrainSettings.from_mapping(checkpoint.manifest.settings, str(checkpoint.path))
+        settings = settings or TrainSettings.from_mapping(own_settings(checkpoint), str(checkpoint.path))
         with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
             require_fit(checkpoint, env)
         steps = checkpoint.manifest.steps
@@ -166,8 +167,8 @@ class RLlibTrainer:
             return
         ends = self._result.get("env_runners", {}).get(ENDS, {})
         for name, values in self._ends.items():
-            said = np.asarray(ends.get(name, ()), np.float64)
-            values.extend(said.tolist() if said.ndim else ())  # where no episode ended, RLlib says NaN
+            said = np.atleast_1d(np.asarray(ends.get(name, ()), np.float64))  # RLlib makes a number of a list of one
+            values.extend(said[~np.isnan(said)].tolist())  # where no episode ended, RLlib may say NaN
         self._require_finite()
         if self._tensorboard is not None:
             self._tensorboard.write(self._metrics() | self._means(), self.steps)
@@ -337,12 +338,20 @@ def _require_offline(settings: TrainSettings) -> None:
     if settings.data is None:
         raise SettingsError(
             f"data: {settings.algo} learns from recorded episodes, found none. Give a folder of Parquet files with "
-            "--data, such as scripts/record_parquet.py writes"
+            "bam-train --data, such as scripts/record_parquet.py writes"
         )
     if settings.num_env_runners:
         raise SettingsError(f"num_env_runners: {settings.algo} learns from recorded episodes alone; leave it out")
     if settings.normalize:
         raise SettingsError(f"normalize: {settings.algo} takes recorded observations as they are; leave it out")
+
+
+def _shares(settings: TrainSettings) -> list[str]:
+    """What runners that cannot share the environments out evenly have."""
+    wanted, runners, each = settings.num_envs, settings.num_env_runners, envs_each(settings)
+    if not runners or each * runners == wanted:
+        return []
+    return [f"num_envs: {wanted} are not shared evenly by {runners} env runners: {each} each, {each * runners} in all"]
 
 
 def _not_saved(settings: TrainSettings) -> list[str]:

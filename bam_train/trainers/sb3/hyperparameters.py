@@ -107,6 +107,12 @@ def complete_normalize(given: bool | Mapping[str, Any], gamma: float) -> bool | 
     return {"gamma": gamma, **fitted}
 
 
+def over_the_whole_run(values: Mapping[str, Any]) -> list[str]:
+    """Names of complete hyperparameters whose course depends on how many steps the run has in all."""
+    schedules = [name for name, value in values.items() if isinstance(value, str) and linear_start(value) is not None]
+    return sorted([*schedules, *({"exploration_fraction"} & values.keys())])
+
+
 def build(values: Mapping[str, Any], action_space: spaces.Space[Any]) -> dict[str, Any]:
     """Turn complete hyperparameters into the arguments that the constructor takes; `values` is left as it is."""
     arguments = {name: _built(value) for name, value in copy.deepcopy(dict(values)).items()}

@@ -29,11 +29,18 @@ class Waiting:
     noise: list[Any]
     same_episodes: bool
     """Whether the episodes that ran when the checkpoint was saved go on."""
+    checkpoint: Checkpoint
+    """Where it comes from."""
 
     def restore(self, model: Any) -> None:
-        """Put it back."""
-        state.load_noise(model, self.noise)
-        state.load_random_states(model, self.random)
+        """Put it back.
+
+        Raises:
+            AlteredCheckpoint: It does not fit the model.
+        """
+        with _fits(self.checkpoint, STATE):
+            state.load_noise(model, self.noise)
+            state.load_random_states(model, self.random)
 
 
 def members(
@@ -82,7 +89,7 @@ def load(checkpoint: Checkpoint, model: Any, venv: VecEnv, normaliser: VecNormal
         if normaliser is not None:
             state.load_normaliser(normaliser, tree["normaliser"])
         same = _load_episodes(model, venv, tree["env"])
-        waiting = Waiting(tree["random"], tree["noise"], same)
+        waiting = Waiting(tree["random"], tree["noise"], same, checkpoint)
     if checkpoint.has(f"{REPLAY}.json"):
         with _fits(checkpoint, REPLAY):
             state.load_replay(model, _read(checkpoint, REPLAY))
@@ -94,7 +101,7 @@ def _fits(checkpoint: Checkpoint, name: str) -> Iterator[None]:
     """What goes wrong when a state is put into a model that is not made like the saved one, in one line."""
     try:
         yield
-    except (RuntimeError, ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
+    except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
         reason = " ".join(str(error).split())
         raise AlteredCheckpoint(checkpoint.path, name, f"{name} does not fit these settings: {reason:.200}") from error
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.save_util import recursive_getattr
@@ -29,6 +30,8 @@ COUNTERS = (
     "exploration_rate",
 )
 """Numbers that a model counts with, where it has them."""
+
+_SHARES = ("_current_progress_remaining", "exploration_rate")
 
 LAST = ("_last_obs", "_last_original_obs", "_last_episode_starts")
 """What the model saw last, where its next rollout begins."""
@@ -75,16 +78,54 @@ def counters(model: Any) -> Tree:
 
 
 def load_counters(model: Any, tree: Mapping[str, Any]) -> None:
-    """Put `counters` back."""
+    """Put `counters` back.
+
+    Raises:
+        ValueError: One is of another kind, or what was seen last has another shape than the environments'.
+    """
     for name in COUNTERS:
         if name in tree:
-            setattr(model, name, tree[name])
+            setattr(model, name, _counter(name, tree[name], share=name in _SHARES))
     for name in LAST:
-        setattr(model, name, tree["last"][name])
+        setattr(model, name, _seen(name, model, tree["last"][name]))
     for name in _DEQUES:
-        setattr(model, name, deque(tree["deques"][name], maxlen=model._stats_window_size))
+        setattr(model, name, deque(_episodes(name, tree["deques"][name]), maxlen=model._stats_window_size))
     if tree["lstm"] is not None:
         model._last_lstm_states = type(model._last_lstm_states)(tree["lstm"]["pi"], tree["lstm"]["vf"])
+
+
+def _counter(name: str, value: Any, *, share: bool) -> Any:
+    """A count, or a share of the run."""
+    kinds, most = ((int, float), 1) if share else ((int,), 2**53)
+    if type(value) not in kinds or not -1 <= value <= most:
+        raise ValueError(f"{name}: expected {'a share of the run' if share else 'a count'}, found {value!r:.40}")
+    return value
+
+
+def _seen(name: str, model: Any, value: Any) -> Any:
+    """Arrays of the environments' shape, one row each; None before the first step."""
+    if value is None:
+        return None
+    space, n = model.observation_space, model.n_envs
+    if name == "_last_episode_starts":
+        wanted = {"": (n,)}
+    elif isinstance(space, spaces.Dict):
+        wanted = {key: (n, *(one.shape or ())) for key, one in space.spaces.items()}
+    else:
+        wanted = {"": (n, *(space.shape or ()))}
+    found = {key: np.shape(one) for key, one in (value if isinstance(value, dict) else {"": value}).items()}
+    if found != wanted:
+        raise ValueError(f"{name}: expected arrays of shape {wanted}, found {found!s:.80}")
+    return value
+
+
+def _episodes(name: str, values: Any) -> list[Any]:
+    """What the statistics average: returns and lengths of episodes, or whether they succeeded."""
+    for value in values:
+        numbers = [value["r"], value["l"]] if name == "ep_info_buffer" else [value]
+        if not all(isinstance(number, (bool, int, float, np.bool_, np.number)) for number in numbers):
+            raise ValueError(f"{name}: expected numbers of episodes, found {value!r:.40}")
+    return list(values)
 
 
 def normaliser(env: VecNormalize | None) -> Tree | None:

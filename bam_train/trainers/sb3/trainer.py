@@ -27,6 +27,7 @@ from bam_train.errors import TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.manifest import manifest
+from bam_train.trainers.resolve import own_settings
 from bam_train.trainers.sb3 import hyperparameters, resume
 from bam_train.trainers.sb3.algorithms import ALGORITHMS
 from bam_train.trainers.sb3.freeze import freeze
@@ -94,13 +95,20 @@ class SB3Trainer:
     @classmethod
     def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None) -> SB3Trainer:
         """Set up a run that goes on from a checkpoint, with its settings or with these."""
-        settings = settings or TrainSettings.from_mapping(checkpoint.manifest.settings, str(checkpoint.path))
+        settings = settings or TrainSettings.from_mapping(own_settings(checkpoint), str(checkpoint.path))
         trainer = cls.create(settings)
         require_fit(checkpoint, one_env(trainer.venv), settings.place)
         trainer._waiting = resume.load(checkpoint, trainer.model, trainer.venv, trainer._normaliser)
         if not trainer._waiting.same_episodes:
             trainer.notices.append(
                 f"{settings.env} cannot save running episodes: new ones begin, so the rest differs from an unbroken run"
+            )
+        before = checkpoint.manifest.settings.get("steps", settings.steps)
+        courses = hyperparameters.over_the_whole_run(settings.hyperparameters)
+        if courses and before != settings.steps:
+            trainer.notices.append(
+                f"{' and '.join(courses)} change{'s' if len(courses) == 1 else ''} over all of --steps, which were "
+                f"{before} and are {settings.steps}: the result differs from an unbroken run's"
             )
         return trainer
 

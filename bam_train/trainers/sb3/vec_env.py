@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,6 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from bam_train.environments import is_batched, make_env, make_rows
 from bam_train.errors import SettingsError
+from bam_train.finite import FiniteEnv, FiniteRows
 from bam_train.place import HERE, Place
 from bam_train.trainers.from_zero import from_zero
 
@@ -29,8 +31,12 @@ def make_training_env(env_id: str, env_kwargs: Mapping[str, Any], num_envs: int,
         SettingsError: The environment cannot be made.
     """
     if is_batched(env_id) or place.transport:
-        return RowsVecEnv(make_rows(env_id, env_kwargs, num_envs, place))
-    return DummyVecEnv([lambda: Monitor(from_zero(make_env(env_id, env_kwargs))) for _ in range(num_envs)])
+        return RowsVecEnv(make_rows(env_id, env_kwargs, num_envs, place), env_id)
+
+    def make_one(row: int) -> Monitor:
+        return Monitor(from_zero(FiniteEnv(make_env(env_id, env_kwargs), env_id, row)))
+
+    return DummyVecEnv([functools.partial(make_one, row) for row in range(num_envs)])
 
 
 class RowsVecEnv(VecEnv):  # type: ignore[misc]
@@ -38,19 +44,21 @@ class RowsVecEnv(VecEnv):  # type: ignore[misc]
 
     Args:
         rows: The environment.
+        env_id: How errors name it; None for the name of its class.
 
     Raises:
+        EnvironmentFailed: From `reset` and `step_wait`, if an observation or a reward is NaN or infinite.
         SettingsError: Its rows do not restart in the same step, or its actions count from another number than 0.
     """
 
-    def __init__(self, rows: VectorEnv[Any, Any, Any]) -> None:
+    def __init__(self, rows: VectorEnv[Any, Any, Any], env_id: str | None = None) -> None:
         mode = rows.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
             raise SettingsError(f"{rows}: expected autoreset mode SAME_STEP, found {mode}")
         start = getattr(rows.single_action_space, "start", 0)
         if np.any(start):
             raise SettingsError(f"{rows}: expected actions that count from 0, found {rows.single_action_space}")
-        self.rows = rows
+        self.rows = FiniteRows(rows, env_id)
         super().__init__(rows.num_envs, rows.single_observation_space, rows.single_action_space)
         self._dict = isinstance(rows.single_observation_space, spaces.Dict)
         self._returns = np.zeros(self.num_envs)
@@ -146,6 +154,7 @@ class RowsVecEnv(VecEnv):  # type: ignore[misc]
         rows.reset()  # builds what a first episode needs before it is overwritten
         rows.load_state_dict(state["rows"])
         self._returns, self._lengths = np.array(state["returns"]), np.array(state["lengths"])
+        self.rows.episode_steps = self._lengths.copy()
 
     def close(self) -> None:
         """Let go of the simulation."""

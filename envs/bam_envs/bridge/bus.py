@@ -8,8 +8,9 @@ taken too.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 Message = Mapping[str, Any]
@@ -23,6 +24,22 @@ class Caller:
     """Unique among the callers of a bus; the same as long as the connection lives."""
     address: str = ""
     """Where it is, for people."""
+    session: str = ""
+    """The session whose signature the message bears; empty without one."""
+    operator: bool = False
+    """Whether it showed the operator's token."""
+    silence: Callable[[], float] = field(default=lambda: math.inf, compare=False)
+    """How long its connection has given no sign of life [s]; infinite where the bus does not know."""
+
+    @property
+    def shown(self) -> str:
+        """What others are told of it."""
+        return self.address or self.name or (f"session {self.session}" if self.session else "a sender without a name")
+
+    @property
+    def client(self) -> str:
+        """Who it is to a `CommandLease`: its session, else its connection."""
+        return f"session {self.session}" if self.session else self.shown
 
 
 UNKNOWN_CALLER = Caller("")
@@ -33,6 +50,13 @@ Listener = Callable[[Message, Caller], None]
 Handler = Callable[[Message, Caller], Message]
 """Answers a service request with its response; runs in a thread of its own. What it raises of our errors is the text of
 a failed response."""
+
+
+def refusal_of(topic: str, reason: object) -> str:
+    """Why a listener refuses a message on `topic`, with its name once: listeners may say it, without a namespace."""
+    head, colon, rest = str(reason).partition(": ")
+    named = bool(colon) and head.startswith("/") and topic.endswith(head)
+    return f"{topic}: {rest if named else reason}"
 
 
 class Bus(Protocol):

@@ -1,7 +1,8 @@
 """The message and service types that are known by their fields, one a line.
 
 ``pkg/Type: type field; type field`` for a message, ``pkg/Type: request -> response`` for a service. A ``|`` separates
-spellings of one type: ROS 1 has ``secs``, ``nsecs`` and ``seq`` where ROS 2 has ``sec`` and ``nanosec``. A type without
+spellings of one type: ROS 1 has ``secs``, ``nsecs`` and ``seq`` where ROS 2 has ``sec`` and ``nanosec``, and bam_msgs
+has several versions. A type without
 a package is in the package of its line; ``time`` and ``duration`` are the built-in ones; ``any`` is any plain value;
 ``Type[?]`` is one or a list of them; ``type field=1`` has a default other than zero.
 """
@@ -98,6 +99,9 @@ rosapi/ServiceType: string service -> string type
 bam_msgs/ErrorCode: int32 value
 bam_msgs/RequestHeader: string client_id; uint8 request_type; bool force_busy; bool force_uncalibrated; \
 bool force_priority; time stamp; string frame_id; float64 expected_duration; bool blocking; int32 priority; \
+bool clear_priority \
+| string client_id; uint8 request_type; bool force_if_busy; bool force_uncalibrated; \
+bool force_priority; time stamp; string frame_id; float64 expected_duration; bool blocking; int32 priority; \
 bool clear_priority
 bam_msgs/WaypointParams: float64 kp_scale; float64 kd_scale; float64 max_velocity; float64 max_effort; \
 string target_link; string planner; float64 vel_scale; float64 accel_scale; float64 blend_radius; float64 goal_tol; \
@@ -105,11 +109,14 @@ float64 path_tol; float64 vertical_angle_scale; float64 gripper_width
 bam_msgs/GymAction: uint8 action_type; string ns; string prefix; string[] discrete_names; int64[] discrete_action; \
 string[] continuous_names; float64[] continuous_action; string[] pose_names; geometry_msgs/PoseStamped[] pose_action; \
 WaypointParams[] pose_param; int64[] target_class; int64 rank
-bam_msgs/ResponseHeader: float64 duration; ErrorCode error_code; string error_msg; bool calibrated
+bam_msgs/ResponseHeader: float64 process_duration; float64 transport_duration; ErrorCode error_code; \
+string error_msg; bool calibrated; time response_stamp \
+| float64 duration; ErrorCode error_code; string error_msg; bool calibrated
 bam_msgs/GymFeedback: string ns; string[] observation_names; float64[] observation; string[] pose_names; \
 geometry_msgs/PoseStamped[] pose; int64[] target_class; sensor_msgs/CompressedImage[?] color_img; \
 sensor_msgs/Image[?] depth_img; sensor_msgs/CameraInfo[?] camera_info; any[] detections; any[] masks; any[] segments; \
-bool duplicate_obs_ns; bool executed; float64 reward; bool terminated; bool truncated; string info
+bool duplicate_obs_ns; bool duplicate_obs; int64 duplicate_index; bool executed; float64 reward; bool terminated; \
+bool truncated; string info
 bam_msgs/GymAPI: RequestHeader header; int64 seed; string env_name; GymAction[] action \
 -> ResponseHeader header; GymFeedback[] feedback
 """

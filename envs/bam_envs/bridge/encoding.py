@@ -15,6 +15,7 @@ from typing import Any
 
 import cbor2
 
+from bam_envs.bridge.bounds import require_bounded
 from bam_envs.bridge.interfaces import Field, describe, normal_name, variants
 from bam_envs.errors import InvalidValue, ProtocolError
 
@@ -26,6 +27,9 @@ LARGEST_ID = 2**53
 """Largest id that is a number: what every JSON reader holds exactly."""
 _MOST_FRAGMENTS = 10_000
 """Of one outgoing message: a smaller fragment size would cost more than it carries."""
+
+_EMPTY = 100
+"""About what a fragment without any text costs [bytes]."""
 
 # RFC 8746: tag of a little-endian typed array, with the type code of `array`.
 _TYPED = {
@@ -41,19 +45,18 @@ _TYPED = {
 }
 
 
-def decode_frame(data: str | bytes) -> list[dict[str, Any]]:
-    """The messages in one frame: JSON objects, one after another. A binary frame holds the same in UTF-8.
+def decode_frame(data: str | bytes) -> dict[str, Any]:
+    """The message in one frame: a JSON object, alone and bounded (`bounds`). A binary frame holds the same in UTF-8.
 
     NaN and infinities are read, so that what refuses them can say in which message and field they were.
 
     Raises:
-        ProtocolError: Not JSON, not an object, too deeply nested.
+        ProtocolError: Not one JSON object, too much in it, too deeply nested.
     """
-    values = _decode_json(data if isinstance(data, str) else _utf8(data))
-    for value in values:
-        if not isinstance(value, dict):
-            raise ProtocolError(f"Message: expected an object, found {describe(value)}.")
-    return values
+    value = _decode_json(data.encode(errors="surrogatepass") if isinstance(data, str) else data)
+    if not isinstance(value, dict):
+        raise ProtocolError(f"Message: expected an object, found {describe(value)}.")
+    return value
 
 
 def encode_json(message: Mapping[str, Any]) -> str:
@@ -98,13 +101,14 @@ class _Parts:
     deadline: float
     texts: dict[int, str] = field(default_factory=dict)
     size: int = 0
+    """Bytes: a text that is not ASCII takes up to four for a character."""
 
 
 class Fragments:
     """Puts the fragments of one connection together again, in whatever order they come.
 
     Args:
-        max_size: Most characters that all unfinished messages may hold together.
+        max_size: Most bytes that all unfinished messages may hold together.
         lifetime: How long a message may stay unfinished [s].
         max_messages: Most unfinished messages.
     """
@@ -112,6 +116,15 @@ class Fragments:
     def __init__(self, max_size: int, lifetime: float = 10.0, max_messages: int = 16) -> None:
         self.max_size, self.lifetime, self.max_messages = max_size, lifetime, max_messages
         self._unfinished: dict[str | int, _Parts] = {}
+
+    @property
+    def size(self) -> int:
+        """What the unfinished messages hold [bytes]."""
+        return sum(parts.size for parts in self._unfinished.values())
+
+    def clear(self) -> None:
+        """Give all of them up."""
+        self._unfinished.clear()
 
     @property
     def deadline(self) -> float | None:
@@ -148,7 +161,8 @@ class Fragments:
             raise ProtocolError(f"Fragment {num} of {total} of {name!r} does not fit the ones before it.")
         if num not in parts.texts:
             parts.texts[num] = data
-            parts.size += len(data)
+            # An empty fragment costs memory too.
+            parts.size += len(data) * (1 if data.isascii() else 4) + _EMPTY
             self._require_room()
         if len(parts.texts) < total:
             return None
@@ -161,10 +175,8 @@ class Fragments:
         return self._unfinished.setdefault(name, _Parts(total, now + self.lifetime))
 
     def _require_room(self) -> None:
-        # An empty fragment costs memory too, about as much as 100 characters.
-        used = sum(parts.size + 100 * len(parts.texts) for parts in self._unfinished.values())
-        if used > self.max_size:
-            raise ProtocolError(f"Fragments: expected at most {self.max_size} characters, found {used}.")
+        if self.size > self.max_size:
+            raise ProtocolError(f"Fragments: expected at most {self.max_size} bytes, found {self.size}.")
 
 
 def _fragment_id(name: object) -> str | int:
@@ -204,19 +216,19 @@ def _utf8(data: bytes) -> str:
         raise ProtocolError(f"Message: expected text in UTF-8: {error.reason} at byte {error.start}.") from None
 
 
-def _decode_json(text: str) -> list[Any]:
-    values: list[Any] = []
-    at = _skip(text, 0)
-    while at < len(text) or not values:
-        try:
-            value, at = _DECODER.raw_decode(text, at)
-        except RecursionError:
-            raise ProtocolError("Message: too deeply nested.") from None
-        except ValueError as error:  # JSONDecodeError, and Python's own limit for the digits of an integer
-            raise ProtocolError(f"Message: expected JSON: {error}.") from None
-        values.append(value)
-        at = _skip(text, at)
-    return values
+def _decode_json(data: bytes) -> Any:
+    require_bounded(data)
+    text = _utf8(data)
+    start = _skip(text, 0)
+    try:
+        value, end = _DECODER.raw_decode(text, start)
+    except RecursionError:
+        raise ProtocolError("Message: too deeply nested.") from None
+    except ValueError as error:  # JSONDecodeError, and Python's own limit for the digits of an integer
+        raise ProtocolError(f"Message: expected JSON: {error}.") from None
+    if _skip(text, end) < len(text):
+        raise ProtocolError("Message: expected one in a frame, found more behind it.")
+    return value
 
 
 def _skip(text: str, at: int) -> int:

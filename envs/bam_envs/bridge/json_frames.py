@@ -6,10 +6,13 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+from bam_envs.bridge.bounds import require_bounded
 from bam_envs.bridge.encoding import encode_json
 from bam_envs.bridge.interfaces import require_plain
 from bam_envs.errors import InvalidValue, ProtocolError
 
+MOST_ITEMS = 4_000_000
+"""Values in one message of a server: an image may come as a list of numbers."""
 _DECODER = json.JSONDecoder(parse_constant=lambda _: None)  # json.loads would make one for each message
 
 
@@ -30,8 +33,9 @@ def decode_frame(payload: bytes | str) -> dict[str, Any]:
     """One message as it came. NaN and Infinity, which are not JSON and come all the same, are None.
 
     Raises:
-        ProtocolError: It is not a JSON object.
+        ProtocolError: It is not a JSON object, or too much is in it.
     """
+    require_bounded(payload.encode(errors="surrogatepass") if isinstance(payload, str) else payload, MOST_ITEMS)
     try:
         message = _DECODER.decode(payload if isinstance(payload, str) else payload.decode())
     except (ValueError, RecursionError) as error:

@@ -11,12 +11,14 @@ from bam_envs.errors import InvalidValue, UnknownName
 from bam_envs.robo_gym.notices import first_told, say_once
 from bam_envs.robo_gym.table import RoboGymId
 from bam_envs.robot_env import render_modes
-from bam_envs.tasks.options import FLAGS, option_names, require_kinds
+from bam_envs.tasks.options import FLAGS, in_our_words, option_names, require_kinds
 
 _MANAGER = ("ip", "lower_bound_port", "upper_bound_port", "server_manager_port")
 """Where robo-gym finds the Server Manager that starts Gazebo."""
 _WINDOWS = ("gui", "gazebo_gui", "rviz_gui")
 _SIMULATED = (*_MANAGER, *_WINDOWS)
+PLACES = frozenset({*_SIMULATED, "rs_address"})
+"""Options that say where an environment of robo-gym's ran, and nothing of what it is."""
 _OTHER_TARGETS = "give the target itself: ee_target_pose=[x, y, z, roll, pitch, yaw], here or to each reset"
 _OF_ENVIRONMENT = frozenset(inspect.signature(registry.make_env).parameters) | {"max_episode_steps"}
 _NOT_HERE = {
@@ -59,7 +61,10 @@ def translate(entry: RoboGymId, given: Mapping[str, Any]) -> dict[str, Any]:
     else:
         _say_where_it_runs(given)
         options |= _window(given)
-    return options if options.get("transport") is not None else {**entry.defaults, **options}
+    if options.get("transport") is not None:
+        return options
+    _say_whose_trajectory(entry, given)
+    return {**entry.defaults, **options}
 
 
 def constructor_options(entry: RoboGymId) -> tuple[frozenset[str], frozenset[str]]:
@@ -92,7 +97,7 @@ def _require_known(entry: RoboGymId, given: Mapping[str, Any]) -> None:
         if name in refused and name in _NOT_HERE:
             raise InvalidValue(f"{name}= of {entry.id}: there is none here; {_NOT_HERE[name]}.")
         if name not in known | refused:
-            raise UnknownName(f"argument of {entry.id}", name, known)
+            raise UnknownName(f"argument of {entry.id}", name, known, meant=in_our_words(name))
 
 
 def _live_address(entry: RoboGymId, given: Mapping[str, Any]) -> str | None:
@@ -155,6 +160,17 @@ def _say_where_it_runs(given: Mapping[str, Any]) -> None:
             " ".join(names),
             f"{said}: accepted, and without effect. The robot is simulated in this process; there is no Server Manager "
             "and no Gazebo, and nothing to be started first.",
+        )
+
+
+def _say_whose_trajectory(entry: RoboGymId, given: Mapping[str, Any]) -> None:
+    """Of parity without robo-gym's file, which is not ours to ship."""
+    if given.get("parity") and "trajectory" in option_names(_task(entry)) and given.get("trajectory") is None:
+        say_once(
+            "trajectory",
+            f"parity=True of {entry.id}: the trajectory is this package's own, up to 0.67 rad from robo-gym's; "
+            "trajectory='.../robo_gym/envs/ur/robot_trajectories/trajectory_raad_2022.json' of an installed robo-gym "
+            "is that one.",
         )
 
 

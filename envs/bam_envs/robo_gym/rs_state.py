@@ -44,25 +44,26 @@ def read_mir(wire: Sequence[float]) -> RobotState:
 
     Args:
         wire: Target x, y, yaw; robot x, y, yaw (m, rad, map); forward and turning speed [m/s, rad/s]; 501 ranges of the
-            front scanner and 511 of the back one [m]; contact (0 or 1); three obstacles x, y, yaw.
+            front scanner and 511 of the back one [m]; contact (0 or 1); three obstacles x, y, yaw. What is not a
+            number is 0, as in robo-gym, but for ranges: they stay, and the task says what they mean.
 
     Raises:
-        InvalidValue: It has not 1030 numbers, or one that is infinite; what is not a number is 0, as in robo-gym.
+        InvalidValue: It has not 1030 numbers, or one that is infinite.
     """
     row = _numbers(wire)
-    signals = {"base_pose": _POSE, "base_velocity": _TWIST, "f_scan": _FRONT, "b_scan": _BACK}
-    return _state({name: row[part] for name, part in signals.items()}, row[_COLLISION], 2)
+    signals = {name: np.nan_to_num(row[part]) for name, part in (("base_pose", _POSE), ("base_velocity", _TWIST))}
+    return _state({**signals, "f_scan": row[_FRONT], "b_scan": row[_BACK]}, row[_COLLISION], 2)
 
 
 def read_mir_target(wire: Sequence[float]) -> Array:
     """The target's x, y [m] and yaw [rad] of a base's wire state. Shape: (3,)."""
-    target: Array = _numbers(wire)[_TARGET].copy()
+    target: Array = np.nan_to_num(_numbers(wire)[_TARGET])
     return target
 
 
 def _numbers(wire: Sequence[float]) -> Array:
     try:
-        row = np.asarray(wire, dtype=np.float64)
+        row: Array = np.asarray(wire, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InvalidValue(f"The wire state of a MiR100 must be {MIR_LENGTH} numbers: {error}.") from error
     if row.shape != (MIR_LENGTH,):
@@ -72,8 +73,7 @@ def _numbers(wire: Sequence[float]) -> Array:
         raise InvalidValue(
             f"Number {infinite[0]} of the wire state of a MiR100 must be finite, not {row[infinite[0]]}."
         )
-    numbers: Array = np.nan_to_num(row)
-    return numbers
+    return row
 
 
 def read_ur(wire: Mapping[str, float]) -> RobotState:

@@ -51,6 +51,8 @@ class RobotSpec:
     """What it is sent."""
     period: float
     """Time between two commands [s]."""
+    lag: float = field(default=0.0, compare=False)
+    """How far a joint that moves steadily is behind its commands, at the end of a period [s]."""
 
     def describe(self) -> dict[str, list[dict[str, Any]]]:
         """Labels, units and limits of state and command, as plain values."""
@@ -112,8 +114,13 @@ def checked_command(command: Array, shape: tuple[int, int]) -> Array:
 class Robot(Protocol):
     """n robots stepped together. The constructor does no I/O; `spec` is known before `connect`."""
 
-    spec: RobotSpec
-    num_robots: int
+    @property
+    def spec(self) -> RobotSpec:
+        """What is known of it."""
+
+    @property
+    def num_robots(self) -> int:
+        """How many are stepped together."""
 
     def connect(self) -> None:
         """Make the robot ready for `reset`. Moves nothing; doing it twice is once."""

@@ -16,7 +16,7 @@ class Order:
     complete: bool = False
     """Whether the message that makes a command complete is among them."""
     tag: str = ""
-    """Text of the newest tag."""
+    """`Tag.echo` of the newest one."""
     client: str = ""
     """Who sent them."""
 

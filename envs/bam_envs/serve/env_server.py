@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from bam_envs.errors import InvalidValue, RemoteError, ResetNeeded
+from bam_envs.bridge.bus import UNKNOWN_CALLER, Caller
+from bam_envs.errors import InvalidValue, NotInCommand, RemoteError, ResetNeeded
 from bam_envs.serve.checked_values import Begun, CheckedValues, Stepped
-from bam_envs.serve.command import CommandLease
+from bam_envs.serve.command import LEASE_SECONDS, CommandLease
 from bam_envs.serve.describe import Env, describe_env, same_name
 from bam_envs.serve.pace import Pace
 from bam_envs.transports.transport import EnvSpecMessage, Info
@@ -31,7 +32,8 @@ class EnvServer:
 
     Args:
         env: Any Gymnasium environment, or a vector environment whose rows begin anew in the same step.
-        lease: Silence after which another client may take command [s], or the lease itself, to share it.
+        lease: Time without a sign of life after which another client may take command [s], or the lease itself, to
+            share it.
         realtime: A step returns no sooner than one period after the one before.
         env_id: What to call it; its Gymnasium id by default.
         clock: A monotonic clock [s].
@@ -45,7 +47,7 @@ class EnvServer:
         self,
         env: Env,
         *,
-        lease: float | CommandLease = 5.0,
+        lease: float | CommandLease = LEASE_SECONDS,
         realtime: bool = False,
         env_id: str | None = None,
         clock: Callable[[], float] = time.monotonic,
@@ -60,6 +62,7 @@ class EnvServer:
         self._pace = Pace(_period(self._spec), clock, sleep) if realtime else None
         self._clock, self._ended, self._closed = clock, False, False
         self._episode: str | None = None  # whose is running
+        self._over: str | None = None  # whose came to its end
         self._callbacks: list[Callable[[], None]] = []
         self.lease.on_change(self._end_episode)
 
@@ -88,23 +91,27 @@ class EnvServer:
         *,
         take: bool = False,
         deadline: float | None = None,
+        caller: Caller = UNKNOWN_CALLER,
+        shown: str | None = None,
     ) -> Begun:
         """Put `client` in command and begin an episode; (observation, info).
 
         Args:
-            client: Its name, which the others are told.
+            client: Its name.
             seed: As for `gymnasium.Env.reset`; rows may have one each.
             options: As for `gymnasium.Env.reset`.
-            take: Take command from whoever has it.
+            take: Take command from whoever has it, which only an operator may.
             deadline: When it is too late to begin [s], on the clock of this server.
+            caller: On whose connection it asks.
+            shown: What the others are told instead of its name, where that is a secret.
 
         Raises:
             NotInCommand: Another client is in command.
             RemoteError: The environment failed.
         """
-        self.lease.take(client, force=take)
+        self._take(client, take, caller, shown)
         with self.lease.busy(client), self._turn(client, deadline):
-            self._episode = None
+            self._episode = self._over = None
             given = self._run(lambda: self.env.reset(seed=seed, options=self._options(options)))  # type: ignore[arg-type]
             begun: Begun = self._run(lambda: self._values.begun(*given))
             self._episode = client
@@ -138,11 +145,26 @@ class EnvServer:
                 given = self._run(lambda: self.env.step(checked))
                 stepped: Stepped = self._run(lambda: self._values.stepped(*given))
                 goes_on = self._spec.vector or not (stepped[2] or stepped[3])
-                self._episode = client if goes_on else None
+                self._episode, self._over = (client, None) if goes_on else (None, client)
                 self._tell()
             if self._pace is not None:
                 self._pace.wait()
         return stepped
+
+    def has_ended(self, client: str) -> bool:
+        """Whether `client` is in command, and its last episode came to its end."""
+        return self._over == client
+
+    def _take(self, client: str, force: bool, caller: Caller, shown: str | None) -> None:
+        """Put `client` in command; whoever it is taken from left a robot that rests."""
+        before = self.lease.holder
+        try:
+            changed = self.lease.take(client, force=force and caller.operator, shown=shown, silence=caller.silence)
+        except NotInCommand as error:
+            raise NotInCommand(f"{error} {_NO_FORCE}") if force else error from None
+        if changed and before is not None:
+            with self.lock:
+                self._halt()
 
     def leave(self, client: str) -> None:
         """`client` goes: if it was in command, the robot halts and another client may take command."""
@@ -199,9 +221,12 @@ class EnvServer:
             callback()
 
     def _end_episode(self, before: str | None, after: str | None) -> None:
-        self._episode = None
+        self._episode = self._over = None
 
 
+_NO_FORCE = (
+    "Taking it by force needs the operator's token: start bam-serve with --operator-token-file, and show that one."
+)
 _NO_EPISODE = "No episode is running: it ended, or never began. Call reset() first."
 
 

@@ -21,11 +21,12 @@ from bam_envs.serve.env_server import EnvServer
 from bam_envs.serve.gymapi_service import GymApiService
 from bam_envs.serve.options import ServeOptions
 from bam_envs.serve.rclpy_bus import RclpyBus
+from bam_envs.serve.refused import Refusals, refusal_lines
 from bam_envs.serve.robot_service import RobotService
 from bam_envs.serve.served_robot import ServedRobot
 from bam_envs.serve.tcp_server import TcpServer
 from bam_envs.tokens import read_token
-from bam_envs.transports.gymapi.requests import service_name
+from bam_envs.transports.gymapi.requests import base_name, service_name
 
 _LOOK = 3.0
 """How long a robot that may be there already may take to answer [s]."""
@@ -41,6 +42,7 @@ class ServedEnvironment:
 
     Raises:
         InvalidValue: Options that exclude each other.
+        RemoteError: On entering: the server of `via` carries nothing of use.
     """
 
     def __init__(self, env: Env, options: ServeOptions, tell: Callable[[str], None] = lambda line: None) -> None:
@@ -56,7 +58,9 @@ class ServedEnvironment:
         """The TCP transport, if there is one."""
         self._tell, self._stack = tell, ExitStack()
         self._robot_service: RobotService | None = None
-        self._token = None if options.token_file is None else read_token(options.token_file)
+        self._refusals: Refusals | None = None
+        self._token = _token(options.token_file, private=options.listens)
+        self._operator_token = _token(options.operator_token_file, private=True)
 
     def __enter__(self) -> ServedEnvironment:
         with ExitStack() as started:
@@ -99,13 +103,28 @@ class ServedEnvironment:
             started.callback(self._robot_service.close)
             self._robot_service.start()
         started.callback(server.end)  # while the robot's clock still ticks: a step that runs waits for it
-        service = GymApiService(server, bus, self.prefix, image_format=self.options.image_format)
+        service = GymApiService(
+            server,
+            bus,
+            self.prefix,
+            image_format=self.options.image_format,
+            version=self.options.gymapi_version,
+        )
         started.callback(service.close)
         service.start()
         name = server.spec().env_id
-        self.endpoints.append(f"{name} on {self._where(bus)}, {_ways(self.prefix, profile, realtime)}")
+        pace = "real time" if realtime else "fast"
+        offered = self._offered(profile, self._refused())
+        if offered:
+            self.endpoints.append(f"{name} on {self._where(bus)}, {pace}: {offered}")
         if self.options.tcp is not None:
-            self.tcp = TcpServer(server, self.options.bind, self.options.tcp, token=self._token)
+            self.tcp = TcpServer(
+                server,
+                self.options.bind,
+                self.options.tcp,
+                token=self._token,
+                operator_token=self._operator_token,
+            )
             started.callback(self.tcp.close)
             self.tcp.start()
             self.endpoints.append(f"{name} on {self.tcp.url}, the environment alone")
@@ -127,9 +146,17 @@ class ServedEnvironment:
             link = RosbridgeLink(options.via, name="serve", ca_file=options.ca_file, token=self._token)
             started.callback(link.close)
             link.on_down(self._say_down)
+            self._refusals = Refusals(link)
             link.connect()
             return link
-        server = BridgeServer(options.bind, options.port, cert=options.cert, key=options.key, token=self._token)
+        server = BridgeServer(
+            options.bind,
+            options.port,
+            cert=options.cert,
+            key=options.key,
+            token=self._token,
+            operator_token=self._operator_token,
+        )
         started.callback(server.close)
         return server.start()
 
@@ -147,6 +174,37 @@ class ServedEnvironment:
             "Give this one names of its own: --namespace NAME."
         )
 
+    def _refused(self) -> frozenset[str]:
+        """Names that the server of ``--via``, or ROS 2 here, does not carry; people are told why."""
+        if isinstance(self.bus, RclpyBus):
+            for name, reason in self.bus.refused.items():
+                self._tell(f"{name} is not offered: {reason}")
+            return frozenset(self.bus.refused)
+        if self._refusals is None:
+            return frozenset()
+        refused = self._refusals.look()
+        for line in refusal_lines(str(self.options.via), refused):
+            self._tell(line)
+        if self._refusals.unchecked:
+            self._tell(f"{self.options.via} does not say what it carries: rosapi, which lists it, does not run there.")
+        return frozenset(refused)
+
+    def _offered(self, profile: RobotProfile | None, refused: frozenset[str]) -> str:
+        """What is of use in spite of what is `refused`.
+
+        Raises:
+            RemoteError: Nothing, and there is no other way in.
+        """
+        prefix, base = self.prefix, base_name(self.prefix)
+        offered = [service_name(prefix)] if service_name(prefix) not in refused else []
+        if not offered and not refused & {f"{base}/request", f"{base}/reply"}:
+            offered = [f'{base}/request and reply (channel="topics")']
+        if profile is not None and _is_usable(profile, prefix, refused):
+            offered.append(f"a {profile.name}'s topics{f' under {prefix}' if prefix else ''}")
+        if not offered and self.options.tcp is None:
+            raise RemoteError(f"{self.options.via or 'ROS 2 here'} carries nothing of use of what is served here.")
+        return " and ".join(offered)
+
     def _where(self, bus: Bus) -> str:
         if isinstance(bus, RclpyBus):
             return f"the ROS 2 graph as the node {bus.name}"
@@ -157,6 +215,10 @@ class ServedEnvironment:
 
     def _say_down(self, error: LinkLost) -> None:
         self._tell(f"{error} It is tried again until it is back; the robot rests meanwhile.")
+
+
+def _token(path: str | None, *, private: bool) -> str | None:
+    return None if path is None else read_token(path, private=private)
 
 
 def _profile_of(env: Env) -> RobotProfile | None:
@@ -181,7 +243,8 @@ def _take_robot(env: Env, profile: RobotProfile, realtime: bool) -> ServedRobot:
     return robot
 
 
-def _ways(prefix: str, profile: RobotProfile | None, realtime: bool) -> str:
-    """What is offered there, and how time passes."""
-    topics = "" if profile is None else f" and a {profile.name}'s topics{f' under {prefix}' if prefix else ''}"
-    return f"{'real time' if realtime else 'fast'}: {service_name(prefix)}{topics}"
+def _is_usable(profile: RobotProfile, prefix: str, refused: frozenset[str]) -> bool:
+    """Whether every state gets out, and commands get in on one of the ways at least."""
+    ways = [{prefix + sink.topic for sink in way} for way in profile.commands.values()]
+    states = {prefix + source.topic for source in profile.state}
+    return not states & refused and any(not way & refused for way in ways)

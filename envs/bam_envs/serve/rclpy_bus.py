@@ -7,9 +7,9 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from bam_envs.bridge.bus import UNKNOWN_CALLER, Caller, Handler, Listener, Message
+from bam_envs.bridge.bus import UNKNOWN_CALLER, Caller, Handler, Listener, Message, refusal_of
 from bam_envs.errors import BamEnvsError, InvalidValue, LinkLost
-from bam_envs.serve.rclpy_messages import interface, need_rclpy, to_dict, to_message
+from bam_envs.serve.rclpy_messages import interface, is_list, need_rclpy, to_dict, to_message
 
 _log = logging.getLogger(__name__)
 _DEPTH = 10
@@ -26,10 +26,14 @@ class RclpyBus:
     Args:
         name: Of the node.
         domain: ROS domain; None for that of the environment variable ROS_DOMAIN_ID.
+        serves: Whether it answers services, several at once; a client needs no pool of threads, which Python ends
+            before anybody can close it.
     """
 
-    def __init__(self, name: str = "bam_serve", *, domain: int | None = None) -> None:
-        self.name, self._domain = name, domain
+    def __init__(self, name: str = "bam_serve", *, domain: int | None = None, serves: bool = True) -> None:
+        self.name, self._domain, self._serves = name, domain, serves
+        self.refused: dict[str, str] = {}
+        """Services that are not offered, and why."""
         self._lock = threading.Lock()
         self._publishers: dict[str, tuple[Any, Any]] = {}  # topic -> class of its messages, publisher
         self._context: Any = None
@@ -55,7 +59,10 @@ class RclpyBus:
         rclpy.init(context=self._context, domain_id=self._domain, signal_handler_options=SignalHandlerOptions.NO)
         try:
             topics = SingleThreadedExecutor(context=self._context)
-            services = MultiThreadedExecutor(_THREADS, context=self._context)
+            if self._serves:
+                services = MultiThreadedExecutor(_THREADS, context=self._context)
+            else:
+                services = SingleThreadedExecutor(context=self._context)
             self._node = self._spinning(self.name, topics)
             self._caller = self._spinning(f"{self.name}_services", services)
         except BaseException:
@@ -112,7 +119,7 @@ class RclpyBus:
             nonlocal said
             refusal = _refusal(listener, to_dict(message))
             if refusal and refusal != said:
-                _log.warning("%s: %s", topic, refusal.removeprefix(f"{topic}: "))
+                _log.warning("%s", refusal_of(topic, refusal))
             said = refusal
 
         node = self._require_node()
@@ -128,14 +135,14 @@ class RclpyBus:
         """Answer `service`, always: ROS has no failed responses, and a client would wait for ever for a missing one.
 
         Where the handler failed, the response is as ROS makes it, with the error's text where the type has room for it.
-        A service whose type is in no package here is not offered, and the log says so.
+        A service whose type is in no package here is not offered; see `refused`.
         """
         from rclpy.callback_groups import ReentrantCallbackGroup
 
         try:
             types = interface(kind, "srv")
         except InvalidValue as error:
-            _log.warning("the service %s is not offered: %s", service, error)
+            self.refused[service] = str(error)
             return
 
         def answer(request: Any, response: Any) -> Any:
@@ -174,6 +181,14 @@ class RclpyBus:
                 why = f"in {timeout:g} s" if self._node is not None else "before this node was closed"
                 raise LinkLost(f"{service} did not answer {why}; whether it did what was asked is unknown.")
         return to_dict(future.result())
+
+    def fields(self, kind: str) -> dict[str, bool]:
+        """The fields of messages of type `kind`; to each, whether it is a list. Nothing for a type that is not here."""
+        try:
+            types = interface(kind, "msg").get_fields_and_field_types()
+        except InvalidValue:
+            return {}
+        return {name: is_list(type_name) for name, type_name in types.items()}
 
     def is_offered(self, service: str) -> bool:
         """Whether some node offers `service`."""

@@ -71,6 +71,11 @@ def _listed(value: Any) -> list[Any]:
     return value.tolist() if hasattr(value, "tolist") else list(value)
 
 
+def is_list(kind: str) -> bool:
+    """Whether fields of the type `kind`, as ROS 2 writes it, are lists."""
+    return _element(kind) is not None
+
+
 def _element(kind: str) -> str | None:
     """What a list type is a list of; None for what is no list."""
     match = _LIST.fullmatch(kind)

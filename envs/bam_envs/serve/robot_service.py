@@ -15,12 +15,14 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from bam_envs.bridge.bus import Bus, Caller, Listener, Message
-from bam_envs.bridge.freshness import FreshnessCheck
+from bam_envs.bridge.freshness import read_tag
+from bam_envs.bridge.sessions import LEASE_TOPIC, LEAVE, RENEW, SESSION_SERVICE, Sessions
 from bam_envs.errors import LinkLost, ProtocolError, RemoteError, RobotFault
 from bam_envs.robots.profiles.tables import RobotProfile
 from bam_envs.robots.wire.codec import (
@@ -32,7 +34,6 @@ from bam_envs.robots.wire.codec import (
     encode_state,
 )
 from bam_envs.robots.wire.messages import numbers, write_stamp
-from bam_envs.serve.clients import Clients, shown
 from bam_envs.serve.clock import Clock
 from bam_envs.serve.command import CommandLease
 from bam_envs.serve.command_slot import CommandSlot, Order
@@ -79,15 +80,18 @@ class RobotService:
         lockstep = not robot.realtime
         self.info = RobotInfo(profile.name, simulated, lockstep, robot.spec.period, _text(robot, profile))
         """What it says of itself."""
-        self._slot, self._fresh, self._clients = CommandSlot(), FreshnessCheck(), Clients()
+        self._slot = CommandSlot()
+        self._sessions = Sessions(lambda name: lease.holder == Caller("", session=name).client)
         self._completing = {way[-1].topic for way in profile.commands.values()}
         self._low, self._high = np.array(robot.spec.command.low), np.array(robot.spec.command.high)
-        self._answered = ""  # text of the tag of the last command that was executed
+        self._answered = ""  # `Tag.echo` of the last command that was executed
         self._connected = True
         self._moving = threading.Lock()  # an order that was taken is begun before a halt, or not at all
         self._ticking, self._took = threading.Lock(), math.inf  # how long the last period took to compute [s]
         self._unsubscribe: list[Callable[[], None]] = []
-        self._scene = StringRpcService(bus, namespace + SCENE_TOPIC, self._set_scene) if simulated else None
+        self._scene = (
+            StringRpcService(bus, namespace + SCENE_TOPIC, self._set_scene, self._sessions) if simulated else None
+        )
         self.clock = Clock(
             self._tick_lockstep if lockstep else self._tick, IDLE_PERIOD if lockstep else robot.tick_period
         )
@@ -101,6 +105,8 @@ class RobotService:
         for topic, kind in {(sink.topic, sink.type) for way in self._profile.commands.values() for sink in way}:
             self._listen(topic, kind, self._command_listener(topic))
         self._listen(HALT_TOPIC, "std_msgs/Empty", self._on_halt)
+        self._listen(LEASE_TOPIC, "std_msgs/String", self._on_lease)
+        self._bus.serve(self._namespace + SESSION_SERVICE, "std_srvs/Trigger", self._sessions.open)
         self._bus.serve(self._namespace + INFO_SERVICE, "std_srvs/Trigger", self._say_who)
         self._bus.on_leave(self._on_leave)
         self._lease.on_change(self._on_change)
@@ -122,24 +128,34 @@ class RobotService:
 
     def _command_listener(self, topic: str) -> Listener:
         def listen(message: Message, caller: Caller) -> None:
-            places, values, tag = decode_command(self._profile, self._robot.spec, topic, message)
+            places, values, tag, content = decode_command(self._profile, self._robot.spec, topic, message)
             told = values.tolist()
             self._require_within(topic, places, told)
             self._require_sound()
             if tag is not None:
-                self._fresh.require(tag, topic)
-            client = self._take_command(caller, None if tag is None else tag.session)
-            text, complete = "" if tag is None else tag.to_text(), topic in self._completing
-            self._slot.put(client, places, told, complete=complete, tag=text)
+                self._sessions.require(tag, topic, content, caller)
+                caller = replace(caller, session=tag.session)
+            self._lease.take(caller.client, shown=caller.shown, silence=caller.silence)
+            echo, complete = "" if tag is None else tag.echo, topic in self._completing
+            self._slot.put(caller.client, places, told, complete=complete, tag=echo)
             if complete and self.info.lockstep:
                 self._go_on()
 
         return listen
 
-    def _take_command(self, caller: Caller, session: str | None) -> str:
-        client = self._clients.name(caller, session)
-        self._lease.take(client, shown=shown(caller, session))
-        return client
+    def _on_lease(self, message: Message, caller: Caller) -> None:
+        """Who drives is there, or leaves: over any of its connections, and whoever does not drive says nothing."""
+        word, _, text = str(message.get("data")).partition(" ")
+        tag = read_tag(text)
+        if tag is None or word not in (RENEW, LEAVE):
+            raise ProtocolError(f"{LEASE_TOPIC}: expected {RENEW} or {LEAVE} and a signed tag.")
+        self._sessions.require(tag, LEASE_TOPIC, word.encode(), caller, anywhere=word == LEAVE)
+        client = replace(caller, session=tag.session).client
+        if word == RENEW:
+            self._lease.renew(client)
+        else:
+            self._sessions.end(tag.session)
+            self._lease.release(client)
 
     def _require_within(self, topic: str, places: list[int], values: list[float]) -> None:
         """Every number is one that the robot can be told at all; how fast it goes there is its own affair."""
@@ -172,8 +188,9 @@ class RobotService:
         return order
 
     def _on_leave(self, caller: Caller) -> None:
-        for client in self._clients.left(caller):
-            self._lease.release(client)
+        for name in self._sessions.left(caller):
+            self._lease.release(replace(caller, session=name).client)
+        self._lease.release(caller.client)
 
     def _on_change(self, before: str | None, after: str | None) -> None:
         if before is not None:  # what it sent is not to go on under another one
@@ -184,11 +201,8 @@ class RobotService:
         return {"success": True, "message": self.info.to_json()}
 
     def _set_scene(self, request: Message, caller: Caller) -> Message:
-        session = request.get("session")
-        if session is not None and not isinstance(session, str):
-            raise ProtocolError(f"session must be text, not {session!r}.")
         pose, seeds = _pose(request.get("object_pose")), _seeds(request.get("seeds"))
-        self._take_command(caller, session)
+        self._lease.take(caller.client, shown=caller.shown, silence=caller.silence)
         self._robot.place_object(pose, seeds)
         return {}
 

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-import hmac
 import logging
 import socket
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from bam_envs.bridge.bus import UNKNOWN_CALLER, Caller
 from bam_envs.bridge.freshness import FreshnessCheck, Tag
 from bam_envs.errors import BamEnvsError, InvalidValue, LinkLost, ProtocolError, RemoteError
 from bam_envs.serve.env_server import EnvServer
+from bam_envs.tokens import Guesses, Tokens
 from bam_envs.transports.frames import FrameSocket, encode
-from bam_envs.transports.tcp_messages import Hello, Request, SpecCodec, read_hello, read_request, refusal
+from bam_envs.transports.tcp_messages import Hello, Request, SpecCodec, action_size, read_hello, read_request, refusal
 from bam_envs.transports.trees import spec_to_json
 from bam_envs.transports.values import Tree
 
@@ -25,6 +27,10 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 _POLL = 0.2  # seconds between two looks at whether the server is closing
 _HELLO_TIMEOUT, _HELLO_LIMIT = 5.0, 65536  # [s], [bytes]: all that a stranger gets
+_STRANGERS, _STRANGERS_OF_ONE = 64, 16
+"""Connections that said no hello yet: of all, and of one address. The oldest gives way."""
+_ROOM = 2**20
+"""What a request may hold beside an action [bytes]."""
 
 
 class TcpServer:
@@ -35,6 +41,7 @@ class TcpServer:
         host: The interface; 127.0.0.1 is this computer alone.
         port: 0 for any that is free.
         token: A secret that clients must know. Nothing is encrypted: it keeps strangers out, not those who listen in.
+        operator_token: Who shows this one instead may take command from others.
         max_clients: How many may be connected.
         patience: Longest time for the rest of a message, and for a client to take its answer [s].
     """
@@ -46,17 +53,21 @@ class TcpServer:
         port: int = 0,
         *,
         token: str | None = None,
+        operator_token: str | None = None,
         max_clients: int = 64,
         patience: float = 10.0,
     ) -> None:
         self.server, self.host, self.port = server, host, port
-        self.token, self.max_clients, self.patience = token, max_clients, patience
+        self.max_clients, self.patience = max_clients, patience
         self.codec = SpecCodec(server.spec())
+        self.most = _ROOM + 2 * action_size(server.spec())
+        """Largest request [bytes]."""
+        self._tokens, self._guesses = Tokens(token, operator_token), Guesses()
         self.freshness = FreshnessCheck()
         self._listener: socket.socket | None = None
         self._thread: threading.Thread | None = None
         self._lock = threading.Lock()
-        self._connections: set[_Connection] = set()
+        self._connections: dict[_Connection, None] = {}  # the oldest first
 
     @property
     def url(self) -> str:
@@ -117,61 +128,82 @@ class TcpServer:
                     time.sleep(_POLL)
                 continue
             try:
-                self._begin(_Connection(self, sock, f"{address[0]}:{address[1]}"))
+                self._begin(_Connection(self, sock, address[0], address[1]))
             except (OSError, RuntimeError) as error:  # it went away at once, or there is no room for another thread
                 _LOG.warning("A client could not be served: %s", error)
                 sock.close()
 
     def _begin(self, connection: _Connection) -> None:
         with self._lock:
-            room = len(self._connections) < self.max_clients
-            if room:
-                self._connections.add(connection)
-        if room:
-            self._start(connection)
-        else:
-            connection.refuse(f"All {self.max_clients} places for clients are taken; try again when one has left.")
-
-    def _start(self, connection: _Connection) -> None:
+            self._connections[connection] = None
+            strangers = [one for one in self._connections if one.caller is None]
+            mine = [one for one in strangers if one.host == connection.host]
+        # What says nothing keeps nobody out: whoever comes is listened to.
+        if len(mine) > _STRANGERS_OF_ONE:
+            mine[0].drop()
+        elif len(strangers) > _STRANGERS:
+            host, _ = Counter(one.host for one in strangers).most_common(1)[0]
+            next(one for one in strangers if one.host == host).drop()
         try:
             connection.start()
         except RuntimeError:
             with self._lock:
-                self._connections.discard(connection)
+                del self._connections[connection]
             raise
 
     def admit(self, hello: Hello, connection: _Connection) -> None:
         """Let a client in; its own older connections are dropped.
 
         Raises:
-            RemoteError: It does not know the token, or wants another environment.
+            RemoteError: It does not know the token, wants another environment, or there is no room.
         """
-        shown = hello.token.encode(errors="surrogatepass")  # a stranger may send anything
-        if self.token is not None and not hmac.compare_digest(shown, self.token.encode()):
-            what = "wrong" if hello.token else "missing"
-            raise RemoteError(f"The token is {what}; give the one that the server was started with (--token-file).")
+        operator = self._is_operator(hello, connection)
         self.server.require_name(hello.env_id)
         with self._lock:
             older = [one for one in self._connections if one is not connection and one.session == hello.session]
+            present = sum(one.caller is not None for one in self._connections) - len(older)
+            if present >= self.max_clients:
+                raise RemoteError(f"All {self.max_clients} places for clients are taken; try again when one has left.")
+            # As long as the connection is there, the system at its other end is: that is its sign of life.
+            connection.caller = Caller(connection.client, connection.client, operator=operator, silence=lambda: 0.0)
         for one in older:
             one.drop()
             self.server.leave(one.client)
+
+    def _is_operator(self, hello: Hello, connection: _Connection) -> bool:
+        """Whether the token is the operator's.
+
+        Raises:
+            RemoteError: It is none that lets anybody in.
+        """
+        if not (self._tokens.needed or (hello.token and self._tokens.exist)):
+            return False
+        if not self._guesses.may_try(connection.host):
+            raise RemoteError("Too many wrong tokens came from this address; try again in a second.")
+        role = self._tokens.role([hello.token])
+        if role is None:
+            if hello.token:
+                self._guesses.wrong(connection.host)
+            what = "wrong" if hello.token else "missing"
+            raise RemoteError(f"The token is {what}; give the one that the server was started with (--token-file).")
+        return role == "operator"
 
     def forget(self, connection: _Connection) -> None:
         """A connection has ended."""
         self.server.leave(connection.client)
         with self._lock:
-            self._connections.discard(connection)
+            self._connections.pop(connection, None)
 
 
 class _Connection:
     """One client, in a thread of its own."""
 
-    def __init__(self, owner: TcpServer, sock: socket.socket, address: str) -> None:
-        self.client, self.session = address, ""
+    def __init__(self, owner: TcpServer, sock: socket.socket, host: str, port: int) -> None:
+        self.host, self.client, self.session = host, f"{host}:{port}", ""
+        self.caller: Caller | None = None  # known when it is let in
         self._owner, self._frames = owner, FrameSocket(sock)
         self._answered: tuple[Tag, list[bytes | memoryview]] | None = None
-        self._thread = threading.Thread(target=self._run, name=f"bam-tcp {address}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"bam-tcp {self.client}", daemon=True)
 
     def start(self) -> None:
         self._thread.start()
@@ -192,7 +224,7 @@ class _Connection:
         try:
             self._greet()
             while True:
-                tree = self._frames.receive(patience=self._owner.patience)
+                tree = self._frames.receive(limit=self._owner.most, patience=self._owner.patience)
                 self._send(self._answer(read_request(tree)))
         except (ProtocolError, RemoteError) as error:
             self.refuse(str(error))
@@ -204,8 +236,9 @@ class _Connection:
 
     def _greet(self) -> None:
         hello = read_hello(self._frames.receive(time.monotonic() + _HELLO_TIMEOUT, _HELLO_LIMIT))
+        self.client = f"{hello.name} ({self.client})"
         self._owner.admit(hello, self)
-        self.session, self.client = hello.session, f"{hello.name} ({self.client})"
+        self.session = hello.session
         self._send(encode([0, "ok", spec_to_json(self._owner.server.spec())]))
 
     def _send(self, parts: list[bytes | memoryview]) -> None:
@@ -230,7 +263,9 @@ class _Connection:
     def _reset(self, request: Request, deadline: float) -> Tree:
         seed, options, take = request.values
         server, codec = self._owner.server, self._owner.codec
-        return codec.pack_result(server.reset(self.client, seed, options, take=take is True, deadline=deadline))
+        caller = self.caller or UNKNOWN_CALLER
+        begun = server.reset(self.client, seed, options, take=take is True, deadline=deadline, caller=caller)
+        return codec.pack_result(begun)
 
     def _step(self, request: Request, deadline: float) -> Tree:
         server, codec = self._owner.server, self._owner.codec

@@ -33,17 +33,21 @@ DEFAULT = (0.0, -1.712, 1.712, 0.0, 0.0, 0.0)
 TARGETS = np.array([[0.35, -0.2, 0.15], [0.65, 0.2, 0.5]])
 """Where targets are: lowest and highest x, y, z [m]."""
 PITCH = np.pi / 2
-"""Of targets [rad]: the x axis of ``tool1`` points down."""
+"""Of targets [rad]: the x axis of the frame at the flange points down."""
+YAW = np.pi, 3.14
+"""Of targets, to either side [rad]; 3.14 with ``parity=True``, as in robo-gym."""
 CLOSE, ALIGNED = 0.02, 0.05
 """The flange has arrived within this distance [m] and this angle [rad]."""
 SPAN = np.pi
 """Joint angle from `DEFAULT` that is 1 in actions and observations [rad]."""
-TOOL1 = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-"""Axes of ``tool1`` in ``tool0``: at the flange, x out of it, as in Isaac's model (``ee_link``)."""
+EE_LINK = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+"""Axes of ``ee_link`` in ``tool0``: at the flange, x out of it, as in Isaac's model."""
+TOOL1 = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
+"""Axes of ``tool1`` in ``tool0``: robo-gym's launch file has yaw pi, pitch -pi/2; 90 degrees about x from the other."""
 
 
 class IsaacReachTask:
-    """Bring ``tool1``, the frame at the flange whose x axis points out of it, to the target pose.
+    """Bring ``ee_link``, the frame at the flange whose x axis points out of it, to the target pose.
 
     Start:
         The joints are at the default pose, [0, -1.712, 1.712, 0, 0, 0] rad, or at the reset option ``joint_positions``
@@ -72,7 +76,8 @@ class IsaacReachTask:
         or "max_steps_exceeded".
 
     With ``parity=True`` nothing is scaled, an action is in units of 0.5 rad and as large as the joints' limits let
-    it be, and 600 steps terminate as "max_steps_exceeded", as in robo-gym: so policies of Isaac Lab fit.
+    it be, 600 steps terminate as "max_steps_exceeded", and the frame is robo-gym's ``tool1``, which is ``ee_link``
+    turned by 90 degrees about x. Observations and actions are then those of Isaac Lab's policies.
 
     Args:
         num_rows: How many robots are scored together.
@@ -117,6 +122,7 @@ class IsaacReachTask:
         self.control = UrControl(self.model, num_rows, RATE, VELOCITY_SCALE)
         self._scale = isaac_scale if parity else SPAN
         self._default, (self._low, self._high) = np.array(DEFAULT), self.model.joint_limits
+        self._frame = TOOL1 if parity else EE_LINK
         self.action_labels = self._action_labels()
         self.observation_labels = self._observation_labels()
         self.action_space: spaces.Box = labelled_box(self.action_labels)
@@ -140,8 +146,8 @@ class IsaacReachTask:
     def _observation_labels(self) -> tuple[Label, ...]:
         inf, farthest = float("inf"), np.full(6, 2.0)
         low, high = -farthest, farthest
-        if self.parity:  # robo-gym lets a joint be a tenth of its limit beyond it
-            low, high = 1.1 * self._low - self._default, 1.1 * self._high - self._default
+        if self.parity:  # robo-gym lets a joint be a tenth of its range beyond it
+            low, high = 1.2 * self._low - self._default, 1.2 * self._high - self._default
         scale, speed, place = (
             ("1", "1", "1") if self.parity else ("/ pi", "/ 0.2 of the fastest", "in the targets' box")
         )
@@ -165,7 +171,8 @@ class IsaacReachTask:
         draws = np.stack([rng.random(4) for rng in rngs])
         seeds = np.array([rng.integers(2**63) for rng in rngs], dtype=np.int64)
         self.target[rows] = TARGETS[0] + draws[:, :3] * (TARGETS[1] - TARGETS[0])
-        angles = np.stack([np.zeros(len(rows)), np.full(len(rows), PITCH), (2 * draws[:, 3] - 1) * np.pi], axis=1)
+        yaw = (2 * draws[:, 3] - 1) * YAW[self.parity]
+        angles = np.stack([np.zeros(len(rows)), np.full(len(rows), PITCH), yaw], axis=1)
         self.quaternion[rows] = from_angles(angles)
         pose = self._standing if options.get("ee_target_pose") is None else _target(options)
         if pose is not None:
@@ -213,7 +220,7 @@ class IsaacReachTask:
 
     def score(self, state: RobotState, action: Floats) -> Score:
         """Nearer and straighter is better."""
-        position, rotation = self._tool1(state)
+        position, rotation = self._tool(state, self._frame)
         way = self.target - position
         distance = np.sqrt(np.einsum("ij,ij->i", way, way))
         angle = angle_between(quaternions(rotation), self.quaternion)
@@ -239,14 +246,14 @@ class IsaacReachTask:
         terminated = collision | success | last if self.parity else collision | success
         return Score(reward, terminated, success, info)
 
-    def _tool1(self, state: RobotState) -> tuple[Array, Array]:
-        """Pose of ``tool1``. Shapes: (n, 3), (n, 3, 3)."""
+    def _tool(self, state: RobotState, frame: Array) -> tuple[Array, Array]:
+        """Pose of a `frame` at the flange. Shapes: (n, 3), (n, 3, 3)."""
         position, rotation = self.model.geometry.flange_pose(state.signals["joint_position"])
-        return position, np.einsum("nij,jk->nik", rotation, TOOL1)
+        return position, np.einsum("nij,jk->nik", rotation, frame)
 
     def rs_state(self, state: RobotState) -> list[Any]:
-        """robo-gym's wire state, a dict of 27 floats a row; the end effector is ``tool1``."""
-        turned = quaternions(self._tool1(state)[1]).tolist()
+        """robo-gym's wire state, a dict of 27 floats a row; the end effector is ``tool1``, with and without parity."""
+        turned = quaternions(self._tool(state, TOOL1)[1]).tolist()
         wire = wire_states(self.model, state, self.target)
         return [row | dict(zip(frame_keys("ee")[3:], q, strict=True)) for row, q in zip(wire, turned, strict=True)]
 

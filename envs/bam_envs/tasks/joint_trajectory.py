@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import json
+import stat
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
@@ -21,6 +22,8 @@ from bam_envs.robots.robot import Rows
 Array = NDArray[np.float64]
 RECORDED = "ur_track.json"
 """The trajectory that is shipped; ``scripts/make_ur_track.py`` makes it."""
+_MOST_BYTES = 2**24
+"""Size of a file at most: which file it is may come from a stranger's checkpoint."""
 
 
 @dataclass(frozen=True)
@@ -72,12 +75,23 @@ def _shipped() -> list[Array]:
 
 def _read(file: Path) -> list[Array]:
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        text = _bounded(file)
     except OSError as error:
         raise InvalidValue(f"The trajectory {file} cannot be read: {error.strerror}.") from error
-    except ValueError as error:
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:
         raise InvalidValue(f"The trajectory {file} is not JSON: {error}.") from error
     return _segments(content, str(file))
+
+
+def _bounded(file: Path) -> bytes:
+    found = file.stat()
+    if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):  # reading a folder fails by itself
+        raise InvalidValue(f"The trajectory {file} is no plain file; expected one in JSON.")
+    if found.st_size > _MOST_BYTES:
+        raise InvalidValue(f"The trajectory {file} has {found.st_size} bytes, expected at most {_MOST_BYTES}.")
+    return file.read_bytes()
 
 
 def _segments(content: Any, name: str) -> list[Array]:

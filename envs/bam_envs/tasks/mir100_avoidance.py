@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bam_envs.robots.mir100 import BACK_RAYS, FOOTPRINT, FRONT_RAYS
+from bam_envs.robots.mir100 import BACK_RAYS, FOOTPRINT, FRONT_RAYS, SCAN_RANGE
 from bam_envs.robots.robot import RobotState, Rows
 from bam_envs.robots.simulated.room import touches
 from bam_envs.tasks.mir100_drive import DriveTask
@@ -66,8 +66,8 @@ class Mir100AvoidanceTask(DriveTask):
 
     With ``parity=True`` observation, reward and end are those of robo-gym's `ObstacleAvoidanceMir100`: metres and
     radians, 16 single rays, the way at a hundred times this reward but none for that of the first step, 100 at
-    success, -200 at a collision; it collides also when a corner comes near the middle of a box, never on a live robot,
-    and the episode is terminated after 500 steps as "max_steps_exceeded".
+    success, -200 at a collision; it collides also when a corner comes near the middle of a box, never on a live robot
+    and never by a ray that is not a number, and the episode is terminated after 500 steps as "max_steps_exceeded".
 
     Args:
         num_rows: How many robots are scored together.
@@ -123,11 +123,16 @@ class Mir100AvoidanceTask(DriveTask):
         return {"obstacle_pose": self.obstacles[rows]}
 
     def sectors(self, state: RobotState) -> Array:
-        """The shortest ray of each sector [m], worked out once for each state. Shape: (n, 32)."""
+        """The shortest ray of each sector [m], worked out once for each state. Shape: (n, 16).
+
+        A ray that is not a number is 0, the shortest there can be; with ``parity=True`` it is no ray at all.
+        """
         if self._sectors is None or self._sectors[0] is not state:
-            front = np.minimum.reduceat(state.signals["f_scan"], _FRONT_STARTS, axis=1)
-            back = np.minimum.reduceat(state.signals["b_scan"], _BACK_STARTS, axis=1)
-            self._sectors = (state, np.concatenate([front, back], axis=1))
+            shortest = np.fmin if self.parity else np.minimum
+            front = shortest.reduceat(state.signals["f_scan"], _FRONT_STARTS, axis=1)
+            back = shortest.reduceat(state.signals["b_scan"], _BACK_STARTS, axis=1)
+            both = np.concatenate([front, back], axis=1)
+            self._sectors = (state, np.nan_to_num(both, nan=SCAN_RANGE[1] if self.parity else 0.0))
         return self._sectors[1]
 
     def seen(self, state: RobotState) -> list[Floats]:
@@ -136,7 +141,7 @@ class Mir100AvoidanceTask(DriveTask):
             return [(1.0 - self.sectors(state) / SIGHT).astype(np.float32)]
         front, back = BEAMS[BEAMS < FRONT_RAYS], BEAMS[BEAMS >= FRONT_RAYS] - FRONT_RAYS
         rays = (state.signals["f_scan"][:, front], state.signals["b_scan"][:, back])
-        return [one.astype(np.float32) for one in rays]
+        return [np.nan_to_num(one).astype(np.float32) for one in rays]
 
     def failed(self, state: RobotState) -> Flags:
         """Whether the base touches something, or nearly does. Shape: (n,)."""
@@ -145,7 +150,8 @@ class Mir100AvoidanceTask(DriveTask):
         near: Flags = self.sectors(state).min(axis=1) < NEAREST
         touching: Any = state.truth.get("collision", False)
         if self.parity:
-            near = near | self._corner_near_box(state.signals["base_pose"])
+            near &= ~np.isnan(state.signals["f_scan"][:, 0])  # Python's min() never leaves a first number that is none
+            near |= self._corner_near_box(state.signals["base_pose"])
         failed: Flags = near | touching
         return failed
 

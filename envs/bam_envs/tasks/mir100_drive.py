@@ -16,7 +16,7 @@ from gymnasium import spaces
 from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS, SCAN_RANGE
 from bam_envs.robots.robot import Initial, RobotState, Rows
 from bam_envs.tasks.poses import floor_pose, preferred, require_at
-from bam_envs.tasks.task import Array, Flags, Floats, Label, Score, labelled_box
+from bam_envs.tasks.task import Array, Flags, Floats, Label, Score, labelled_box, require_inside
 
 FASTEST = np.array([0.5, 0.7])
 """Speeds of an action of 1: forward [m/s], turning anticlockwise [rad/s]."""
@@ -154,7 +154,7 @@ class DriveTask:
         observation = np.stack(columns, axis=1).astype(np.float32)
         observation = np.concatenate([observation, *self.seen(state)], axis=1)
         if self.parity:
-            return observation
+            return require_inside(observation, self.observation_space, self.observation_labels)
         clipped: Floats = np.clip(observation, self.observation_space.low, self.observation_space.high)
         return clipped
 

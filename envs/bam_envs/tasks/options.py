@@ -23,6 +23,11 @@ def option_names(task: Callable[..., Any]) -> set[str]:
     return set(inspect.signature(task).parameters) - {"num_rows"}
 
 
+def in_our_words(name: str) -> str:
+    """The name of an option with robo-gym's name of a joint for ROS's: ``fix_shoulder_pan`` is ``fix_base``."""
+    return name.replace("shoulder_pan", "base").replace("shoulder_lift", "shoulder")
+
+
 def require_options(env_id: str, task: Callable[..., Any], given: Mapping[str, Any], others: frozenset[str]) -> None:
     """Refuse what `task` cannot be made with.
 
@@ -39,7 +44,7 @@ def require_options(env_id: str, task: Callable[..., Any], given: Mapping[str, A
     known = option_names(task)
     for name in given:
         if name not in known:
-            raise UnknownName(f"argument of {env_id}", name, known | others)
+            raise UnknownName(f"argument of {env_id}", name, known | others, meant=in_our_words(name))
     require_kinds(env_id, task, given)
 
 

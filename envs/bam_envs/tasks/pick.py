@@ -148,7 +148,7 @@ class PickTask:
 
     def command(self, action: Floats, state: RobotState) -> Array:
         """Joint positions [rad] and gripper width [m]. Shape: (n, 7)."""
-        return self.control.command(action, self.sense(state).tool)
+        return self.control.command(action, self.sense(state).tool, state.command[:, :6])
 
     def grasped(self, sense: CubeSense) -> Any:
         """Whether the closed gripper is stopped by the object between its pads. Shape: (n,) bool."""

@@ -70,7 +70,6 @@ class ReachTask:
         self.observation_space: spaces.Box = labelled_box(self.observation_labels)
         self.goal = np.zeros((num_rows, 3))
         """Goals [m]. Shape: (n, 3)."""
-        self._joints = np.zeros((num_rows, 6))
 
     def begin(self, rows: Rows, rngs: Sequence[np.random.Generator]) -> Initial:
         """Joint positions about `HOME`; a goal in `GOAL_AREA`."""
@@ -80,8 +79,7 @@ class ReachTask:
         return Initial({"joint_position": HOME + START_NOISE * (2 * draws[:, :6] - 1)}, seeds)
 
     def start(self, rows: Rows, state: RobotState) -> None:
-        """Commands go on from the measured joints."""
-        self._joints[rows] = state.signals["joint_position"][rows]
+        """Nothing is kept: commands go on from the one that was really sent last."""
 
     def observe(self, state: RobotState) -> Floats:
         """See `observation_labels`. Shape: (n, 21) float32."""
@@ -90,7 +88,7 @@ class ReachTask:
         offset = self.goal - tool
         columns = [
             joints - HOME,
-            (self._joints - joints) / LEASH,
+            (state.command[:, :6] - joints) / LEASH,
             (tool - GOAL_AREA.mean(axis=0)) / 0.3,
             offset / 0.3,
             offset / 0.05,
@@ -100,11 +98,10 @@ class ReachTask:
 
     def command(self, action: Floats, state: RobotState) -> Array:
         """Joint positions [rad], at most `TOOL_STEP` and `JOINT_STEP` on, and the open gripper. Shape: (n, 7)."""
-        measured = state.signals["joint_position"]
-        wanted = self._joints + np.clip(action, -1.0, 1.0).astype(np.float64) * JOINT_STEP
+        measured, sent = state.signals["joint_position"], state.command[:, :6]
+        wanted = sent + np.clip(action, -1.0, 1.0).astype(np.float64) * JOINT_STEP
         wanted = np.clip(np.clip(wanted, measured - LEASH, measured + LEASH), _LOW, -_LOW)
-        self._joints = slow_step(self._joints, wanted)
-        return np.concatenate([self._joints, np.full((self.num_rows, 1), GRIPPER_OPEN)], axis=1)
+        return np.concatenate([slow_step(sent, wanted), np.full((self.num_rows, 1), GRIPPER_OPEN)], axis=1)
 
     def score(self, state: RobotState, action: Floats) -> Score:
         """Nearer is better; arriving is worth staying there."""
@@ -120,11 +117,11 @@ class ReachTask:
 
     def state_dict(self) -> dict[str, Any]:
         """The memory, as plain arrays."""
-        return {"goal": self.goal.copy(), "joints": self._joints.copy()}
+        return {"goal": self.goal.copy()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go to what `state_dict` returned."""
-        self.goal, self._joints = np.array(state["goal"]), np.array(state["joints"])
+        self.goal = np.array(state["goal"])
 
 
 def slow_step(joints: Array, wanted: Array) -> Array:

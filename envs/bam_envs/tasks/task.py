@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from bam_envs.errors import ProtocolError
 from bam_envs.robots.robot import Initial, RobotState, Rows
 
 Array = NDArray[np.float64]
@@ -91,3 +92,20 @@ def labelled_box(labels: Sequence[Label]) -> spaces.Box:
     """The float32 space whose numbers are `labels`."""
     low, high = ([getattr(label, side) for label in labels] for side in ("low", "high"))
     return spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
+
+
+def require_inside(observation: Floats, space: spaces.Box, labels: Sequence[Label]) -> Floats:
+    """`observation` (n, k), if every row is in `space`; robo-gym has no observation outside, with ``parity=True``.
+
+    Raises:
+        ProtocolError: Names the first number that is not; robo-gym raises ``InvalidStateError``.
+    """
+    outside = ~((observation >= space.low) & (observation <= space.high))  # also what is not a number
+    if outside.any():
+        row, column = np.argwhere(outside)[0]
+        label, value = labels[column], observation[row, column]
+        raise ProtocolError(
+            f"{label.name} is {value:.6g} {label.unit}, expected {label.low:.6g} to {label.high:.6g}, as in robo-gym: "
+            "with parity=True there is no observation outside its space; leave parity out, or look at the sensor."
+        )
+    return observation

@@ -1,8 +1,9 @@
 """From tool actions (dx, dy, dz, dyaw, grip) to joint commands, slow enough for a robot near people.
 
 The actions move a tool *target*, not the measured tool, which sags and lags; the target stays within `LEASH` of the
-measured tool and inside the workspace. The tool always points straight down, so the joints follow in closed form. From
-one command to the next the tool target moves at most `TOOL_STEP` and no joint more than `JOINT_STEP`.
+measured tool and inside the workspace, and begins at what was really sent where guards made another command of it.
+The tool always points straight down, so the joints follow in closed form. From one command to the next the tool target
+moves at most `TOOL_STEP` and no joint more than `JOINT_STEP`.
 """
 
 from __future__ import annotations
@@ -64,22 +65,31 @@ class ToolControl:
 
     def start(self, rows: Rows, joints: Array) -> None:
         """Begin at the measured `joints` (k, 6) [rad] of `rows`."""
-        position, x_axis = GEOMETRY.tool_pose(joints)
-        self.target[rows] = position
-        self.yaw[rows] = np.arctan2(x_axis[:, 1], x_axis[:, 0])
+        self._go_on(rows, joints)
         self.closed[rows] = False
+
+    def _go_on(self, rows: Rows, joints: Array) -> None:
+        """The next targets begin at `joints` (k, 6) [rad] of `rows`."""
+        position, x_axis = GEOMETRY.tool_pose(joints)
+        self.target, self.yaw, self._joints = self.target.copy(), self.yaw.copy(), self._joints.copy()
+        self.target[rows], self.yaw[rows] = position, np.arctan2(x_axis[:, 1], x_axis[:, 0])
         self._joints[rows] = joints
 
-    def command(self, action: Floats, tool: Array) -> Array:
+    def command(self, action: Floats, tool: Array, sent: Array) -> Array:
         """Joint positions [rad] and gripper width [m] for an action.
 
         Args:
             action: dx, dy, dz, dyaw, grip in [-1, 1]. Shape: (n, 5).
             tool: Measured tool position [m]. Shape: (n, 3).
+            sent: Joints that were really sent last [rad]; where guards made others of them, the target begins there.
+                Shape: (n, 6).
 
         Returns:
             Shape: (n, 7).
         """
+        held = np.flatnonzero((sent != self._joints).any(axis=1))
+        if len(held):
+            self._go_on(held, sent[held])
         moves: Array = np.clip(action, -1.0, 1.0).astype(np.float64)
         travel = self._travel(moves[:, :3] * TOOL_STEP, tool)
         turn = np.clip(self.yaw + moves[:, 3] * YAW_STEP, -YAW_LIMIT, YAW_LIMIT) - self.yaw

@@ -14,7 +14,7 @@ from gymnasium import spaces
 from bam_envs.robots.robot import RobotState, Rows
 from bam_envs.robots.ur import JOINTS
 from bam_envs.robots.ur import ur_model as model_called
-from bam_envs.tasks.task import Array, Flags, Floats, Label, labelled_box
+from bam_envs.tasks.task import Array, Flags, Floats, Label, labelled_box, require_inside
 from bam_envs.tasks.ur_control import (
     UrControl,
     collisions,
@@ -152,7 +152,7 @@ class UrObstacleTask:
         """See `observation_labels`. Shape: (n, k) float32."""
         observation = np.concatenate(self._columns(self.sense(state)), axis=1).astype(np.float32)
         if self.parity:
-            return observation
+            return require_inside(observation, self.observation_space, self.observation_labels)
         return np.clip(observation, self.observation_space.low, self.observation_space.high)
 
     def _columns(self, sense: ObstacleSense) -> list[Array]:

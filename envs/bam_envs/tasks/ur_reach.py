@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from bam_envs.errors import InvalidValue
 from bam_envs.robots.robot import Initial, RobotState, Rows
 from bam_envs.robots.ur import DEFAULT_MODEL, JOINTS, UrModel
+from bam_envs.robots.ur import START as STRAIGHT
 from bam_envs.robots.ur import ur_model as model_called
 from bam_envs.tasks.task import Array, Floats, Label, Score, labelled_box
 from bam_envs.tasks.ur_control import (
@@ -93,8 +94,8 @@ class UrReachTask:
         randomize_start: See above.
         continue_on_success: See above.
         modular: Observations and infos of robo-gym's EndEffectorPositioning2UR: the last action is that of the joints
-            that move, and never an older one; the distance is `dist_coord` too. With `parity`, targets that are not
-            given are the origin.
+            that move, and never an older one; the distance is `dist_coord` too. With `parity`, wrist 1 starts at 0 rad
+            and its action means its whole range, and targets that are not given are the origin.
     """
 
     reset_options = ("joint_positions", "ee_target_pose", "randomize_start", "continue_on_success")
@@ -124,7 +125,8 @@ class UrReachTask:
         self.num_rows, self.model, self.parity, self.ends_by_itself = num_rows, model_called(ur_model), parity, parity
         fixed = (fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3)
         self._control = UrControl(self.model, num_rows, RATE, VELOCITY_SCALE, fixed)
-        self._near, self._restrict, self._tells_wire = ee_distance_threshold, restrict_wrist_1, rs_state_to_info
+        self._near, self._tells_wire = ee_distance_threshold, rs_state_to_info
+        self._start, self._restrict = (STRAIGHT, False) if modular and parity else (START, restrict_wrist_1)
         self.action_labels = self._control.labels("where the joint is to be", "rad", "/ its limit")
         self.modular, self._seen = modular, self._control.free if modular else np.arange(6)  # whose actions are seen
         told = _parity_labels(modular) if parity else _labels(self.model)
@@ -151,7 +153,7 @@ class UrReachTask:
     ) -> Initial:
         """The start pose, or what the options say; a target in the workspace."""
         options = self._standing | {name: value for name, value in (options or {}).items() if value is not None}
-        joints = np.tile(joint_option(options, "joint_positions", START, self.model), (len(rows), 1))
+        joints = np.tile(joint_option(options, "joint_positions", self._start, self.model), (len(rows), 1))
         target = self._target_option(options)
         if target is None and self.modular and self.parity:
             target = np.zeros(3)  # robo-gym's sampler forgets the place
@@ -163,7 +165,7 @@ class UrReachTask:
             self.target[row] = workspace_point(self.model, rng) if target is None else target
         if flag_option(options, "continue_on_success"):
             joints = np.where(self._continues[rows, None], self._last_end[rows], joints)
-        if not self.parity:  # there a success of any earlier episode counts
+        if self.modular or not self.parity:  # else a success of any earlier episode counts
             self._continues[rows] = False
         seeds = np.array([rng.integers(2**63) for rng in rngs], dtype=np.int64)
         return Initial({"joint_position": joints}, seeds)

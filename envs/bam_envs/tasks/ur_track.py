@@ -99,7 +99,8 @@ class UrTrackTask(UrObstacleTask):
         "collision".
 
     With ``parity=True`` nothing is scaled, the end of a segment is worth nothing and is counted one step later, the
-    arm starts at the first waypoint whatever the reset option says, and 1000 steps terminate, as in robo-gym.
+    arm starts at the first waypoint whatever the reset option says, and 1000 steps terminate, as in robo-gym. The
+    trajectory is still this package's own; ``trajectory`` names robo-gym's.
 
     Args:
         num_rows: How many robots are scored together.
@@ -115,6 +116,7 @@ class UrTrackTask(UrObstacleTask):
         fixed_object_position: Where the obstacle stays in every episode [m].
         rs_state_to_info: Whether infos have robo-gym's wire state.
         trajectory: A JSON file with another trajectory, in robo-gym's form; see `bam_envs.tasks.joint_trajectory`.
+            robo-gym's own, up to 0.67 rad from the default, is ``trajectory_raad_2022.json`` in its package.
         fixed_paths: For tests of policies: the obstacle is on one of 50 paths that are always the same, and faster
             (40 s once around). Which one is drawn; with ``parity`` they come one after the other.
     """

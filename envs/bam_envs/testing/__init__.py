@@ -17,11 +17,12 @@
             return MyTransport(address_of_a_server_of(env))
 
 They need nothing but NumPy and Gymnasium, and hold for arms with the signals of `bam_envs.robots.ur5e`; for another
-robot, override the hooks that name an arm.
+robot, override the hooks that name an arm. `DrivenRobot` is a simulated robot as a live one whose driver misbehaves.
 """
 
+from bam_envs.testing.drivers import DrivenRobot
 from bam_envs.testing.robots import ARM_HOME, RobotContract
 from bam_envs.testing.tasks import TaskContract
 from bam_envs.testing.transports import TransportContract
 
-__all__ = ["ARM_HOME", "RobotContract", "TaskContract", "TransportContract"]
+__all__ = ["ARM_HOME", "DrivenRobot", "RobotContract", "TaskContract", "TransportContract"]

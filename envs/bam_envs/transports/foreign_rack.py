@@ -12,7 +12,8 @@ from bam_envs.errors import InvalidValue
 from bam_envs.registry import resolve_id
 from bam_envs.transports.gymapi.actions import DEFAULT
 from bam_envs.transports.gymapi.codec import EnvCodec
-from bam_envs.transports.transport import EnvSpecMessage
+from bam_envs.transports.gymapi.versions import Version, version_named
+from bam_envs.transports.transport import EnvSpecMessage, Info
 
 
 @dataclass(frozen=True)
@@ -30,9 +31,20 @@ class ForeignRack:
     action_type: int = DEFAULT
     """What it is to do with an action: 1 default, 2 pick and lift, 3 pick and place, 4 open, 5 fold."""
 
+    gymapi_version: str | None = None
+    """Version of its messages; None to find out by its first answer."""
+    autoreset: bool | None = None
+    """Whether it begins the next episode in the step that ends one; None: as racks of its version do, from June on."""
+
     def __post_init__(self) -> None:
         if self.num_envs < 1:
             raise InvalidValue(f"num_envs must be at least 1, not {self.num_envs}.")
+        self.version  # noqa: B018 - refuses a name that is none
+
+    @property
+    def version(self) -> Version | None:
+        """The version that was given."""
+        return None if self.gymapi_version is None else version_named(self.gymapi_version)
 
     @property
     def is_described(self) -> bool:
@@ -62,3 +74,35 @@ def _registered_spaces(env_id: str) -> tuple[Space[Any], Space[Any]]:
         return env.observation_space, env.action_space
     finally:
         env.close()  # type: ignore[no-untyped-call]
+
+
+class LastKnown:
+    """The last observation of each episode of a rack that begins the next one in the step that ends one.
+
+    What such a rack observes then is the first observation of the next episode, and the last one of the old never
+    comes: that of the step before stands in its place.
+    """
+
+    def __init__(self) -> None:
+        self._observation: Any = None
+
+    def begin(self, observation: Any) -> None:
+        """Episodes begin with `observation`, a list of rows of a vector environment."""
+        self._observation = observation
+
+    def instead(self, result: tuple[Any, Any, Any, Any, Any], vector: bool) -> tuple[Any, Any, Any, Any, Any]:
+        """A step's result with the last known observation where an episode ended; `info` says so."""
+        before, (observation, reward, terminated, truncated, info) = self._observation, result
+        self._observation = observation
+        if not vector:
+            if terminated or truncated:
+                observation, info = before, _stale(info)
+        else:
+            ended = [done or cut for done, cut in zip(terminated, truncated, strict=True)]
+            observation = [before[row] if end else observation[row] for row, end in enumerate(ended)]
+            info = [_stale(info[row]) if end else info[row] for row, end in enumerate(ended)]
+        return observation, reward, terminated, truncated, info
+
+
+def _stale(info: Info) -> Info:
+    return {**info, "stale_observation": True}

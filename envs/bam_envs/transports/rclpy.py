@@ -64,7 +64,7 @@ class RclpyLink:
         self.epoch = 0
         """Counts the connections: 1 from `connect` on."""
         self._channel, self._timeout, self._closed = channel, timeout, False
-        self._bus = RclpyBus(f"bam_client_{uuid.uuid4().hex[:8]}", domain=domain)
+        self._bus = RclpyBus(f"bam_client_{uuid.uuid4().hex[:8]}", domain=domain, serves=False)
 
     @property
     def is_up(self) -> bool:

@@ -12,10 +12,10 @@ from typing import Any
 from gymnasium import Space
 
 from bam_envs.bridge.freshness import Tagger
-from bam_envs.bridge.interfaces import complete, request_type
 from bam_envs.bridge.link.link import RosbridgeLink
+from bam_envs.bridge.sessions import is_over, read_session
 from bam_envs.errors import InvalidValue, LinkLost, NoServer, ProtocolError, RemoteError, UnknownName
-from bam_envs.transports.foreign_rack import ForeignRack
+from bam_envs.transports.foreign_rack import ForeignRack, LastKnown
 from bam_envs.transports.gymapi.actions import DEFAULT
 from bam_envs.transports.gymapi.codec import EnvCodec
 from bam_envs.transports.gymapi.requests import (
@@ -26,6 +26,7 @@ from bam_envs.transports.gymapi.requests import (
     plain_seed,
     refuse_foreign,
     service_name,
+    whole_request,
     write_request,
 )
 from bam_envs.transports.gymapi.responses import GymResponse, read_response
@@ -58,7 +59,7 @@ class RosbridgeTransport:
         token: The server's shared secret, if it has one.
         take: Take command from whoever has it.
         observation_space: Of another rack; see `ForeignRack`.
-        action_space, num_envs, period, action_type: Likewise.
+        action_space, num_envs, period, action_type, gymapi_version, autoreset: Likewise.
 
     Raises:
         InvalidValue: The URL or an option is not possible.
@@ -81,6 +82,8 @@ class RosbridgeTransport:
         num_envs: int = 1,
         period: float | None = None,
         action_type: int = DEFAULT,
+        gymapi_version: str | None = None,
+        autoreset: bool | None = None,
     ) -> None:
         if channel not in CHANNELS:
             raise InvalidValue(f"The channel must be service or topics, not {channel!r}.")
@@ -88,7 +91,10 @@ class RosbridgeTransport:
             raise InvalidValue(f"Time-outs must be above 0 s, not {timeout:g} and {connect_timeout:g}.")
         self.url, self.env_id, self.channel = url, env_id, channel
         self.timeout, self.connect_timeout, self.take = timeout, connect_timeout, take
-        self._rack = ForeignRack(observation_space, action_space, num_envs, period, action_type)
+        self._rack = ForeignRack(
+            observation_space, action_space, num_envs, period, action_type, gymapi_version, autoreset
+        )
+        self._version, self._last_known = self._rack.version, LastKnown()
         self._name, self._tagger, self._lock = name, Tagger(), threading.Lock()
         self._ca_file, self._token = ca_file, token
         self._link = self._make_link()
@@ -119,6 +125,7 @@ class RosbridgeTransport:
             epoch = self._link.epoch
             observation, *_, info = there.read_result(self._ask(RequestType.RESET, **request))
             self._known_epoch = epoch
+            self._last_known.begin(observation)
             return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
@@ -131,7 +138,8 @@ class RosbridgeTransport:
             there = self._there
             if there is None or self._closed or self._known_epoch != self._link.epoch or os.getpid() != self._pid:
                 raise LinkLost(f"{self.url}: {self._why_unknown()}, and nothing was sent. Call reset() first.")
-            return there.read_result(self._ask(RequestType.STEP, actions=there.write_actions(action)))
+            result = there.read_result(self._ask(RequestType.STEP, actions=there.write_actions(action)))
+            return self._last_known.instead(result, there.spec.vector) if self._begins_next(there) else result
 
     def close(self) -> None:
         """Let go of the environment there and drop the link; a request under way ends with `LinkLost`."""
@@ -145,6 +153,11 @@ class RosbridgeTransport:
                 self._lock.release()
         self._rpc.close()
         self._link.close()
+
+    def _begins_next(self, there: EnvCodec) -> bool:
+        """Whether what it observes at the end of an episode is the first observation of the next one."""
+        by_version = self._version is not None and self._version.june
+        return there.foreign and (by_version if self._rack.autoreset is None else self._rack.autoreset)
 
     def _why_unknown(self) -> str:
         if self._closed:
@@ -165,7 +178,7 @@ class RosbridgeTransport:
         )
 
     def _make_rpc(self) -> StringRpc:
-        return StringRpc(self._link, base_name(self._link.namespace))
+        return StringRpc(self._link, base_name(self._link.namespace), self._tagger)
 
     def _connect(self) -> EnvCodec:
         if self._closed:
@@ -179,7 +192,23 @@ class RosbridgeTransport:
             self._link.wait_up(self.connect_timeout)
         if self._there is None or self._described_epoch != self._link.epoch:
             self._there = self._described()
+            if self.channel == "topics" and not self._there.foreign and not self._tagger.signs:
+                self._open_session()
         return self._there
+
+    def _open_session(self) -> None:
+        """What is asked on topics can be read by everybody, and is signed."""
+        service = f"{base_name(self._link.namespace)}/session"
+        try:
+            answer = self._link.call(service, "std_srvs/Trigger", {}, self.connect_timeout)
+        except RemoteError:  # an older server
+            return
+        self._sign_with(read_session(answer, service))
+
+    def _sign_with(self, tagger: Tagger) -> None:
+        self._rpc.close()
+        self._tagger = tagger
+        self._rpc = self._make_rpc()
 
     def _described(self) -> EnvCodec:
         """What is there on this connection; it must be what was there on the one before."""
@@ -209,10 +238,13 @@ class RosbridgeTransport:
         """What it answers when it is asked who it is; asked again while nothing comes, for that moves nothing."""
         try:
             return self._exchange(RequestType.NONE, None, timeout=max(self.connect_timeout, 1.0) / _QUESTIONS)
-        except (LinkLost, RemoteError) as error:
-            # A server that ends the call itself says it with a failed response.
-            silent = isinstance(error, LinkLost) or "Timeout exceeded" in str(error)
-            if questions == 1 or not silent:
+        except RemoteError as error:
+            if not is_over(error):
+                raise
+            self._sign_with(Tagger())
+            return self._introduction(questions)
+        except LinkLost:
+            if questions == 1:
                 raise
         return self._introduction(questions - 1)
 
@@ -260,7 +292,10 @@ class RosbridgeTransport:
         request = GymRequest(kind, client_id=client, env_name=self.env_id, tag=tag, **fields)
         message = write_request(request, self._link.stamp(time.time()))
         if foreign:
-            message = complete(request_type(KIND), message)  # a rack may look at any field
+            message = whole_request(message, self._version)
         if self.channel == "topics":
-            return read_response(self._rpc.call(message, limit))
-        return read_response(self._link.call(service_name(self._link.namespace), KIND, message, limit))
+            response = read_response(self._rpc.call(message, limit))
+        else:
+            response = read_response(self._link.call(service_name(self._link.namespace), KIND, message, limit))
+        self._version = self._version or response.version
+        return response

@@ -7,7 +7,11 @@ import json
 import math
 from typing import Any
 
+from bam_envs.bridge.bounds import require_bounded
 from bam_envs.errors import InvalidValue, ProtocolError
+
+_MOST_ITEMS = 4_000_000
+"""An image may come as a list of numbers."""
 
 
 def dump_json(value: Any, what: str) -> str:
@@ -28,18 +32,20 @@ def _base64(value: object) -> str:
     raise TypeError(f"{type(value).__name__} is none")
 
 
-def load_json(text: object, what: str) -> dict[str, Any]:
-    """The object that `text` is in strict JSON.
+def load_json(text: object, what: str, most_items: int = _MOST_ITEMS) -> dict[str, Any]:
+    """The object that `text` is in strict JSON, with at most `most_items` values in it.
 
     Raises:
-        ProtocolError: It is no JSON object, or a number in it is not finite.
+        ProtocolError: It is no JSON object, too much is in it, or a number in it is not finite.
     """
     if not isinstance(text, str):
         raise ProtocolError(f"{what} must be a string with a JSON object, not {type(text).__name__}.")
     try:
+        require_bounded(text.encode(errors="surrogatepass"), most_items)
         value = json.loads(text, parse_constant=_refuse_constant, parse_float=_finite)
-    except (ValueError, RecursionError) as error:
-        raise ProtocolError(f"{what} must be a JSON object: {error}.") from error
+    except (ProtocolError, ValueError, RecursionError) as error:
+        reason = str(error).removeprefix("Message: ").rstrip(".")
+        raise ProtocolError(f"{what} must be a JSON object: {reason}.") from error
     if not isinstance(value, dict):
         raise ProtocolError(f"{what} must be a JSON object, not {type(value).__name__}.")
     return value

@@ -2,7 +2,8 @@
 
 Every ROS graph has std_msgs, and a topic pair goes through a bridge several times faster than a service. On
 ``<name>/request`` goes ``{"id": …, "tag": …, "payload": {…}}``; on ``<name>/reply`` comes ``{"id": …, "payload": {…}}``
-or ``{"id": …, "error": text, "kind": name}``. A request without a tag is somebody else's and as good.
+or ``{"id": …, "error": text, "kind": name}``. A request without a tag is somebody else's and as good; one whose tag is
+signed is of its session.
 """
 
 from __future__ import annotations
@@ -13,10 +14,13 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NoAnswer  # not the builtin before Python 3.11
+from dataclasses import replace
 from typing import Any
 
+from bam_envs.bridge.bounds import MOST_ITEMS
 from bam_envs.bridge.bus import Bus, Caller, Handler, Message
 from bam_envs.bridge.freshness import FreshnessCheck, Tagger, read_tag
+from bam_envs.bridge.sessions import Sessions
 from bam_envs.errors import BamEnvsError, LinkLost, NotInCommand, ProtocolError, RemoteError
 from bam_envs.transports.answers import RecentAnswers
 from bam_envs.transports.strict_json import dump_json, load_json
@@ -37,12 +41,13 @@ class StringRpc:
     Args:
         bus: Carries the topics. If it knows when its link drops (`on_down`), calls under way fail at once.
         name: Such as ``/bam/scene``.
+        tagger: Of the session to ask for; None: of none.
     """
 
-    def __init__(self, bus: Bus, name: str) -> None:
+    def __init__(self, bus: Bus, name: str, tagger: Tagger | None = None) -> None:
         self.name = name
         """See above."""
-        self._bus, self._tagger, self._lock = bus, Tagger(), threading.Lock()
+        self._bus, self._tagger, self._lock = bus, tagger or Tagger(), threading.Lock()
         self._pending: dict[str, Future[dict[str, Any]]] = {}
         self._unsubscribe: Callable[[], None] | None = None
         self._watched, self._answered = False, -1
@@ -57,7 +62,9 @@ class StringRpc:
         """
         tag = self._tagger.next(self._epoch(), timeout)
         identity = f"{tag.session}-{tag.sequence}"
-        text = dump_json({"id": identity, "tag": tag.to_text(), "payload": payload}, f"A request to {self.name}")
+        content = _content(identity, payload, f"A request to {self.name}")
+        signed = dump_json({"tag": self._tagger.sign(tag, self.name, content.encode())}, self.name)
+        text = f"{signed[:-1]},{content[1:]}"
         self._open()
         future = self._pending[identity] = Future()
         try:
@@ -110,6 +117,11 @@ class StringRpc:
                 future.set_exception(LinkLost(f"No reply: {reason}. Whether it did what was asked is unknown."))
 
 
+def _content(identity: str, payload: object, what: str) -> str:
+    """What the tag of a request signs."""
+    return dump_json({"id": identity, "payload": payload}, what)
+
+
 def _payload_of(reply: dict[str, Any], name: str) -> dict[str, Any]:
     if "error" in reply:
         raise (NotInCommand if reply.get("kind") == NotInCommand.__name__ else RemoteError)(str(reply["error"]))
@@ -126,12 +138,13 @@ class StringRpcService:
         bus: Carries the topics.
         name: Such as ``/bam/scene``.
         handler: Makes the reply's payload. What it raises of our errors is the text of the reply's error.
+        sessions: Those that requests may be signed for; None: a signature means nothing.
     """
 
-    def __init__(self, bus: Bus, name: str, handler: Handler) -> None:
+    def __init__(self, bus: Bus, name: str, handler: Handler, sessions: Sessions | None = None) -> None:
         self.name = name
         """See above."""
-        self._bus, self._handler = bus, handler
+        self._bus, self._handler, self._sessions = bus, handler, sessions
         self._freshness, self._answers = FreshnessCheck(), RecentAnswers[str]()
         self._workers = ThreadPoolExecutor(_WORKERS, thread_name_prefix=f"rpc{name.replace('/', '-')}")
         self._room = threading.BoundedSemaphore(_MOST_WAITING)
@@ -151,33 +164,39 @@ class StringRpcService:
         self._workers.shutdown()
 
     def _on_request(self, message: Message, caller: Caller) -> None:
-        request = load_json(message.get("data"), f"{self.name}/request")
+        request = load_json(message.get("data"), f"{self.name}/request", MOST_ITEMS)
         identity = request.get("id")
         if not isinstance(identity, str):
             raise ProtocolError(f"{self.name}/request: id must be a string, not {type(identity).__name__}.")
         if not self._room.acquire(blocking=False):
             raise RemoteError(f"{self.name} is busy: {_MOST_WAITING} requests are waiting.")
-        refused = self._refusal(request, identity)
+        caller, refused = self._proven(request, identity, caller)
         try:
             self._workers.submit(self._answer, request, caller, refused, time.monotonic())
         except RuntimeError as error:  # shut down meanwhile
             self._room.release()
             raise RemoteError(f"{self.name} is closed.") from error
 
-    def _refusal(self, request: dict[str, Any], identity: str) -> str:
-        """Why a request that is new here must not be executed, found at arrival; empty if it may."""
+    def _proven(self, request: dict[str, Any], identity: str, caller: Caller) -> tuple[Caller, str]:
+        """Who asks, and why a request that is new here must not be executed, found at arrival; empty if it may."""
         tag = read_tag(request.get("tag"))
         if tag is None or not identity.startswith(tag.session):
-            return ""
+            return caller, ""
         try:
-            self._freshness.require(tag, self.name)
-        except RemoteError as error:
-            return str(error)
-        return ""
+            if self._sessions is None or not tag.mac:
+                self._freshness.require(tag, self.name)
+                return caller, ""
+            content = _content(identity, request.get("payload"), self.name).encode()
+            fresh = self._sessions.prove(tag, self.name, content, caller)
+            caller = replace(caller, session=tag.session)
+            fresh.require(tag, self.name)
+        except BamEnvsError as error:
+            return caller, str(error)
+        return caller, ""
 
     def _answer(self, request: dict[str, Any], caller: Caller, refused: str, arrived: float) -> None:
         try:
-            future, new = self._answers.claim(request["id"])
+            future, new = self._answers.claim((caller.session, request["id"]))
             if new:
                 future.set_result(self._reply(request, caller, refused, arrived))
             if new or future.done():  # while the first one is being answered, nothing

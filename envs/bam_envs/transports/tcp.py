@@ -150,7 +150,7 @@ class TcpTransport:
         except (ForeignPeer, RemoteError) as error:
             raise NoServer(self.url, f"{error}") from error
         except (LinkLost, ProtocolError) as error:
-            raise NoServer(self.url, f"not a bam-serve TCP server: {error}. {self._remedy()}") from error
+            raise NoServer(self.url, f"not a bam-serve TCP server: {error}. {self._other_port()}") from error
 
     def _unreachable(self, error: OSError) -> str:
         if isinstance(error, ConnectionRefusedError):
@@ -163,6 +163,11 @@ class TcpTransport:
 
     def _remedy(self) -> str:
         return f"Start one: bam-serve --env {self.env_id or 'bam/pick'} --tcp {self._port}"
+
+    def _other_port(self) -> str:
+        """The remedy where something else has the port."""
+        start = f"bam-serve --env {self.env_id or 'bam/pick'} --tcp PORT"
+        return f"If it is rosbridge, use ws://; else start one at a free port: {start}"
 
     def _ask(self, kind: str, *values: Any, timeout: float | None = None) -> Tree:
         """The answer to a request. After anything else than an answer the link is down."""

@@ -63,7 +63,7 @@ def read_hello(tree: Tree) -> Hello:
     if isinstance(kind, str) and kind == "hello" and isinstance(said, Mapping):
         fields = {key: said.get(key) for key in ("session", "name", "token", "env_id")}
         epoch = said.get("epoch")
-        if all(isinstance(one, str) for one in fields.values()) and isinstance(epoch, int):
+        if all(isinstance(one, str) for one in fields.values()) and fields["session"] and isinstance(epoch, int):
             return Hello(epoch=epoch, **fields)  # type: ignore[arg-type]
     raise ProtocolError(f"Expected a hello, found {shown(tree)}.")
 
@@ -125,6 +125,14 @@ def answer_in(tree: Tree, sequence: int) -> Tree:
     if kind == "ok":
         return content
     raise (NotInCommand if kind == "NotInCommand" else RemoteError)(str(content))
+
+
+def action_size(spec: EnvSpecMessage) -> int:
+    """What an action holds at most, of all rows [bytes]; about, where its space does not say."""
+    try:
+        return 8 * spaces.flatdim(spec.action_space) * spec.num_envs
+    except (NotImplementedError, ValueError):  # sequences may be of any length
+        return 2**22
 
 
 class SpecCodec:

@@ -12,6 +12,9 @@ from PIL import Image
 from bam_envs.bridge.encoding import Fragments, decode_frame, encode_cbor, encode_json, encode_png, split
 from bam_envs.errors import InvalidValue, ProtocolError
 
+DEEP = "Message: expected at most 32 lists and objects in one another, found more."
+MANY = "Message: expected at most 100000 values, found more."
+
 
 def refusal(frame):
     with pytest.raises(ProtocolError) as caught:
@@ -19,10 +22,16 @@ def refusal(frame):
     return str(caught.value)
 
 
-def test_one_frame_holds_one_object_or_several():
-    assert decode_frame('{"op": "a"}') == [{"op": "a"}]
-    assert decode_frame(' {"op":"a"}\n{"op":"b"}{"op":"c"} ') == [{"op": "a"}, {"op": "b"}, {"op": "c"}]
-    assert decode_frame('{"id": null, "text": "é"}'.encode()) == [{"id": None, "text": "é"}]
+def test_one_frame_holds_one_object():
+    assert decode_frame(' {"op": "a"}\n') == {"op": "a"}
+    assert decode_frame('{"id": null, "text": "é"}'.encode()) == {"id": None, "text": "é"}
+
+
+def test_brackets_in_texts_are_not_deep():
+    text = "[" * 50 + '"' + "{" * 50 + "\\"
+    message = {"op": "a", "text": text, "list": [[]] * 50, text: text}
+    assert decode_frame(json.dumps(message)) == message
+    assert decode_frame('{"a":' * 32 + "1" + "}" * 32)
 
 
 @pytest.mark.parametrize(
@@ -31,11 +40,18 @@ def test_one_frame_holds_one_object_or_several():
         ("", "Message: expected JSON: Expecting value: line 1 column 1 (char 0)."),
         (b"", "Message: expected JSON: Expecting value: line 1 column 1 (char 0)."),
         ("nonsense", "Message: expected JSON: Expecting value: line 1 column 1 (char 0)."),
-        ('{"op": "a"} x', "Message: expected JSON: Expecting value: line 1 column 13 (char 12)."),
+        ('{"op": "a"} x', "Message: expected one in a frame, found more behind it."),
+        ('{"op": "a"}{"op": "b"}', "Message: expected one in a frame, found more behind it."),
+        ("\ud800", "Message: expected text in UTF-8: invalid continuation byte at byte 0."),
         ("[]", "Message: expected an object, found a list of 0."),
         ("3", "Message: expected an object, found 3."),
         (b"\xff\x00", "Message: expected text in UTF-8: invalid start byte at byte 0."),
-        ("[" * 100_000, "Message: too deeply nested."),
+        ("[" * 33 + "]" * 33, DEEP),
+        ('{"a":' * 33 + "1" + "}" * 33, DEEP),
+        ('["\\\\", "\\"[", ' + '{"a":[' * 17 + "]}" * 17 + "]", DEEP),
+        ("[" * 90_000, DEEP),
+        ("{}" * 2_000_000, MANY),
+        ("[" + "0," * 100_000 + "0]", MANY),
     ],
 )
 def test_everything_else_is_refused(frame, text):
@@ -47,7 +63,7 @@ def test_numbers_without_end_are_refused():
 
 
 def test_numbers_that_are_not_finite_are_for_others_to_refuse():
-    assert decode_frame('{"a": [-Infinity, 1e400]}') == [{"a": [-math.inf, math.inf]}]
+    assert decode_frame('{"a": [-Infinity, 1e400]}') == {"a": [-math.inf, math.inf]}
 
 
 def test_json_is_ascii_and_finite():
@@ -142,7 +158,7 @@ GOOD = {"id": "a", "data": "x", "num": 0, "total": 2}
         ({"num": 2}, "Fragment 2 of 2 of 'a' does not fit the ones before it."),
         ({"num": 1, "total": 3}, "Fragment 1 of 3 of 'a' does not fit the ones before it."),
         ({"data": "other"}, "Fragment 0 of 2 of 'a' does not fit the ones before it."),
-        ({"num": 1, "data": "x" * 2000}, "Fragments: expected at most 1000 characters, found 2201."),
+        ({"num": 1, "data": "x" * 2000}, "Fragments: expected at most 1000 bytes, found 2201."),
     ],
 )
 def test_fragments_that_do_not_fit_are_refused(change, text):

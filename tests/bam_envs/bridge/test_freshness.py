@@ -2,7 +2,7 @@
 
 import pytest
 
-from bam_envs.bridge.freshness import ClockOffset, FreshnessCheck, Tag, Tagger, read_tag
+from bam_envs.bridge.freshness import ClockOffset, FreshnessCheck, Tag, Tagger, read_echo, read_tag
 from bam_envs.errors import RemoteError
 
 
@@ -37,6 +37,25 @@ def test_a_tag_travels_as_text():
 )
 def test_other_text_is_no_tag(text):
     assert read_tag(text) is None
+
+
+def test_an_echo_says_session_and_number_alone():
+    tagger = Tagger(session="4f1c", key=b"secret")
+    tag = tagger.next(2, 0.1)
+    assert tag.echo == "bam1 s=4f1c q=1"
+    assert read_echo(tag.echo) == ("4f1c", 1)
+    assert read_tag(tag.echo) is None
+    others = ["", None, "base_link", "bam1 s=4f1c", "bam1 q=1 s=4f1c", "bam1 s=4f1c q=x", "bam1 s=4f1c q=-1"]
+    assert [read_echo(text) for text in (*others, tag.to_text(), tagger.sign(tag, "/go", b""))] == [None] * 9
+
+
+def test_a_signature_is_of_the_tag_its_channel_and_its_content():
+    tagger = Tagger(session="4f1c", key=b"secret")
+    tag = tagger.next(1, 0.1)
+    text = tagger.sign(tag, "/go", b"content")
+    assert text == f"{tag.to_text()} m={read_tag(text).mac}"
+    assert len({tagger.sign(*one) for one in ((tag, "/go", b""), (tag, "/to", b"content"), (tag, "/go", b"c"))}) == 3
+    assert Tagger(session="4f1c").sign(tag, "/go", b"content") == tag.to_text()
 
 
 def test_a_tagger_counts_and_says_when():

@@ -70,6 +70,21 @@ def test_an_option_is_said_once_whatever_else_is_given(told):
     ]
 
 
+def test_parity_without_robo_gyms_trajectory(told):
+    raad, test = (ROBO_GYM[f"AvoidanceRaad2022{kind}Sim-v0"] for kind in ("UR", "TestUR"))
+    options.translate(SIM, {"parity": True})
+    options.translate(raad, {"parity": False})
+    options.translate(raad, {"parity": True, "trajectory": "theirs.json"})
+    assert told() == []
+    for entry in (raad, test):
+        options.translate(entry, {"parity": True})
+    assert told() == [
+        "parity=True of AvoidanceRaad2022URSim-v0: the trajectory is this package's own, up to 0.67 rad from "
+        "robo-gym's; trajectory='.../robo_gym/envs/ur/robot_trajectories/trajectory_raad_2022.json' of an installed "
+        "robo-gym is that one."
+    ]
+
+
 @pytest.mark.parametrize("name", ["gui", "gazebo_gui"])
 def test_gui_is_a_window(name, told, monkeypatch):
     monkeypatch.setattr(options, "render_modes", lambda: ["rgb_array", "human"])
@@ -167,7 +182,17 @@ def test_what_cannot_be_had(entry, given, text):
     assert str(caught.value) == text
 
 
-@pytest.mark.parametrize(("name", "closest"), [("ur_modle", "ur_model"), ("lower_port", "lower_bound_port")])
+@pytest.mark.parametrize(
+    ("name", "closest"),
+    [
+        ("ur_modle", "ur_model"),
+        ("lower_port", "lower_bound_port"),
+        ("fix_shoulder_pan", "fix_base"),
+        ("fix_shoulder_pan_joint", "fix_base"),
+        ("fix_shoulder_lift", "fix_shoulder"),
+        ("fix_wrist_3_joint", "fix_wrist_3"),
+    ],
+)
 def test_a_typo_is_not_swallowed(name, closest):
     with pytest.raises(UnknownName) as caught:
         options.translate(SIM, {name: 1})

@@ -74,10 +74,15 @@ def test_numbers_of_a_base_are_where_robo_gym_has_them():
     assert state.truth["collision"].tolist() == [True]
 
 
-def test_what_is_no_number_is_zero():
+def test_what_is_no_number_is_zero_but_for_ranges():
     wire = [1.0] * 1030
-    wire[3] = float("nan")
-    assert read_mir(wire).signals["base_pose"].tolist() == [[0, 1, 1]]
+    wire[0] = wire[3] = wire[7] = wire[509] = float("nan")
+    state = read_mir(wire)
+    assert read_mir_target(wire).tolist() == [0, 1, 1]
+    assert state.signals["base_pose"].tolist() == [[0, 1, 1]]
+    assert state.signals["base_velocity"].tolist() == [[1, 0]]
+    assert np.isnan(state.signals["b_scan"][0, 0])
+    assert np.isnan(state.signals["b_scan"]).sum() == 1
 
 
 def test_an_object_and_its_quaternion():

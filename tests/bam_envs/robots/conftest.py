@@ -182,11 +182,11 @@ class ScriptedRobot:
     def _listener(self, topic):
         def listen(message, caller):
             message = copy.deepcopy(dict(message))
-            places, values, tag = decode_command(self.profile, self.spec, topic, message)
+            places, values, tag, _ = decode_command(self.profile, self.spec, topic, message)
             with self._lock:
                 self._told.update(zip(places, values.tolist(), strict=True))
                 complete = topic in {way[-1].topic for way in self.profile.commands.values()}
-                self._tag = tag.to_text() if tag and complete else self._tag
+                self._tag = tag.echo if tag and complete else self._tag
                 if complete:
                     self._move()
             with self._changed:

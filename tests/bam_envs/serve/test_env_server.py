@@ -9,6 +9,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
+from bam_envs.bridge.bus import Caller
 from bam_envs.errors import InvalidValue, NotInCommand, RemoteError, ResetNeeded, SafetyStop
 from bam_envs.serve.command import CommandLease
 from bam_envs.serve.env_server import EnvServer
@@ -99,7 +100,7 @@ def test_the_others_are_told_who_is_in_command():
     server.reset("ann")
     for act in (lambda: server.reset("bob"), lambda: server.step("bob", np.zeros(2))):
         assert raised(NotInCommand, act) == (
-            "ann is in command, not bob; it passes on when ann leaves or is silent for 5 s."
+            "ann is in command, not bob; it passes on when ann leaves or is silent for 2 s."
         )
     assert (len(env.given), env.seen) == (1, [])
     server.leave("ann")
@@ -109,7 +110,11 @@ def test_the_others_are_told_who_is_in_command():
 def test_after_a_change_of_command_a_reset_is_needed():
     _, server = mirror()
     server.reset("ann")
-    server.reset("bob", take=True)
+    assert raised(NotInCommand, lambda: server.reset("bob", take=True)) == (
+        "ann is in command, not bob; it passes on when ann leaves or is silent for 2 s. Taking it by force needs the "
+        "operator's token: start bam-serve with --operator-token-file, and show that one."
+    )
+    server.reset("bob", take=True, caller=Caller("x", operator=True))
     server.leave("bob")
     assert raised(ResetNeeded, lambda: server.step("ann", np.zeros(2))) == NO_EPISODE
 

@@ -2,6 +2,7 @@
 
 import json
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -69,10 +70,46 @@ def test_an_episode_of_a_client_that_says_the_least(serve):
     assert (info["elapsed"], info["text"], info["array"]) == (1, "grün", [0, 1, 2])
     [last] = ask(STEP, action=[{"continuous_action": [0, 0]}])["feedback"]
     assert last["terminated"] is True
-    assert refusal(ask(STEP, action=[{"continuous_action": [0, 0]}])).endswith("Call reset() first.")
     assert code_of(ask(CLOSE)) == 1
     assert [one.tolist() for one in env.seen] == [[0.5, -1.0], [0.0, 0.0]]
     assert env.given == [(None, None)]
+
+
+def ends(row):
+    return row["reward"], row["terminated"], row["truncated"], row["executed"]
+
+
+def test_a_step_after_the_end_begins_the_next_episode(serve):
+    env = MirrorEnv(spaces.Box(-1, 1, (1,), np.float32), episode_steps=1)
+    ask = serve(env)
+    action = [{"continuous_action": [0.5]}]
+    assert refusal(ask(STEP, action=action)).endswith("Call reset() first.")
+    ask(RESET, seed=3)
+    rows = [ask(STEP, action=action)["feedback"][0] for _ in range(3)]
+    assert [ends(row) for row in rows] == [
+        (1 / 7, True, False, True),
+        (0.0, False, False, False),
+        (1 / 7, True, False, True),
+    ]
+    assert [row["observation"] == [0.5] for row in rows] == [True, False, True]
+    assert env.given == [(3, None), (None, None)]
+    assert len(env.seen) == 2
+
+
+def test_a_step_after_the_end_is_refused_to_our_own_clients_and_to_the_next_one(serve):
+    env = MirrorEnv(spaces.Discrete(3), episode_steps=1)
+    ask = serve(env)
+    step = {"action": [{"discrete_action": [1]}]}
+    ask(RESET, frame_id=frame_id(1))
+    ask(STEP, frame_id=frame_id(2), **step)
+    assert refusal(ask(STEP, frame_id=frame_id(3), **step)).endswith("Call reset() first.")
+    ask(CLOSE, frame_id=frame_id(4))
+    ask(RESET)
+    ask(STEP, **step)
+    ask(CLOSE)
+    assert refusal(ask(STEP, **step)).endswith("Call reset() first.")
+    assert refusal(ask(STEP, OTHER, **step)).endswith("Call reset() first.")
+    assert len(env.given) == 2
 
 
 def test_seeds(serve):
@@ -140,19 +177,34 @@ def test_one_client_is_in_command(serve):
     step = {"action": [{"discrete_action": [1]}]}
     assert code_of(ask(RESET, client_id="ann")) == 1
     refused = ask(RESET, OTHER, client_id="bob")
-    assert refusal(refused).startswith("ann#c1 is in command, not bob#c2;")
-    assert "ann#c1 is in command" in refusal(ask(STEP, OTHER, client_id="bob", **step))
-    assert code_of(ask(RESET, OTHER, client_id="bob", force_priority=True)) == 1
-    assert "bob#c2 is in command" in refusal(ask(STEP, client_id="ann", **step))
+    assert refusal(refused).startswith("ann (127.0.0.1:1) is in command, not bob (127.0.0.1:2);")
+    assert "ann (127.0.0.1:1) is in command" in refusal(ask(STEP, OTHER, client_id="bob", **step))
+    text = refusal(ask(RESET, OTHER, client_id="bob", force_priority=True))
+    assert text.endswith(
+        "Taking it by force needs the operator's token: start bam-serve with --operator-token-file, and show that one."
+    )
+    operator = replace(OTHER, operator=True)
+    assert code_of(ask(RESET, operator, client_id="bob", force_priority=True)) == 1
+    assert "bob (127.0.0.1:2) is in command" in refusal(ask(STEP, client_id="ann", **step))
     assert code_of(ask(STEP, OTHER, client_id="bob", **step)) == 1
     assert code_of(ask(CLOSE, OTHER, client_id="bob")) == 1
     assert code_of(ask(RESET, client_id="ann")) == 1
 
 
+def test_nobody_is_told_the_session_of_another(serve):
+    """It is the proof of who made it."""
+    ask = serve(MirrorEnv(spaces.Discrete(3)))
+    ask(RESET, client_id="ann", frame_id=frame_id(1))
+    for kind in (RESET, STEP):
+        assert "abc" not in json.dumps(ask(kind, OTHER, client_id="bob", action=[{"discrete_action": [1]}]))
+
+
 def test_a_long_name_is_cut(serve):
     ask = serve(MirrorEnv(spaces.Discrete(3)))
     ask(RESET, client_id="a" * 1000)
-    assert refusal(ask(RESET, OTHER)).startswith(f"{'a' * 100}#c1 is in command, not somebody#c2;")
+    assert refusal(ask(RESET, OTHER)).startswith(
+        f"{'a' * 100} (127.0.0.1:1) is in command, not somebody (127.0.0.1:2);"
+    )
 
 
 def test_who_hangs_up_is_no_longer_in_command(serve, bus):
@@ -251,7 +303,7 @@ def test_rows_are_one_request(serve):
 def test_pictures_and_stamps(serve, bus):
     bus.stamp = lambda t: {"secs": int(t), "nsecs": 0}
     ask = serve(MirrorEnv(spaces.Box(0, 255, (8, 12, 3), np.uint8)), clock=lambda: 77.0)
-    image = ask(RESET)["feedback"][0]["color_img"]
+    [image] = ask(RESET)["feedback"][0]["color_img"]
     assert image["format"] == "png"
     assert image["header"] == {"stamp": {"secs": 77, "nsecs": 0}, "frame_id": "observation"}
     assert decode_image(image["data"]).shape == (8, 12, 3)

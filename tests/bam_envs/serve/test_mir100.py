@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from bam_envs.errors import InvalidValue
+from bam_envs.errors import InvalidValue, SafetyStop
 from bam_envs.serve.options import ServeOptions
 from bam_envs.serve.program import ServedEnvironment
 from bam_envs.serve.served_robot import ServedRobot
@@ -76,12 +76,17 @@ def test_a_live_base_in_a_box_like_the_simulated_one(serve, make):
     assert one[4]["final_status"] == "collision"
 
 
-def test_a_live_base_in_parity_has_no_collisions(serve, make):
+def test_a_live_base_in_parity_has_no_collisions_and_is_stopped_at_the_wall(serve, make):
     served = serve(AVOIDANCE, [0.0, -2.6, math.pi / 2], fast=True)
     env = live(make, served, AVOIDANCE, parity=True)
     env.reset(seed=1)
-    ends = [env.step(FORWARD)[2] for _ in range(80)]
-    assert not any(ends)
+
+    def drive():
+        for _ in range(80):
+            assert not env.step(FORWARD)[2]
+
+    with pytest.raises(SafetyStop, match=r"^The robot was stopped by G23 base following: "):
+        drive()
     assert served.env.unwrapped.robot.state.truth["collision"].tolist() == [True]
 
 

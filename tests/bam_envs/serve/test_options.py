@@ -29,6 +29,11 @@ def test_a_token_of_the_tcp_port_beside_a_ros_2_node():
             {"rclpy": True, "token_file": "t"},
             "--token-file protects nothing with --rclpy: ROS 2 has no token. Leave it out.",
         ),
+        ({"no_token": True, "token_file": "t"}, "--no-token and --token-file exclude each other; give one of the two."),
+        (
+            {"via": "ws://a", "operator_token_file": "t"},
+            "--operator-token-file means something only where clients connect to this program.",
+        ),
         ({"lease": 0.0}, "--lease must be above 0 s, not 0."),
         ({"lease": float("nan")}, "--lease must be above 0 s, not nan."),
         ({"port": -1}, "--port must be 0 to 65535, not -1."),
@@ -43,7 +48,12 @@ def test_what_cannot_be(options, text):
     assert str(error.value) == text
 
 
-OPEN = "Anybody who reaches {} may command what is served here: give --token-file, or --bind 127.0.0.1."
+CLEAR = "The token travels in the clear to {}, and so does all else: give --cert, or trust that network."
+OPEN = "Anybody who reaches {} may command what is served here, as --no-token says."
+REFUSED = (
+    "Anybody who reaches {} could command what is served here: give --token-file, or --bind 127.0.0.1; or --no-token, "
+    "if everybody there is to."
+)
 
 
 @pytest.mark.parametrize(
@@ -53,18 +63,34 @@ OPEN = "Anybody who reaches {} may command what is served here: give --token-fil
         ({"bind": "127.0.0.5"}, None),
         ({"bind": "::1"}, None),
         ({"bind": "localhost", "tcp": 0}, None),
-        ({"bind": "0.0.0.0"}, OPEN.format("0.0.0.0")),
-        ({"bind": "::"}, OPEN.format("::")),
-        ({"bind": ""}, OPEN.format("every address of this computer")),
-        ({"bind": "robot.lab"}, OPEN.format("robot.lab")),
-        ({"bind": "0.0.0.0", "token_file": "t"}, None),
+        ({"bind": "0.0.0.0", "no_token": True}, OPEN.format("0.0.0.0")),
+        ({"bind": "", "no_token": True}, OPEN.format("every address of this computer")),
+        ({"bind": "0.0.0.0", "token_file": "t"}, CLEAR.format("0.0.0.0")),
+        ({"bind": "0.0.0.0", "token_file": "t", "rclpy": True, "tcp": 0}, CLEAR.format("0.0.0.0")),
+        ({"bind": "0.0.0.0", "token_file": "t", "cert": "c"}, None),
         ({"bind": "0.0.0.0", "via": "ws://a"}, None),
         ({"bind": "0.0.0.0", "rclpy": True}, None),
-        ({"bind": "0.0.0.0", "rclpy": True, "tcp": 0}, OPEN.format("0.0.0.0")),
     ],
 )
 def test_what_stands_open_is_said(options, text):
+    ServeOptions(**options).require_sane()
     assert ServeOptions(**options).warning == text
+
+
+@pytest.mark.parametrize(
+    ("options", "place"),
+    [
+        ({"bind": "0.0.0.0"}, "0.0.0.0"),
+        ({"bind": "::"}, "::"),
+        ({"bind": ""}, "every address of this computer"),
+        ({"bind": "robot.lab", "cert": "c"}, "robot.lab"),
+        ({"bind": "0.0.0.0", "rclpy": True, "tcp": 0}, "0.0.0.0"),
+    ],
+)
+def test_no_network_without_a_token_by_oversight(options, place):
+    with pytest.raises(InvalidValue) as error:
+        ServeOptions(**options).require_sane()
+    assert str(error.value) == REFUSED.format(place)
 
 
 @pytest.mark.parametrize(("name", "prefix"), [("", ""), ("/", ""), ("a", "/a"), ("/a/b_1/", "/a/b_1")])

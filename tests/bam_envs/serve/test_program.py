@@ -278,6 +278,7 @@ def test_what_was_started_ends_if_the_rest_cannot_start(serve):
 def test_a_token(serve, link, transport, tmp_path):
     path = tmp_path / "token"
     path.write_text(" secret \n")
+    path.chmod(0o600)
     served = serve("CartPole-v1", token_file=str(path), tcp=0)
     with pytest.raises(NoServer, match="token"):
         link(served.bus.url)

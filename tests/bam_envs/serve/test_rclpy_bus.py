@@ -195,12 +195,12 @@ def test_a_service_that_fails_answers_too(node, caplog):
     }
 
 
-def test_a_service_of_an_unknown_type_is_not_offered(node, caplog):
-    node("server").serve("/test/unknown", "no_msgs/Nothing", lambda request, caller: {})
-    assert caplog.messages == [
-        "the service /test/unknown is not offered: no_msgs/Nothing is in no package of this Python; source a ROS 2 "
-        "workspace that has it."
-    ]
+def test_a_service_of_an_unknown_type_is_not_offered(node):
+    server = node("server")
+    server.serve("/test/unknown", "no_msgs/Nothing", lambda request, caller: {})
+    assert server.refused == {
+        "/test/unknown": "no_msgs/Nothing is in no package of this Python; source a ROS 2 workspace that has it."
+    }
 
 
 def test_a_service_that_is_not_there(node):

@@ -6,7 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bam_envs.bridge.freshness import read_tag
+from bam_envs.bridge.bus import Caller
+from bam_envs.bridge.freshness import Tagger, read_echo
+from bam_envs.bridge.sessions import LEASE_TOPIC, read_session
 from bam_envs.errors import LinkLost, PhysicsDiverged
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.profiles.profile import load_profile
@@ -35,21 +37,32 @@ def command(change=0.0, width=0.085):
 class Service:
     """A service, its robot, its bus and its lease."""
 
-    def __init__(self, bus, robot, realtime, **options):
-        self.bus, self.lease = bus, CommandLease(5.0)
+    def __init__(self, bus, robot, realtime, lease=None, **options):
+        self.bus, self.lease = bus, lease or CommandLease(5.0)
         self.robot = ServedRobot(robot, dead_man=0.1, realtime=realtime)
         self.robot.connect()
         self.robot.reset(np.zeros(1, dtype=np.int64), initial())
         self.service = RobotService(self.robot, UR5E, bus, self.lease, **options)
         self.service.start()
 
-    def send(self, numbers, tag=None, caller="a", namespace=""):
-        """Every message of a command; the first refusal, or None."""
-        for topic, _, message in encode_command(UR5E, self.robot.spec, numbers, tag):
-            refusal = self.bus.say(namespace + topic, message, caller)
+    def session(self, caller="a"):
+        """What signs for a new session of `caller`."""
+        who = Caller(caller, f"{caller}:1") if caller else Caller("")
+        return read_session(self.bus.services["/bam/session"][1]({}, who), "/bam/session")
+
+    def send(self, numbers, tagger=None, caller="a", tag=None):
+        """Every message of a command, signed by `tagger` if there is one; the first refusal, or None."""
+        tag = tag or (tagger.next(1, 0.1) if tagger else None)
+        for topic, _, message in encode_command(UR5E, self.robot.spec, numbers, tag, sign=tagger and tagger.sign):
+            refusal = self.bus.say(topic, message, caller)
             if refusal is not None:
                 return refusal
         return None
+
+    def say(self, word, tagger, caller="a"):
+        """A signed word about the lease; the refusal, or None."""
+        tag = tagger.next(1, 0.1)
+        return self.bus.say(LEASE_TOPIC, {"data": f"{word} {tagger.sign(tag, LEASE_TOPIC, word.encode())}"}, caller)
 
     def joints(self, condition=lambda message: True):
         return self.bus.wait_for("/joint_states", condition)
@@ -83,9 +96,13 @@ def test_what_it_offers(serve, bus):
         "/cell/forward_position_controller/commands": "std_msgs/Float64MultiArray",
         "/cell/scaled_joint_trajectory_controller/joint_trajectory": "trajectory_msgs/JointTrajectory",
         "/cell/bam/halt": "std_msgs/Empty",
+        "/cell/bam/lease": "std_msgs/String",
         "/cell/bam/scene/request": "std_msgs/String",
     }
-    assert {name: kind for name, (kind, _) in bus.services.items()} == {"/cell/bam/robot": "std_srvs/Trigger"}
+    assert {name: kind for name, (kind, _) in bus.services.items()} == {
+        "/cell/bam/robot": "std_srvs/Trigger",
+        "/cell/bam/session": "std_srvs/Trigger",
+    }
 
 
 def test_an_arm_without_gripper_offers_no_topics_of_one(serve, bus):
@@ -95,6 +112,7 @@ def test_an_arm_without_gripper_offers_no_topics_of_one(serve, bus):
         ARM,
         "/scaled_joint_trajectory_controller/joint_trajectory",
         "/bam/halt",
+        "/bam/lease",
         "/bam/scene/request",
     }
     assert bus.say(ARM, {"data": (HOME[0] + 0.01).tolist()}, "a") is None
@@ -116,11 +134,12 @@ def test_it_says_what_it_is(serve, bus, realtime, text):
     assert read_info(answer["message"], "/bam/robot") == RobotInfo("ur5e", True, not realtime, 0.05, text)
 
 
-def test_in_lockstep_each_command_is_one_period_and_is_echoed(serve, tagger):
+def test_in_lockstep_each_command_is_one_period_and_is_echoed(serve):
+    """The echo is public; the signature of the command is not in it."""
     service = serve()
-    tag = tagger.next(1, 0.1)
-    assert service.send(command(0.01), tag) is None
-    state = service.joints(lambda message: message["header"]["frame_id"] == tag.to_text())
+    tagger = service.session()
+    assert service.send(command(0.01), tagger) is None
+    state = service.joints(lambda message: message["header"]["frame_id"] == f"bam1 s={tagger.session} q=1")
     np.testing.assert_allclose(state["position"], HOME[0] + 0.01)
     assert abs(state["header"]["stamp"]["sec"] - time.time()) < 10
     assert service.robot.state.stamp == pytest.approx(0.05)
@@ -206,7 +225,7 @@ def test_in_real_time_states_come_with_or_without_commands(serve, bus):
         assert bus.news.wait_for(lambda: service.robot.state.stamp[0] > stamp, 10)
 
 
-def refused(service, tagger):
+def refused():
     return [
         ([1.0, 2.0], f"ProtocolError: {ARM}: data must have 6 (", "not 2."),
         ([None] + [0.0] * 5, f"ProtocolError: {ARM}: data[0] must be a finite number, not null.", ""),
@@ -220,9 +239,9 @@ def refused(service, tagger):
     ]
 
 
-def test_bad_commands_are_refused_and_the_robot_does_not_move(serve, bus, tagger):
+def test_bad_commands_are_refused_and_the_robot_does_not_move(serve, bus):
     service = serve()
-    for data, begin, end in refused(service, tagger):
+    for data, begin, end in refused():
         text = bus.say(ARM, {"data": data})
         assert text.startswith(begin)
         assert text.endswith(end)
@@ -230,16 +249,97 @@ def test_bad_commands_are_refused_and_the_robot_does_not_move(serve, bus, tagger
     assert service.lease.holder is None
 
 
-def test_old_commands_are_refused(serve, tagger):
+def test_old_commands_are_refused(serve):
     service = serve()
+    tagger = service.session()
     first, second = tagger.next(1, 0.1), tagger.next(1, 0.1)
-    assert service.send(command(0.01), second) is None
-    assert service.send(command(0.5), first) == "RemoteError: old message: number 1 after number 2"
+    assert service.send(command(0.01), tagger, tag=second) is None
+    assert service.send(command(0.5), tagger, tag=first) == "RemoteError: old message: number 1 after number 2"
     late = replace(second, sequence=9, sent=second.sent - 5.0, deadline=second.sent - 4.9)
-    assert service.send(command(0.5), late).startswith("RemoteError: expired: ")
-    assert service.send(command(0.02), replace(tagger.next(2, 0.1), sequence=10)) is None
+    assert service.send(command(0.5), tagger, tag=late).startswith("RemoteError: expired: ")
+    assert service.send(command(0.02), tagger, tag=replace(tagger.next(2, 0.1), sequence=10)) is None
     old = replace(tagger.next(1, 0.1), sequence=11)
-    assert service.send(command(0.5), old) == "RemoteError: old connection: epoch 1, and epoch 2 is there"
+    assert service.send(command(0.5), tagger, tag=old) == ("RemoteError: old connection: epoch 1, and epoch 2 is there")
+
+
+def forgeries(service, tagger, heard):
+    """Messages of somebody who has heard everything but the key: (what it is, messages, the refusal)."""
+    tag = tagger.next(1, 5.0)
+    ahead = replace(tag, sequence=tag.sequence + 10**6)
+    (_, _, gripper), (arm, _, message) = heard
+    moved = {**message, "data": [value + 1.0 for value in message["data"]]}
+    other = Tagger(session=tagger.session, key=bytes(32))
+    wrong = f"RemoteError: session {tagger.session}: the signature of a message on {arm} is wrong"
+    unsigned = encode_command(UR5E, service.robot.spec, command(0.5), ahead)[1][2]
+    guessed = encode_command(UR5E, service.robot.spec, command(0.5), ahead, sign=other.sign)[1][2]
+    label = message["layout"]["dim"][0]["label"].replace(" q=1 ", " q=1000000 ")
+    counted = {**message, "layout": {**message["layout"], "dim": [{**message["layout"]["dim"][0], "label": label}]}}
+    elsewhere = {**moved, "layout": gripper["layout"]}
+    return arm, {
+        "the tag without a signature": (unsigned, wrong),
+        "a guessed key": (guessed, wrong),
+        "the signature with other numbers": (moved, wrong),
+        "the signature with another counter": (counted, wrong),
+        "the signature of another topic": (elsewhere, wrong),
+    }
+
+
+@pytest.mark.parametrize("driver", ["a", ""])
+def test_nothing_that_a_watcher_can_send_is_executed(serve, bus, driver):
+    """On the embedded server, and through somebody else's bridge, where all senders are nameless."""
+    service = serve()
+    tagger = service.session(driver)
+    heard = encode_command(UR5E, service.robot.spec, command(0.01), tagger.next(1, 5.0), sign=tagger.sign)
+    assert [bus.say(topic, message, driver) for topic, _, message in heard] == [None, None]
+    service.joints(lambda message: message["header"]["frame_id"] == f"bam1 s={tagger.session} q=1")
+    stamp = service.robot.state.stamp[0]
+    arm, forged = forgeries(service, tagger, heard)
+    for what, (message, text) in forged.items():
+        assert bus.say(arm, message, driver and "b") == text, what
+    replayed = bus.say(arm, heard[1][2], driver and "b")
+    other, old = f"session {tagger.session} is of another connection", "old message: number 1 after number 1"
+    assert replayed == f"RemoteError: {other if driver else old}"
+    assert bus.say(arm, {"data": [0.0] * 6}, driver and "b").startswith("NotInCommand: ")
+    assert service.robot.state.stamp[0] == stamp
+    assert service.send(command(0.02), tagger, driver) is None
+
+
+def test_a_session_that_nobody_opened_is_told_the_remedy(serve, tagger):
+    service = serve()
+    assert service.send(command(0.5), tagger) == (
+        f"RemoteError: session {tagger.session} is not open here: reset(), which opens one at /bam/session; "
+        "both sides must be of one version of bam-train"
+    )
+
+
+def test_who_drives_keeps_command_by_signs_of_life_and_leaves_by_a_word(serve, bus):
+    now = [0.0]
+    service = serve(lease=CommandLease(2.0, lambda: now[0]))
+    tagger = service.session("")
+    assert service.send(command(0.01), tagger, "") is None
+    for _ in range(10):
+        now[0] += 1.0
+        assert service.say("renew", tagger, "") is None
+    assert service.send(command(0.02), caller="b").startswith("NotInCommand: ")
+    forger = Tagger(session=tagger.session, key=bytes(32))
+    wrong = f"RemoteError: session {tagger.session}: the signature of a message on /bam/lease is wrong"
+    assert [service.say(word, forger, "") for word in ("renew", "leave")] == [wrong, wrong]
+    assert bus.say(LEASE_TOPIC, {"data": "leave"}, "b") == (
+        "ProtocolError: /bam/lease: expected renew or leave and a signed tag."
+    )
+    assert service.say("leave", tagger, "") is None
+    assert service.robot._resting
+    assert service.lease.holder is None
+    assert "is not open here" in service.say("renew", tagger, "")
+
+
+def test_a_dead_driver_loses_command_soon(serve):
+    now = [0.0]
+    service = serve(lease=CommandLease(2.0, lambda: now[0]))
+    assert service.send(command(0.01), service.session(""), "") is None
+    now[0] += 2.1
+    assert service.send(command(0.02), caller="b") is None
+    assert service.lease.holder == "b:1"
 
 
 def test_one_client_is_in_command_and_the_others_are_told(serve, bus):
@@ -254,23 +354,32 @@ def test_one_client_is_in_command_and_the_others_are_told(serve, bus):
     assert service.lease.holder == "b:1"
 
 
-def test_a_session_is_one_client_on_both_of_its_connections(serve, bus, tagger):
+def test_a_session_ends_with_the_connection_that_opened_it(serve, bus):
     service = serve()
-    assert service.send(command(0.01), tagger.next(1, 0.1), "control") is None
-    assert service.send(command(0.02), tagger.next(1, 0.1), "halt") is None
+    tagger = service.session("control")
+    assert service.send(command(0.01), tagger, "control") is None
     bus.leave("halt")
     assert service.lease.holder == f"session {tagger.session}"
     bus.leave("control")
     assert service.lease.holder is None
+    assert "is not open here" in service.send(command(0.02), tagger, "again")
 
 
-def test_a_refusal_does_not_tell_the_session_of_who_is_in_command(serve, bus, tagger):
+def test_who_comes_back_leaves_over_the_new_connection(serve):
+    """The end of the old one may come late."""
     service = serve()
-    assert service.send(command(0.01), tagger.next(1, 0.1), "a") is None
+    tagger = service.session("old")
+    assert service.send(command(0.01), tagger, "old") is None
+    assert service.say("leave", tagger, "new") is None
+    assert service.send(command(0.02), service.session("new"), "new") is None
+
+
+def test_others_are_told_the_address_of_who_is_in_command(serve, bus):
+    service = serve()
+    assert service.send(command(0.01), service.session(), "a") is None
     assert service.send(command(0.02), caller="b") == (
         "NotInCommand: a:1 is in command, not b:1; it passes on when a:1 leaves or is silent for 5 s."
     )
-    assert tagger.session not in scene(bus, {}, "b")["error"]
 
 
 def test_what_a_client_sent_does_not_go_on_under_the_next_one(serve, bus):
@@ -301,14 +410,15 @@ def test_anybody_may_halt(serve, bus):
     assert service.lease.holder == "a:1"
 
 
-def test_a_command_that_a_halt_overtakes_is_answered_and_moves_nothing(serve, bus, tagger):
+def test_a_command_that_a_halt_overtakes_is_answered_and_moves_nothing(serve, bus):
     """Who waits for the state behind it would wait for nothing."""
-    service, tag = serve(), tagger.next(1, 5.0)
+    service = serve()
+    tagger = service.session()
     service.service.clock.stop()  # the command waits for it
-    assert service.send(command(0.5), tag, "a") is None
+    assert service.send(command(0.5), tagger, "a") is None
     assert bus.say("/bam/halt", {}, "somebody") is None
     service.service._tick_lockstep()
-    assert service.joints()["header"]["frame_id"] == tag.to_text()
+    assert service.joints()["header"]["frame_id"] == f"bam1 s={tagger.session} q=1"
     assert service.robot.state.stamp == 0.0
     assert service.robot._resting
 
@@ -359,7 +469,6 @@ def test_the_scene_can_be_set(serve, bus):
         ({"object_pose": [1.0, "x", 0.0]}, "object_pose[1] must be a finite number, not 'x'."),
         ({"seeds": [-1]}, "seeds must be one number, 0 or more, not [-1]."),
         ({"seeds": [1.5]}, "seeds must be one number, 0 or more, not [1.5]."),
-        ({"session": 3}, "session must be text, not 3."),
     ],
 )
 def test_a_wrong_scene_is_refused(serve, bus, payload, text):
@@ -367,13 +476,21 @@ def test_a_wrong_scene_is_refused(serve, bus, payload, text):
     assert scene(bus, payload) == {"id": "1", "error": text, "kind": "ProtocolError"}
 
 
-def test_only_the_client_in_command_sets_the_scene(serve, bus, tagger):
+def test_only_the_client_in_command_sets_the_scene(serve, bus):
     service = serve()
-    service.send(command(), tagger.next(1, 0.1), "a")
+    tagger = service.session()
+    service.send(command(), tagger, "a")
     assert scene(bus, {}, "b")["kind"] == "NotInCommand"
-    assert scene(bus, {"session": tagger.session}, "c", "2") == {"id": "2", "payload": {}}
-    bus.leave("a")
-    assert service.lease.holder == f"session {tagger.session}"
+    tag = tagger.next(1, 5.0)
+    request = {"id": f"{tagger.session}-2", "payload": {}}
+    content = json.dumps(request, separators=(",", ":")).encode()
+    signed = {**request, "tag": tagger.sign(tag, "/bam/scene", content)}
+    bus.say("/bam/scene/request", {"data": json.dumps(signed)}, "a")
+    bus.wait_for("/bam/scene/reply", lambda message: message["data"] == json.dumps(request, separators=(",", ":")))
+    forged = {**signed, "payload": {"seeds": [7]}}
+    bus.say("/bam/scene/request", {"data": json.dumps(forged)}, "a")
+    text = f"session {tagger.session}: the signature of a message on /bam/scene is wrong"
+    bus.wait_for("/bam/scene/reply", lambda message: text in message["data"])
 
 
 def test_a_scene_takes_command(serve, bus):
@@ -424,10 +541,10 @@ def test_stamps_are_as_the_bus_spells_them(serve, bus):
     assert serve().joints()["header"]["stamp"] == {"secs": 1, "nsecs": 2}
 
 
-def test_the_tag_of_the_last_command_stays_until_command_changes(serve, bus, tagger):
+def test_the_tag_of_the_last_command_stays_until_command_changes(serve, bus):
     service = serve()
-    service.send(command(), tagger.next(1, 0.1), "a")
-    service.joints(lambda message: read_tag(message["header"]["frame_id"]) is not None)
+    service.send(command(), service.session(), "a")
+    service.joints(lambda message: read_echo(message["header"]["frame_id"]) is not None)
     bus.leave("a")
     count = len(bus.published)
     with bus.news:

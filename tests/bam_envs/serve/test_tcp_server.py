@@ -1,5 +1,6 @@
 """The TCP server, whatever its clients do."""
 
+import contextlib
 import random
 import socket
 import threading
@@ -134,15 +135,65 @@ def test_clients_are_told_who_is_in_command(client):
     two.reset()
 
 
-def test_command_can_be_taken(client, env):
-    one, two = client(), client(take=True)
+def test_command_can_be_taken_by_an_operator(env):
+    with TcpServer(EnvServer(env), token="secret", operator_token="mine") as server:
+        one, thief, two = (
+            TcpTransport(server.url, token=token, take=take)
+            for token, take in (("secret", False), ("secret", True), ("mine", True))
+        )
+        one.connect(), two.connect()
+        one.reset()
+        with pytest.raises(NotInCommand, match="Taking it by force needs the operator's token"):
+            thief.reset()
+        two.reset()
+        with pytest.raises(NotInCommand):
+            one.step(ACTION)
+        two.step(ACTION)
+        assert len(env.seen) == 1
+        for each in (one, thief, two):
+            each.close()
+
+
+def test_a_silent_client_keeps_command_while_its_connection_is_there(server, client, env):
+    one, two = client(), client()
     one.connect(), two.connect()
     one.reset()
-    two.reset()
+    server.server.lease._clock = lambda: 1e9
     with pytest.raises(NotInCommand):
-        one.step(ACTION)
-    two.step(ACTION)
-    assert len(env.seen) == 1
+        two.reset()
+
+
+def test_connections_that_say_nothing_keep_nobody_out(server, client):
+    silent = [socket.create_connection((server.host, server.port)) for _ in range(80)]
+    client().connect()
+    for one in silent:
+        one.close()
+
+
+def test_guessing_tokens_is_slow(env):
+    with TcpServer(EnvServer(env), token="secret") as server:
+        server._guesses._clock = lambda: 100.0
+        said = []
+        for _ in range(6):
+            with pytest.raises(NoServer) as caught:
+                TcpTransport(server.url, token="guess").connect()
+            said.append(str(caught.value).removeprefix(f"{server.url}: "))
+        wrong = "The token is wrong; give the one that the server was started with (--token-file)."
+        assert said == [wrong] * 4 + ["Too many wrong tokens came from this address; try again in a second."] * 2
+        server._guesses._clock = lambda: 101.0
+        with contextlib.closing(TcpTransport(server.url, token="secret")) as owner:
+            owner.connect()
+
+
+def test_an_array_of_a_million_dimensions_is_refused_at_once(stranger):
+    one = stranger()
+    one.hello()
+    content = msgpack.packb(["<f4", [2**63 - 1] * 90_000, 0])
+    header = msgpack.packb(["step", ["s1", 1, 1, 0.0, 1.0], msgpack.ExtType(1, content)])
+    one.socket.sendall(b"bam\x01" + len(header).to_bytes(4, "big") + bytes(4) + header)
+    assert one.frames.receive(time.monotonic() + PATIENCE)[2] == (
+        "A message is damaged: an array has at most 32 dimensions, not 90000."
+    )
 
 
 def test_a_client_that_vanishes_gives_command_back(server, stranger, client):
@@ -251,7 +302,7 @@ def test_a_request_of_100_mb_ends_its_connection_alone(server, stranger, client)
     one.hello()
     one.socket.sendall(b"bam\x01" + (2**31).to_bytes(4, "big") + bytes(4))
     assert one.frames.receive(time.monotonic() + PATIENCE)[2] == (
-        "A message of 2147483648 bytes is too large; 268435456 are allowed."
+        "A message of 2147483648 bytes is too large; 1048608 are allowed."
     )
     two = client()
     two.connect()

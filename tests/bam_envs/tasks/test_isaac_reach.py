@@ -13,7 +13,7 @@ from bam_envs.kinematics import UR10, quaternions
 from bam_envs.robots.robot import RobotState
 from bam_envs.robots.simulated.ur import isaac_arm
 from bam_envs.robots.ur import ur_model
-from bam_envs.tasks.isaac_reach import DEFAULT, TOOL1, IsaacReachTask
+from bam_envs.tasks.isaac_reach import DEFAULT, EE_LINK, TOOL1, IsaacReachTask
 from bam_envs.testing import TaskContract
 
 ROW = np.zeros(1, np.int64)
@@ -48,8 +48,8 @@ class TestIsaacReachParity(IsaacReach):
         np.testing.assert_array_equal(task.action_space.high, ((LIMITS - DEFAULT) / 0.5).astype(np.float32))
         np.testing.assert_array_equal(task.action_space.low, ((-LIMITS - DEFAULT) / 0.5).astype(np.float32))
         inf = math.inf
-        high = [*(1.1 * LIMITS - DEFAULT), *[inf] * 9, *[1.0] * 4, *task.action_space.high]
-        low = [*(-1.1 * LIMITS - DEFAULT), *[-inf] * 9, *[-1.0] * 4, *task.action_space.low]
+        high = [*(1.2 * LIMITS - DEFAULT), *[inf] * 9, *[1.0] * 4, *task.action_space.high]
+        low = [*(-1.2 * LIMITS - DEFAULT), *[-inf] * 9, *[-1.0] * 4, *task.action_space.low]
         np.testing.assert_array_equal(task.observation_space.high, np.array(high, np.float32))
         np.testing.assert_array_equal(task.observation_space.low, np.array(low, np.float32))
         assert len({label.name for label in task.observation_labels}) == 25
@@ -72,27 +72,47 @@ def state(joints, velocity=(0.0,) * 6, collision=False):
     return RobotState(signals, np.zeros(1), np.zeros((1, 6)), {"collision": np.array([collision])})
 
 
-def pose_of(joints):
-    """Position of tool1, and its axes."""
+def pose_of(joints, parity=False):
+    """Position of the frame at the flange, and its axes."""
     position, rotation = UR10.flange_pose(np.array([joints]))
-    return position[0], rotation[0] @ TOOL1
+    return position[0], rotation[0] @ (TOOL1 if parity else EE_LINK)
 
 
-def facing(joints, forward=0.0, turned=0.0):
+def facing(joints, forward=0.0, turned=0.0, parity=False):
     """A target that many metres before the flange at `joints`, turned about the flange's axis [rad]."""
-    position, axes = pose_of(joints)
+    position, axes = pose_of(joints, parity)
     sine, cosine = math.sin(turned), math.cos(turned)
     rotation = axes @ np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
     return [*(position + forward * axes[:, 0]), *quaternions(rotation[None])[0]]
 
 
-def test_tool1_points_out_of_the_flange():
+@pytest.mark.parametrize("parity", [False, True])
+def test_the_frame_points_out_of_the_flange(parity):
     _, rotation = UR10.flange_pose(np.array([DEFAULT]))
-    _, axes = pose_of(DEFAULT)
+    _, axes = pose_of(DEFAULT, parity)
     np.testing.assert_array_equal(axes[:, 0], rotation[0, :, 2])
-    np.testing.assert_allclose(np.linalg.det(TOOL1), 1.0)
+    np.testing.assert_allclose(np.linalg.det(axes), 1.0)
     down = UR10.reach_down(np.array([[0.5, 0.1, 0.3]]), np.zeros(1))[0]
-    np.testing.assert_allclose(pose_of(down)[1][:, 0], [0, 0, -1], atol=1e-12)
+    np.testing.assert_allclose(pose_of(down, parity)[1][:, 0], [0, 0, -1], atol=1e-12)
+
+
+def test_tool1_is_that_of_robo_gyms_launch_file():
+    """``static_transform_publisher 0 0 0 3.1415 -1.5707 0 tool0 tool1``: yaw, pitch, roll."""
+    (yaw_sine, yaw_cosine), (sine, cosine) = ((math.sin(a), math.cos(a)) for a in (3.1415, -1.5707))
+    yaw = np.array([[yaw_cosine, -yaw_sine, 0], [yaw_sine, yaw_cosine, 0], [0, 0, 1]])
+    pitch = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+    np.testing.assert_allclose(TOOL1, yaw @ pitch, atol=2e-4)
+
+
+def test_with_parity_the_frame_is_robo_gyms():
+    """What is at the target by default is a quarter turn beside it, as in robo-gym; its wire state says the same."""
+    target = {"ee_target_pose": facing(DEFAULT)}
+    for parity, angle in ((False, 0.0), (True, math.pi / 2)):
+        task = began(target, parity=parity)
+        np.testing.assert_allclose(task.score(state(DEFAULT), QUIET).info["dist_rot"], [angle], atol=1e-7)
+        wire = task.rs_state(state(DEFAULT))[0]
+        turned = quaternions(pose_of(DEFAULT, parity=True)[1][None])[0]
+        assert [wire[f"ee_to_ref_rotation_{axis}"] for axis in "xyzw"] == turned.tolist()
 
 
 def test_targets():
@@ -126,7 +146,7 @@ def test_rewards(parity):
         (0.0199, 0.0499, 2.0, True, "success"),
         (0.0199, 0.0501, -0.0000995 - 0.002505, False, ""),
     ):
-        task = began({"ee_target_pose": facing(DEFAULT, forward, turned)}, parity=parity)
+        task = began({"ee_target_pose": facing(DEFAULT, forward, turned, parity)}, parity=parity)
         score = task.score(state(DEFAULT), QUIET)
         assert score.reward[0] == pytest.approx(reward, abs=1e-9)
         assert (bool(score.terminated[0]), score.info["final_status"][0]) == (terminated, status)
@@ -158,7 +178,7 @@ def test_the_time_limit():
 def test_an_arrival_in_the_last_step():
     """robo-gym pays for it, and says that the time is over."""
     for parity, status in ((False, "success"), (True, "max_steps_exceeded")):
-        task = began({"ee_target_pose": facing(DEFAULT)}, parity=parity)
+        task = began({"ee_target_pose": facing(DEFAULT, parity=parity)}, parity=parity)
         task.steps[:] = 599
         score = task.score(state(DEFAULT), QUIET)
         assert (score.reward[0], score.terminated[0], score.success[0]) == (2.0, True, True)
@@ -204,7 +224,7 @@ def test_it_goes_on_from_where_it_ended():
             ({"continue_except_collision": False}, {}, DEFAULT),
         ):
             task = IsaacReachTask(parity=parity, **options)
-            first = task.begin(ROW, [rng], {"ee_target_pose": facing(ended)}).signals["joint_position"]
+            first = task.begin(ROW, [rng], {"ee_target_pose": facing(ended, parity=parity)}).signals["joint_position"]
             np.testing.assert_array_equal(first[0], DEFAULT)
             assert task.score(state(ended, **end), QUIET).terminated[0]
             np.testing.assert_array_equal(task.begin(ROW, [rng]).signals["joint_position"][0], start)
@@ -261,7 +281,7 @@ def test_options():
 
 
 def test_wire_states():
-    task = began({"ee_target_pose": facing(DEFAULT)}, rs_state_to_info=True)
+    task = began({"ee_target_pose": facing(DEFAULT, parity=True)}, rs_state_to_info=True)
     wire = pickle.loads(pickle.dumps(task.score(state(DEFAULT), QUIET).info["rs_state"][0]))
     assert len(wire) == 27
     assert {type(value) for value in wire.values()} == {float}

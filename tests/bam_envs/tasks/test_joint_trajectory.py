@@ -1,6 +1,7 @@
 """Recorded joint trajectories."""
 
 import json
+import os
 import runpy
 from pathlib import Path
 
@@ -79,6 +80,16 @@ def test_files_that_are_none(tmp_path, content, text):
     with pytest.raises(InvalidValue) as caught:
         load_trajectory(path, LIMITS)
     assert str(caught.value) == text.format(path=path)
+
+
+def test_files_without_an_end(tmp_path):
+    large, pipe = tmp_path / "large.json", tmp_path / "pipe.json"
+    with large.open("wb") as file:
+        file.truncate(2**24 + 1)
+    os.mkfifo(pipe)
+    for path, found in ((large, "has 16777217 bytes, expected at most 16777216"), (pipe, "is no plain file")):
+        with pytest.raises(InvalidValue, match=f"^The trajectory {path} {found}"):
+            load_trajectory(path, LIMITS)
 
 
 @pytest.mark.parametrize("file", [5, True, b"track.json", ["track.json"]])

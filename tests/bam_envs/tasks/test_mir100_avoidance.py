@@ -10,7 +10,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import bam_envs  # noqa: F401 - registers the environments
-from bam_envs.errors import InvalidValue
+from bam_envs.errors import InvalidValue, ProtocolError
 from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS
 from bam_envs.robots.robot import RobotState
 from bam_envs.tasks.mir100_avoidance import BEAMS, BOXES, Mir100AvoidanceTask
@@ -84,6 +84,45 @@ def test_a_short_ray_is_a_collision(parity, reward, ray):
 def test_a_touch_is_a_collision(parity):
     score = begun(parity=parity).score(at(0.0, -2.5, touching=True), STILL)
     assert (score.terminated.item(), score.info["final_status"].item()) == (True, "collision")
+
+
+@pytest.mark.parametrize(
+    ("parity", "rays", "collides"),
+    [
+        (False, {540: math.nan}, True),
+        (True, {540: math.nan}, False),
+        (True, {540: math.nan, 541: 0.1}, True),
+        (True, {0: math.nan, 541: 0.1}, False),  # Python's min() gives the first, which is not a number
+        (True, dict.fromkeys(range(FRONT_RAYS + BACK_RAYS), math.nan), False),
+    ],
+)
+def test_rays_that_are_not_numbers(parity, rays, collides):
+    """As near as can be; in robo-gym none at all, and observed as 0."""
+    task, scan = begun(parity=parity), np.full(FRONT_RAYS + BACK_RAYS, 5.0)
+    for ray, metres in rays.items():
+        scan[ray] = metres
+    here = at(0.0, -2.5, scan=scan, touching=False)
+    assert task.score(here, STILL).terminated.tolist() == [collides]
+    seen = task.observe(here)[0, 4:]
+    if parity:
+        np.testing.assert_array_equal(seen, np.float32(np.nan_to_num(scan[BEAMS])))
+    else:
+        assert (seen.max(), np.isfinite(seen).all()) == (1.0, True)
+
+
+def test_what_is_outside_robo_gyms_space_is_no_observation():
+    """robo-gym raises InvalidStateError."""
+    far, fast = at(0.0, -2.5, scan=near(67, 29.5)), at(0.0, -2.5)
+    fast.signals["base_velocity"][0, 0] = 1.2
+    more = "with parity=True there is no observation outside its space; leave parity out, or look at the sensor."
+    for state, text in (
+        (far, "range_67 is 29.5 m, expected 0 to 29, as in robo-gym: "),
+        (fast, "linear_velocity is 1.2 m/s, expected -1.1 to 1.1, as in robo-gym: "),
+    ):
+        with pytest.raises(ProtocolError) as caught:
+            begun(parity=True).observe(state)
+        assert str(caught.value) == text + more
+        assert np.isfinite(begun().observe(state)).all()
 
 
 def test_corners_near_the_middle_of_a_box_in_parity():

@@ -5,6 +5,7 @@ import pytest
 
 from bam_envs.errors import InvalidValue, UnknownName
 from bam_envs.robots.robot import RobotState
+from bam_envs.robots.ur import START as STRAIGHT
 from bam_envs.robots.ur import UR_MODELS
 from bam_envs.tasks.ur_reach import START, UrReachTask, workspace_point
 
@@ -217,21 +218,30 @@ def test_random_starts(make):
     assert (np.abs(env.unwrapped.state.signals["joint_position"][0] - given) <= [1.5, 0.25, 0.5, 1.0, 0.4, 3.14]).all()
 
 
-@pytest.mark.parametrize(("parity", "after_a_failure"), [(False, False), (True, True)])
-def test_going_on_after_a_success(make, parity, after_a_failure):
-    """robo-gym goes on from the last success, whatever came after it; ours only from the last episode."""
-    env = make("bam/ur-reach-v0", parity=parity)
-    going_on = {"continue_on_success": True, "ee_target_pose": [*FLANGE, 0, 0, 0]}
+@pytest.mark.parametrize(
+    ("options", "start", "after_a_failure"),
+    [
+        ({}, START, False),
+        ({"parity": True}, START, True),
+        ({"modular": True}, START, False),
+        ({"modular": True, "parity": True}, STRAIGHT, False),
+    ],
+)
+def test_going_on_after_a_success(make, options, start, after_a_failure):
+    """The older of robo-gym's two goes on from the last success, whatever came after it; else from the last episode."""
+    env = make("bam/ur-reach-v0", **options)
+    flange = UR5.geometry.tool_position(np.array([start]))[0].tolist()
+    going_on = {"continue_on_success": True, "ee_target_pose": [*flange, 0, 0, 0]}
     env.reset(options=going_on)
-    np.testing.assert_array_equal(env.unwrapped.state.signals["joint_position"], [START])
+    np.testing.assert_array_equal(env.unwrapped.state.signals["joint_position"], [start])
     assert env.step(ONES)[2]
     end = env.unwrapped.last_state.signals["joint_position"].copy()
-    assert (end != START).any()
+    assert (end != start).any()
     env.reset(options=going_on | {"ee_target_pose": far_pose()})
     np.testing.assert_array_equal(env.unwrapped.state.signals["joint_position"], end)
     env.step(ONES)
     env.reset(options=going_on)
-    expected = end if after_a_failure else [START]
+    expected = end if after_a_failure else [start]
     np.testing.assert_array_equal(env.unwrapped.state.signals["joint_position"], expected)
 
 
@@ -310,8 +320,8 @@ def test_the_joints_of_a_place_bring_the_flange_there(make_rows, name):
 def test_modular_observations_end_with_the_last_action_of_the_joints_that_move(make, parity):
     env = make("bam/ur-reach-v0", parity=parity, modular=True, fix_base=True)
     env.reset(options={"ee_target_pose": far_pose()})
-    plain = make("bam/ur-reach-v0", parity=parity, fix_base=True)
-    plain.reset(options={"ee_target_pose": far_pose()})
+    plain = make("bam/ur-reach-v0", parity=parity, fix_base=True, restrict_wrist_1=not parity)
+    plain.reset(options={"ee_target_pose": far_pose(), "joint_positions": STRAIGHT if parity else START})
     for k in range(1, 4):
         action = np.full(4, 0.1 * k, np.float32)
         observation, reward, *_, info = env.step(action)
@@ -323,6 +333,17 @@ def test_modular_observations_end_with_the_last_action_of_the_joints_that_move(m
         f"action_{one}_joint" for one in ("shoulder_lift", "elbow", "wrist_1", "wrist_2")
     ]
     assert env.observation_space.high[21:].tolist() == [1.0] * 4
+
+
+def test_wrist_1_of_the_modular_environment():
+    """Of robo-gym's it starts at 0, and an action reaches the whole of its range."""
+    for parity, start, end in ((False, START, -3.48), (True, STRAIGHT, -2 * np.pi)):
+        task = UrReachTask(modular=True, parity=parity)
+        begun = task.begin(np.arange(1), [np.random.default_rng(0)]).signals["joint_position"]
+        np.testing.assert_array_equal(begun, [start])
+        near = end + 0.01
+        command = task.command(np.array([[0, 0, 0, -1, 0]], np.float32), state_at([0, 0, 0, near, 0, 0]))
+        assert command[0, 3] - near == pytest.approx(-0.01 / 5)  # a fifth of the way in a step
 
 
 def test_modular_targets_are_the_origin_in_parity():

@@ -10,7 +10,7 @@ from bam_envs.transports.rosbridge import RosbridgeTransport
 
 @pytest.fixture
 def server():
-    with BridgeServer(port=0) as server:
+    with BridgeServer(port=0, operator_token="operator") as server:
         yield server
 
 

@@ -95,14 +95,22 @@ def test_another_environment_after_a_cut_is_told(served, open_to, server):
         transport.close()
 
 
+NO_FORCE = (
+    r"for 2 s\. Taking it by force needs the operator's token: start bam-serve with --operator-token-file, and show "
+    r"that one\.$"
+)
+
+
 def test_one_client_is_in_command(served, open_to):
     served(MirrorEnv(spaces.Discrete(3)))
-    ann, bob, eve = open_to(name="ann"), open_to(name="bob"), open_to(name="eve", take=True)
+    ann, bob, eve = open_to(name="ann"), open_to(name="bob"), open_to(name="eve", take=True, token="operator")
     ann.reset()
-    with pytest.raises(NotInCommand, match=r"^ann#.* is in command, not bob#.*"):
+    with pytest.raises(NotInCommand, match=r"^ann \(127\.0\.0\.1:\d+\) is in command, not bob \(127\.0\.0\.1:\d+\)"):
         bob.reset()
+    with pytest.raises(NotInCommand, match=NO_FORCE):
+        open_to(name="bob", take=True).reset()
     eve.reset()
-    with pytest.raises(NotInCommand, match=r"^eve#.* is in command, not ann#.*"):
+    with pytest.raises(NotInCommand, match=r"^eve \(127\.0\.0\.1:\d+\) is in command, not ann#.*"):
         ann.step(1)
     eve.close()
     bob.reset()

@@ -190,6 +190,16 @@ def test_a_request_without_an_id_is_refused_at_the_topic(pair):
         bus.publish("/bam/scene/request", {"data": "{}"})
 
 
+def test_a_request_with_too_much_in_it_is_refused_before_it_is_read(pair):
+    _, bus, _ = pair(lambda payload: {})
+    for data, text in (
+        ("[" + "{}," * 500_000 + "{}]", "expected at most 100000 values, found more"),
+        ("[" * 1000 + "]" * 1000, "expected at most 32 lists and objects in one another, found more"),
+    ):
+        with pytest.raises(ProtocolError, match=f"^/bam/scene/request must be a JSON object: {text}"):
+            bus.publish("/bam/scene/request", {"data": data})
+
+
 def test_closing_is_possible_twice(pair):
     rpc, bus, _ = pair(lambda payload: {})
     rpc.call({}, 5)

@@ -106,13 +106,18 @@ def test_somebody_listens_and_says_nothing():
     with socket.create_server(("127.0.0.1", 0)) as silent:
         url = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
         begun = time.monotonic()
-        assert refused(url, connect_timeout=0.05).startswith("not a bam-serve TCP server: timed out. Start one: ")
+        assert refused(url, connect_timeout=0.05).startswith(
+            "not a bam-serve TCP server: timed out. If it is rosbridge, use ws://; "
+        )
         assert time.monotonic() - begun < 3
 
 
 def test_somebody_who_hangs_up():
     with answering(hang_up) as (url, _):
-        assert refused(url).startswith("not a bam-serve TCP server: the other end closed the connection. Start one: ")
+        assert refused(url) == (
+            "not a bam-serve TCP server: the other end closed the connection. If it is rosbridge, use ws://; "
+            "else start one at a free port: bam-serve --env bam/pick --tcp PORT"
+        )
 
 
 def test_a_server_of_http():

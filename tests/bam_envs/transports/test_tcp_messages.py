@@ -33,7 +33,8 @@ def test_a_hello():
 @pytest.mark.parametrize(
     "tree",
     [None, [], ["hello"], ["hello", 3], ["hello", {}], ["hallo", HELLO.to_tree()[1]], [np.zeros(2), {}]]
-    + [["hello", {**HELLO.to_tree()[1], key: None}] for key in ("session", "epoch", "name", "token", "env_id")],
+    + [["hello", {**HELLO.to_tree()[1], key: None}] for key in ("session", "epoch", "name", "token", "env_id")]
+    + [["hello", {**HELLO.to_tree()[1], "session": ""}]],  # the session of everybody who has not said hello yet
 )
 def test_what_is_no_hello(tree):
     with pytest.raises(ProtocolError) as caught:

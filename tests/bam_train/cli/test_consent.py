@@ -23,8 +23,13 @@ class RealArm:
 
     info = SimpleNamespace(simulated=False, text="ur5e at ws://10.0.0.5:9090")
 
+    trouble = None
+
     def report(self):
         return GUARDS
+
+    def not_ready(self):
+        return self.trouble
 
 
 def consent(monkeypatch, robot, answer=None, yes=False, plan=()):
@@ -85,6 +90,16 @@ def test_nobody_to_ask_is_no(monkeypatch):
         consent(monkeypatch, RealArm())
     assert str(caught.value) == message
     consent(monkeypatch, RealArm(), yes=True)
+
+
+def test_nobody_is_asked_about_a_robot_that_is_not_ready(monkeypatch):
+    robot = RealArm()
+    robot.trouble = "protective stop (/io_and_status_controller/safety_mode)"
+    with pytest.raises(SettingsError) as caught:
+        consent(monkeypatch, robot, yes=True)
+    assert str(caught.value) == (
+        "not ready: protective stop (/io_and_status_controller/safety_mode); nothing has moved"
+    )
 
 
 def test_simulated_robots_move_without_asking(monkeypatch, capsys):

@@ -1,9 +1,11 @@
 import io
 import json
 import os
+import pkgutil
 import signal
 import subprocess
 import sys
+import weakref
 
 import gymnasium as gym
 import pytest
@@ -34,6 +36,7 @@ def test_report_for_programs(corridor_checkpoint, starting_cell, run):
         "target_rate_hz": None,
         "lateness_ms": None,
         "missed_ticks": 0,
+        "warnings": [],
         "seed": 7,
         "env": "test/Corridor-v0",
         "algorithm": "ppo",
@@ -72,7 +75,8 @@ def test_deadlines_are_reported(corridor_checkpoint, run):
 
 def test_the_environment_gives_the_rate(corridor_checkpoint, corridor):
     from bam_train.checkpoint import Checkpoint
-    from bam_train.cli.deploy import DeployConfig, period_of
+    from bam_train.cli.deploy import period_of
+    from bam_train.cli.deploy_config import DeployConfig
 
     path = corridor_checkpoint()
     with gym.make(corridor) as env:
@@ -100,6 +104,39 @@ def test_a_signal_still_gives_the_report(corridor_checkpoint, corridor, run, mon
     assert err == "bam-deploy: interrupted\n"
     assert (report["stop_reason"], report["episodes"]) == ("interrupted", 0)
     assert [record["end"] for record in report["per_episode"]] == ["stopped"]
+
+
+@pytest.mark.parametrize(
+    "during",
+    [
+        "tyro.cli",
+        "bam_train.environments.require_fit",
+        "bam_train.deploy.loop.Deployment.connect",
+        "bam_train.cli.deploy.require_consent",
+        "bam_train.deploy.display.PlainDisplay",
+    ],
+)
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_nothing_moves_after_a_signal_whose_exception_is_discarded(
+    corridor_checkpoint, corridor, run, monkeypatch, during, number, status
+):
+    """As in the weak reference callbacks of an import: Python prints what the handler raises there, and goes on."""
+    path, moved, called = corridor_checkpoint(), [], pkgutil.resolve_name(during)
+
+    def interrupted(*args, **kwargs):
+        passing = {number}
+        weakref.finalize(passing, signal.raise_signal, number)
+        del passing
+        return called(*args, **kwargs)
+
+    monkeypatch.setattr(sys, "unraisablehook", lambda _: None)
+    monkeypatch.setattr(during, interrupted)
+    for name in ("reset", "step"):
+        monkeypatch.setattr(corridor_class(corridor), name, lambda *_, **__: moved.append(True))
+    found, _, err = run(main, path, "--fast")
+    assert found == status
+    assert err in ("bam-deploy: interrupted\n", "bam-deploy: ended by SIGTERM\n")
+    assert moved == []
 
 
 def test_a_fault_still_gives_the_report(corridor_checkpoint, corridor, run, monkeypatch):
@@ -173,7 +210,7 @@ def test_an_environment_that_is_not_here(corridor_checkpoint, run):
     path = corridor_checkpoint(env="bam/stack-v9")
     status, out, err = run(main, path, "--fast")
     assert (status, out, err.count("\n")) == (1, "", 1)
-    assert err.startswith("bam-deploy: bam/stack-v9 cannot be made: Environment `stack` doesn't exist in namespace bam")
+    assert err.startswith(f"bam-deploy: {path}: its manifest: Unknown environment 'bam/stack-v9'. ")
 
 
 def test_a_robot_that_cannot_be_connected(corridor_checkpoint, corridor, run, monkeypatch):

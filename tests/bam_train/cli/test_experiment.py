@@ -1,14 +1,18 @@
 """What experiment scripts share: their command line, Ctrl-C, and the environment of a checkpoint."""
 
+import argparse
 import os
 import signal
+import sys
+import weakref
 from pathlib import Path
 
 import pytest
 
 from bam_envs.errors import LinkLost
 from bam_train.checkpoint import Checkpoint
-from bam_train.cli.experiment import ScriptParser, ctrl_c_asks, open_env, whole
+from bam_train.cli.experiment import ScriptParser, environment_of, open_env, require_place, signals_ask, whole
+from bam_train.cli.program import Terminated
 from bam_train.errors import SettingsError
 
 PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
@@ -53,21 +57,70 @@ def test_help_shows_the_docstring_as_it_is(parser, capsys):
     assert capsys.readouterr().out.startswith(f"usage: try.py [options]\n\n{DESCRIPTION}")
 
 
-def interrupt():
-    os.kill(os.getpid(), signal.SIGINT)
+@pytest.mark.parametrize(
+    ("number", "kind", "again"),
+    [
+        (signal.SIGINT, KeyboardInterrupt, "Ctrl-C again"),
+        (signal.SIGTERM, Terminated, "another signal"),
+        (signal.SIGHUP, Terminated, "another signal"),
+    ],
+)
+def test_the_first_signal_asks_and_leaving_does_what_it_wants(number, kind, again, capsys):
+    before = signal.getsignal(number)
+    sent = [number] * (2 if number == signal.SIGTERM else 1)  # `timeout` sends it to the process, and to its group
+    with pytest.raises(KeyboardInterrupt) as caught:
+        under_signals(*sent)
+    assert type(caught.value) is kind
+    said = f"finishing the update and saving; {again} quits at once\n"
+    assert capsys.readouterr() == ("asked\nleft\n", said)
+    assert signal.getsignal(number) is before
 
 
-def test_the_first_ctrl_c_asks_and_the_second_interrupts(capsys):
-    before = signal.getsignal(signal.SIGINT)
-    with ctrl_c_asks() as asked:
+def under_signals(*numbers):
+    """A block that is sent these."""
+    with signals_ask() as asked:
         assert not asked()
-        interrupt()
-        assert asked()
-        assert capsys.readouterr().err == "finishing the update and saving; Ctrl-C again quits at once\n"
-        with pytest.raises(KeyboardInterrupt):
-            interrupt()
-    assert asked()
-    assert signal.getsignal(signal.SIGINT) is before
+        for number in numbers:
+            os.kill(os.getpid(), number)
+        print("asked" if asked() else "not asked")
+        print("left")
+
+
+def test_the_second_signal_interrupts(capsys):
+    with pytest.raises(Terminated):
+        under_signals(signal.SIGINT, signal.SIGTERM)
+    assert capsys.readouterr().out == ""
+    under_signals()
+    assert capsys.readouterr() == ("not asked\nleft\n", "")
+
+
+@pytest.mark.parametrize(
+    ("env", "parity", "expected"),
+    [
+        (None, False, {"env": "bam/ur-reach-v0", "env_kwargs": {"ur_model": "ur5"}}),
+        (None, True, {"env": "bam/ur-reach-v0", "env_kwargs": {"ur_model": "ur5", "parity": True}}),
+        ("CartPole-v1", False, {"env": "CartPole-v1", "env_kwargs": {}}),
+    ],
+)
+def test_the_environment_that_is_asked_for(env, parity, expected):
+    args = argparse.Namespace(env=env, parity=parity)
+    assert environment_of(args, "bam/ur-reach-v0", {"ur_model": "ur5"}) == expected
+
+
+@pytest.mark.parametrize(
+    ("place", "text"),
+    [
+        (("bam/pick-v0", None, True), "--render needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set; "),
+        (("bam/pick-v0", "ws://10.0.0.5:9090", True), "--render shows the simulation here, and there is none with"),
+        (("CartPole-v1", "ws://10.0.0.5:9090", False), "CartPole-v1 has no robot that --robot could exchange; "),
+    ],
+)
+def test_a_place_that_cannot_be_is_refused_before_training(place, text, monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(SettingsError) as caught:
+        require_place(*place)
+    assert str(caught.value).startswith(text)
 
 
 def test_the_environment_of_a_checkpoint_is_closed_at_the_end():
@@ -102,6 +155,7 @@ def test_a_real_robot_does_not_move_unasked(monkeypatch, capsys):
     monkeypatch.setattr(environments, "make_env", lambda *arguments, **options: made)
     robot = made.unwrapped.robot
     robot.info = Info()
+    robot.not_ready = lambda: None
     closed = []
     monkeypatch.setattr(robot, "close", lambda: closed.append(True))
     opening = open_env(Checkpoint.open(PICK), "ws://10.0.0.5:9090", who="try", episodes=3)
@@ -111,3 +165,20 @@ def test_a_real_robot_does_not_move_unasked(monkeypatch, capsys):
     assert f"try: {PICK} will move a real robot:" in capsys.readouterr().err
     with open_env(Checkpoint.open(PICK), "ws://10.0.0.5:9090", who="try", episodes=3, yes=True) as env:
         assert env is made
+
+
+@pytest.mark.parametrize(("number", "error"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)])
+def test_nothing_moves_after_a_signal_whose_exception_is_discarded(monkeypatch, number, error):
+    from bam_train.cli.program import guarded
+
+    def lose(*_, **__):  # Python prints what the callback of a dying object raises, and goes on
+        passing = {number}
+        weakref.finalize(passing, signal.raise_signal, number)
+
+    def use():
+        with pytest.raises(error), open_env(Checkpoint.open(PICK), who="try", episodes=3):
+            pytest.fail("it went on")
+
+    monkeypatch.setattr(sys, "unraisablehook", lambda _: None)
+    monkeypatch.setattr("bam_train.environments.require_fit", lose)
+    assert guarded(use, "try.py") == 0

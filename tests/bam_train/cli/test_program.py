@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import logging
 import os
 import signal
 import subprocess
@@ -10,12 +11,15 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from bam_envs.errors import MissingExtra, UnknownName
+from bam_train.cli import console
 from bam_train.cli.console import count, duration, number, percent
 from bam_train.cli.program import Terminated, guarded, run_program, usage_error
-from bam_train.errors import OutputError
+from bam_train.errors import OutputError, SettingsError
+from bam_train.shown import rich_text, shown
 
 
 @dataclass(frozen=True)
@@ -212,6 +216,24 @@ def test_ctrl_c_while_the_command_line_is_read_is_one_line(monkeypatch, capsys):
     assert capsys.readouterr().err == "prog: interrupted\n"
 
 
+def test_ctrl_c_while_flags_are_imported_is_one_line():
+    """So nothing slow is imported before signals are answered."""
+    code = (
+        "import signal, sys\n"
+        "from bam_train.cli import deploy, eval\n"
+        "class Interrupted:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name == 'tyro': signal.raise_signal(signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Interrupted())\n"
+        "for program in (deploy, eval):\n"
+        "    try: program.main(['--help'])\n"
+        "    except SystemExit as end: print(end.code)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
+    assert (done.stdout, done.stderr) == ("130\n130\n", "bam-deploy: interrupted\nbam-eval: interrupted\n")
+
+
 def test_the_box_of_a_terminal_without_unicode_is_one_line_too():
     lines = ["+- Unrecognized options ---+", "| Unrecognized options: --qqq |", "| -------- |", "| For full helptext |"]
     box = "\n".join([*lines, "+------+"])
@@ -228,3 +250,61 @@ def test_a_full_device_behind_standard_output_is_one_line():
         )
     assert done.returncode == 1
     assert done.stderr == "bam-envs: standard output cannot be written: no space left on its device\n"
+
+
+STRANGE = "\x1b]0;title\x07\x1b[2J\x9b31m\x7f\r\n\u202egnp\u2028\ud800 é µ"
+SHOWN = r"\x1b]0;title\x07\x1b[2J\x9b31m\x7f\r\n\u202egnp\u2028\ud800 é µ"
+
+
+def test_what_acts_on_a_terminal_is_shown(capsys):
+    assert shown(STRANGE) == SHOWN
+    console.say(STRANGE)
+    console.tell(STRANGE, "next")
+    assert capsys.readouterr() == (f"{SHOWN}\nnext\n", f"{SHOWN}\n")
+
+
+def test_an_error_is_one_line_whatever_is_in_it(capsys):
+    def fail():
+        raise SettingsError(STRANGE)
+
+    assert guarded(fail, "bam-x") == 1
+    line = r"bam-x: \x1b]0;title\x07\x1b[2J\x9b31m\x7f \u202egnp \ud800 é µ"
+    assert capsys.readouterr().err == f"{line}\n"
+
+
+def test_an_error_is_no_flood(capsys):
+    def fail():
+        raise SettingsError("x" * 1_000_000)
+
+    assert guarded(fail, "bam-x") == 1
+    assert capsys.readouterr().err == f"bam-x: {'x' * 2000} ... (1000000 characters)\n"
+
+
+def test_a_rich_console_gets_plain_text(capsys, monkeypatch):
+    monkeypatch.setenv("TERM", "dumb")
+    live = console.make_console()
+    live.print(rich_text(f"[red]{STRANGE}[/red] :smile:"), soft_wrap=True)
+    assert capsys.readouterr().err == f"[red]{SHOWN}[/red] :smile:\n"
+
+
+def test_logs_and_tracebacks_are_shown(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
+    monkeypatch.setattr(logging, "lastResort", logging.StreamHandler())
+    console.show_logs_and_tracebacks()
+    record = logging.LogRecord("a", logging.WARNING, "", 1, "%s", (STRANGE,), None)
+    assert logging.lastResort.format(record) == SHOWN
+    try:
+        raise RuntimeError("\x1b[2J")
+    except RuntimeError as error:
+        sys.excepthook(type(error), error, error.__traceback__)
+        record = logging.LogRecord("a", logging.WARNING, "", 1, "failed", (), sys.exc_info())
+    assert capsys.readouterr().err.splitlines()[-1] == r"RuntimeError: \x1b[2J"
+    assert logging.lastResort.format(record).splitlines()[-1] == r"RuntimeError: \x1b[2J"
+
+
+def test_memory_that_is_not_there_is_one_line(capsys):
+    def fail():
+        np.zeros(2**62, np.int8)
+
+    assert guarded(fail, "bam-x") == 1
+    assert capsys.readouterr().err.startswith("bam-x: not enough memory: Unable to allocate 4.00 EiB for an array")

@@ -8,7 +8,8 @@ import sys
 import pytest
 
 from bam_train.cli.program import Terminated
-from bam_train.cli.serve import SignalMemory, env_kwargs, main
+from bam_train.cli.serve import env_kwargs, main
+from bam_train.cli.signal_memory import SignalMemory
 from bam_train.errors import SettingsError
 
 

@@ -1,5 +1,6 @@
 import os
 import signal
+import weakref
 
 import gymnasium as gym
 import numpy as np
@@ -8,7 +9,11 @@ import pytest
 from bam_envs.errors import LinkLost, RobotFault, SafetyStop, StaleState
 from bam_envs.robot_env import RobotEnv
 from bam_envs.robots.fake import FakeRobot
+from bam_envs.robots.safety.safe import SafeRobot
+from bam_envs.robots.simulated.arm import SimulatedArm
 from bam_envs.tasks.pick import PickTask
+from bam_envs.tasks.reach import ReachTask
+from bam_envs.testing.drivers import DrivenRobot
 from bam_train.deploy.journal import Journal, Startup
 from bam_train.deploy.loop import Deployment, Ending, fault_text
 from bam_train.deploy.pacer import Pacer
@@ -80,6 +85,32 @@ def raises(error):
     return happens
 
 
+@pytest.mark.parametrize(("takes", "at", "ticks"), [(0.3, 0, 11), (10.0, 5, 6)])
+def test_a_slow_policy_or_a_process_that_stood_still_stops_a_live_robot(takes, at, ticks):
+    """A policy of 0.3 s a step, and one pause of 10 s, as by SIGSTOP; the robot's time is simulated."""
+    driven = DrivenRobot(SimulatedArm(with_object=False))
+    env = RobotEnv(SafeRobot(driven, clock=driven.clock), ReachTask())
+    driven.connect()
+    driven.place(ReachTask().begin(np.zeros(1, np.int64), [np.random.default_rng(7)]))
+    policy = Right(np.zeros(6, np.float32))
+    decide = policy.act
+
+    def act(observation):
+        if at in (0, len(policy.seen)):
+            driven.now += takes
+        return decide(observation)
+
+    policy.act = act
+    ending, _, _ = run(env, policy, episodes=1)
+    assert ending.status == 3
+    assert ending.reason.startswith(
+        f"safety stop: The robot was stopped by G15 command pace: the command came {takes + 0.05:.3f} s"
+    )
+    assert ending.reason.endswith("When it is safe, run it again.")
+    assert len(policy.seen) == ticks
+    assert env.robot.report()["command pace"]["stopped"] == 1
+
+
 def test_all_episodes(corridor, starting_cell):
     env, policy, watcher = Driven(gym.make(corridor)), Right(), Silent()
     ending, journal, pacer = run(env, policy, watcher=watcher)
@@ -132,6 +163,22 @@ def test_a_signal_halts(corridor, number, status):
     assert env.robot.calls == ["halt", "halt", "close"]  # after the first episode, and at the end
     assert [record.end for record in journal.records] == ["truncated", "stopped"]
     assert signal.getsignal(number) is before
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_after_a_signal_whose_exception_is_discarded_nothing_more_is_sent(corridor):
+    passing = {1}
+
+    def lose():  # Python discards what the callback of a dying object raises
+        nonlocal passing
+        weakref.finalize(passing, signal.raise_signal, signal.SIGINT)
+        passing = None
+
+    env = Driven(gym.make(corridor, slow=True), lose)
+    ending, journal, _ = run(env)
+    assert ending == Ending("interrupted", 130)
+    assert (env.count, journal.records[0].length) == (2, 2)
+    assert env.robot.calls == ["halt", "close"]
 
 
 def test_a_second_signal_does_not_stop_the_halt(corridor):

@@ -50,13 +50,6 @@ def test_every_kind_of_attribute_is_read():
     assert found.attributes == values
 
 
-def test_attributes_of_other_kinds_are_none():
-    inner = helper.make_graph([], "inner", [], [])
-    assert parse(model([helper.make_node("If", ["c"], ["y"], then_branch=inner)], {})).nodes[0].attributes == {
-        "then_branch": None
-    }
-
-
 @pytest.mark.parametrize("code", DTYPES)
 @pytest.mark.parametrize("raw", [True, False])
 def test_every_type_of_number_is_read_however_it_is_stored(code: int, raw: bool):

@@ -12,7 +12,7 @@ from bam_envs.errors import InvalidValue, UnknownName
 from bam_envs.serve.env_server import EnvServer
 from bam_envs.serve.tcp_server import TcpServer
 from bam_train.checkpoint import Checkpoint, write_checkpoint
-from bam_train.errors import CheckpointMismatch, OutputError, SettingsError
+from bam_train.errors import AlteredCheckpoint, CheckpointMismatch, OutputError, SettingsError
 from bam_train.settings import TrainSettings
 from bam_train.trainers import load_trainer, require_algorithm
 from bam_train.trainers import presets as presets_module
@@ -175,6 +175,49 @@ def test_a_run_that_was_elsewhere_goes_on_here(saved, tmp_path):
     link = {"transport": ["wss://a:1"], "ca_file": "ca.pem", "token_file": "token"}
     there = saved(tmp_path / "there.zip", **link)
     assert resolve_resumed({"transport": []}, there) == saved.settings
+    with pytest.raises(CheckpointMismatch) as caught:
+        resolve_resumed({}, there)
+    assert str(caught.value) == (
+        f"{there.path}: was trained with --transport ['wss://a:1'], and an address is never read from a file: "
+        "give --transport again, or --transport '' to go on in the simulation here"
+    )
+
+
+def test_where_a_run_computes_is_not_read_from_a_file(saved, tmp_path):
+    elsewhere = {"token_file": "/etc/passwd", "ca_file": "a.pem"}
+    manifest = fields(saved.settings, 3000)
+    manifest["settings"] |= elsewhere
+    manifest["settings"]["env_kwargs"] = {"robot": "ws://10.0.0.5:9090"}  # the manifest's own are {}
+    assert resolve_resumed({}, write_checkpoint(tmp_path / "a.zip", manifest, {})) == saved.settings
+    manifest["settings"]["address"] = "ray://10.0.0.5:10001"
+    with pytest.raises(CheckpointMismatch, match=r"--address again, or --set address=null to go on here"):
+        resolve_resumed({}, write_checkpoint(tmp_path / "a.zip", manifest, {}))
+    manifest["settings"] |= {"address": None, "data": "http://10.0.0.5/episodes"}
+    with pytest.raises(CheckpointMismatch, match=r"was trained with --data 'http://10\.0\.0\.5/episodes', and"):
+        resolve_resumed({}, write_checkpoint(tmp_path / "a.zip", manifest, {}))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("num_envs", 10**9, "num_envs: expected at most 100000, found 1000000000"),
+        ("num_env_runners", 10**9, "num_env_runners: expected at most 10000, found 1000000000"),
+        ("threads", 10**6, "threads: expected at most 1024, found 1000000"),
+        ("steps", 1e300, "steps: expected at most 1000000000000000, found 1000"),
+        ("eval_episodes", 1e12, "eval_episodes: expected at most 1000000, found 1000000000000"),
+        ("eval_episodes", "many", "eval_episodes: expected an int, found 'many' (text)"),
+        ("hyperparameters", [1], "hyperparameters: expected a table, found [1] (a list)"),
+        ("hyperparameters", {"n_steps": "x"}, "n_steps: expected an int, found 'x' (text)"),
+        ("normalize", 3, "normalize: expected true or false or a table, found 3 (an int)"),
+        ("device", 7, "device: expected text, found 7 (an int)"),
+    ],
+)
+def test_settings_that_no_run_has_are_refused(saved, tmp_path, name, value, message):
+    manifest = fields(saved.settings, 3000)
+    manifest["settings"][name] = value
+    with pytest.raises(SettingsError) as caught:
+        resolve_resumed({}, write_checkpoint(tmp_path / "a.zip", manifest, {}))
+    assert str(caught.value).startswith(message)
 
 
 def test_what_is_said_again_is_no_difference(saved):
@@ -242,8 +285,10 @@ def test_a_run_that_is_done_says_so(saved, tmp_path):
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
+def here(saved, tmp_path, monkeypatch):
+    """The folder of the run that made what `saved` writes."""
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "config.json").write_text(json.dumps(saved.settings.to_mapping()))
     return tmp_path
 
 
@@ -255,7 +300,10 @@ def test_the_default_place(saved, here):
 def test_an_existing_checkpoint_is_kept(saved, here):
     saved(here / "checkpoints" / "CartPole-v1-ppo.zip")
     saved(here / "checkpoints" / "CartPole-v1-ppo-2.zip")
+    orphan = here / "checkpoints" / ".CartPole-v1-ppo-2.zip.q0_w9e3r.tmp"
+    orphan.write_text("a run was killed")
     output = choose_output(saved.settings, None, False, None)
+    assert not orphan.exists()
     assert str(output.path) == "checkpoints/CartPole-v1-ppo-3.zip"
     assert output.notices == (
         "checkpoints/CartPole-v1-ppo.zip exists: "
@@ -301,6 +349,64 @@ def test_the_best_of_before_keeps_its_interval(saved, here):
     assert output.best == Best(2000, 0.5, 90.0, (0.3, 0.7), 20)
 
 
+@pytest.mark.parametrize("folder", ["none", "another run", "no settings"])
+def test_a_forged_note_makes_no_other_file_be_overwritten(saved, here, folder):
+    """All that a stranger can know is right: settings and steps of somebody's best, and where it usually lies."""
+    best = {"steps": 2000, "success_rate": None, "return_mean": -1e9, "path": str(here / "best.zip")}
+    saved(here / "best.zip", steps=2000)
+    {
+        "none": (here / "config.json").unlink,
+        "another run": lambda: (here / "config.json").write_text(json.dumps({"env": "CartPole-v1", "algo": "sac"})),
+        "no settings": lambda: (here / "config.json").write_text("[]"),
+    }[folder]()
+    output = choose_output(saved.settings, None, False, saved(here / "last.zip", best=best))
+    assert (str(output.path), output.best) == ("checkpoints/CartPole-v1-ppo.zip", None)
+
+
+def test_a_best_checkpoint_goes_on_in_its_own_place(saved, here):
+    (here / "config.json").unlink()
+    best = {"steps": 2000, "success_rate": None, "return_mean": 90.0, "path": str(here / "best.zip")}
+    output = choose_output(saved.settings, None, False, saved(here / "best.zip", steps=2000, best=best))
+    assert (output.path, output.best) == (here / "best.zip", Best(2000, None, 90.0))
+
+
+@pytest.mark.parametrize(
+    ("notes", "message"),
+    [
+        ([], "Expected `object`, got `array`"),
+        ({"best": 1}, "Expected `object | null`, got `int` - at `$.best`"),
+        ({"best": []}, "Expected `object | null`, got `array` - at `$.best`"),
+        ({"best": {"path": 1}}, "Expected `str`, got `int` - at `$.best.path`"),
+        ({"best": {"path": "a"}}, "Object missing required field `steps` - at `$.best`"),
+        (
+            {"best": {"steps": 1, "success_rate": None, "return_mean": 0, "path": 1}},
+            "Expected `str`, got `int` - at `$",
+        ),
+        (
+            {"best": {"steps": "1", "success_rate": None, "return_mean": 0, "path": "a"}},
+            "Expected `int`, got `str` - at",
+        ),
+        (
+            {"best": {"steps": 1, "success_rate": {}, "return_mean": 0, "path": "a"}},
+            "Expected `float | null`, got `obj",
+        ),
+    ],
+)
+def test_notes_of_another_form_are_refused(saved, here, notes, message):
+    members = {"bam/resume/notes.json": json.dumps(notes).encode()}
+    resumed = write_checkpoint(here / "odd.zip", fields(saved.settings, 3000), members)
+    with pytest.raises(AlteredCheckpoint) as caught:
+        choose_output(saved.settings, None, False, resumed)
+    assert str(caught.value).startswith(f"{here / 'odd.zip'}: bam/resume/notes.json: {message}")
+
+
+@pytest.mark.parametrize("path", ["", "\0", "/", "/dev/null", "x" * 5000, "\ud800"])
+def test_a_path_that_is_none_is_no_best(saved, here, path):
+    best = {"steps": 2000, "success_rate": None, "return_mean": 90.0, "path": path}
+    output = choose_output(saved.settings, None, False, saved(here / "last.zip", best=best))
+    assert (str(output.path), output.best) == ("checkpoints/CartPole-v1-ppo.zip", None)
+
+
 def test_settings_of_another_time_to_stop_are_the_same_run(saved, here):
     best = {"steps": 2000, "success_rate": None, "return_mean": 90.0, "path": str(here / "best.zip")}
     saved(here / "best.zip", steps=2000, best=best)
@@ -316,12 +422,13 @@ def test_a_name_of_robo_gym_is_tuned_as_the_environment():
     assert replace(theirs, env=ours.env, env_kwargs=ours.env_kwargs) == ours
 
 
-def test_an_argument_that_neither_robo_gym_nor_we_have():
-    given = {"env": "EndEffectorPositioningURSim", "algo": "ppo", "env_kwargs": {"ur_modle": "ur5"}}
+@pytest.mark.parametrize(("name", "closest"), [("ur_modle", "ur_model"), ("fix_shoulder_pan", "fix_base")])
+def test_an_argument_that_neither_robo_gym_nor_we_have(name, closest):
+    given = {"env": "EndEffectorPositioningURSim", "algo": "ppo", "env_kwargs": {name: "ur5"}}
     with pytest.raises(SettingsError) as caught:
         resolve(given)
     assert str(caught.value) == (
-        "env_kwargs: unknown setting 'ur_modle' of EndEffectorPositioningURSim-v0. Did you mean 'ur_model'?"
+        f"env_kwargs: unknown setting {name!r} of EndEffectorPositioningURSim-v0. Did you mean {closest!r}?"
     )
 
 
@@ -332,7 +439,7 @@ def test_only_what_an_id_takes_is_offered():
     assert str(caught.value) == (
         "env_kwargs: unknown setting 'ur_model' of NoObstacleNavigationMir100Sim-v0. Choose from: gazebo_gui, gui, ip, "
         "lower_bound_port, max_episode_steps, parity, randomize, rs_state_to_info, rviz_gui, server_manager_port, "
-        "timeout, upper_bound_port."
+        "upper_bound_port."
     )
 
 

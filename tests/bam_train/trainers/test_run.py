@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from bam_envs.errors import LinkLost
-from bam_train.errors import OutputError, ProcessesLost, TrainingFailed
+from bam_train.errors import EnvironmentFailed, OutputError, ProcessesLost, TrainingFailed
 from bam_train.evaluation import EvaluationReport, wilson_interval
 from bam_train.settings import TrainSettings
 from bam_train.trainers import judge as judge_module
@@ -44,6 +44,7 @@ class Counter:
     def __init__(self, settings, clock=None):
         self.settings, self.steps, self.clock = settings, 0, clock
         self.saved, self.refuse, self.fails_at, self.logged, self.notices = [], [], None, [], []
+        self.failure = TrainingFailed("train/loss is nan at step 10")
         self.statistics = STATISTICS
         self.rows = self.link = None
         self.news = []
@@ -58,7 +59,7 @@ class Counter:
             if self.steps == 20:
                 self.notices += self.news
             if self.fails_at is not None and self.steps >= self.fails_at:
-                raise TrainingFailed("train/loss is nan at step 60; expected finite numbers")
+                raise self.failure
             if not on_progress(Progress(self.steps, steps, lambda: self.statistics)):
                 return
 
@@ -236,15 +237,20 @@ def test_slow_saving_is_done_less_often(start):
     assert [row[1] for row in trainer.saved if row[0] == "last.zip"] == [30, 1040, 2000, 2000]
 
 
-def test_a_nan_names_the_last_good_checkpoint(start, tmp_path):
+@pytest.mark.parametrize(
+    ("failure", "text"),
+    [
+        (TrainingFailed("train/loss is nan at step 60"), "train/loss is nan at step 60"),
+        (EnvironmentFailed("test/Count-v0: reward is inf"), "at step 60: test/Count-v0: reward is inf"),
+    ],
+)
+def test_a_nan_names_the_last_good_checkpoint(start, tmp_path, failure, text):
     run, trainer, _ = start({30: report(0.5)})
-    trainer.fails_at = 60
+    trainer.fails_at, trainer.failure = 60, failure
     with pytest.raises(TrainingFailed) as caught:
         run.run()
     last = tmp_path / "runs" / "count-ppo" / "last.zip"
-    assert str(caught.value) == (
-        f"train/loss is nan at step 60; expected finite numbers; the last good checkpoint is {last}"
-    )
+    assert str(caught.value) == f"{text}; the last good checkpoint is {last}"
     assert last.read_text() == "30"
 
 

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from bam_train.checkpoint.temporary import temporary_file
 from bam_train.errors import OutputError
 from bam_train.trainers.curve import draw_curve
 from bam_train.trainers.run_folder import RunFolder, require_room, require_writable
@@ -16,6 +17,17 @@ from bam_train.trainers.run_folder import RunFolder, require_room, require_writa
 def test_each_run_has_a_folder_of_its_own(tmp_path):
     names = [RunFolder(tmp_path / "runs", "pick-ppo").path.name for _ in range(3)]
     assert names == ["pick-ppo", "pick-ppo-2", "pick-ppo-3"]
+
+
+def test_what_killed_runs_left_half_written_goes_with_the_next(tmp_path):
+    folders = [RunFolder(tmp_path, name) for name in ("pick-ppo", "pick-ppo", "reach-ppo")]
+    orphans = [folder.path / f".{name}.zip.q0_w9e3r.tmp" for folder in folders for name in ("last", "best")]
+    for orphan in orphans:
+        orphan.write_text("half")
+    with temporary_file(folders[0].last) as alive:
+        RunFolder(tmp_path, "pick-ppo")
+        assert [orphan.exists() for orphan in orphans] == [False] * 4 + [True] * 2
+        assert alive.exists()
 
 
 def test_config_and_records(tmp_path):

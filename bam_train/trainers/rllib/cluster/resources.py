@@ -45,7 +45,8 @@ def learners(settings: TrainSettings) -> tuple[int, int]:
     if number == 0:
         return (0, wanted) if wanted <= 1 else (wanted, 1)
     if wanted not in (0, number):
-        raise SettingsError(f"num_gpus: {number} learners use 0 or {number} GPUs, one each, found {wanted}")
+        said = _said_by(settings)
+        raise SettingsError(f"{said}: {number} learners use 0 or {number} GPUs, one each, found {wanted}")
     return number, int(wanted > 0)
 
 
@@ -77,7 +78,7 @@ def require_resources(settings: TrainSettings) -> None:
     there = ray.cluster_resources() if joined else {"CPU": cores(), "GPU": _own_gpus()}
     wanted = asked(settings)
     if wanted["GPU"] > there.get("GPU", 0):
-        raise SettingsError(_gpus_missing(wanted["GPU"], int(there.get("GPU", 0)), where))
+        raise SettingsError(_gpus_missing(settings, wanted["GPU"], int(there.get("GPU", 0)), where))
     if wanted["CPU"] > there.get("CPU", 0):
         raise SettingsError(_cpus_missing(settings, wanted["CPU"], there, where, joined))
     if joined:
@@ -102,7 +103,7 @@ def _require_own_gpu(settings: TrainSettings) -> None:
     """The trainer's own process learns on a GPU of this computer."""
     number, gpus_each = learners(settings)
     if number == 0 and gpus_each > _own_gpus():
-        raise SettingsError(_gpus_missing(gpus_each, _own_gpus(), "on this computer"))
+        raise SettingsError(_gpus_missing(settings, gpus_each, _own_gpus(), "on this computer"))
 
 
 def _own_gpus() -> int:
@@ -111,10 +112,14 @@ def _own_gpus() -> int:
     return int(torch.cuda.device_count())
 
 
-def _gpus_missing(wanted: int, there: int, where: str) -> str:
-    return (
-        f"num_gpus: {_number(wanted, 'GPU')} asked for, {there} {where}. Give --num-gpus {there}, or unset {VARIABLE}"
-    )
+def _said_by(settings: TrainSettings) -> str:
+    """What says how many GPUs."""
+    return VARIABLE if settings.num_gpus is None else "num_gpus"
+
+
+def _gpus_missing(settings: TrainSettings, wanted: int, there: int, where: str) -> str:
+    remedy = f"Set it to {there}, or unset it" if settings.num_gpus is None else f"Give --num-gpus {there}"
+    return f"{_said_by(settings)}: {_number(wanted, 'GPU')} asked for, {there} {where}. {remedy}"
 
 
 def _cpus_missing(settings: TrainSettings, wanted: int, there: Mapping[str, float], where: str, joined: bool) -> str:

@@ -69,7 +69,7 @@ class Directory:
         return AlteredCheckpoint(self.given, self.member(path), f"{self.member(path)} {text}")
 
     def _read(self, path: Path, reader: Callable[[bytes], Any]) -> Any:
-        data = self._bytes(path)
+        data = self.read_bytes(path)
         try:
             return reader(data)
         except RefusedPickle as error:
@@ -88,7 +88,12 @@ class Directory:
             reason = " ".join(str(error).split())
             raise self.altered(path, f"cannot be unpickled: {type(error).__name__}: {reason:.160}") from error
 
-    def _bytes(self, path: Path) -> bytes:
+    def read_bytes(self, path: Path) -> bytes:
+        """A file's content.
+
+        Raises:
+            CheckpointError: It is missing, no file, or too large.
+        """
         try:
             return _content(path)
         except FileNotFoundError as error:

@@ -1,15 +1,17 @@
-"""From a checkpoint directory of RLlib to a checkpoint.zip that can be evaluated and deployed, and not resumed.
+"""From a checkpoint directory of RLlib to a checkpoint.zip that can be evaluated and deployed, and resumed if whole.
 
 The file is long because every way in which directory and environment may differ has a refusal of its own.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -19,26 +21,35 @@ import numpy as np
 from gymnasium import spaces
 
 from bam_envs.errors import UnknownName
-from bam_envs.registry import are_same, resolve_id
+from bam_envs.registry import are_same, entry_of, resolve_id
+from bam_envs.robo_gym.options import PLACES
 from bam_envs.spaces import space_to_json
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, safetensors_file, write_checkpoint
-from bam_train.environments import control_period, first_difference, make_env
-from bam_train.errors import CheckpointMismatch, PolicyError
+from bam_train.environments import (
+    control_period,
+    first_difference,
+    make_env,
+    must_be_named,
+    parity_if_needed,
+    require_env_kwargs,
+)
+from bam_train.errors import CheckpointMismatch, PolicyError, SettingsError
 from bam_train.policy import FrozenPolicy
 from bam_train.policy.golden import TOLERANCE, worst_difference
 from bam_train.policy.spaces import leaf, leaves
+from bam_train.settings import TrainSettings
 from bam_train.trainers.freezing.golden import pack
 from bam_train.trainers.manifest import origin
 from bam_train.trainers.rllib.foreign.directory import Directory, find_policy
 from bam_train.trainers.rllib.foreign.parts import ForeignPolicy
 from bam_train.trainers.rllib.foreign.reading import read_policy
+from bam_train.trainers.rllib.foreign.training import states, training_settings
 from bam_train.trainers.rllib.freezing.by_hand import actions_by_hand
 from bam_train.trainers.rllib.freezing.freeze import freeze
 from bam_train.trainers.rllib.freezing.golden import clear_observations
 from bam_train.trainers.rllib.freezing.parts import AnySpace, Array, PolicyParts, leaf_spaces
 from bam_train.trainers.rllib_algorithms import ALGORITHMS
 
-_OWN_MODULES = ("bam_envs", "bam_train", "gymnasium")
 EXPORTED = "exported"
 """Setting of the manifest that says where an exported checkpoint comes from; a run's own has none of this name."""
 
@@ -65,6 +76,8 @@ class Exported:
     difference: float
     """The largest difference from them."""
     policy: FrozenPolicy
+    training: TrainSettings | str
+    """Settings of a run that goes on from it, or why there is none."""
 
     def write(self, path: Path) -> Checkpoint:
         """Write the checkpoint.zip.
@@ -78,6 +91,13 @@ class Exported:
             "ray": self.directory.ray_version,
             "golden": self.checked_by,
         }
+        settings: dict[str, Any] = {EXPORTED: source}
+        members = {POLICY: self.graph, GOLDEN: self.golden}
+        made_by = origin()
+        if isinstance(self.training, TrainSettings):
+            settings |= self.training.to_mapping()
+            members |= states(self.directory)
+            made_by["versions"] = {**made_by["versions"], "ray": self.directory.ray_version}  # whose states they are
         fields = {
             "env": self.env,
             "env_kwargs": self.env_kwargs,
@@ -87,19 +107,20 @@ class Exported:
             "period": self.period,
             "algorithm": self.parts.algorithm,
             "trainer": "rllib",
-            "settings": {EXPORTED: source},
+            "settings": settings,
             "steps": self.steps,
-            "seed": 0,
+            "seed": settings.get("seed", 0),
             "scores": {},
-            **origin(),
+            **made_by,
         }
-        return write_checkpoint(path, fields, {POLICY: self.graph, GOLDEN: self.golden})
+        return write_checkpoint(path, fields, members)
 
 
 def export(
     given: Path,
     *,
     env: str | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
     algo: str | None = None,
     policy: str | None = None,
     otherwise: str | None = None,
@@ -111,6 +132,7 @@ def export(
     Args:
         given: The directory, of an algorithm or of a policy.
         env: Its environment, where the directory does not say it or means another.
+        env_kwargs: Arguments of the environment; they win over the directory's.
         algo: Its algorithm, where the directory does not say it.
         policy: Its name, where there are several.
         otherwise: Its environment, where neither `env` nor the directory says it.
@@ -127,22 +149,22 @@ def export(
     foreign = read_policy(directory)
     if env is None and foreign.env is None:
         env = otherwise
-    env_id, env_kwargs = _environment(directory, foreign, env)
-    made = make_env(env_id, env_kwargs)
-    try:
-        parts = _fitted(directory, foreign, env_id, made, warn)
-        parts = replace(parts, algorithm=_algorithm(directory, foreign, algo))
-        describe = getattr(made.unwrapped, "describe", None)
-        signals, period = {} if describe is None else describe(), control_period(made)
-    finally:
-        made.close()  # type: ignore[no-untyped-call]
+    env_id, kwargs = _environment(directory, foreign, env)
+    require_env_kwargs(env_id, env_kwargs or {})
+    kwargs, (parts, signals, period) = parity_if_needed(
+        env_id, {**kwargs, **(env_kwargs or {})}, partial(_in_environment, directory, foreign, env_id, warn), warn
+    )
+    parts = replace(parts, algorithm=_algorithm(directory, foreign, algo))
     graph = freeze(parts)
     golden, by = _golden(parts)
     frozen = FrozenPolicy.from_graph(graph, *_spaces(parts))
     difference = _checked(directory, frozen, golden, by)
-    return Exported(
-        directory, parts, env_id, env_kwargs, foreign.steps, signals, period, graph, golden, by, difference, frozen
-    )
+    try:
+        training: TrainSettings | str = training_settings(directory, foreign, parts, env_id, kwargs)
+    except SettingsError as error:
+        training = str(error)
+    made = directory, parts, env_id, kwargs, foreign.steps, signals, period
+    return Exported(*made, graph, golden, by, difference, frozen, training)
 
 
 def _spaces(parts: PolicyParts) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -168,7 +190,8 @@ def _environment(directory: Directory, foreign: ForeignPolicy, asked: str | None
         raise CheckpointMismatch(directory.given, "does not say on which environment it was trained; give --env ID")
     env = resolve_id(asked) if asked is not None else str(own)
     if own is not None and are_same(env, own):
-        return env, _plain(directory, foreign.env_kwargs)
+        given = _plain(directory, foreign.env_kwargs)
+        return env, {name: given[name] for name in given if entry_of(env) is None or name not in PLACES}
     if foreign.env_kwargs:
         names = ", ".join(map(str, foreign.env_kwargs))
         directory.warn(f"the env_config of its own environment ({names:.200}) is not given to {env}")
@@ -184,7 +207,7 @@ def _own_environment(directory: Directory, name: str | None, asked: str | None) 
     module = (name or "").rpartition(":")[0]
     if name is None or (asked is not None and module and asked != name):
         return None
-    if module and asked is None and not directory.trust and module.split(".")[0] not in _OWN_MODULES:
+    if asked is None and not directory.trust and must_be_named(name):
         text = f"was trained on {name!r}, and importing {module!r} runs its code. If you trust it, give --env {name!r}"
         raise CheckpointMismatch(directory.given, text)
     try:
@@ -209,6 +232,20 @@ def _of_numpy(value: Any) -> Any:
     if not isinstance(value, (np.ndarray, np.generic)):
         raise TypeError(type(value).__name__)
     return value.tolist()
+
+
+def _in_environment(
+    directory: Directory,
+    foreign: ForeignPolicy,
+    env_id: str,
+    warn: Callable[[str], None],
+    env_kwargs: dict[str, Any],
+) -> tuple[PolicyParts, dict[str, Any], float | None]:
+    """The parts with the environment's own spaces, its signals and its period."""
+    with contextlib.closing(make_env(env_id, env_kwargs)) as env:
+        parts = _fitted(directory, foreign, env_id, env, warn)
+        describe = getattr(env.unwrapped, "describe", None)
+        return parts, {} if describe is None else describe(), control_period(env)
 
 
 def _fitted(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,8 @@ class ForeignPolicy:
     """Whether the directory says what RLlib's connectors do before and after the network."""
     algorithm_known: bool
     """Whether the directory names the algorithm; else it is that whose network this is, if any."""
+    config: Mapping[str, Any] = field(default_factory=dict)
+    """Fields of the algorithm's configuration; {} if unknown, as of the old API stack."""
 
 
 def read_weights(directory: Directory, path: Path, state: Any) -> dict[str, Array]:

@@ -66,7 +66,8 @@ def _new_policy(directory: Directory) -> ForeignPolicy:
         **fields,
     )
     known = bool(config.algorithm)
-    return ForeignPolicy(parts, config.env, dict(config.env_kwargs), _steps(directory), pipelines is not None, known)
+    env_kwargs, whole = dict(config.env_kwargs), pipelines is not None
+    return ForeignPolicy(parts, config.env, env_kwargs, _steps(directory), whole, known, config.fields)
 
 
 def _arguments(directory: Directory, path: Any) -> tuple[Any, tuple[Any, ...], dict[str, Any]]:
@@ -120,6 +121,7 @@ class _Config:
     algorithm: str = ""
     env: str | None = None
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    fields: Mapping[str, Any] = field(default_factory=dict)
 
 
 def _config(directory: Directory) -> _Config:
@@ -139,7 +141,8 @@ def _config(directory: Directory) -> _Config:
 
 def _settings(algorithm: str, given: Mapping[str, Any]) -> _Config:
     env, more = given.get("env"), given.get("env_config")
-    return _Config(algorithm, env if isinstance(env, str) else None, dict(more) if isinstance(more, Mapping) else {})
+    kwargs = dict(more) if isinstance(more, Mapping) else {}
+    return _Config(algorithm, env if isinstance(env, str) else None, kwargs, given)
 
 
 def _pipelines(directory: Directory) -> dict[str, Any] | None:

@@ -31,6 +31,7 @@ from ray.rllib.utils.spaces.space_utils import clip_action, unsquash_action
 
 from bam_train.environments import is_batched, make_rows
 from bam_train.errors import SettingsError
+from bam_train.finite import FiniteRows
 from bam_train.trainers.rllib.cluster.faults import FaultReporting
 from bam_train.trainers.rllib.sampling.filters import MeanStdFilter
 from bam_train.trainers.rllib.sampling.rows import End, Rollout, Running
@@ -89,7 +90,7 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
             )
         kwargs = dict(self.config.env_config)
         with _cores(self.config.num_cpus_per_env_runner if self.worker_index else None):
-            self.env = make_rows(env_id, kwargs, self.config.num_envs_per_env_runner)
+            self.env = FiniteRows(make_rows(env_id, kwargs, self.config.num_envs_per_env_runner), env_id)
         if self.env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
             raise SettingsError(f"{env_id}: expected rows that restart in the same step")
         self.num_envs = self.env.num_envs

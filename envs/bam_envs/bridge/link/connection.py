@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 _CLOSE_WITHIN = 1.0
+_MOST_PASSED_OVER = 20
+"""Messages of one connection that mean nothing, after which it is ended."""
 
 
 def bare_reason(url: str, error: BamEnvsError) -> str:
@@ -71,6 +73,7 @@ class Connection:
         self._held_up = False
         self._pending: dict[str, Future[dict[str, Any]]] = {}
         self._fragments = Fragments(max_message)
+        self._passed_over = 0
 
     # ---- sending
 
@@ -191,15 +194,27 @@ class Connection:
         self.answered_at = time.monotonic()
 
     def received(self, payload: bytes, binary: bool) -> None:
-        """A message came. What cannot be read is logged, and nothing else suffers."""
+        """A message came. What cannot be read is passed over; a server that sends nothing else is left."""
         self.answered_at = time.monotonic()
         if binary:
-            _LOG.warning("%s: a binary message of %d bytes, which nobody asked for, is ignored", self.url, len(payload))
+            self.pass_over(f"a binary message of {len(payload)} bytes, which nobody asked for")
             return
         try:
             self._dispatch(decode_frame(payload))
         except BamEnvsError as error:  # nonsense, or an answer to it that cannot be sent
-            _LOG.warning("%s: %s", self.url, error)
+            self.pass_over(str(error))
+
+    def pass_over(self, text: str) -> None:
+        """Take note of a message that means nothing here; `text` says what it is."""
+        _LOG.info("%s: passed over: %s", self.url, text)
+        self._passed_over += 1
+        if self._passed_over == _MOST_PASSED_OVER:
+            self.drop(
+                ProtocolError(
+                    f"{self.url}: the server sends what is no rosbridge message, {self._passed_over} times by now: "
+                    f"{text}. Is it the right port?"
+                )
+            )
 
     def _dispatch(self, message: dict[str, Any]) -> None:
         operation = message.get("op")

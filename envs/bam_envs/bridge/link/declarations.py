@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from bam_envs.bridge.bus import UNKNOWN_CALLER, Handler, Listener
+from bam_envs.bridge.bus import UNKNOWN_CALLER, Handler, Listener, refusal_of
 from bam_envs.bridge.interfaces import normal_name
 from bam_envs.errors import BamEnvsError, InvalidValue
 
@@ -132,7 +132,7 @@ def _give(topic: str, message: Mapping[str, Any], listener: Listener) -> None:
     try:
         listener(message, UNKNOWN_CALLER)
     except BamEnvsError as error:
-        _LOG.warning("%s: a listener refused a message: %s", topic, error)
+        _LOG.info("a message was refused: %s", refusal_of(topic, error))
     except Exception:  # a listener is foreign code, and the others must hear the message all the same
         _LOG.exception("%s: a listener failed", topic)
 

@@ -37,6 +37,9 @@ from bam_envs.errors import BamEnvsError, InvalidValue, LinkLost, ProtocolError,
 _LOG = logging.getLogger(__name__)
 _SEND_WITHIN = 0.5
 _STATUSES_KEPT = 20
+_ENDED = "Timeout exceeded"
+"""What servers say of a call that they end; rosbridge from 2.2 on does after 5 s, if it is told no other time."""
+_NEARLY = 0.9
 
 
 class RosbridgeLink:
@@ -163,6 +166,11 @@ class RosbridgeLink:
 
     # ---- topics
 
+    @property
+    def declared(self) -> dict[str, tuple[str, str]]:
+        """What was declared: id of the declaration, which a `status` may name -> topic or service, and type."""
+        return {one["id"]: (one.get("topic") or one["service"], one["type"]) for one in self._declarations.greeting()}
+
     def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
         """Say that `topic` of type `kind` will be published."""
         self._keeper.require_process()
@@ -264,8 +272,9 @@ class RosbridgeLink:
         type waits for the service to appear, and one that is not says at once that there is none.
 
         Raises:
-            LinkLost: The link is down, drops while waiting, or no answer comes in `timeout` [s]. In the first case
-                nothing was sent; in the others what was asked may have been done.
+            LinkLost: The link is down, drops while waiting, or no answer comes in `timeout` [s], or in the time that
+                the server itself allows. In the first case nothing was sent; in the others what was asked may have been
+                done.
             RemoteError: The service, or the server, refused or failed.
             ProtocolError: The response is none.
             InvalidValue: A number in `args` is not finite or not plain; `timeout` is none; or called on the network
@@ -280,11 +289,25 @@ class RosbridgeLink:
             request["type"] = normal_name(kind)
         # Servers that know the field end the call then, and not after a shorter time of their own.
         self._hand_over(connection, Parcel(encode_frame({**request, "timeout": timeout}), identity, answer))
+        begun = time.monotonic()
         try:
-            return _response(service, answer.result(timeout))
+            said = answer.result(timeout)
+            if said.get("result") is False and _ENDED in str(said.get("values")):
+                raise self._ended(service, time.monotonic() - begun, timeout)
+            return _response(service, said)
         except NoResultYet as error:
             self._keeper.post(connection.forget, identity)
             raise LinkLost(f"{self.url}: {service} did not answer in {timeout:g} s; it may still be at it.") from error
+
+    def _ended(self, service: str, waited: float, timeout: float) -> LinkLost:
+        """The server gave a call up after `waited` [s]."""
+        if waited > _NEARLY * timeout:
+            return LinkLost(f"{self.url}: {service} did not answer in {timeout:g} s; it may still be at it.")
+        return LinkLost(
+            f"{self.url}: the server gave up {service} after {waited:.1f} s, and {timeout:g} s were asked for; it may "
+            f"still be at it. Start the bridge with default_call_service_timeout:={timeout:.1f}, or use a pair of "
+            'topics instead of the service (channel="topics").'
+        )
 
     def serve(self, service: str, kind: str, handler: Handler) -> None:
         """Answer `service` of type `kind` through the server: always, also when the handler fails."""
@@ -336,7 +359,7 @@ class RosbridgeLink:
         elif operation == "status":
             self._take_status(message)
         else:
-            _LOG.warning("%s: a message with op %r is ignored", self.url, operation)
+            connection.pass_over(f"a message with op {operation!r:.40}")
 
     def _take_published(self, message: dict[str, Any]) -> None:
         topic, content = message.get("topic"), message.get("msg")

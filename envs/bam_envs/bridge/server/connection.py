@@ -3,25 +3,35 @@
 from __future__ import annotations
 
 import asyncio
+import time
+from collections import Counter, deque
 from typing import Any
 
 from websockets.asyncio.server import ServerConnection
-from websockets.protocol import State
+from websockets.frames import DATA_OPCODES, Frame
+from websockets.protocol import Event, State
 
 from bam_envs.bridge.server.outbox import Outbox, OutboxLimits
 from bam_envs.bridge.server.packets import Packet
+from bam_envs.tokens import Role
 
 TRY_AGAIN_LATER = 1013
 """Close code of a client that does not read what it must get."""
+_STRANGERS, _STRANGERS_OF_ONE = 128, 32
+"""Sockets that nobody has been let in through yet: of all, and of one address. The oldest gives way."""
+_OF_A_STRANGER = 65536
+"""What a stranger may say [bytes]."""
+_FRAME = 200
+"""About what a frame costs beside what it holds [bytes]."""
 
 
 class BridgeConnection(ServerConnection):
-    """A connection that knows when its socket takes more.
+    """A connection that knows when its socket takes more, and how much of what came is not a message yet.
 
     Args:
         *args: Of `websockets`.
         sockets: Every open socket of the server; this one is added and taken out.
-        most_sockets: A socket beyond is closed at once.
+        most_unfinished: What all of them may hold that is not done yet [bytes]; who holds most gives way.
         most_unsent: Most bytes that may wait for the socket [bytes]; pings that are never read would pile up.
         outbox_limits: Of what waits beside.
         **options: Of `websockets`.
@@ -31,14 +41,24 @@ class BridgeConnection(ServerConnection):
         self,
         *args: Any,
         sockets: set[BridgeConnection],
-        most_sockets: int,
+        most_unfinished: int,
         most_unsent: int,
         outbox_limits: OutboxLimits,
         **options: Any,
     ) -> None:
         super().__init__(*args, **options)
-        self._sockets, self._most_sockets, self._most_unsent = sockets, most_sockets, most_unsent
+        self._sockets, self._most_unfinished, self._most_unsent = sockets, most_unfinished, most_unsent
         self.outbox = Outbox(outbox_limits)
+        self.role: Role | None = None
+        """What who it is was let in as; None before."""
+        self.host = ""
+        """The IP address there."""
+        self.heard = time.monotonic()
+        """When anything came last [s, monotonic]."""
+        self.born = self.heard
+        """When the socket opened [s, monotonic]."""
+        self._waiting = 0  # what whole frames cost that are not taken yet [bytes]
+        self._message, self._whole = 0, deque[int]()  # what those of the unfinished message cost, and of whole ones
         self._takes_more = True
         self._closing: asyncio.Task[None] | None = None
 
@@ -77,9 +97,19 @@ class BridgeConnection(ServerConnection):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """A socket opened."""
         super().connection_made(transport)
+        self.host = str((self.remote_address or [""])[0])
         self._sockets.add(self)
-        if len(self._sockets) > self._most_sockets:
-            self.transport.abort()
+        self._make_room()
+
+    def _make_room(self) -> None:
+        """Sockets that say nothing keep nobody out: whoever comes is listened to, and the oldest of them gives way."""
+        strangers = sorted((one for one in self._sockets if one.role is None), key=lambda one: one.born)
+        mine = [one for one in strangers if one.host == self.host]
+        if len(mine) > _STRANGERS_OF_ONE:
+            mine[0].transport.abort()
+        elif len(strangers) > _STRANGERS:
+            host, _ = Counter(one.host for one in strangers).most_common(1)[0]
+            next(one for one in strangers if one.host == host).transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """The socket closed."""
@@ -88,9 +118,36 @@ class BridgeConnection(ServerConnection):
 
     def data_received(self, data: bytes) -> None:
         """Bytes came."""
+        self.heard = time.monotonic()
         super().data_received(data)
+        if self.role is None and self.unfinished > _OF_A_STRANGER:
+            self.transport.abort()
+        elif self.unfinished > _OF_A_STRANGER and sum(one.unfinished for one in self._sockets) > self._most_unfinished:
+            max(self._sockets, key=lambda one: one.unfinished).transport.abort()
         if not self._takes_more and self.transport.get_write_buffer_size() > self._most_unsent:
             self.transport.abort()
+
+    def process_event(self, event: Event) -> None:
+        """A frame came."""
+        if isinstance(event, Frame) and event.opcode in DATA_OPCODES:
+            cost = len(event.data) + _FRAME
+            self._waiting += cost
+            self._message += cost
+            if event.fin:
+                self._whole.append(self._message)
+                self._message = 0
+        super().process_event(event)
+
+    async def next_frame(self) -> bytes:
+        """The next message."""
+        message = await self.recv(decode=False)
+        self._waiting -= self._whole.popleft()
+        return message if isinstance(message, bytes) else message.encode()
+
+    @property
+    def unfinished(self) -> int:
+        """What it holds that was not taken yet [bytes]."""
+        return self._waiting + len(self.protocol.reader.buffer)
 
     def pause_writing(self) -> None:
         """The socket takes no more for now."""

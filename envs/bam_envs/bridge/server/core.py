@@ -9,9 +9,10 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from bam_envs.bridge.bus import Caller, Handler, Listener, Message
+from bam_envs.bridge.bus import Caller, Handler, Listener, Message, refusal_of
 from bam_envs.bridge.encoding import decode_frame
 from bam_envs.bridge.interfaces import complete
 from bam_envs.bridge.server.operations import Operations
@@ -26,6 +27,16 @@ T = TypeVar("T")
 
 _logger = logging.getLogger(__name__)
 _PROCESS = Caller("this process")
+
+
+@dataclass(frozen=True)
+class Incoming:
+    """A frame of a client, read."""
+
+    message: Mapping[str, Any]
+    """What it says."""
+    error: ProtocolError | None = None
+    """Why it says nothing."""
 
 
 class Bridge:
@@ -75,13 +86,39 @@ class Bridge:
             frame: Of text, or binary.
             now: Any steady clock [s]; the same one everywhere.
         """
+        text = self.take(session, self.read(frame), now)
+        if text is not None:
+            self.take(session, self.read(text, joined=True), now)
+
+    def read(self, frame: str | bytes, *, joined: bool = False, check: bool = False) -> Incoming:
+        """What a frame says, for `take`. From any thread, and never raises about what it holds.
+
+        Args:
+            frame: Of text, or binary.
+            joined: It is the text of fragments.
+            check: Check its content here, which may be long, and not where it is done.
+        """
         try:
-            messages = decode_frame(frame)
+            message = decode_frame(frame)
+            if joined and message.get("op") == "fragment":
+                raise ProtocolError("A fragment must not hold fragments.")
         except ProtocolError as error:
-            self._status(session, str(error))
-            return
-        for message in messages:
-            self._receive(session, message, now)
+            return Incoming({}, error)
+        return Incoming(self._operations.checked(message) if check else message)
+
+    def take(self, session: Session, incoming: Incoming, now: float) -> str | None:
+        """Do what a frame of a client says; the text of a message whose last fragment it was, to be read in turn."""
+        message = incoming.message
+        try:
+            if incoming.error is not None:
+                self._status(session, str(incoming.error))
+            elif message.get("op") == "fragment":
+                return self._add_fragment(session, message, now)
+            else:
+                self._operations.execute(session, message, now)
+        except BamEnvsError as error:
+            self._status(session, f"{_title(message, str(error))}: {error}", _id(message))
+        return None
 
     def tick(self, now: float) -> None:
         """Do what `next_deadline` was about."""
@@ -131,12 +168,7 @@ class Bridge:
         found = self.topics.find(name)
         if found is None:
             raise InvalidValue(f"Topic {name} does not exist; advertise it with its type first.")
-        publication = Publication(name, found.kind, complete(found.kind, message))
-        # Packed here, an image costs the time of who publishes it, and not that of everybody's network.
-        for stream in list(found.streams.values()):
-            if stream.is_prompt:
-                publication.packet(stream.name, stream.wire)
-        return publication
+        return found.packed(Publication(name, found.kind, complete(found.kind, message)))
 
     def publish(self, publication: Publication, now: float) -> None:
         """Send a message of this process to all who want it."""
@@ -167,26 +199,20 @@ class Bridge:
 
     # Inside.
 
-    def _receive(self, session: Session, message: Mapping[str, Any], now: float) -> None:
+    def _add_fragment(self, session: Session, message: Mapping[str, Any], now: float) -> str | None:
         try:
-            if message.get("op") == "fragment":
-                self._add_fragment(session, message, now)
-            else:
-                self._operations.execute(session, message, now)
-        except BamEnvsError as error:
-            self._status(session, f"{_title(message)}: {error}", _id(message))
-
-    def _add_fragment(self, session: Session, message: Mapping[str, Any], now: float) -> None:
-        try:
-            text = session.fragments.add(message, now)
+            return session.fragments.add(message, now)
         finally:
             self._note_fragments(session)
-        if text is None:
-            return
-        for whole in decode_frame(text):
-            if whole.get("op") == "fragment":
-                raise ProtocolError("A fragment must not hold fragments.")
-            self._receive(session, whole, now)
+            self._require_room()
+
+    def _require_room(self) -> None:
+        """Who holds most in fragments gives way when all together hold too much."""
+        while sum(session.fragments.size for session in self._fragmented) > self.limits.unfinished:
+            greatest = max(self._fragmented, key=lambda session: session.fragments.size)
+            greatest.fragments.clear()
+            self._note_fragments(greatest)
+            self._status(greatest, f"All unfinished fragments hold more than {self.limits.unfinished} bytes.")
 
     def _note_fragments(self, session: Session) -> None:
         if session.fragments.deadline is not None:
@@ -221,9 +247,9 @@ class Bridge:
 
     def _refused(self, publication: Publication, publisher: Session | None, reason: str) -> None:
         if publisher is None:
-            _logger.warning("%s: %s", publication.topic, reason)
+            _logger.warning("%s", refusal_of(publication.topic, reason))
         else:
-            self._status(publisher, f"{publication.topic}: {reason}")
+            self._status(publisher, refusal_of(publication.topic, reason))
 
     def _status(self, session: Session, text: str, name: Id = None) -> None:
         self._events.extend(session.status("error", text, name))
@@ -237,10 +263,10 @@ def _own(work: Callable[[], T]) -> T:
         raise InvalidValue(str(error)) from None
 
 
-def _title(message: Mapping[str, Any]) -> str:
-    """What a message was about, for the status that says what is wrong with it."""
-    parts = [message.get(name) for name in ("op", "topic", "service")]
-    return " ".join(part[:80] for part in parts if isinstance(part, str)) or "message"
+def _title(message: Mapping[str, Any], said: str) -> str:
+    """What a message was about, for the status that says what is wrong with it; no name that is `said` there."""
+    names = [name for name in (message.get("topic"), message.get("service")) if f" {name} " not in said]
+    return " ".join(part[:80] for part in (message.get("op"), *names) if isinstance(part, str)) or "message"
 
 
 def _id(message: Mapping[str, Any]) -> Id:

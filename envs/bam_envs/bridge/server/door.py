@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
-import hmac
 import logging
 import ssl
 from collections.abc import Callable
@@ -14,16 +14,25 @@ from urllib.parse import parse_qs, urlsplit
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
-from bam_envs.errors import InvalidValue
+from bam_envs.bridge.encoding import decode_frame
+from bam_envs.bridge.server.connection import BridgeConnection
+from bam_envs.errors import InvalidValue, ProtocolError
+from bam_envs.tokens import Guesses, Tokens
 
 _NO_TOKEN = (
     "This server needs its token: send the header 'Authorization: Bearer TOKEN', or open the URL with ?token=TOKEN."
 )
+_TOO_OFTEN = "Too many wrong tokens came from this address; try again in a second."
 _NO_PAGES = "A web page comes in only with the token of this server, and it was started without one."
 _PAGE_REFUSED = (
     "The web page %r was refused: a browser comes in only with a token. "
-    "To let it in, start the server with one, and open its URL with ?token=TOKEN."
+    'To let it in, start the server with one, and send it as the first message: {"op": "auth", "token": TOKEN}.'
 )
+_FIRST = 'The first message of a page must be its token, within {:g} s: {{"op": "auth", "token": TOKEN}}'
+_GREETING = 2.0
+"""How long a page may take to show its token [s]."""
+_POLICY_VIOLATION = 1008
+"""Close code of who does not show it."""
 _logger = logging.getLogger(__name__)
 
 
@@ -31,38 +40,89 @@ class Door:
     """Lets clients in, or says why not.
 
     Args:
-        token: What they must show; None for nothing.
+        tokens: What they must show.
         most: Most clients.
         present: How many there are.
     """
 
-    def __init__(self, token: str | None, most: int, present: Callable[[], int]) -> None:
-        if token is not None and not token:
-            raise InvalidValue("Token: expected a text, found an empty one.")
-        self._token = token.encode() if token is not None else None
+    def __init__(self, tokens: Tokens, most: int, present: Callable[[], int]) -> None:
+        self._tokens, self._guesses = tokens, Guesses()
         self._most, self._present = most, present
 
     def check(self, connection: ServerConnection, request: Request) -> Response | None:
-        """The refusal of a request to open a WebSocket, or None."""
-        if self._token is not None and not self._shows_token(request):
-            response = connection.respond(HTTPStatus.UNAUTHORIZED, _NO_TOKEN + "\n")
-            response.headers["WWW-Authenticate"] = "Bearer"
-            return response
-        if self._token is None and "Origin" in request.headers:
+        """The refusal of a request to open a WebSocket, or None; a page may show its token later (`greet`)."""
+        if not isinstance(connection, BridgeConnection):
+            raise TypeError(f"Expected a BridgeConnection, found {connection!r}.")
+        shown, is_page = _shown(request), "Origin" in request.headers
+        if shown and self._tokens.exist:
+            refusal = self._look(connection, shown)
+            if refusal is not None:
+                return refusal
+        elif is_page and not self._tokens.exist:
             # Any page open in a browser on this computer reaches loopback; programs send no Origin.
             _logger.warning(_PAGE_REFUSED, ", ".join(request.headers.get_all("Origin"))[:100])
             return connection.respond(HTTPStatus.FORBIDDEN, _NO_PAGES + "\n")
+        elif is_page:
+            return None  # browsers set no headers, and an address with a token is logged: it may be a message, too
+        elif self._tokens.needed:
+            return _unauthorized(connection)
         if self._present() >= self._most:
             text = f"There are {self._most} clients, and no room for more.\n"
             return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, text)
+        connection.role = connection.role or "client"
         return None
 
-    def _shows_token(self, request: Request) -> bool:
-        headers = request.headers.get_all("Authorization")
-        shown = [text.partition(" ")[2].strip() for text in headers if text.lower().startswith("bearer ")]
-        shown += parse_qs(urlsplit(request.path).query).get("token", [])
-        # In constant time: how long a refusal takes must not tell how much of the token was right.
-        return any(hmac.compare_digest(one.encode("utf-8", "surrogateescape"), self._token or b"") for one in shown)
+    def _look(self, connection: BridgeConnection, shown: list[str]) -> Response | None:
+        if not self._guesses.may_try(connection.host):
+            return connection.respond(HTTPStatus.TOO_MANY_REQUESTS, _TOO_OFTEN + "\n")
+        connection.role = self._tokens.role(shown) if len(set(shown)) == 1 else None  # several would be several guesses
+        if connection.role is None:
+            self._guesses.wrong(connection.host)
+            return _unauthorized(connection)
+        return None
+
+    async def greet(self, connection: BridgeConnection) -> None:
+        """See to it that who came in without a token shows it now, or is out."""
+        if connection.role is not None:
+            return
+        reason = _FIRST.format(_GREETING)
+        try:
+            token = _read_auth(await asyncio.wait_for(connection.next_frame(), _GREETING))
+        except (TimeoutError, asyncio.TimeoutError):
+            token = None
+        if token is not None and not self._guesses.may_try(connection.host):
+            reason, token = _TOO_OFTEN, None
+        if token is not None:
+            connection.role = self._tokens.role([token])
+            if connection.role is None:
+                self._guesses.wrong(connection.host)
+                reason = "The token is wrong."
+        if connection.role is not None and self._present() >= self._most:
+            connection.role, reason = None, f"There are {self._most} clients, and no room for more."
+        if connection.role is None:
+            await connection.close(_POLICY_VIOLATION, reason)
+
+
+def _shown(request: Request) -> list[str]:
+    """The tokens that `request` shows."""
+    headers = request.headers.get_all("Authorization")
+    bearers = [text.partition(" ")[2].strip() for text in headers if text.lower().startswith("bearer ")]
+    return bearers + parse_qs(urlsplit(request.path).query).get("token", [])
+
+
+def _read_auth(frame: str | bytes) -> str | None:
+    try:
+        message = decode_frame(frame)
+    except ProtocolError:
+        return None
+    token = message.get("token")
+    return token if message.get("op") == "auth" and isinstance(token, str) else None
+
+
+def _unauthorized(connection: BridgeConnection) -> Response:
+    response = connection.respond(HTTPStatus.UNAUTHORIZED, _NO_TOKEN + "\n")
+    response.headers["WWW-Authenticate"] = "Bearer"
+    return response
 
 
 def tls_context(cert: str, key: str | None) -> ssl.SSLContext:

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from bam_envs.bridge.interfaces import complete
 from bam_envs.bridge.server.packets import Publication, Wire, pack
-from bam_envs.bridge.server.services import Request, Services, new_service, packed_response
+from bam_envs.bridge.server.services import (
+    Request,
+    Services,
+    checked_args,
+    checked_values,
+    new_service,
+    packed_response,
+)
 from bam_envs.bridge.server.session import (
     LEVELS,
     Event,
@@ -21,12 +28,44 @@ from bam_envs.bridge.server.session import (
     read_text,
     read_wire,
 )
-from bam_envs.bridge.server.topics import Stream, Topics, Wish
+from bam_envs.bridge.server.topics import Stream, Topic, Topics, Wish
 from bam_envs.errors import BamEnvsError, ProtocolError
 
 _LONGEST_QUEUE = 100
 _NO_ACTIONS = "Actions are not supported by this server; use a service, or a pair of topics."
-_NO_AUTH = "The op auth is not supported by this server; send its token as the header 'Authorization: Bearer ...'."
+_NO_AUTH = "The op auth is for the first message of a web page; this client has been let in already."
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What stands in a message for content that was checked before, in another thread."""
+
+    kind: str
+    """Of what it was found to be."""
+    value: Any = None
+    """What came of it."""
+    error: BamEnvsError | None = None
+    """Why nothing came of it."""
+
+    @classmethod
+    def of(cls, kind: str, check: Callable[[], Any]) -> Checked:
+        """What `check` returns, or raises."""
+        try:
+            return cls(kind, check())
+        except BamEnvsError as error:
+            return cls(kind, error=error)
+
+    def get(self, kind: str) -> Any:
+        """The value.
+
+        Raises:
+            BamEnvsError: It does not fit, or should be of another type by now.
+        """
+        if self.error is not None:
+            raise self.error
+        if self.kind != kind:
+            raise ProtocolError(f"Expected a {kind}, found a {self.kind}: the type was another one a moment ago.")
+        return self.value
 
 
 class Operations:
@@ -73,11 +112,38 @@ class Operations:
             raise ProtocolError(_unknown(name, self._table))
         operation(session, message, now)
 
+    def checked(self, message: Mapping[str, Any]) -> Mapping[str, Any]:
+        """`message` with its content checked, where `execute` would do that. From any thread."""
+        find = _CONTENT.get(str(message.get("op")))
+        try:
+            return message if find is None else find(self, message)
+        except ProtocolError:  # it is about nothing, as `execute` will say
+            return message
+
+    def _checked_publish(self, message: Mapping[str, Any]) -> Mapping[str, Any]:
+        topic = self._topics.find(read_name(message, "topic"))
+        if topic is None or None in topic.publishers:
+            return message
+        return {**message, "msg": Checked.of(topic.kind, lambda: _publication(topic, message))}
+
+    def _checked_call(self, message: Mapping[str, Any]) -> Mapping[str, Any]:
+        service = self._services.find(read_name(message, "service"))
+        if service is None:
+            return message
+        return {**message, "args": Checked.of(service.kind, lambda: checked_args(service, message.get("args")))}
+
+    def _checked_response(self, message: Mapping[str, Any]) -> Mapping[str, Any]:
+        kind = self._services.kind_of_call(message.get("id"))
+        if kind is None or message.get("result", True) is not True:
+            return message
+        return {**message, "values": Checked.of(kind, lambda: checked_values(kind, message.get("values")))}
+
     def _advertise(self, session: Session, message: Mapping[str, Any], now: float) -> None:
         name, kind = read_name(message, "topic"), read_text(message, "type")
         latch, number = read_flag(message, "latch", False), read_id(message)
         _require_room(sum(map(len, session.advertised.values())), session.limits.topics, "advertisements")
         topic = self._topics.require(name, kind)
+        _require_public(topic)
         topic.publishers.add(session)
         if latch:
             topic.latching.add(session)
@@ -99,9 +165,10 @@ class Operations:
         topic = self._topics.find(name)
         if topic is None:
             raise ProtocolError(f"Topic {name} does not exist; advertise it with its type first.")
+        _require_public(topic)
         content = message.get("msg")
-        publication = Publication(name, topic.kind, complete(topic.kind, {} if content is None else content))
-        self._spread(publication, session, now)
+        ready = content.get(topic.kind) if isinstance(content, Checked) else _publication(topic, message)
+        self._spread(ready, session, now)
 
     def _subscribe(self, session: Session, message: Mapping[str, Any], now: float) -> None:
         name, number = read_name(message, "topic"), read_id(message)
@@ -140,7 +207,9 @@ class Operations:
             if service is None:
                 raise ProtocolError(f"Service {name} does not exist")
             limit = read_number(message, "timeout", 0) or None
-            self._services.call(service, replace(request, wire=read_wire(message), timeout=limit), now)
+            args = request.args
+            values = args.get(service.kind) if isinstance(args, Checked) else checked_args(service, args)
+            self._services.call(service, replace(request, wire=read_wire(message), timeout=limit), values, now)
         except BamEnvsError as error:
             self._emit(Send(session, packed_response(request, str(error), False)))
 
@@ -160,7 +229,8 @@ class Operations:
         self._services.withdraw(service)
 
     def _service_response(self, session: Session, message: Mapping[str, Any], now: float) -> None:
-        self._services.respond(session, message)
+        values = message.get("values")
+        self._services.respond(session, message, values.get if isinstance(values, Checked) else None)
 
     def _set_level(self, session: Session, message: Mapping[str, Any], now: float) -> None:
         level = message.get("level")
@@ -172,6 +242,25 @@ class Operations:
         action, aborted = read_text(message, "action"), 6
         result = {"op": "action_result", "action": action, "values": _NO_ACTIONS, "status": aborted, "result": False}
         self._emit(Send(session, pack({**result, "id": read_id(message)}, Wire())))
+
+
+_CONTENT = {
+    "publish": Operations._checked_publish,
+    "call_service": Operations._checked_call,
+    "service_response": Operations._checked_response,
+}
+"""What may be long in a message, by its op."""
+
+
+def _publication(topic: Topic, message: Mapping[str, Any]) -> Publication:
+    content = message.get("msg")
+    return topic.packed(Publication(topic.name, topic.kind, complete(topic.kind, {} if content is None else content)))
+
+
+def _require_public(topic: Topic) -> None:
+    """What this process says, such as where its robot is, nobody says in its place."""
+    if None in topic.publishers:
+        raise ProtocolError(f"Topic {topic.name} is published by this server alone; its clients may subscribe.")
 
 
 def _require_room(used: int, most: int, what: str) -> None:

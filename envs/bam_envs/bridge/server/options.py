@@ -18,10 +18,10 @@ class ServerOptions:
     """What one client may use."""
     outbox: OutboxLimits = field(default_factory=OutboxLimits)
     """How much may wait for a client that reads slowly."""
-    open_timeout: float = 10.0
+    open_timeout: float = 5.0
     """A socket must have become a WebSocket by then [s]."""
-    ping_interval: float = 10.0
-    """How often a client is asked whether it is still there [s]."""
+    ping_interval: float = 1.0
+    """How often a client is asked whether it is still there [s]: who drives and does not answer loses command soon."""
     ping_timeout: float = 20.0
     """How long its answer may take [s]."""
     close_timeout: float = 1.0

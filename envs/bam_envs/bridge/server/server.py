@@ -1,7 +1,8 @@
 """The embedded rosbridge server: the protocol of `core` on WebSockets, in a thread of its own.
 
-The thread of the network runs the protocol and the listeners; handlers of services run in a pool of threads. A client
-that sends nonsense, does not read, or opens sockets and says nothing costs a bounded amount of memory and time.
+The thread of the network runs the protocol and the listeners; handlers of services run in a pool of threads, and what
+is long is read in a thread of its own, so that nobody's halt waits for it. A client that sends nonsense, does not read,
+or opens sockets and says nothing costs a bounded amount of memory and time.
 
 The file is long because the two sides of the server, its bus for this process and its connections, meet in one loop.
 """
@@ -24,7 +25,7 @@ from websockets.exceptions import ConnectionClosed
 
 from bam_envs.bridge.bus import Caller, Handler, Listener, Message
 from bam_envs.bridge.server.connection import BridgeConnection
-from bam_envs.bridge.server.core import Bridge
+from bam_envs.bridge.server.core import Bridge, Incoming
 from bam_envs.bridge.server.door import Door, listening_error, tls_context
 from bam_envs.bridge.server.loop_thread import LoopThread
 from bam_envs.bridge.server.options import ServerOptions
@@ -32,14 +33,18 @@ from bam_envs.bridge.server.packets import Publication
 from bam_envs.bridge.server.session import Invoke, Send, Session
 from bam_envs.bridge.server.workers import Workers
 from bam_envs.errors import InvalidValue, LinkLost
+from bam_envs.tokens import Tokens
 
 __all__ = ["BridgeServer", "ServerOptions"]
 
 T = TypeVar("T")
 
-_SPARE_SOCKETS = 64
 _HANDLER_THREADS = 32
+_SHORT = 4096
+"""A frame up to this is read in the thread of the network [bytes]."""
 _TURN = 4
+_QUEUE = 2
+"""Messages of a client that are taken from its socket before they are done."""
 _logger = logging.getLogger(__name__)
 # Of `websockets`, to which every port scanner is worth a traceback.
 _quiet = logging.getLogger(f"{__name__}.websockets")
@@ -54,8 +59,9 @@ class BridgeServer:
         port: 0 takes a free one, `port` says which.
         cert: File with the certificate chain in PEM, for ``wss://``.
         key: File with its key, if it is not the same one.
-        token: Clients must show it: ``Authorization: Bearer TOKEN``, or ``?token=TOKEN`` in the URL. Without one no web
-            page comes in.
+        token: Clients must show it: ``Authorization: Bearer TOKEN``, or ``?token=TOKEN`` in the URL; a page in a
+            browser also by its first message, ``{"op": "auth", "token": TOKEN}``. Without one no page comes in.
+        operator_token: Who shows this one instead is an operator (`Caller.operator`).
         options: The rest.
     """
 
@@ -67,6 +73,7 @@ class BridgeServer:
         cert: str | None = None,
         key: str | None = None,
         token: str | None = None,
+        operator_token: str | None = None,
         options: ServerOptions | None = None,
     ) -> None:
         if not 0 <= port <= 65535:
@@ -79,10 +86,11 @@ class BridgeServer:
         self._bridge = Bridge(self.options.limits)
         self._connections: dict[Session, BridgeConnection] = {}
         self._sockets: set[BridgeConnection] = set()
-        self._door = Door(token, self.options.max_clients, lambda: len(self._connections))
+        self._door = Door(Tokens(token, operator_token), self.options.max_clients, lambda: len(self._connections))
         self._numbers = itertools.count(1)
         self._thread = LoopThread("bam-bridge-server")
         self._workers = Workers(_HANDLER_THREADS, "bam-bridge-handler")
+        self._reader = Workers(1, "bam-bridge-reader")  # one: each more would leave the network less of the interpreter
         self._timer: asyncio.TimerHandle | None = None
         self._stop: asyncio.Event | None = None
 
@@ -119,6 +127,7 @@ class BridgeServer:
             self._thread.post(self._stop.set)
         self._thread.join()
         self._workers.close()
+        self._reader.close()
 
     def __enter__(self) -> BridgeServer:
         return self.start()
@@ -183,6 +192,7 @@ class BridgeServer:
             ping_timeout=options.ping_timeout,
             close_timeout=options.close_timeout,
             max_size=options.limits.max_incoming,
+            max_queue=_QUEUE,
             logger=_quiet,
             create_connection=self._connection_type(),
             **extra,
@@ -194,7 +204,7 @@ class BridgeServer:
         return functools.partial(
             BridgeConnection,
             sockets=self._sockets,
-            most_sockets=self.options.max_clients + _SPARE_SOCKETS,
+            most_unfinished=self.options.limits.unfinished,
             most_unsent=self.options.limits.max_message + self.options.outbox.size,
             outbox_limits=self.options.outbox,
         )
@@ -223,8 +233,13 @@ class BridgeServer:
         """Read one client's frames until its connection ends."""
         if not isinstance(connection, BridgeConnection):
             raise TypeError(f"Expected a BridgeConnection, found {connection!r}.")
-        host, port = connection.remote_address[:2]
-        session = self._bridge.open(Caller(f"client{next(self._numbers)}", f"{host}:{port}"))
+        try:
+            await self._door.greet(connection)
+        except ConnectionClosed:
+            return
+        if connection.role is None:
+            return
+        session = self._bridge.open(self._caller(connection))
         self._connections[session] = connection
         try:
             await self._read(connection, session)
@@ -235,14 +250,40 @@ class BridgeServer:
             self._bridge.lost(session)
             self._flush()
 
+    def _caller(self, connection: BridgeConnection) -> Caller:
+        host, port = connection.remote_address[:2]
+        return Caller(
+            f"client{next(self._numbers)}",
+            f"{host}:{port}",
+            operator=connection.role == "operator",
+            silence=lambda: time.monotonic() - connection.heard,
+        )
+
     async def _read(self, connection: BridgeConnection, session: Session) -> None:
         for number in itertools.count(1):
-            frame = await connection.recv(decode=False)
-            self._bridge.receive(session, frame, time.monotonic())
+            text: bytes | str | None = await connection.next_frame()
+            joined = False
+            while text is not None:
+                incoming = await self._incoming(text, joined)
+                text, joined = self._bridge.take(session, incoming, time.monotonic()), True
             self._flush()
             # Frames that are there already come without a pause; the other clients must not wait for them all.
             if number % _TURN == 0:
                 await asyncio.sleep(0)
+
+    async def _incoming(self, text: bytes | str, joined: bool) -> Incoming:
+        """What a frame says; a long one is read elsewhere, and its client's next one waits for it."""
+        if len(text) <= _SHORT:
+            return self._bridge.read(text, joined=joined)
+        loop = asyncio.get_running_loop()
+        done: asyncio.Future[Incoming] = loop.create_future()
+
+        def read() -> None:
+            incoming = self._bridge.read(text, joined=joined, check=True)
+            self._thread.post(lambda: None if done.cancelled() else done.set_result(incoming))
+
+        self._reader.submit(read)
+        return await done
 
     def _publish(self, publications: Sequence[Publication]) -> None:
         now = time.monotonic()

@@ -27,7 +27,9 @@ from bam_envs.bridge.server.session import Event, Id, Invoke, Send, Session
 from bam_envs.errors import BamEnvsError, ProtocolError
 
 _LENIENT = ("bam_msgs/GymAPI",)
-"""Types that are still growing: what a newer client says beside is ignored, as on every other way to an environment."""
+"""Types that are still growing: what a newer end says beside is ignored, as on every other way to an environment."""
+_LONGEST_NUMBER = 20
+"""Digits of the number of a call."""
 _logger = logging.getLogger(__name__)
 
 
@@ -143,20 +145,19 @@ class Services:
         for name in list(session.services):
             self.withdraw(self._services[name])
 
-    def call(self, service: Service, request: Request, now: float) -> None:
+    def call(self, service: Service, request: Request, values: Mapping[str, Any], now: float) -> None:
         """Pass a request on to who offers `service`.
 
         Args:
             service: What is asked.
-            request: By whom, and what.
+            request: By whom, and how.
+            values: What `checked_args` makes of its arguments.
             now: Clock of `Bridge` [s].
 
         Raises:
-            BamEnvsError: The request does not fit, or there are too many.
+            BamEnvsError: There are too many.
         """
         session, limits = request.session, request.session.limits
-        check = complete_known if service.kind in _LENIENT else complete
-        values = check(request_type(service.kind), _named(service.kind, request.args))
         if max(len(session.calls), len(session.waiting)) >= limits.calls:
             raise ProtocolError(f"At most {limits.calls} calls may be unanswered; wait for an answer first.")
         usual = limits.service_timeout if service.provider is not None else limits.handler_timeout
@@ -201,7 +202,9 @@ class Services:
             return None
         try:
             values = invoke.handler(invoke.request, invoke.caller)
-            return self._packed(call, values if call.service.inline else _response(call.service, values), True)
+            return self._packed(
+                call, values if call.service.inline else checked_values(call.service.kind, values), True
+            )
         except BamEnvsError as error:
             return self._packed(call, str(error), False)
         # A caller is always answered, whatever the handler of somebody else does.
@@ -220,14 +223,25 @@ class Services:
         session.running -= 1
         self._start_waiting(session)
 
-    def respond(self, provider: Session, message: Mapping[str, Any]) -> None:
-        """Pass on what a client answers to a call of its service.
+    def kind_of_call(self, name: object) -> str | None:
+        """Type of the service that the unanswered call with the id `name` is of. From any thread."""
+        call = self._call_named(name)
+        return None if call is None else call.service.kind
+
+    def _call_named(self, name: object) -> Call | None:
+        known = isinstance(name, str) and len(name) < _LONGEST_NUMBER and name.isascii() and name.isdigit()
+        return self._calls.get(int(str(name))) if known else None
+
+    def respond(
+        self, provider: Session, message: Mapping[str, Any], checked: Callable[[str], Any] | None = None
+    ) -> None:
+        """Pass on what a client answers to a call of its service; `checked` gives what was found good in it before.
 
         Raises:
             ProtocolError: Nobody waits for it, or it does not fit.
         """
         name = message.get("id")
-        call = self._calls.get(int(name)) if isinstance(name, str) and name.isascii() and name.isdigit() else None
+        call = self._call_named(name)
         if call is None or call.service.provider is not provider:
             raise ProtocolError(f"Nobody waits for a response with the id {describe(name)}.")
         result = message.get("result", True)
@@ -235,7 +249,9 @@ class Services:
             self.fail(call, _reason(call, message.get("values")))
             return
         try:
-            self._answer(call, self._packed(call, _response(call.service, message.get("values")), True))
+            kind = call.service.kind
+            values = checked(kind) if checked is not None else checked_values(kind, message.get("values"))
+            self._answer(call, self._packed(call, values, True))
         except BamEnvsError as error:
             self.fail(call, f"Service {call.service.name} answered wrongly: {error}")
             raise ProtocolError(f"Response of {call.service.name}: {error}") from None
@@ -280,8 +296,26 @@ def _named(kind: str, args: Any) -> Any:
     return {one.name: value for one, value in zip(fields[0], args, strict=False)}
 
 
-def _response(service: Service, values: Any) -> dict[str, Any]:
-    return complete(response_type(service.kind), {} if values is None else values)
+def checked_args(service: Service, args: Any) -> dict[str, Any]:
+    """The arguments of a call, complete.
+
+    Raises:
+        BamEnvsError: They do not fit.
+    """
+    return _check_of(service.kind)(request_type(service.kind), _named(service.kind, args))
+
+
+def checked_values(kind: str, values: Any) -> dict[str, Any]:
+    """The response of a service of type `kind`, complete.
+
+    Raises:
+        InvalidValue: It does not fit.
+    """
+    return _check_of(kind)(response_type(kind), {} if values is None else values)
+
+
+def _check_of(kind: str) -> Callable[[str, object], dict[str, Any]]:
+    return complete_known if kind in _LENIENT else complete
 
 
 def _reason(call: Call, values: Any) -> str:

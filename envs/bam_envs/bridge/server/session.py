@@ -39,8 +39,10 @@ class Limits:
     max_message: int = 64 * 2**20
     """Largest answer to a client [bytes]."""
     max_incoming: int = 16 * 2**20
-    """Largest message from a client [bytes], and most that its unfinished fragments may hold together: reading one
-    holds up everybody, and each client may have one under way."""
+    """Largest message from a client [bytes], and most that its unfinished fragments may hold together."""
+    unfinished: int = 64 * 2**20
+    """Most that the unfinished fragments of all clients may hold together, and their unfinished frames [bytes]: who
+    holds most gives way."""
     topics: int = 1024
     """Most subscriptions, and most advertisements."""
     services: int = 256

@@ -114,6 +114,13 @@ class Topic:
     latched: tuple[Session | None, Publication] | None = None
     """That message, and whose it is."""
 
+    def packed(self, publication: Publication) -> Publication:
+        """`publication`, packed for who gets it at once, which nobody else is to wait for. From any thread."""
+        for stream in list(self.streams.values()):
+            if stream.is_prompt:
+                publication.packet(stream.name, stream.wire)
+        return publication
+
     @property
     def is_used(self) -> bool:
         """Whether anyone publishes or listens."""

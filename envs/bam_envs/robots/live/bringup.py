@@ -7,7 +7,8 @@ server can tell it (rosapi), and the first message of every source.
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
 
 from bam_envs.errors import InvalidValue, LinkLost, ProtocolError, RemoteError, StaleState
 from bam_envs.robots.live.state import LiveState
@@ -22,26 +23,43 @@ if TYPE_CHECKING:
 _ASK_AGAIN = 0.1
 TIMEOUT = 3.0
 """Longest that a question to the server takes, and that a first message is waited for [s]."""
+_LOOKS = 5
+"""How many states of a topic are to come in a period, or in the time after which one is too old."""
 _QUESTIONS = 3
-"""How often the robot is asked who it is in that time."""
+"""How often a question is asked in that time."""
 
 
-def ask_info(link: RosbridgeLink, questions: int = _QUESTIONS) -> RobotInfo | None:
-    """What the robot says of itself; None if it says nothing, as somebody else's does. Asked again where all is silent.
+def ask_info(link: RosbridgeLink) -> RobotInfo | None:
+    """What the robot says of itself; None if it says nothing, as somebody else's does."""
+    service = link.namespace + INFO_SERVICE
+    answer = ask(link, service)
+    return None if answer is None else read_info(answer.get("message"), service)
+
+
+def ask(link: RosbridgeLink, service: str, questions: int = _QUESTIONS) -> dict[str, Any] | None:
+    """What `service`, which takes nothing, answers; None if there is no such service. Asked again where all is silent.
 
     A ROS 2 bridge makes a client for each call, and the answer is lost where it comes before the two have met.
+
+    Raises:
+        LinkLost: No answer.
     """
-    service = link.namespace + INFO_SERVICE
     try:
-        answer = link.call(service, "", {}, TIMEOUT / _QUESTIONS)
-    except (LinkLost, RemoteError) as error:
-        # A server that ends the call itself says it with a failed response.
-        if isinstance(error, RemoteError) and "Timeout exceeded" not in str(error):  # there is no such service
-            return None
+        return link.call(service, "", {}, TIMEOUT / _QUESTIONS)
+    except RemoteError:  # there is no such service
+        return None
+    except LinkLost:
         if questions == 1 or not link.is_up:
             raise
-        return ask_info(link, questions - 1)
-    return read_info(answer.get("message"), service)
+        return ask(link, service, questions - 1)
+
+
+def info_by_profile(url: str, profile: RobotProfile, unknown: Iterable[str] = ()) -> RobotInfo:
+    """What is known of a robot at `url` that does not describe itself; `unknown` is where it might say more."""
+    silent = ", ".join(name.rpartition("/")[2] for name in unknown)
+    rest = f"; it does not say {silent}" if silent else ""
+    known = f"profile {profile.name}: {', '.join(profile.command.labels)}"
+    return RobotInfo(profile.name, text=f"the robot at {url}, which does not describe itself ({known}{rest})")
 
 
 def tagged_sinks(profile: RobotProfile, way: str | None, info: RobotInfo) -> tuple[Sink, ...]:
@@ -98,6 +116,11 @@ class TopicTypes:
             raise self._misfit(topic, expected, found)
         return found or expected
 
+    def may_be(self, topic: str, kind: str) -> bool:
+        """Whether `topic` is of type `kind` there, or the server does not say."""
+        found = self._found(topic)
+        return same_type(found, kind) if found else not self._answers
+
     def _misfit(self, topic: str, expected: str, found: str) -> ProtocolError:
         return ProtocolError(
             f"{topic} is a {found} there, and {expected} was expected. "
@@ -135,6 +158,18 @@ class TopicTypes:
             return ""
         kind = answer.get("type")
         return kind if isinstance(kind, str) else ""
+
+
+def throttle(profile: RobotProfile, topic: str, period: float) -> int:
+    """Least time between two states on `topic` that a bridge is asked for [ms].
+
+    A driver may send 500 a second, and a busy bridge ages each that nobody looks at. A fifth of the `period` [s], or of
+    the oldest that is acted on, costs no freshness that matters. Of several publishers on one topic it could be always
+    the same one's messages that are left out, so such a topic comes whole.
+    """
+    if any(source.partial for source in profile.state if source.topic == topic):
+        return 0
+    return int(1000 * min(period, profile.max_age) / _LOOKS)
 
 
 def await_first(link: RosbridgeLink, state: LiveState, profile: RobotProfile) -> None:

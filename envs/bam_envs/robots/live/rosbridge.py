@@ -18,20 +18,42 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.bridge.freshness import Tag, Tagger
+from bam_envs.at_exit import close_at_exit
+from bam_envs.bridge.freshness import Tag
 from bam_envs.bridge.link.addresses import parse_address
 from bam_envs.bridge.link.connection import bare_reason
 from bam_envs.bridge.link.link import RosbridgeLink
-from bam_envs.errors import BamEnvsError, InvalidValue, LinkLost, NotInCommand, RemoteError, ResetNeeded, StaleState
-from bam_envs.robots.live.bringup import TopicTypes, ask_info, await_first, require_period, tagged_sinks
+from bam_envs.bridge.sessions import is_over
+from bam_envs.errors import (
+    BamEnvsError,
+    InvalidValue,
+    LinkLost,
+    NotInCommand,
+    NotReady,
+    RemoteError,
+    ResetNeeded,
+    StaleState,
+)
+from bam_envs.robots.live.bringup import (
+    TopicTypes,
+    ask_info,
+    await_first,
+    info_by_profile,
+    require_period,
+    tagged_sinks,
+    throttle,
+)
 from bam_envs.robots.live.grid import Grid
 from bam_envs.robots.live.mailbox import Letter
+from bam_envs.robots.live.readiness import LiveReadiness
 from bam_envs.robots.live.rest import hold_command, places_of, rest_command
+from bam_envs.robots.live.session import DrivingSession
 from bam_envs.robots.live.state import LiveState
 from bam_envs.robots.profiles.tables import RobotProfile
 from bam_envs.robots.robot import Initial, RobotSpec, RobotState, Rows
 from bam_envs.robots.safety.safe import ClearedCommand
 from bam_envs.robots.wire.codec import HALT_TOPIC, SCENE_TOPIC, RobotInfo, encode_sink
+from bam_envs.robots.wire.command_messages import has_room
 from bam_envs.transports.string_rpc import StringRpc
 
 Array = NDArray[np.float64]
@@ -43,10 +65,11 @@ _RESET_TIMEOUT = 3.0
 """Longest that a fresh state, or a scene, is waited for [s]."""
 _HALT_WAITS = 0.05
 """Longest that a halt waits for a command that is being sent, so as to come after it [s]."""
-_HALT_NOT_SENT = (
-    "%s: the halt could not be sent, %s: stop it by hand if it moves; a robot with a dead-man stops by itself."
-)
+_BY_HAND = "stop it by hand if it moves; a robot with a dead-man stops by itself"
+_HALT_NOT_SENT = f"%s: the halt could not be sent, %s: {_BY_HAND}."
 _AS_SAID = ". Nothing was sent, and nothing is kept"
+_FAR, _CANNOT_BE_FAR = 0.3, 1.0
+"""An arm that was commanded in the last second cannot be farther than this [rad] from its command."""
 _LATE = ("expired", "old message", "old connection")
 """How the robot's side says that a command came too late: it holds, and the next one counts."""
 
@@ -83,17 +106,17 @@ class RosbridgeRobot:
         command: str | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.spec = profile.spec(spec, command)
+        self._spec = profile.spec(spec, command)
         self.profile = profile.narrowed(self.spec.command.labels, command)
         self.url = url
         self.namespace = parse_address(url).namespace
-        self.info = RobotInfo(self.profile.name)
-        """What it says of itself; known after `connect`."""
+        self._info = RobotInfo(self.profile.name)
         self._hears_halts = False
         self._way, self._sinks = command, self.profile.sinks(command)
         self._ca_file, self._token = ca_file, token
         self._clock, self._state = clock, LiveState(self.profile, self.spec, clock)
-        self._grid, self._tagger = Grid(self.spec.period), Tagger()
+        self._readiness: LiveReadiness | None = None  # of a robot that is real
+        self._grid, self._session = Grid(self.spec.period), DrivingSession()
         self._command_life = profile.command_life(self.spec.period)
         self._control: RosbridgeLink | None = None
         self._halting: RosbridgeLink | None = None
@@ -102,11 +125,28 @@ class RosbridgeRobot:
         self._sending, self._halts = threading.Lock(), 0
         self._halt_failed = False  # and somebody was told
         self._commanded = False  # since `connect`
+        self._drove = False  # since the session was opened
+        self._session_over = False  # by the words of the robot's side
         self._refusals: list[BamEnvsError] = []
         self._sent: Array | None = None
+        self._sent_at = -math.inf
+        self._answers = False  # whether it says which command it has executed, while its time goes on
+        self._owed: dict[int, float] = {}  # number of the command -> when it was sent [s], of those without an answer
+
+    @property
+    def spec(self) -> RobotSpec:
+        """The signals and commands of the task."""
+        return self._spec
+
+    @property
+    def info(self) -> RobotInfo:
+        """What it says of itself; known after `connect`."""
+        return self._info
 
     def connect(self) -> None:
         """Open both connections, learn who is there, and see that every topic is what the profile says.
+
+        It is closed when Python ends, which halts it.
 
         Raises:
             NoServer: There is no usable server.
@@ -126,6 +166,7 @@ class RosbridgeRobot:
             halting.close()
             control.close()
             raise
+        close_at_exit(self)
 
     def _new_link(self, name: str) -> RosbridgeLink:
         return RosbridgeLink(self.url, name=name, ca_file=self._ca_file, token=self._token)
@@ -137,18 +178,27 @@ class RosbridgeRobot:
         halting.connect()
         halting.heartbeat(_HEARTBEAT, _LOST_AFTER)
         said = ask_info(control)
-        self._hears_halts, self.info = said is not None, said or RobotInfo(self.profile.name)
+        self._hears_halts, self._info = said is not None, said or info_by_profile(self.url, self.profile)
         if said is not None:
             self._sinks = tagged_sinks(self.profile, self._way, said)
             require_period(said, self.spec.period)
+            tagged = all(sink.tag and has_room(sink.type) for sink in self._sinks)
+            self._answers = tagged and not said.lockstep
         self._state.server_offset = lambda: control.clock_offset
-        self._declare(control, halting, TopicTypes(control, self.profile))
+        types = TopicTypes(control, self.profile)
+        self._declare(control, halting, types)
+        self._readiness = None
+        if said is None:
+            self._readiness = LiveReadiness(self.profile, self._sinks, types)
 
     def _declare(self, control: RosbridgeLink, halting: RosbridgeLink, types: TopicTypes) -> None:
         """Subscribe states and advertise commands, with the types that they have there."""
         for topic, kind in self._state.topics.items():
             name = self.namespace + topic
-            control.subscribe(name, types.check(name, kind), self._state.listener(topic))
+            # What describes itself sends no more than is needed; in lockstep every state is the answer to a command.
+            least = 0 if self._hears_halts else throttle(self.profile, topic, self.spec.period)
+            listener, kind = self._state.listener(topic), types.check(name, kind)
+            control.subscribe(name, kind, listener, throttle_ms=least, queue_length=1 if least else 0)
         for sink in self._sinks:
             name = self.namespace + sink.topic
             kind = types.check_listened(name, sink)
@@ -162,36 +212,58 @@ class RosbridgeRobot:
         self._epoch = control.epoch
         self._state.forget_ages()
         await_first(control, self._state, self.profile)
+        if self._readiness is not None:
+            self._readiness.begin(control)
+            self._info = info_by_profile(self.url, self.profile, self._readiness.unknown)
+        self._open_session(control)
         self._refusals.clear()
         self._state.read()
         self._sent = None
 
+    def _open_session(self, control: RosbridgeLink) -> None:
+        """From now on commands are signed for a new session, where the robot's side has such."""
+        if self._hears_halts:
+            self._session.open(control)
+        self._drove = self._session_over = False
+
+    def _answered_session(self) -> str | None:
+        echo = self._state.echo()
+        return None if echo is None else echo[0]
+
     def _on_down(self, error: LinkLost) -> None:
         self._cut.set()
         self._state.mailbox.clear()
+        if self._readiness is not None:
+            self._readiness.forget()
         self._state.stop_waiting()
 
     def _on_status(self, status: Mapping[str, Any]) -> None:
         """The server, or the robot's side behind it, says that something does not work."""
+        if self._readiness is not None and self._readiness.owns(status, self.namespace):
+            return
         if status.get("level") == "error":
             text = str(status.get("msg"))
             _LOG.debug("%s: %s", self.url, text)
             if not any(reason in text for reason in _LATE):
                 refusal = NotInCommand if " in command" in text else RemoteError
-                self._on_refusal(refusal(f"{self.url}: {text}"))
+                error = refusal(f"{self.url}: {text}")
+                self._session_over |= is_over(error)
+                self._on_refusal(error)
 
     def _on_refusal(self, error: BamEnvsError) -> None:
         """The command that was sent last is refused, there or here."""
-        self._refusals.append(error)
+        if not self._refusals:  # the first one is told, however many a server sends
+            self._refusals.append(error)
         self._state.stop_waiting()
 
     def reset(self, rows: Rows, initial: Initial) -> RobotState:
-        """A fresh state. Nothing real moves; the object of a simulated robot is put where `initial` says.
+        """A fresh state. Nothing real moves; a simulated robot is at rest, its object where `initial` says.
 
         After the link dropped and is back, this is what makes the robot usable again.
 
         Raises:
             LinkLost: The link is down.
+            NotReady: The robot says that it cannot move now.
             RemoteError: The other end refused the scene.
             StaleState: No fresh state came.
         """
@@ -199,19 +271,24 @@ class RosbridgeRobot:
         control.wait_up(_RESET_TIMEOUT)
         if control.epoch != self._epoch or self._cut.is_set():
             self._begin(control)
+        elif self._session_over or (self._drove and self._answered_session() != self._session.tagger.session):
+            self._open_session(control)  # the robot's side began anew, and does not know the old one
         self._refusals.clear()
-        if self.info.simulated and "object_pose" in initial.signals:
+        self._require_ready(self.not_ready())
+        if self.info.simulated:
             self._set_scene(control, initial)
         self._await(lambda slots: self._state.age() <= self.profile.max_age)
         self._grid.restart()
         return self.measure()
 
     def _set_scene(self, control: RosbridgeLink, initial: Initial) -> None:
-        pose = np.asarray(initial.signals["object_pose"], dtype=np.float64)
-        rpc = StringRpc(control, self.namespace + SCENE_TOPIC)
+        pose = initial.signals.get("object_pose")
+        scene = {"object_pose": None if pose is None else pose.tolist(), "seeds": np.asarray(initial.seeds).tolist()}
+        rpc = StringRpc(control, self.namespace + SCENE_TOPIC, self._session.tagger)
+        self._drove = True
+        self._session.drive()
         try:
-            scene = {"object_pose": pose.tolist(), "seeds": np.asarray(initial.seeds).tolist()}
-            rpc.call({**scene, "session": self._tagger.session}, _RESET_TIMEOUT)
+            rpc.call(scene, _RESET_TIMEOUT)
         finally:
             rpc.close()
         before = {name: letter.number for name, letter in self._state.mailbox.newest().items()}
@@ -234,6 +311,7 @@ class RosbridgeRobot:
             ResetNeeded: Not connected.
             InvalidValue: The command did not pass the guards.
             LinkLost: A connection dropped, before or during this step; nothing more is sent until `reset`.
+            NotReady: The robot says that it cannot move now.
             NotInCommand: Another client is in command of the robot.
             RemoteError: The robot's side refused a command.
             StaleState: The robot did not answer in time.
@@ -242,15 +320,16 @@ class RosbridgeRobot:
         control = self._connected()
         if not isinstance(command, ClearedCommand):
             raise InvalidValue("Commands reach a live robot only through SafeRobot. Build it with live_robot(...).")
+        told = command.for_robot(self)[0]
         self._require_link()
         self._require_accepted()
         end = self._grid.next(self._clock())
         # Where no time passes between commands, a late one does no harm before it is given up.
-        tag = self._tagger.next(self._epoch, ANSWER_TIMEOUT if self.info.lockstep else self._command_life)
+        tag = self._session.tagger.next(self._epoch, ANSWER_TIMEOUT if self.info.lockstep else self._command_life)
         if self.info.lockstep:
-            self._ask(control, command.command[0], tag)
+            self._ask(control, told, tag)
         else:
-            self._send(control, command.command[0], tag)
+            self._send(control, told, tag)
             self._cut.wait(max(0.0, end - self._clock()))
         self._require_link()
         self._require_accepted()
@@ -261,28 +340,35 @@ class RosbridgeRobot:
         halts, messages = self._halts, self._messages(control, command, tag)
         with self._sending:
             if self._halts == halts:
-                self._commanded = True
+                self._note_driving()
                 control.publish_all(messages)
-                self._sent = command.copy()
+                self._sent, self._sent_at = command.copy(), self._clock()
+                if self._answers:
+                    self._owed[tag.sequence] = self._sent_at
 
     def _ask(self, control: RosbridgeLink, command: Array, tag: Tag) -> None:
         """Send as `_send`, and wait for the answer; that they were sent need not be waited for before."""
         halts, messages, take_back = self._halts, self._messages(control, command, tag), _nothing
-        self._state.expect(tag.to_text())
+        self._state.expect(tag.echo)
         try:
             with self._sending:
                 if self._halts == halts:
-                    self._commanded = True
+                    self._note_driving()
                     take_back = control.begin_publishing(messages, self._on_refusal)
                     self._sent = command.copy()
             self._await_answer()
         finally:
             take_back()
 
+    def _note_driving(self) -> None:
+        self._commanded = self._drove = True
+        self._session.drive()
+
     def _messages(self, control: RosbridgeLink, command: Array, tag: Tag) -> list[tuple[str, dict[str, Any]]]:
         """Topics and messages that send `command` (m,)."""
         ros1 = control.ros == "ros1"
-        envelopes = [encode_sink(sink, self.spec, command, tag, ros1=ros1) for sink in self._sinks]
+        sign = self._session.tagger.sign
+        envelopes = [encode_sink(sink, self.spec, command, tag, sign=sign, ros1=ros1) for sink in self._sinks]
         return [(self.namespace + topic, message) for topic, _, message in envelopes]
 
     def _await_answer(self) -> None:
@@ -314,10 +400,21 @@ class RosbridgeRobot:
         age = self._state.age()
         return 0.0 if self.info.lockstep and math.isfinite(age) else age
 
+    def waiting(self) -> float:
+        """For how long the robot has owed the answer to a command [s]; 0 where it owes none, or gives none."""
+        echo = self._state.echo()
+        if echo is not None and echo[0] == self._session.tagger.session:
+            for number in list(self._owed):
+                if number <= echo[1]:  # executed, or replaced by one that was
+                    self._owed.pop(number, None)
+        owed = list(self._owed.values())  # a halt in another thread clears it
+        return self._clock() - owed[0] if owed else 0.0
+
     def halt(self) -> None:
         """Stop moving and keep the link, on the connection that does nothing else. From any thread; never raises."""
         self._halts += 1
         halting = self._halting
+        self._owed.clear()  # what has not been executed is not any more
         if halting is None:
             return
         first = self._sending.acquire(timeout=_HALT_WAITS)
@@ -337,7 +434,7 @@ class RosbridgeRobot:
         if self._hears_halts:
             return
         hold = self._hold()
-        tag = self._tagger.next(self._epoch, self._command_life)
+        tag = self._session.tagger.next(self._epoch, self._command_life)
         for sink in self._sinks:
             if np.isfinite(hold[places_of(self.spec, sink)]).all():  # what is not known is not commanded
                 topic, _, message = encode_sink(sink, self.spec, hold, tag, ros1=halting.ros == "ros1")
@@ -350,12 +447,19 @@ class RosbridgeRobot:
             signals = self._state.signals() if self._state.age() <= self.profile.max_age else {}
         except BamEnvsError:  # what it measures cannot be read: it holds what it was sent
             signals = {}
-        return hold_command(self.spec, self._sinks, signals, self._sent)
+        hold = hold_command(self.spec, self._sinks, signals, self._sent)
+        if self._sent is None or self._clock() - self._sent_at > _CANNOT_BE_FAR:
+            return hold
+        joints = np.array([unit == "rad" for unit in self.spec.command.units])
+        if (np.abs(hold - self._sent)[joints] > _FAR).any():  # guards let no joint get so far: it is measured wrongly
+            hold[joints] = self._sent[joints]
+        return hold
 
     def close(self) -> None:
         """Halt what was commanded from here, then drop both connections. As often as one likes."""
         if self._commanded:  # who only looked moves nothing, and stops nobody else
             self.halt()
+        self._session.leave()
         control, halting = self._control, self._halting
         self._control = self._halting = None
         self._commanded = False
@@ -373,13 +477,29 @@ class RosbridgeRobot:
         """Both connections are up, and have been since `connect` or `reset`."""
         control, halting = self._connected(), self._halting
         if not control.is_up:
-            raise LinkLost(f"{self.url}: the link is down. Nothing was sent, and nothing is kept.")
+            self._halt_failed = self._commanded  # as is said here
+            advice = f"; {_BY_HAND}" if self._commanded else ""
+            raise LinkLost(f"{self.url}: the link is down. Nothing was sent, and nothing is kept{advice}.")
         if self._cut.is_set() or control.epoch != self._epoch:
             raise LinkLost(f"{self.url}: the link dropped, and is back. Nothing is sent before reset().")
         if halting is None or not halting.is_up:
             raise LinkLost(f"{self.url}: the connection that halts the robot is down. Nothing is sent without it.")
 
+    def not_ready(self) -> str | None:
+        """Why the robot cannot move now, by its own words; None if it does not say so, or is not connected.
+
+        Not while commands are sent: it may ask the server, which takes a while.
+        """
+        control = self._control
+        return None if control is None or self._readiness is None else self._readiness.not_ready(control)
+
+    def _require_ready(self, why: str | None) -> None:
+        if why is not None:
+            raise NotReady(f"{self.url}: not ready: {why}. Nothing moves before it is ready and reset() is called.")
+
     def _require_accepted(self) -> None:
+        if self._readiness is not None:
+            self._require_ready(self._readiness.fault(moving=True))
         if self._refusals:
             refusal = self._refusals[0]
             self._refusals.clear()

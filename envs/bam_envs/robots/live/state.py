@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.bridge.bus import Caller, Listener, Message
-from bam_envs.bridge.freshness import ClockOffset
+from bam_envs.bridge.freshness import ClockOffset, read_echo
 from bam_envs.errors import StaleState
 from bam_envs.robots.live.mailbox import Alarm, Letter, Mailbox
 from bam_envs.robots.profiles.tables import RobotProfile, Source
@@ -181,8 +181,13 @@ class LiveState:
         self._look(letters)
         return max(self._ages[head].at(now) - extra for head, extra in self._extra.items())
 
+    def echo(self) -> tuple[str, int] | None:
+        """Session and number of the command that the newest state answers; None if it answers none."""
+        echoes = (read_echo(tag_text(letter.message)) for letter in self.mailbox.newest().values())
+        return next((one for one in echoes if one is not None), None)
+
     def expect(self, tag: str) -> None:
-        """From now on look for the answer to the command with the text `tag`, which is about to be sent."""
+        """From now on look for the answer to the command with the echo `tag`, which is about to be sent."""
         self._answered.stop()
         self._expected = tag
 

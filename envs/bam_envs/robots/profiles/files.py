@@ -36,12 +36,14 @@ def read_profile(name: str) -> tuple[str, Table]:
     if path.suffix not in _SUFFIXES and len(path.parts) == 1:
         if name not in shipped_profiles():
             raise UnknownName("robot profile", name, shipped_profiles())
-        return f"{name}.toml", _parsed(f"{name}.toml", (_folder() / f"{name}.toml").read_text(encoding="utf-8"))
-    table = _parsed(name, _text_of(path))
+        path = Path(f"{name}.toml")
+        table = _parsed(path.name, (_folder() / path.name).read_text(encoding="utf-8"))
+    else:
+        table = _parsed(name, _text_of(path))
     if "extends" not in table:
-        return name, table
+        return str(path), table
     _, base = read_profile(_extended(path, table["extends"]))
-    return name, {**base, **{key: value for key, value in table.items() if key != "extends"}}
+    return str(path), {**base, **{key: value for key, value in table.items() if key != "extends"}}
 
 
 def _extended(path: Path, base: object) -> str:

@@ -1,8 +1,8 @@
 """Robot profiles: which topics a live robot has, in which order and unit its numbers come, how old they may be.
 
 A profile is one TOML or YAML file; ``profiles/ur5e.toml`` and ``profiles/mir100.toml`` are shipped and show every
-table. A file may start from another (``extends = "ur5e"``), replace whole tables of it, and rename topics
-(``[rename]``); ``ignore`` at its top lists names that may come with every source of names.
+table. A file may start from another (``extends = "ur5e"``), replace whole tables of it, rename topics (``[rename]``)
+and frames (``[frames]``); ``ignore`` at its top lists names that may come with every source of names.
 
 Longer than other modules because it is one list of what each key must be.
 """
@@ -18,17 +18,18 @@ from typing import Any, Literal, TypeVar
 from bam_envs.errors import InvalidValue, UnknownName
 from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.profiles.files import read_profile, shipped_profiles
-from bam_envs.robots.profiles.tables import IMAGE_TYPES, CameraSource, RobotProfile, Sink, Source
+from bam_envs.robots.profiles.tables import IMAGE_TYPES, CameraSource, Readiness, RobotProfile, Sink, Source
 from bam_envs.robots.profiles.typed_table import read_table, require_known, require_table, require_tables
 from bam_envs.robots.robot import RobotSpec, SignalSpec
-from bam_envs.robots.safety.guard import PROFILE_TOPS, Limits
+from bam_envs.robots.safety.guard import BOUNDS, Limits
 from bam_envs.robots.ur5e import arm_spec
 from bam_envs.robots.wire.command_messages import LISTED_TYPES
+from bam_envs.robots.wire.messages import has_header
 
 __all__ = ["CameraSource", "RobotProfile", "Sink", "Source", "load_profile", "profile_for", "shipped_profiles"]
 
 Table = Mapping[str, Any]
-Topical = TypeVar("Topical", Source, Sink, CameraSource)
+Topical = TypeVar("Topical", Source, Sink, CameraSource, Readiness)
 _TYPE = re.compile(r"([A-Za-z]\w*)/(?:msg/)?([A-Za-z]\w*)")
 _TOPIC = re.compile(r"(/[A-Za-z]\w*)+")
 _AGES = {"arm": 0.1, "base": 0.5}
@@ -77,7 +78,9 @@ class _Head:
     dead_man: float | None = None
     limits: Mapping[str, float] = field(default_factory=dict)
     rename: Mapping[str, str] = field(default_factory=dict)
+    frames: Mapping[str, str] = field(default_factory=dict)
     ignore: tuple[str, ...] = ()
+    controllers: str = ""
 
 
 @dataclass(frozen=True)
@@ -92,21 +95,27 @@ class _Signal:
     max_rate: tuple[float, ...] = ()
 
 
-_TABLES = ("signals", "command", "state", "commands", "cameras")
+_TABLES = ("signals", "command", "state", "commands", "cameras", "readiness")
 
 
 def _profile(where: str, table: Table) -> RobotProfile:
     """The profile in `table`, which the file `where` holds."""
     require_known(table, [*_Head.__dataclass_fields__, *_TABLES, "extends"], where)
     head = read_table(_Head, {key: value for key, value in table.items() if key not in _TABLES}, where)
-    _require_positive(where, {"period": head.period, "dead_man": head.dead_man})
+    _require_positive(where, {"period": head.period})
     _require_age(where, head.max_age)
+    _require_age(where, head.dead_man, "dead_man")
     _require_limits(where, head.limits)
     spec = _robot(where, head, table)
     state = tuple(_ignoring(source, head.ignore) for source in _state(where, table, spec))
+    state = _framed(where, head.frames, state)
     commands = _commands(where, table, spec.command)
     cameras = tuple(_checked_camera(at, _topical(CameraSource, row, at)) for row, at in _rows(where, table, "cameras"))
-    new_name = _renaming(where, head.rename, [*state, *cameras, *(sink for way in commands.values() for sink in way)])
+    readiness = tuple(
+        _checked_readiness(at, _topical(Readiness, row, at)) for row, at in _rows(where, table, "readiness")
+    )
+    sinks = [sink for way in commands.values() for sink in way]
+    new_name = _renaming(where, head.rename, [*state, *cameras, *readiness, *sinks])
     return RobotProfile(
         name=head.name,
         kind=head.kind,
@@ -119,6 +128,8 @@ def _profile(where: str, table: Table) -> RobotProfile:
         dead_man=head.dead_man or _AGES[head.kind],
         limits=head.limits,
         cameras=tuple(map(new_name, cameras)),
+        readiness=tuple(map(new_name, readiness)),
+        controllers=head.controllers,
     )
 
 
@@ -128,11 +139,12 @@ def _require_positive(where: str, numbers: Mapping[str, float | None]) -> None:
             raise InvalidValue(f"{where}: {key} must be above 0, not {number:g}.")
 
 
-def _require_age(where: str, max_age: float | None) -> None:
-    top, unit = PROFILE_TOPS["max_age"]
-    _require_positive(where, {"max_age": max_age})
-    if max_age is not None and max_age > top:
-        raise InvalidValue(f"{where}: max_age may be {top:g} {unit} at most, not {max_age:g}.")
+def _require_age(where: str, age: float | None, key: str = "max_age") -> None:
+    """States that are older mean nothing any more, nor do commands (`dead_man`)."""
+    _, top, unit = BOUNDS["max_age"]
+    _require_positive(where, {key: age})
+    if age is not None and age > top:
+        raise InvalidValue(f"{where}: {key} may be {top:g} {unit} at most, not {age:g}.")
 
 
 def _require_limits(where: str, limits: Mapping[str, float]) -> None:
@@ -229,6 +241,8 @@ def _checked_source(where: str, source: Source, size: int) -> Source:
         raise InvalidValue(f"{where}: partial and ignore need names.")
     _require_once(where, "name", [*source.names, *source.ignore])
     _require_age(where, source.max_age)
+    if source.frame and not has_header(source.type):
+        raise InvalidValue(f"{where}: frame needs a type with a header, such as {source.type}Stamped.")
     return replace(source, **_conversion(where, source, size))
 
 
@@ -236,6 +250,15 @@ def _ignoring(source: Source, names: tuple[str, ...]) -> Source:
     """`source`, which has nothing to do with `names` that are not its own."""
     others = tuple(name for name in names if name not in (*source.names, *source.ignore))
     return replace(source, ignore=(*source.ignore, *others)) if source.names else source
+
+
+def _framed(where: str, frames: Mapping[str, str], state: tuple[Source, ...]) -> tuple[Source, ...]:
+    """The sources, with what `frames` calls the frames of their topics."""
+    framed = {source.topic for source in state if source.frame}
+    for topic in frames:
+        if topic not in framed:
+            raise InvalidValue(f"{where}: frames: {UnknownName('topic with a frame', topic, framed)}")
+    return tuple(replace(source, frame=frames.get(source.topic, source.frame)) for source in state)
 
 
 def _conversion(where: str, entry: Source | Sink, size: int) -> dict[str, Any]:
@@ -272,7 +295,7 @@ def _checked_sink(where: str, sink: Sink) -> Sink:
             raise InvalidValue(f"{where}: {key} must have {size} values, not {len(values)}.")
     if not sink.fields and sink.type not in LISTED_TYPES:
         raise InvalidValue(f"{where}: {sink.type} needs fields; only {', '.join(sorted(LISTED_TYPES))} do without.")
-    _require_positive(where, {"reach": sink.reach})
+    _require_positive(where, {"reach": sink.reach, "reach_periods": sink.reach_periods})
     return replace(sink, names=sink.names or sink.labels, **_conversion(where, sink, size))
 
 
@@ -283,8 +306,14 @@ def _checked_camera(where: str, camera: CameraSource) -> CameraSource:
     return camera
 
 
+def _checked_readiness(where: str, entry: Readiness) -> Readiness:
+    if bool(entry.ready) == (entry.at_least is not None):
+        raise InvalidValue(f"{where}: give either ready (the values with which it can move) or at_least.")
+    return entry
+
+
 def _renaming(
-    where: str, names: Mapping[str, str], entries: list[Source | Sink | CameraSource]
+    where: str, names: Mapping[str, str], entries: list[Source | Sink | CameraSource | Readiness]
 ) -> Callable[[Topical], Topical]:
     """Gives an entry the new name of its topic."""
     topics = {entry.topic for entry in entries}
@@ -293,4 +322,12 @@ def _renaming(
             raise InvalidValue(f"{where}: rename: {UnknownName('topic', old, topics)}")
         if not _TOPIC.fullmatch(new):
             raise InvalidValue(f"{where}: rename: {old} must become an absolute name such as /ur/state, not {new!r}.")
-    return lambda entry: replace(entry, topic=names.get(entry.topic, entry.topic))
+
+    def rename(entry: Topical) -> Topical:
+        if entry.topic not in names:
+            return entry
+        # Who takes commands on a topic of another name is another controller.
+        other: dict[str, Any] = {"controller": ""} if isinstance(entry, Sink) else {}
+        return replace(entry, topic=names[entry.topic], **other)
+
+    return rename

@@ -6,10 +6,14 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 from bam_envs.errors import InvalidValue, UnknownName
 from bam_envs.robots.robot import RobotSpec, SignalSpec
+
+_TRAJECTORY = "trajectory_msgs/JointTrajectory"
+_LAGS = {"arm": 0.1, "base": 0.3}
+"""How far live robots are behind their commands [s], network and controller together; the limit `lag` changes it."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,8 @@ class Source:
     """What null, NaN and infinities in `field` mean; None: they are errors."""
     within: tuple[float, float] | None = None
     """Least and greatest that its numbers can be, as they travel: what is beyond is cut. None: as they come."""
+    frame: str = ""
+    """Frame that ``header.frame_id`` must name, or the message is refused; empty: not looked at."""
     max_age: float | None = None
     """Oldest that is acted on [s]; None: the profile's."""
     optional: bool = False
@@ -75,17 +81,66 @@ class Sink:
     offset: tuple[float, ...] = (0.0,)
     """See `scale`."""
     reach: float | None = None
-    """When a trajectory's point is to be reached [s]; None: one period after it was sent."""
+    """When a trajectory's point is to be reached [s]; None: `reach_periods` after it was sent."""
+    reach_periods: float = 1.0
+    """The same, in periods of the task; above 1 an arm does not stop where the next command is late."""
     hold: Literal["measured", "last", "zero"] = "measured"
     """What a halt sends: where it is, what was sent last, or zeros."""
     tag: bool = True
     """Whether the message says who sent it when, if its type has room for a text: ``header.frame_id``, or the label of
     an array's first dimension."""
+    controller: str = ""
+    """The controller of ros2_control that takes it, which must be active; empty, and where the topic is renamed: it is
+    not asked for."""
+
+    def reach_at(self, period: float) -> float:
+        """When a trajectory's point is to be reached [s], where a command is sent every `period` [s]."""
+        return period * self.reach_periods if self.reach is None else self.reach
 
     @cached_property
     def is_si(self) -> bool:
         """Whether its numbers travel in SI units, as they are."""
         return set(self.scale) == {1.0} and set(self.offset) == {0.0}
+
+
+@dataclass(frozen=True)
+class Readiness:
+    """A topic on which a robot says whether it can move. A robot that does not have it is driven without."""
+
+    topic: str
+    """Absolute name, without namespace."""
+    type: str
+    """Message type, ``pkg/Type``."""
+    field: tuple[str, ...]
+    """Where the value is, e.g. ``mode``; of several names the first that the message has."""
+    ready: tuple[float | bool | str, ...] = ()
+    """The values with which it can move; or `at_least`."""
+    at_least: float | None = None
+    """The least number with which it can begin to move."""
+    words: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """What other values mean, e.g. ``3 = "protective stop"``."""
+    otherwise: str = ""
+    """What all further values mean; ``{}`` stands for the value. Empty: the value itself is said."""
+
+    def value(self, message: Any) -> Any:
+        """The value in `message`; None if it has none."""
+        for path in self.field:
+            found = message
+            for name in path.split("."):
+                found = found.get(name) if isinstance(found, Mapping) else None
+            if found is not None:
+                return found
+        return None
+
+    def trouble(self, message: Any) -> str | None:
+        """Why the robot cannot move, by `message`; None if it can, or does not say."""
+        value = self.value(message)
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        enough = self.at_least is not None and not (number and value < self.at_least)
+        if value is None or value in self.ready or enough:
+            return None
+        text = f"{value:g}" if number else str(value).lower() if isinstance(value, bool) else str(value)
+        return self.words.get(text) or self.otherwise.replace("{}", text) or f"{self.field[0]} is {text}"
 
 
 IMAGE_TYPES = ("sensor_msgs/CompressedImage", "sensor_msgs/Image")
@@ -132,6 +187,10 @@ class RobotProfile:
     """Limits of the guards that differ from their defaults, by their names in `bam_envs.robots.safety.guards`."""
     cameras: tuple[CameraSource, ...] = ()
     """Its cameras."""
+    readiness: tuple[Readiness, ...] = ()
+    """Where it says whether it can move; the first one that says no is told."""
+    controllers: str = ""
+    """The service that lists its controllers and their states (``list_controllers``); empty: there is none."""
 
     @cached_property
     def sinks_by_topic(self) -> Mapping[str, Sink]:
@@ -226,10 +285,16 @@ class RobotProfile:
         """
         if wanted is None:
             signals = tuple(signal for signal in self.signals if not self.source(signal.name).optional)
-            return RobotSpec(self.name, signals, self.command, self.period)
+            return RobotSpec(self.name, signals, self.command, self.period, self._lag(self.period, mode))
         self._require_measured(wanted)
         signals = tuple(self.signal(signal.name) for signal in wanted.signals)
-        return RobotSpec(self.name, signals, self.narrowed(wanted.command.labels, mode).command, wanted.period)
+        command = self.narrowed(wanted.command.labels, mode).command
+        return RobotSpec(self.name, signals, command, wanted.period, self._lag(wanted.period, mode))
+
+    def _lag(self, period: float, mode: str | None) -> float:
+        """How far it is behind commands that are sent every `period` [s]: more where a trajectory takes longer."""
+        longest = max((sink.reach_at(period) for sink in self.sinks(mode) if sink.type == _TRAJECTORY), default=0.0)
+        return _LAGS[self.kind] + max(0.0, longest - period)
 
     def _require_measured(self, wanted: RobotSpec) -> None:
         known = {signal.name: signal for signal in self.signals}

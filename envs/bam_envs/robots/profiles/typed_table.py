@@ -71,6 +71,10 @@ def _text(value: Any) -> Any:
     return value if isinstance(value, str) and value else _MISFIT
 
 
+def _any_text(value: Any) -> Any:
+    return value if isinstance(value, str) else _MISFIT
+
+
 def _switch(value: Any) -> Any:
     return value if isinstance(value, bool) else _MISFIT
 
@@ -78,6 +82,10 @@ def _switch(value: Any) -> Any:
 def _number(value: Any) -> Any:
     plain = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
     return float(value) if plain else _MISFIT
+
+
+def _plain(value: Any) -> Any:
+    return value if isinstance(value, (bool, str)) else _number(value)
 
 
 def _count(value: Any) -> Any:
@@ -123,8 +131,9 @@ _READERS: dict[str, tuple[str, Callable[[Any], Any]]] = {
     str(float | None): ("a finite number", _number),
     str(tuple[str, ...]): ("a list of texts", _several(_text)),
     str(tuple[float, ...]): ("a list of finite numbers", _several(_number)),
+    str(tuple[float | bool | str, ...]): ("a list of numbers, texts, true and false", _several(_plain)),
     str(tuple[int, int]): ("two counts", _pair),
     str(tuple[float, float] | None): ("two finite numbers, the least first", _range),
     str(Mapping[str, float]): ("a table of finite numbers", _named(_number)),
-    str(Mapping[str, str]): ("a table of texts", _named(_text)),
+    str(Mapping[str, str]): ("a table of texts", _named(_any_text)),
 }

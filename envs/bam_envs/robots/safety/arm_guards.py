@@ -52,11 +52,11 @@ class JointSpeed(Guard):
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self._joints = joint_columns(spec)
         fastest = np.minimum(limits.joint_speed, max_rate(spec.command)[self._joints])
-        self.limit_value, self._reach = float(fastest.max()), fastest * spec.period
+        self.limit_value, self._fastest = float(fastest.max()), fastest
 
     def limit(self, tick: Tick) -> bool:
         """Shorten the step of all joints."""
-        return _shorten(tick, self._joints, self._reach)
+        return _shorten(tick, self._joints, self._fastest * tick.period)
 
 
 class RampIn(Guard):
@@ -70,7 +70,7 @@ class RampIn(Guard):
         fastest = np.minimum(limits.joint_speed, max_rate(spec.command)[self._joints])
         # Where nothing limits a joint's speed, a first step of any length would be near.
         free = np.where(np.isfinite(fastest), fastest, limits.reset_speed)
-        self._one_step, self._reach = free * spec.period * ROUNDING, limits.reset_speed * spec.period
+        self._one_step = free * spec.period * ROUNDING
         self._longest = math.ceil(limits.ramp_time / spec.period)
         self._left: int | None = None
 
@@ -80,13 +80,14 @@ class RampIn(Guard):
 
     def limit(self, tick: Tick) -> bool:
         """Shorten the step until the command is caught up with."""
+        reach = self.limit_value * tick.period
         if tick.approach:
-            return _shorten(tick, self._joints, self._reach)
+            return _shorten(tick, self._joints, reach)
         if self._left == 0:
             return False
         far = bool((np.abs(tick.goal - tick.last)[self._joints] > self._one_step).any())
         self._left = 0 if not far else self._longest - 1 if self._left is None else self._left - 1
-        return far and _shorten(tick, self._joints, self._reach)
+        return far and _shorten(tick, self._joints, reach)
 
 
 class ToolSpeed(Guard):
@@ -98,19 +99,19 @@ class ToolSpeed(Guard):
     def __init__(self, spec: RobotSpec, limits: Limits, tool_position: ToolPosition) -> None:
         self.limit_value = limits.tool_speed
         self._joints = joint_columns(spec)
-        self._reach, self._tool = limits.tool_speed * spec.period, tool_position
+        self._tool = tool_position
         self._known: dict[bytes, Array] = {}
 
     def limit(self, tick: Tick) -> bool:
         """Shorten the step of all joints."""
         last = tick.last[self._joints]
         step, share = tick.command[self._joints] - last, 1.0
-        here = self._position(last)
+        here, reach = self._position(last), self.limit_value * tick.period
         for _ in range(self._ROUNDS):
             travel = math.dist(here, self._position(last + share * step))
-            if travel <= self._reach * ROUNDING:
+            if travel <= reach * ROUNDING:
                 break
-            share *= 0.999 * self._reach / travel
+            share *= 0.999 * reach / travel
         else:
             share = 0.0
         if share == 1.0:
@@ -141,23 +142,25 @@ class JointAcceleration(Guard):
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self.limit_value = limits.joint_acceleration
         self._joints = joint_columns(spec)
-        self._change = limits.joint_acceleration * spec.period**2
+        self._period = spec.period
 
     def limit(self, tick: Tick) -> bool:
         """Bring the step near to the last one."""
         last = tick.last[self._joints]
         wanted, before = tick.command[self._joints] - last, tick.last_step[self._joints]
         distance = np.abs(tick.goal[self._joints] - last)
-        slowed = wanted * _least_share(longest_step(distance, self._change), np.abs(wanted))
-        step = self._near(slowed, before)
+        change = self.limit_value * tick.period**2
+        longest = longest_step(distance, self.limit_value * self._period**2) * (tick.period / self._period)
+        slowed = wanted * _least_share(np.where(distance <= change, distance, longest), np.abs(wanted))
+        step = self._near(slowed, before, change * ROUNDING)
         if (step == wanted).all():
             return False
         tick.command[self._joints] = last + step
         return True
 
-    def _near(self, wanted: Array, before: Array) -> Array:
+    @staticmethod
+    def _near(wanted: Array, before: Array, change: float) -> Array:
         """The longest part of `wanted` within reach of the step `before`; where there is none, each joint by itself."""
-        change = self._change * ROUNDING
         low, high = before - change, before + change
         if (wanted >= low).all() and (wanted <= high).all():
             return wanted
@@ -176,14 +179,15 @@ class GripperSpeed(Guard):
     def __init__(self, spec: RobotSpec) -> None:
         self._columns = np.flatnonzero([unit == "m" for unit in spec.command.units])
         rate = max_rate(spec.command)[self._columns]
-        self.limit_value, self._reach = float(rate.min()), rate * spec.period
+        self.limit_value, self._rate = float(rate.min()), rate
 
     def limit(self, tick: Tick) -> bool:
         """Clip the width."""
+        reach = self._rate * tick.period
         wanted = tick.command[self._columns]
         last, measured = tick.last[self._columns], tick.measured[self._columns]
         # Around a held object the last width is far below the fingers: opening begins at the fingers.
-        low, high = np.fmin(last, measured) - self._reach, np.fmax(last, measured) + self._reach
+        low, high = np.fmin(last, measured) - reach, np.fmax(last, measured) + reach
         tick.command[self._columns] = width = np.clip(wanted, low, high)
         return bool((width != wanted).any())
 

@@ -6,7 +6,8 @@ Each has a number, a name, a limit and a unit, and says one of three things:
 * `Guard.limit`: the command goes so far and no farther;
 * `Guard.trip`: what was measured is beyond what the robot may ever do, it is stopped.
 
-All of them look at one robot, at the last command that was *sent*, and take a tick to last one period.
+All of them look at one robot and at the last command that was *sent*; speeds and accelerations hold over the real time
+since then.
 """
 
 from __future__ import annotations
@@ -27,13 +28,30 @@ from bam_envs.robots.safety.arm_guards import (
     ToolPosition,
     ToolSpeed,
 )
-from bam_envs.robots.safety.guard import Guard, Limits, Tick, columns_in, default_age, is_base, joint_columns, max_rate
+from bam_envs.robots.safety.following import BaseFollowing, JointFollowing
+from bam_envs.robots.safety.guard import (
+    Guard,
+    Limits,
+    Tick,
+    columns_in,
+    default_age,
+    is_base,
+    joint_columns,
+    max_rate,
+    ticks_of,
+)
+from bam_envs.robots.safety.measured import measured_guards
 from bam_envs.robots.ur5e import GEOMETRY, JOINTS
 
 __all__ = ["Guard", "Limits", "Tick", "ToolPosition", "default_guards"]
 
 Array = NDArray[np.float64]
 _SPEEDS = {"m/s", "rad/s"}
+LATE = 2.0
+"""A live robot that was sent nothing for so many periods need not be where it was going to: its dead-man may have
+stopped it."""
+LATE_TICKS = 10
+"""So many late commands, one after another, stop the robot."""
 
 
 class Shape(Guard):
@@ -67,7 +85,8 @@ class Finite(Guard):
     number, name, unit = "G2", "finite", "bad ticks in a row"
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
-        self.limit_value, self._labels = limits.bad_ticks, spec.command.labels
+        self.limit_value = self.patience = limits.bad_ticks
+        self._labels = spec.command.labels
 
     def fault(self, tick: Tick) -> str | None:
         """Names the numbers that are not finite."""
@@ -83,14 +102,52 @@ class Freshness(Guard):
 
     number, name, unit = "G3", "state age", "s"
 
-    def __init__(self, max_age: float) -> None:
-        self.limit_value = max_age
+    def __init__(self, spec: RobotSpec, limits: Limits) -> None:
+        self.limit_value = limits.max_age or default_age(spec)
+        self.patience = ticks_of(limits.hold_time, spec)
 
     def fault(self, tick: Tick) -> str | None:
         """Says how old the state is."""
         if tick.age <= self.limit_value:
             return None
         return f"the newest state is {tick.age:.3f} s old, and at most {self.limit_value:g} s are allowed"
+
+
+class Pace(Guard):
+    """Commands come one period after the other: a late one is not executed, and a pause or many late ones stop."""
+
+    number, name, unit = "G15", "command pace", "s"
+
+    def __init__(self, spec: RobotSpec, limits: Limits) -> None:
+        self.limit_value, self._period = limits.max_pause, spec.period
+
+    def fault(self, tick: Tick) -> str | None:
+        """Says how late the command is."""
+        if tick.pause <= LATE * self._period:
+            return None
+        self.patience = 1 if tick.pause > self.limit_value else LATE_TICKS
+        return (
+            f"the command came {tick.pause:.3f} s after the one before, and one is expected every {self._period:g} s: "
+            "the policy takes too long, or this process was paused or the computer is busy"
+        )
+
+
+class Answers(Guard):
+    """A robot that says which command it has executed does so soon; else commands do not arrive, or late."""
+
+    number, name, unit = "G4", "answer to a command", "s"
+
+    def __init__(self, spec: RobotSpec, limits: Limits) -> None:
+        self.limit_value, self.patience = limits.answer_time, ticks_of(limits.hold_time, spec)
+
+    def fault(self, tick: Tick) -> str | None:
+        """Says for how long it has been waited."""
+        if tick.waiting <= self.limit_value:
+            return None
+        return (
+            f"a command that was sent {tick.waiting:.3f} s ago is not answered, and at most {self.limit_value:g} s are "
+            "allowed: commands do not arrive, or late; look at the network and at who else commands the robot"
+        )
 
 
 class BaseSpeed(Guard):
@@ -121,13 +178,14 @@ class BaseAcceleration(Guard):
         self.name, self.unit = name, f"{unit}^2"
         self._columns = columns_in(spec.command, unit)
         fastest = np.minimum(limit, max_rate(spec.command)[self._columns])
-        self.limit_value, self._change = float(fastest.max()), fastest * spec.period
+        self.limit_value, self._fastest = float(fastest.max()), fastest
 
     def limit(self, tick: Tick) -> bool:
         """Clip it around the last."""
         wanted, last = tick.command[self._columns], tick.last[self._columns]
-        low = np.where(last > 0, np.minimum(0.0, last - self._change), last - self._change)
-        high = np.where(last < 0, np.maximum(0.0, last + self._change), last + self._change)
+        change = self._fastest * tick.period
+        low = np.where(last > 0, np.minimum(0.0, last - change), last - change)
+        high = np.where(last < 0, np.maximum(0.0, last + change), last + change)
         tick.command[self._columns] = speed = np.clip(wanted, low, high)
         return bool((speed != wanted).any())
 
@@ -172,7 +230,13 @@ def default_guards(
     """
     limits = limits or Limits()
     _require_guarded(spec)
-    first: list[Guard] = [Shape(spec), Finite(spec, limits), Freshness(limits.max_age or default_age(spec))]
+    first: list[Guard] = [
+        Shape(spec),
+        Finite(spec, limits),
+        Freshness(spec, limits),
+        Pace(spec, limits),
+        Answers(spec, limits),
+    ]
     moving = _base_guards(spec, limits) if is_base(spec) else _arm_guards(spec, limits, tool_position)
     return [*first, *moving, MeasuredLimits(spec)]
 
@@ -193,10 +257,12 @@ def _require_guarded(spec: RobotSpec) -> None:
 
 def _arm_guards(spec: RobotSpec, limits: Limits, tool_position: ToolPosition | None) -> list[Guard]:
     # The tool's speed is looked at twice: joints that change their speed one by one can speed up the tool.
-    tool = _tool_guard(spec, limits, tool_position)
+    position = None if math.isinf(limits.tool_speed) else _kinematics(spec, tool_position)
+    tool: list[Guard] = [] if position is None else [ToolSpeed(spec, limits, position)]
     gripper: list[Guard] = [GripperSpeed(spec)] if "m" in spec.command.units else []
     acceleration = JointAcceleration(spec, limits)
     return [
+        *measured_guards(spec, limits, position),
         PositionLimits(spec, limits),
         *gripper,
         JointSpeed(spec, limits),
@@ -204,25 +270,41 @@ def _arm_guards(spec: RobotSpec, limits: Limits, tool_position: ToolPosition | N
         *tool,
         *([acceleration] if math.isfinite(limits.joint_acceleration) else []),
         *tool,
+        JointFollowing(spec, limits, position),
     ]
 
 
-def _tool_guard(spec: RobotSpec, limits: Limits, tool_position: ToolPosition | None) -> list[Guard]:
-    if math.isinf(limits.tool_speed):
-        return []
-    labels = tuple(np.array(spec.command.labels)[joint_columns(spec)])
-    if tool_position is None and labels != JOINTS:
+def _kinematics(spec: RobotSpec, tool_position: ToolPosition | None) -> ToolPosition:
+    """Forward kinematics.
+
+    Raises:
+        InvalidValue: They are not known, or the tool stays where it is when the joints turn.
+    """
+    joints = joint_columns(spec)
+    if tool_position is None:
+        if tuple(np.array(spec.command.labels)[joints]) == JOINTS:
+            return GEOMETRY.tool_position
         raise InvalidValue(
             f"The tool speed of {spec.name} cannot be limited: its kinematics are not known. "
-            "Give tool_position=, or the limit tool_speed = inf."
+            "Give tool_position=; a simulated robot may do with the limit tool_speed = inf."
         )
-    return [ToolSpeed(spec, limits, tool_position or GEOMETRY.tool_position)]
+    middle = (np.array(spec.command.low) + np.array(spec.command.high))[joints] / 2
+    turned = tool_position(middle + 0.5 * np.vstack([np.zeros_like(middle), np.eye(len(middle))]))
+    if not np.ptp(turned, axis=0).max() > 0.01:
+        raise InvalidValue(
+            f"tool_position of {spec.name} must give the position of the tool [m] for joints [rad], and the tool stays "
+            "within 0.01 m when each joint is turned by 0.5 rad."
+        )
+    return tool_position
 
 
 def _base_guards(spec: RobotSpec, limits: Limits) -> list[Guard]:
     return [
+        *measured_guards(spec, limits, None),
         BaseSpeed("base speed", "m/s", limits.base_speed, spec),
         BaseSpeed("turn speed", "rad/s", limits.turn_speed, spec),
         BaseAcceleration("base acceleration", "m/s", limits.base_acceleration, spec),
         BaseAcceleration("turn acceleration", "rad/s", limits.turn_acceleration, spec),
+        BaseFollowing("base following", "m/s", limits.base_acceleration, spec, limits),
+        BaseFollowing("turn following", "rad/s", limits.turn_acceleration, spec, limits),
     ]

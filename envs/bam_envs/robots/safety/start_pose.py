@@ -68,12 +68,13 @@ class StartPose:
         told = bool((sent == self.command)[self._joints].all())
         return told and not self.joints_off(measured)
 
-    def failure(self, measured: Array) -> StartNotReached:
-        """The error that names the joints."""
+    def failure(self, measured: Array, why: str | None = None) -> StartNotReached:
+        """The error that names the joints, and `why` the robot cannot move, if it says so."""
         off = self.joints_off(measured)
         where = ", ".join(f"{name} is {far:+.3f} rad from it" for name, far in off.items()) or "it is on its way"
+        said = "" if why is None else f"Not ready: {why}. "
         return StartNotReached(
-            f"The arm did not reach its start pose in {self._limits.reset_timeout:g} s: {where}. "
+            f"{said}The arm did not reach its start pose in {self._limits.reset_timeout:g} s: {where}. "
             "Look for what holds it, or raise the limit reset_timeout.",
             off,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +24,8 @@ LOWEST, HIGHEST = np.array(COMMAND.low), np.array(COMMAND.high)
 MAX_RATE = np.array(COMMAND.max_rate)
 GRIPPER_LEASH = 0.011
 """Farthest the gripper's set point runs ahead of its fingers [m]: what full force needs, so that it opens at once."""
+LAG = 0.05
+"""How far the joints are behind their set points [s]: damping by stiffness of the actuators."""
 PHYSICS_STEPS = 10
 """Physics steps a control period."""
 
@@ -42,7 +45,7 @@ class SimulatedArm:
     def __init__(self, num_robots: int = 1, *, with_object: bool = True, randomize: bool = False) -> None:
         self.num_robots = num_robots
         self.randomize = randomize
-        self.spec = arm_spec("ur5e", with_object=with_object)
+        self.spec = replace(arm_spec("ur5e", with_object=with_object), lag=LAG)
         self._with_object = with_object
         self._scene = "ur5e_cube.xml" if with_object else "ur5e_gripper.xml"
         self._physics: Physics | None = None
@@ -94,7 +97,9 @@ class SimulatedArm:
         return self._measure(rows)
 
     def place_object(self, pose: Array | None, seeds: NDArray[np.int64]) -> RobotState:
-        """Put the object elsewhere, at rest, and draw a new episode's differences; the arms stay as they are.
+        """Put the object elsewhere, draw a new episode's differences; all is at rest, and the arms stay where they are.
+
+        A drive whose force saturates can swing about its set point for good; an arm at rest has no such swing.
 
         Args:
             pose: x, y [m] and yaw [rad] on the table; None leaves it where it is. Shape: (n, 3).
@@ -109,9 +114,9 @@ class SimulatedArm:
         if self._imperfection is not None:
             for row, seed in enumerate(seeds):
                 self._imperfection.reset(row, int(seed), self._command[row])
+        physics.state = physics.state.copy()  # states handed out earlier are views of the old array
+        physics.qvel[:, : 8 if pose is None else None] = 0.0
         if pose is not None:
-            physics.state = physics.state.copy()  # states handed out earlier are views of the old array
-            physics.qvel[:, 8:] = 0.0
             self._lay_object(self._all_rows, pose)
         return self._measure(self._all_rows)
 

@@ -6,10 +6,10 @@ A live robot reads states and writes commands; a served one writes states and re
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from bam_envs.robots.wire.messages import (
     number_at,
     numbers,
     put_at,
+    require_frame,
     require_message,
     require_names,
     shown,
@@ -38,6 +39,8 @@ Array = NDArray[np.float64]
 Message = Mapping[str, Any]
 Envelope = tuple[str, str, dict[str, Any]]
 """Topic, type, message."""
+Sign = Callable[[Tag, str, bytes], str]
+"""The text of a tag on a topic with that content; `Tagger.sign` is one."""
 INFO_SERVICE = "/bam/robot"
 """Where a served robot says what it is (std_srvs/Trigger; `RobotInfo` in its message)."""
 HALT_TOPIC = "/bam/halt"
@@ -128,6 +131,8 @@ def decode_source(source: Source, message: object, size: int) -> Array:
         raw = _by_name(source, content, where)
     else:
         raw = _in_order(source, content, where, size)
+    if source.frame:
+        require_frame(source.frame, content, where)
     return _to_si(source, raw if source.within is None else np.clip(raw, *source.within))
 
 
@@ -191,8 +196,8 @@ def encode_state(
         state: Of all rows.
         row: Which row.
         stamp: When, as ROS 1 or ROS 2 writes it.
-        tag: Text of the tag of the command that this state is the answer to; it goes into ``frame_id`` of the last
-            of the messages, so that with it everything has arrived.
+        tag: `Tag.echo` of the command that this state is the answer to; it goes into ``frame_id`` of the last of the
+            messages, which is one without a frame, so that with it everything has arrived.
     """
     messages: dict[tuple[str, tuple[str, ...]], Envelope] = {}
     for source in profile.state:
@@ -202,7 +207,7 @@ def encode_state(
         if key not in messages:
             messages[key] = (source.topic, source.type, _new_state(source, stamp))
         _write_source(messages[key][2], source, state.signals[source.signal][row])
-    stamped = [envelope for envelope in messages.values() if has_header(envelope[1])]
+    stamped = [one for one in messages.values() if has_header(one[1]) and not one[2]["header"]["frame_id"]]
     if not stamped:
         return list(messages.values())
     stamped[0][2]["header"]["frame_id"] = tag
@@ -210,7 +215,7 @@ def encode_state(
 
 
 def _new_state(source: Source, stamp: Mapping[str, int]) -> dict[str, Any]:
-    header = {"header": {"stamp": dict(stamp), "frame_id": ""}} if has_header(source.type) else {}
+    header = {"header": {"stamp": dict(stamp), "frame_id": source.frame}} if has_header(source.type) else {}
     return {**header, **source.constants}
 
 
@@ -234,6 +239,7 @@ def encode_command(
     tag: Tag | None,
     mode: str | None = None,
     *,
+    sign: Sign | None = None,
     ros1: bool = False,
 ) -> list[Envelope]:
     """The messages that send `command`, in the order in which they must be sent.
@@ -244,6 +250,7 @@ def encode_command(
         command: Finite numbers [SI]. Shape: (m,).
         tag: Who sends it when, for how long it means anything.
         mode: Way of sending it; None is the default.
+        sign: Makes the text of `tag`; None: without a signature.
         ros1: Whether stamps are spelled as in ROS 1.
 
     Raises:
@@ -251,20 +258,53 @@ def encode_command(
     """
     if command.shape != (len(spec.command.labels),) or not np.isfinite(command).all():
         raise InvalidValue(f"A command must be {len(spec.command.labels)} finite numbers, not {command.tolist()}.")
-    return [encode_sink(sink, spec, command, tag, ros1=ros1) for sink in profile.sinks(mode)]
+    return [encode_sink(sink, spec, command, tag, sign=sign, ros1=ros1) for sink in profile.sinks(mode)]
 
 
-def encode_sink(sink: Sink, spec: RobotSpec, command: Array, tag: Tag | None, *, ros1: bool = False) -> Envelope:
+def encode_sink(
+    sink: Sink, spec: RobotSpec, command: Array, tag: Tag | None, *, sign: Sign | None = None, ros1: bool = False
+) -> Envelope:
     """The message that sends the part of `command` (m,) that goes to `sink`. Arguments as of `encode_command`."""
-    part = command[_places(sink.labels, spec.command.labels)]
-    text = tag.to_text() if tag is not None and sink.tag else ""
-    return sink.topic, sink.type, write_command(sink, _from_si(sink, part), text, spec.period, ros1=ros1)
+    raw = _from_si(sink, command[_places(sink.labels, spec.command.labels)])
+    text = _tag_text(sink, raw, tag, sign, spec.period)
+    return sink.topic, sink.type, write_command(sink, raw, text, spec.period, ros1=ros1)
 
 
-def decode_command(
-    profile: RobotProfile, spec: RobotSpec, topic: str, message: object
-) -> tuple[list[int], Array, Tag | None]:
-    """What a message on `topic` commands: places in the command, numbers [SI] for them, and its tag if it has one.
+def _tag_text(sink: Sink, raw: list[float], tag: Tag | None, sign: Sign | None, period: float) -> str:
+    if tag is None or not sink.tag:
+        return ""
+    if sign is None:
+        return tag.to_text()
+    if any("(" in path for path in sink.fields):  # an angle is written as a quaternion, and read with rounding
+        return sign(tag, sink.topic, _content(read_command(sink, write_command(sink, raw, "", period))))
+    return sign(tag, sink.topic, _content(raw))
+
+
+def _content(raw: list[float] | Array) -> bytes:
+    """What is signed of a command: its numbers as they are in the message, in 32 bits, since some types have no more.
+
+    Args:
+        raw: In the order of the sink's labels.
+    """
+    with np.errstate(over="ignore"):
+        return np.asarray(raw, dtype="<f4").tobytes()
+
+
+class Decoded(NamedTuple):
+    """A message that commands."""
+
+    places: list[int]
+    """Where its numbers are in the command."""
+    values: Array
+    """Its numbers [SI]."""
+    tag: Tag | None
+    """Its tag, if it has one."""
+    content: bytes
+    """What a signature in the tag is for; empty without one."""
+
+
+def decode_command(profile: RobotProfile, spec: RobotSpec, topic: str, message: object) -> Decoded:
+    """What a message on `topic` commands.
 
     Raises:
         ProtocolError: The message is not what the profile says, or no command comes on `topic`.
@@ -273,5 +313,6 @@ def decode_command(
     if sink is None:
         raise ProtocolError(f"{topic}: no command of {profile.name} comes here.")
     content = require_message(message, topic)
-    values = _to_si(sink, read_command(sink, content))
-    return list(_places(sink.labels, spec.command.labels)), values, read_tag(tag_text(content))
+    raw, tag = read_command(sink, content), read_tag(tag_text(content))
+    signed = _content(raw) if tag is not None and tag.mac else b""
+    return Decoded(list(_places(sink.labels, spec.command.labels)), _to_si(sink, raw), tag, signed)

@@ -88,9 +88,8 @@ def _write_joints(draft: _Draft) -> dict[str, Any]:
 
 def _write_trajectory(draft: _Draft) -> dict[str, Any]:
     """One point."""
-    reach = draft.period if draft.sink.reach is None else draft.sink.reach
     point = {"positions": draft.values, "velocities": [], "accelerations": [], "effort": []}
-    timed = {**point, "time_from_start": write_stamp(reach, ros1=draft.ros1)}
+    timed = {**point, "time_from_start": write_stamp(draft.sink.reach_at(draft.period), ros1=draft.ros1)}
     return {"header": draft.header(), "joint_names": list(draft.sink.names), "points": [timed]}
 
 

@@ -172,6 +172,23 @@ def require_names(names: Sequence[str], found: list[str], where: str, ignore: Se
         )
 
 
+def require_frame(frame: str, message: Message, where: str) -> None:
+    """The header of `message` names `frame`; ROS 1 may write a slash before it.
+
+    Raises:
+        ProtocolError: It names another frame, or none: where its numbers are is not known.
+    """
+    header = message.get("header")
+    found = header.get("frame_id") if isinstance(header, _OBJECT) else None
+    if found == frame or (isinstance(found, str) and found.lstrip("/") == frame):
+        return
+    raise ProtocolError(
+        f"{where}: header.frame_id must be {frame!r}, not {shown(found)}: a pose in another frame is another place "
+        f"(a UR's base is its base_link turned by 180 degrees about z). Publish it in {frame}; if that frame has "
+        f"another name there, give the name under [frames] of the profile."
+    )
+
+
 def put_at(message: dict[str, Any], path: str, value: float) -> None:
     """Write `value` at `path`; at ``yaw(path)`` the quaternion of that angle about z."""
     quaternion = _quaternion(path)

@@ -9,6 +9,7 @@ from bam_envs.errors import InvalidValue, ProtocolError
 from bam_envs.transports.gymapi.actions import DEFAULT, ActionCodec
 from bam_envs.transports.gymapi.observations import ObservationCodec
 from bam_envs.transports.gymapi.responses import GymResponse, write_feedback
+from bam_envs.transports.gymapi.versions import JUNE_22, Version
 from bam_envs.transports.transport import EnvSpecMessage, Info
 from bam_envs.transports.values import pack, shown, unpack
 
@@ -63,22 +64,35 @@ class EnvCodec:
         actions = [self._actions.decode(one) for one in messages]
         return actions if self.spec.vector else actions[0]
 
-    def write_result(self, result: tuple[Any, ...], stamp: Mapping[str, int]) -> list[dict[str, Any]]:
-        """The feedback of a reset or step: (observation, info), or with reward, terminated and truncated between."""
+    def write_result(
+        self,
+        result: tuple[Any, ...],
+        stamp: Mapping[str, int],
+        version: Version = JUNE_22,
+        *,
+        executed: bool = True,
+    ) -> list[dict[str, Any]]:
+        """The feedback of a reset or step: (observation, info), or with reward, terminated and truncated between.
+
+        Args:
+            result: As Gymnasium gives it.
+            stamp: When.
+            version: The messages' version.
+            executed: Whether the action was done.
+        """
         observation, *ends, info = result
         size = self.spec.num_envs
-        if not self.spec.vector:
-            row: tuple[Any, ...] = (observation, *(ends or (0.0, False, False)), info)
-            return [self._write_row(stamp, *row)]
-        columns = ends or ([0.0] * size, [False] * size, [False] * size)
-        rows: Iterable[tuple[Any, ...]] = zip(observation, *columns, map(self._packed_final, info), strict=True)
-        return [self._write_row(stamp, *row) for row in rows]
-
-    def _write_row(
-        self, stamp: Mapping[str, int], observation: Any, reward: float, terminated: bool, truncated: bool, info: Info
-    ) -> dict[str, Any]:
-        fields, trees = self._observations.encode(observation, stamp)
-        return write_feedback(fields, trees, (reward, terminated, truncated), info)
+        if self.spec.vector:
+            columns = ends or ([0.0] * size, [False] * size, [False] * size)
+            rows: Iterable[tuple[Any, ...]] = zip(observation, *columns, map(self._packed_final, info), strict=True)
+        else:
+            rows = [(observation, *(ends or (0.0, False, False)), info)]
+        feedback = []
+        for observed, reward, terminated, truncated, told in rows:
+            fields, trees = self._observations.encode(observed, stamp, version)
+            flags = (reward, terminated, truncated)
+            feedback.append(write_feedback(fields, trees, flags, told, version, executed=executed))
+        return feedback
 
     def _packed_final(self, info: Info) -> Info:
         if "final_obs" not in info:

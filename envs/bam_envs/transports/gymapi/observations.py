@@ -1,7 +1,8 @@
 """Observations as the fields of bam_msgs/GymFeedback and back; see `gymapi_leaves` for what goes where.
 
-The first image goes into ``color_img``, a depth image that was asked for into ``depth_img``. What these fields cannot
-say exactly is a tree of JSON by the name of its leaf, which travels in ``info``.
+Images go into ``color_img``, all of them where that is a list and the first one where it is not; a depth image that was
+asked for into ``depth_img``. What these fields cannot say exactly is a tree of JSON by the name of its leaf, which
+travels in ``info``.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from bam_envs.transports.gymapi.leaves import (
     to_numbers,
     to_pose,
 )
+from bam_envs.transports.gymapi.versions import JUNE_22, Version
 from bam_envs.transports.images import (
     FORMATS,
     color_message,
@@ -58,15 +60,16 @@ class ObservationCodec:
     def __init__(self, space: Space[Any], image_format: str = "png", depth: Sequence[str] = ()) -> None:
         self.space, self.image_format, self.depth = space, image_format, tuple(depth)
         self._leaves = leaves_of(space, "observation")
+        self._images = [leaf for leaf in self._leaves if leaf.kind == IMAGE]
         if image_format not in FORMATS:
             raise InvalidValue(f"The image format must be png or jpeg, not {image_format!r}.")
         fitting = [leaf.name for leaf in self._leaves if is_depth(leaf.space)]
         if not set(self.depth) <= set(fitting) or len(self.depth) > 1:
             raise InvalidValue(f"depth must name one of the depth images ({', '.join(fitting)}), not {self.depth}.")
-        images = [leaf.name for leaf in self._leaves if leaf.kind == IMAGE]
-        self._first_image = images[0] if images else None
 
-    def encode(self, observation: Any, stamp: Mapping[str, int] | None = None) -> tuple[dict[str, Any], Trees]:
+    def encode(
+        self, observation: Any, stamp: Mapping[str, int] | None = None, version: Version = JUNE_22
+    ) -> tuple[dict[str, Any], Trees]:
         """Fields of a message, those at their defaults left out, and the exact trees of what is not in them.
 
         Raises:
@@ -76,27 +79,18 @@ class ObservationCodec:
         value = exact(self.space, observation, "observation")
         fields: dict[str, Any] = {}
         trees: Trees = {}
+        images = self._images if version.lists else self._images[:1]
         for leaf in self._leaves:
             part = part_of(value, leaf.path)
-            if not self._write(leaf, part, fields, stamp):
+            if leaf.name in self.depth:
+                image = depth_message(part, leaf.name, stamp)
+                fields["depth_img"] = [image] if version.lists else image
+            elif leaf in images:
+                image = color_message(part, self.image_format, leaf.name, stamp)
+                fields["color_img"] = [*fields.get("color_img", []), image] if version.lists else image
+            elif not _write_numbers(leaf, part, fields):
                 trees[leaf.name] = tree_to_json(pack(leaf.space, part, leaf.name))
         return fields, trees
-
-    def _write(self, leaf: Leaf, part: Any, fields: dict[str, Any], stamp: Mapping[str, int] | None) -> bool:
-        """Put `part` into `fields`, if they can say it exactly or it was asked for; whether it was."""
-        if leaf.name in self.depth:
-            fields["depth_img"] = depth_message(part, leaf.name, stamp)
-        elif leaf.kind == NUMBERS and (numbers := to_numbers(part)) is not None:
-            fields.setdefault("observation_names", []).extend(leaf.labels)
-            fields.setdefault("observation", []).extend(map(float, numbers))
-        elif leaf.kind == POSE and (pose := to_pose(part)) is not None:
-            fields.setdefault("pose_names", []).append(leaf.name)
-            fields.setdefault("pose", []).append(pose)
-        elif leaf.name == self._first_image and leaf.kind == IMAGE:
-            fields["color_img"] = color_message(part, self.image_format, leaf.name, stamp)
-        else:
-            return False
-        return True
 
     def decode(self, feedback: Mapping[str, Any], trees: Mapping[str, Any]) -> Any:
         """The observation in a complete, checked message and its exact trees.
@@ -144,6 +138,19 @@ class ObservationCodec:
         for leaf, image in zip(done, found, strict=False):
             values[leaf.path] = _shaped(leaf, image, "depth_img").astype(leaf.space.dtype)
         return [leaf for leaf in leaves if leaf not in done]
+
+
+def _write_numbers(leaf: Leaf, part: Any, fields: dict[str, Any]) -> bool:
+    """Put numbers or a pose into `fields`, if those can say it exactly; whether they can."""
+    if leaf.kind == NUMBERS and (numbers := to_numbers(part)) is not None:
+        fields.setdefault("observation_names", []).extend(leaf.labels)
+        fields.setdefault("observation", []).extend(map(float, numbers))
+        return True
+    if leaf.kind == POSE and (pose := to_pose(part)) is not None:
+        fields.setdefault("pose_names", []).append(leaf.name)
+        fields.setdefault("pose", []).append(pose)
+        return True
+    return False
 
 
 def _from_tree(leaf: Leaf, tree: Any) -> Any:

@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from bam_envs.bridge.freshness import Tag, read_tag
-from bam_envs.bridge.interfaces import complete_known, request_type
+from bam_envs.bridge.interfaces import complete, complete_known, request_type
 from bam_envs.errors import InvalidValue, ProtocolError
 from bam_envs.transports.gymapi.actions import PREFIX
+from bam_envs.transports.gymapi.versions import JUNE_22, Version
 from bam_envs.transports.strict_json import dump_json, load_json
 from bam_envs.transports.transport import Info
 from bam_envs.transports.trees import plain_info, tree_from_json, tree_to_json
@@ -76,7 +77,7 @@ def base_name(namespace: str = "") -> str:
 
 
 def write_request(request: GymRequest, stamp: Mapping[str, int]) -> dict[str, Any]:
-    """The message of `request`, for one of our servers. `stamp` is the time in the spelling of the ROS there."""
+    """The message of `request`, with fields that every version has. `stamp` is as the ROS there spells a time."""
     in_field = request.seed if isinstance(request.seed, int) and 0 < request.seed <= MAX_SEED else 0
     zero = _SEED_ZERO if request.seed == 0 and isinstance(request.seed, int) else ""
     beside = None if in_field or zero else request.seed
@@ -91,6 +92,15 @@ def write_request(request: GymRequest, stamp: Mapping[str, int]) -> dict[str, An
     }
     actions = [dict(one) for one in request.actions] + _beside(beside, request.options)
     return {"header": header, "seed": in_field, "env_name": request.env_name, "action": actions}
+
+
+def whole_request(message: Message, version: Version | None) -> dict[str, Any]:
+    """`message` with all fields, for a rack that may look at any: those of `version`, or of all versions."""
+    busy = (version or JUNE_22).busy
+    whole = complete(request_type(KIND), {**message, "header": {**message["header"], busy: False}})
+    if version is not None:
+        return whole
+    return {**whole, "header": {name: value for name, value in whole["header"].items() if name != busy}}
 
 
 def _beside(seed: Seed, options: Info | None) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""The answers of bam_msgs/GymAPI; see `gymapi` for the requests."""
+"""The answers of bam_msgs/GymAPI; see `requests` for what is asked."""
 
 from __future__ import annotations
 
@@ -12,11 +12,24 @@ from bam_envs.bridge.interfaces import complete_known, response_type
 from bam_envs.errors import BamEnvsError, InvalidValue, NotInCommand, ProtocolError, RemoteError
 from bam_envs.transports.gymapi.info import read_info, write_info
 from bam_envs.transports.gymapi.requests import KIND, Message
+from bam_envs.transports.gymapi.versions import JUNE_22, Version, version_of_response
 from bam_envs.transports.strict_json import dump_json
 from bam_envs.transports.transport import Info
 
 _UNREAD = ("camera_info", "detections", "masks", "segments")
 """Fields that no space asks for."""
+_OWN = (
+    "ns",
+    "duplicate_obs_ns",
+    "duplicate_obs",
+    "duplicate_index",
+    "executed",
+    "reward",
+    "terminated",
+    "truncated",
+    "info",
+)
+"""Fields of an entry that are not its observation."""
 _NOWHERE = {"pose": {"position": dict.fromkeys("xyz", math.nan), "orientation": dict.fromkeys("xyzw", math.nan)}}
 
 
@@ -41,6 +54,8 @@ class GymResponse:
     """What each feedback's info says to people and programs."""
     exact: tuple[Info, ...]
     """What it says to us, under ``bam``; empty dicts from everybody else's servers."""
+    version: Version | None = None
+    """Which version of the messages who made it speaks; None if that does not show."""
 
     @property
     def ours(self) -> bool:
@@ -49,7 +64,13 @@ class GymResponse:
 
 
 def write_feedback(
-    fields: Mapping[str, Any], trees: Mapping[str, Any], ends: tuple[float, bool, bool], info: Mapping[str, Any]
+    fields: Mapping[str, Any],
+    trees: Mapping[str, Any],
+    ends: tuple[float, bool, bool],
+    info: Mapping[str, Any],
+    version: Version = JUNE_22,
+    *,
+    executed: bool = True,
 ) -> dict[str, Any]:
     """The message of one row.
 
@@ -58,6 +79,8 @@ def write_feedback(
         trees: The parts of it that the fields cannot say, as JSON.
         ends: Reward, terminated, truncated.
         info: Gymnasium's, as a tree.
+        version: Of the messages.
+        executed: Whether the action was done.
 
     Raises:
         InvalidValue: The reward is not finite.
@@ -66,20 +89,27 @@ def write_feedback(
     if not math.isfinite(reward):
         raise InvalidValue(f"The reward must be finite to be sent, not {reward}.")
     text = write_info(info, {"observation": dict(trees)} if trees else {})
-    flags = {"executed": True, "reward": reward, "terminated": terminated, "truncated": truncated}
-    return {**fields, **flags, "info": text}
+    flags = {"executed": executed, "reward": reward, "terminated": terminated, "truncated": truncated}
+    return {**version.no_images, **fields, **flags, "info": text}
 
 
-def write_response(feedback: Sequence[Message], duration: float = 0.0) -> dict[str, Any]:
-    """The message of a success that took `duration` [s]."""
+def write_response(
+    feedback: Sequence[Message], duration: float, stamp: Mapping[str, int], version: Version = JUNE_22
+) -> dict[str, Any]:
+    """The message of a success that took `duration` [s] and is sent at `stamp`, in the words of `version`."""
     code = {"value": int(ErrorCode.SUCCESS)}
-    header = {"duration": duration, "error_code": code, "error_msg": "", "calibrated": True}
+    # How long it travels (transport_duration) only the client can tell.
+    times = {"process_duration": duration, "response_stamp": dict(stamp)} if version.june else {"duration": duration}
+    header = {**times, "error_code": code, "error_msg": "", "calibrated": True}
     return {"header": header, "feedback": list(feedback)}
 
 
-def write_failure(error: BamEnvsError, duration: float = 0.0) -> dict[str, Any]:
-    """The message of a request that was refused or failed."""
-    message = write_response([{"info": dump_json({"bam": {"error": type(error).__name__}}, "info")}], duration)
+def write_failure(
+    error: BamEnvsError, duration: float, stamp: Mapping[str, int], version: Version = JUNE_22
+) -> dict[str, Any]:
+    """The message of a request that was refused or failed; see `write_response`."""
+    row = {**version.no_images, "info": dump_json({"bam": {"error": type(error).__name__}}, "info")}
+    message = write_response([row], duration, stamp, version)
     message["header"] |= {"error_code": {"value": int(ErrorCode.FAILURE)}, "error_msg": str(error)}
     return message
 
@@ -98,7 +128,7 @@ def read_response(message: object) -> GymResponse:
     read = [read_info(one["info"]) for one in feedback]
     infos, exact = tuple(info for info, _ in read), tuple(bam for _, bam in read)
     failure = _error(whole["header"]["error_code"]["value"], whole["header"]["error_msg"], exact[0] if exact else {})
-    return GymResponse(failure, tuple(_filled(feedback)), infos, exact)
+    return GymResponse(failure, tuple(_filled(feedback)), infos, exact, version_of_response(message))
 
 
 def _without_gaps(message: Any) -> Any:
@@ -158,12 +188,27 @@ def _error(code: int, text: str, bam: Info) -> RemoteError | None:
 
 
 def _filled(feedback: list[Message]) -> list[Message]:
-    """Entries that are marked as equal to another one of their namespace get its observation."""
-    whole = {one["ns"]: one for one in reversed(feedback) if not one["duplicate_obs_ns"]}
-    own = ("ns", "duplicate_obs_ns", "executed", "reward", "terminated", "truncated", "info")
-    return [
-        {**whole[one["ns"]], **{key: one[key] for key in own}}
-        if one["duplicate_obs_ns"] and one["ns"] in whole
-        else one
-        for one in feedback
-    ]
+    """Entries that are marked as equal to another one get its observation."""
+    return [{**feedback[_source(feedback, at)], **{key: one[key] for key in _OWN}} for at, one in enumerate(feedback)]
+
+
+def _source(feedback: list[Message], at: int) -> int:
+    """The place of the observation of the entry at `at`, which names it, or says that it is in its ``ns``."""
+    one, path = feedback[at], [at]
+    while one["duplicate_obs"]:
+        place = one["duplicate_index"]
+        if place in path or not 0 <= place < len(feedback):
+            raise ProtocolError(
+                f"feedback[{path[-1]}].duplicate_index must be the place of another entry, one of {len(feedback)} with "
+                f"an observation of its own, not {place}."
+            )
+        one = feedback[place]
+        path.append(place)
+    if not one["duplicate_obs_ns"]:
+        return path[-1]
+    same = (place for place, other in enumerate(feedback) if other["ns"] == one["ns"] and _has_own(other))
+    return next(same, path[-1])
+
+
+def _has_own(one: Message) -> bool:
+    return not (one["duplicate_obs"] or one["duplicate_obs_ns"])

@@ -222,6 +222,19 @@ def test_a_call_that_nobody_answers_ends_in_time(scripted, link):
     assert link.is_up
 
 
+def test_a_server_that_gives_a_call_up_is_no_refusal(scripted, link):
+    """The service may still be at it; a bridge that was told no other time does so after 5 s."""
+    scripted.responses["/slow"] = lambda args: "Timeout exceeded while waiting for service response"
+    with pytest.raises(LinkLost) as caught:
+        link.call("/slow", "std_srvs/Trigger", {}, 30.0)
+    assert str(caught.value) == (
+        f"{scripted.url}: the server gave up /slow after 0.0 s, and 30 s were asked for; it may still be at it. Start "
+        "the bridge with default_call_service_timeout:=30.0, or use a pair of topics instead of the service "
+        '(channel="topics").'
+    )
+    assert scripted.of("call_service")[-1]["timeout"] == 30.0
+
+
 @pytest.mark.parametrize("timeout", [None, 0.0, -1.0, float("inf"), float("nan")])
 def test_a_call_needs_a_time_limit(link, timeout):
     with pytest.raises(InvalidValue) as raised:

@@ -364,10 +364,10 @@ def test_fragments_are_joined_whatever_the_server_calls_their_number(scripted, l
 @pytest.mark.parametrize(
     ("bad", "text"),
     [
-        (b"\x00\x01\x02", "a binary message of 3 bytes, which nobody asked for, is ignored"),
+        (b"\x00\x01\x02", "a binary message of 3 bytes, which nobody asked for"),
         ("{", "expected a JSON object, found b'{': Expecting property name enclosed in double quotes"),
         ("[1, 2]", "expected a JSON object, found b'[1, 2]'"),
-        ('{"op": "dance"}', "a message with op 'dance' is ignored"),
+        ('{"op": "dance"}', "a message with op 'dance'"),
         ('{"op": "publish", "topic": "/pong", "msg": 3}', "a published message has topic '/pong' and msg 3"),
         ('{"op": "fragment", "id": "f", "num": 2, "total": 1, "data": ""}', "Fragment 2 of 1 of 'f' does not fit"),
     ],
@@ -375,15 +375,27 @@ def test_fragments_are_joined_whatever_the_server_calls_their_number(scripted, l
 def test_nonsense_is_logged_and_the_link_stays_up(scripted, link, heard, caplog, bad, text):
     link.subscribe("/pong", STRING, heard)
     scripted.wait_for("subscribe")
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(logging.INFO):
         scripted.send(bad, {"op": "publish", "topic": "/pong", "msg": {"data": "1"}})
         assert heard.wait() == [{"data": "1"}]
-    assert [record.getMessage()[: len(scripted.url) + 2 + len(text)] for record in caplog.records] == [
-        f"{scripted.url}: {text}"
-    ]
+    start = f"{scripted.url}: passed over: {text}"
+    said = [record for record in caplog.records if record.name.startswith("bam_envs.")]
+    assert [(record.levelname, record.getMessage()[: len(start)]) for record in said] == [("INFO", start)]
 
 
-def test_no_message_ends_the_link(scripted, link, heard):
+@pytest.mark.parametrize("bad", [b"\x00", "nonsense", '{"op": "dance"}', "{}" * 100])
+def test_a_server_that_sends_nothing_but_nonsense_is_left_with_one_text(scripted, link, caplog, bad):
+    lost, down = threading.Event(), []
+    link.on_down(lambda error: (down.append(str(error)), lost.set()))
+    scripted.send(*[bad] * 20)
+    assert lost.wait(10.0)
+    assert down[0].startswith(f"{scripted.url}: the server sends what is no rosbridge message, 20 times by now: ")
+    assert down[0].endswith(". Is it the right port?")
+    assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
+
+
+def test_no_message_ends_the_link(scripted, link, heard, monkeypatch):
+    monkeypatch.setattr("bam_envs.bridge.link.connection._MOST_PASSED_OVER", 10**6)
     link.subscribe("/pong", STRING, heard)
     scripted.wait_for("subscribe")
     values = [None, True, 7, 1e300, "x", [], {}, [{}], {"id": {}}]

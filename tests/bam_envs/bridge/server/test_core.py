@@ -107,10 +107,10 @@ def text(value):
             '{"op": "set_level", "level": "loud"}',
             "set_level: level: expected one of none, error, warning, info, found 'loud'.",
         ),
-        ('{"op": "subscribe", "topic": "/new"}', "subscribe /new: Topic /new does not exist yet; its type is needed."),
+        ('{"op": "subscribe", "topic": "/new"}', "subscribe: Topic /new does not exist yet; its type is needed."),
         (
             '{"op": "subscribe", "topic": "/t", "type": "std_msgs/Bool"}',
-            "subscribe /t: Topic /t is of type std_msgs/String, found 'std_msgs/Bool'.",
+            "subscribe: Topic /t is of type std_msgs/String, found 'std_msgs/Bool'.",
         ),
         (
             '{"op": "subscribe", "topic": "/t", "throttle_rate": "300"}',
@@ -148,20 +148,20 @@ def text(value):
             '{"op": "subscribe", "topic": "/t", "throttle_rate": 1e400}',
             "subscribe /t: throttle_rate: expected a number >= 0, found Infinity.",
         ),
-        ('{"op": "unsubscribe", "topic": "/t"}', "unsubscribe /t: Topic /t was not subscribed so by this client."),
+        ('{"op": "unsubscribe", "topic": "/t"}', "unsubscribe: Topic /t was not subscribed so by this client."),
         (
             '{"op": "advertise", "topic": "/t", "type": "std_msgs/Bool"}',
-            "advertise /t: Topic /t is of type std_msgs/String, found 'std_msgs/Bool'.",
+            "advertise: Topic /t is of type std_msgs/String, found 'std_msgs/Bool'.",
         ),
         ('{"op": "advertise", "topic": "/u"}', "advertise /u: type: expected a text, found null."),
         (
             '{"op": "advertise", "topic": "/u", "type": "Bool"}',
             "advertise /u: Type: expected a name such as 'std_msgs/String', found 'Bool'.",
         ),
-        ('{"op": "unadvertise", "topic": "/u"}', "unadvertise /u: Topic /u was not advertised so by this client."),
+        ('{"op": "unadvertise", "topic": "/u"}', "unadvertise: Topic /u was not advertised so by this client."),
         (
             '{"op": "publish", "topic": "/u", "msg": {}}',
-            "publish /u: Topic /u does not exist; advertise it with its type first.",
+            "publish: Topic /u does not exist; advertise it with its type first.",
         ),
         (
             '{"op": "publish", "topic": "/t", "msg": {"datum": ""}}',
@@ -193,11 +193,11 @@ def text(value):
         ),
         (
             '{"op": "unadvertise_service", "service": "/s"}',
-            "unadvertise_service /s: Service /s is not offered by this client.",
+            "unadvertise_service: Service /s is not offered by this client.",
         ),
         (
             '{"op": "advertise_service", "service": "/s", "type": "std_srvs/Empty"}',
-            "advertise_service /s: Service /s is offered by this server already.",
+            "advertise_service: Service /s is offered by this server already.",
         ),
         (
             '{"op": "service_response", "id": "7", "service": "/s"}',
@@ -205,8 +205,7 @@ def text(value):
         ),
         (
             '{"op": "auth", "mac": ""}',
-            "auth: The op auth is not supported by this server; "
-            "send its token as the header 'Authorization: Bearer ...'.",
+            "auth: The op auth is for the first message of a web page; this client has been let in already.",
         ),
         (
             '{"op": "advertise_action", "action": "/a"}',
@@ -243,9 +242,9 @@ def test_a_goal_of_an_action_is_answered_as_one(peers):
     assert peers.say(peers.client(), op="send_action_goal", action="/a", action_type="x/Y", id="g") == [answer]
 
 
-def test_two_messages_in_one_frame_are_both_done(peers):
+def test_two_messages_in_one_frame_are_refused(peers):
     frame = json.dumps({"op": "call_service", "service": "/no"})
-    assert peers.say(peers.client(), frame + frame) == 2 * response("Service /no does not exist", False, "/no")
+    assert peers.say(peers.client(), frame + frame) == status("Message: expected one in a frame, found more behind it.")
 
 
 def test_json_in_a_binary_frame_is_done(peers):
@@ -409,15 +408,24 @@ def test_listeners_of_this_process(peers):
     assert heard == [([1.0], Caller("c", "here"))]
 
 
-def test_a_listener_may_refuse(peers):
+@pytest.mark.parametrize(
+    ("reason", "text"),
+    [
+        ("client b is in command", "/a/cmd: client b is in command"),
+        ("/a/cmd: data must have 6 numbers, not 1.", "/a/cmd: data must have 6 numbers, not 1."),
+        ("/cmd: data must have 6 numbers, not 1.", "/a/cmd: data must have 6 numbers, not 1."),
+        ("/other: it is busy", "/a/cmd: /other: it is busy"),
+    ],
+)
+def test_a_listener_may_refuse_and_the_topic_is_told_once(peers, reason, text):
     def refuse(message, caller):
-        raise NotInCommand("client b is in command")
+        raise NotInCommand(reason)
 
     heard = []
-    peers.bridge.subscribe("/cmd", FLOATS, refuse)
-    peers.bridge.subscribe("/cmd", FLOATS, lambda message, caller: heard.append(message))
-    answer = peers.say(peers.client(), op="publish", topic="/cmd", msg={"data": [1]})
-    assert answer == status("/cmd: client b is in command")
+    peers.bridge.subscribe("/a/cmd", FLOATS, refuse)
+    peers.bridge.subscribe("/a/cmd", FLOATS, lambda message, caller: heard.append(message))
+    answer = peers.say(peers.client(), op="publish", topic="/a/cmd", msg={"data": [1]})
+    assert answer == status(text)
     assert len(heard) == 1
 
 
@@ -707,7 +715,55 @@ def test_fragments_that_do_not_come_are_told_of(peers):
 def test_fragments_hold_no_fragments(peers):
     inner = json.dumps({"op": "fragment", "id": "g", "data": "{}", "num": 0, "total": 1})
     answer = peers.say(peers.client(), op="fragment", id="f", data=inner, num=0, total=1)
-    assert answer == status("fragment: A fragment must not hold fragments.", id="f")
+    assert answer == status("A fragment must not hold fragments.")
+
+
+def test_who_holds_most_in_fragments_gives_way(peers):
+    peers = Peers(Limits(unfinished=10_000))
+    small, great, new = (peers.client(name) for name in "abc")
+    for client, size in ((small, 1000), (great, 8000), (new, 2000)):
+        peers.say(client, op="fragment", id="f", num=0, total=2, data="x" * size)
+    assert [peers.take(one) for one in (small, new)] == [[], []]
+    assert peers.take(great) == status("All unfinished fragments hold more than 10000 bytes.")
+    assert peers.say(new, op="fragment", id="f", num=1, total=2, data="")[0]["msg"].startswith("Message: expected JSON")
+
+
+def test_what_this_process_publishes_nobody_else_does(peers):
+    """Else a client could say where the robot is."""
+    peers.bridge.advertise("/joint_states", JOINTS)
+    listener, liar = peers.client("a"), peers.client("b")
+    peers.say(listener, op="subscribe", topic="/joint_states")
+    text = "Topic /joint_states is published by this server alone; its clients may subscribe."
+    assert peers.say(liar, op="advertise", topic="/joint_states", type=JOINTS) == status(f"advertise: {text}")
+    for check in (False, True):
+        frame = json.dumps({"op": "publish", "topic": "/joint_states", "msg": {"position": [1.0]}})
+        peers.bridge.take(liar, peers.bridge.read(frame, check=check), peers.now)
+        assert peers.take(liar) == status(f"publish: {text}")
+    assert peers.take(listener) == []
+
+
+def test_what_is_checked_elsewhere_is_done_as_what_is_not(peers):
+    first, second = peers.client("a"), peers.client("b")
+    peers.bridge.serve("/mine", SET_BOOL, lambda request, caller: {"success": request["data"], "message": "done"})
+    peers.say(first, op="subscribe", topic="/t", type=FLOATS)
+    peers.say(second, op="advertise_service", service="/theirs", type=SET_BOOL)
+    messages = [
+        {"op": "publish", "topic": "/t", "msg": {"data": [1.0, 2.0]}},
+        {"op": "publish", "topic": "/t", "msg": {"data": ["x"]}},
+        {"op": "publish", "topic": "no name", "msg": {}},
+        {"op": "call_service", "service": "/mine", "args": {"data": True}},
+        {"op": "call_service", "service": "/mine", "args": {"data": 3}},
+        {"op": "call_service", "service": "/theirs", "args": [True]},
+        {"op": "service_response", "service": "/theirs", "id": "1", "values": {}},
+        {"op": "unheard of", "msg": {}},
+    ]
+    for message in messages:
+        got = []
+        for check in (True, False):
+            peers.bridge.take(second, peers.bridge.read(json.dumps(message), check=check), peers.now)
+            peers.run()
+            got.append([[{**one, "id": ""} for one in peers.take(client)] for client in (first, second)])
+        assert got[0] == got[1], message
 
 
 @pytest.mark.parametrize(

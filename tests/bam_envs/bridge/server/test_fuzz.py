@@ -1,6 +1,7 @@
 """Whatever clients send, the server goes on, and forgets it. ``python test_fuzz.py 1000000`` says what that costs."""
 
 import contextlib
+import copy
 import json
 import math
 import random
@@ -90,7 +91,7 @@ def change(message, dice):
         return
     what = dice.random()
     if what < 0.6:
-        place[key] = dice.choice(STRANGE)
+        place[key] = copy.deepcopy(dice.choice(STRANGE))  # it may be changed in its turn
     elif what < 0.7 and isinstance(place, dict):
         place[f"/n{dice.randrange(3000)}"] = place.pop(key)
     elif what < 0.85 and isinstance(inside, str):

@@ -3,7 +3,9 @@ import contextlib
 import json
 import socket
 import ssl
+import struct
 import threading
+import time
 
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -82,14 +84,17 @@ def client(new_client):
     return new_client()
 
 
+@pytest.fixture
 def threads():
-    return {one.name for one in threading.enumerate() if one.name.startswith("bam-bridge")}
+    """Names of the threads of servers that the test started and that still run; other tests may have servers too."""
+    before = set(threading.enumerate())
+    return lambda: {one.name for one in set(threading.enumerate()) - before if one.name.startswith("bam-bridge")}
 
 
 # Start and end.
 
 
-def test_it_ends_with_a_goodbye_and_leaves_no_thread():
+def test_it_ends_with_a_goodbye_and_leaves_no_thread(threads):
     with BridgeServer(port=0) as server:
         assert server.url == f"ws://127.0.0.1:{server.port}"
         client = Client(server.url)
@@ -110,7 +115,7 @@ def test_it_starts_once(server):
         server.start()
 
 
-def test_a_constructor_opens_nothing_and_close_may_come_first():
+def test_a_constructor_opens_nothing_and_close_may_come_first(threads):
     server = BridgeServer(port=0)
     server.close()
     server.close()
@@ -278,13 +283,81 @@ def test_a_web_page_comes_in_only_with_the_token(new_server, new_client, caplog)
     )
     assert [record.getMessage() for record in caplog.records] == [
         "The web page 'https://evil.example' was refused: a browser comes in only with a token. "
-        "To let it in, start the server with one, and open its URL with ?token=TOKEN."
+        'To let it in, start the server with one, and send it as the first message: {"op": "auth", "token": TOKEN}.'
     ]
     url = new_server(token="secret").url
-    with pytest.raises(InvalidStatus) as caught:
-        new_client(url, **page)
-    assert caught.value.response.status_code == 401
     new_client(url + "/?token=secret", **page).sync()
+    with pytest.raises(InvalidStatus) as caught:
+        new_client(url + "/?token=wrong", **page)
+    assert caught.value.response.status_code == 401
+
+
+def ending(client):
+    """Close code and reason with which the server ends a connection."""
+    with pytest.raises(ConnectionClosed) as caught:
+        client.receive()
+    return caught.value.rcvd.code, caught.value.rcvd.reason
+
+
+def test_a_page_shows_its_token_in_its_first_message(new_server, new_client, monkeypatch):
+    url, page = new_server(token="secret").url, {"additional_headers": {"Origin": "https://good.example"}}
+    good = new_client(url, **page)
+    good.send(op="auth", token="secret")
+    good.sync()
+    first = 'The first message of a page must be its token, within 2 s: {"op": "auth", "token": TOKEN}'
+    others = [
+        ({"op": "auth", "token": "wrong"}, "The token is wrong."),
+        ({"op": "auth", "token": 3}, first),
+        ({"op": "call_service", "service": "/rosapi/get_time"}, first),
+    ]
+    for message, reason in others:
+        bad = new_client(url, **page)
+        bad.send(**message)
+        assert ending(bad) == (1008, reason)
+    monkeypatch.setattr("bam_envs.bridge.server.door._GREETING", 0.05)
+    assert ending(new_client(url, **page)) == (1008, first.replace("2 s", "0.05 s"))
+
+
+def test_an_operator_is_known_by_another_token(new_server, new_client):
+    server, callers = new_server(token="secret", operator_token="mine"), []
+    server.subscribe("/who", TEXT, lambda message, caller: callers.append(caller))
+    for token in ("secret", "mine"):
+        client = new_client(server.url, additional_headers={"Authorization": f"Bearer {token}"})
+        client.send(op="publish", topic="/who", msg={"data": token})
+        client.sync()
+    assert [caller.operator for caller in callers] == [False, True]
+    assert all(0.0 <= caller.silence() < DEADLINE for caller in callers)
+
+
+def guess(url, source=None):
+    """The HTTP status of a wrong token from the address `source`."""
+    options = {"sock": socket.create_connection(url, source_address=(source, 0) if source else None)}
+    with pytest.raises(InvalidStatus) as caught:
+        connect("ws://127.0.0.1/", additional_headers={"Authorization": "Bearer guess"}, **options)
+    return caught.value.response.status_code
+
+
+def test_guessing_tokens_is_slow_and_keeps_no_other_address_out(new_server, new_client):
+    server = new_server(token="secret")
+    place = ("127.0.0.1", server.port)
+    server._door._guesses._clock = lambda: 100.0
+    assert [guess(place) for _ in range(6)] == [401] * 4 + [429] * 2
+    try:
+        elsewhere = socket.create_connection(place, source_address=("127.0.0.2", 0))
+    except OSError:
+        pytest.skip("this system has one loopback address")
+    new_client(server.url, sock=elsewhere, additional_headers={"Authorization": "Bearer secret"}).sync()
+    server._door._guesses._clock = lambda: 101.0
+    new_client(server.url, additional_headers={"Authorization": "Bearer secret"}).sync()
+
+
+@pytest.mark.parametrize("headers", [{"Authorization": "Bearer first"}, {}])
+def test_one_request_is_one_guess(new_server, new_client, headers):
+    url = new_server(token="secret").url
+    with pytest.raises(InvalidStatus) as caught:
+        new_client(f"{url}/?token=second&token=secret", additional_headers=headers)
+    assert caught.value.response.status_code == 401
+    new_client(f"{url}/?token=secret", additional_headers={"Authorization": "Bearer secret"}).sync()
 
 
 def test_tls(new_server, new_client, certificates):
@@ -294,7 +367,7 @@ def test_tls(new_server, new_client, certificates):
     new_client(url, ssl=ssl.create_default_context(cafile=cert)).sync()
 
 
-def test_certificates_that_are_none(certificates, tmp_path):
+def test_certificates_that_are_none(certificates, tmp_path, threads):
     cert, _ = certificates("127.0.0.1")
     with pytest.raises(
         InvalidValue, match=r"^Certificate: .*nowhere\.pem cannot be read: No such file or directory\.$"
@@ -355,22 +428,75 @@ def test_fragments_may_not_be_larger_together_than_one_message(new_server, new_c
     client = new_client(new_server(options=ServerOptions(limits=Limits(max_incoming=1000))).url)
     client.send(op="fragment", id="a", num=0, total=3, data="x" * 700)
     answer = client.ask(op="fragment", id="a", num=1, total=3, data="x" * 700)
-    assert answer["msg"] == "fragment: Fragments: expected at most 1000 characters, found 1600."
+    assert answer["msg"] == "fragment: Fragments: expected at most 1000 bytes, found 1600."
 
 
-def test_sockets_that_say_nothing_are_closed(new_server, new_client):
-    server = new_server(options=ServerOptions(open_timeout=0.05, max_clients=1))
-    silent = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(70)]
-    silent[0].sendall(b"GET / HTTP/1.1\r\n")
+def test_sockets_that_say_nothing_are_closed_and_keep_nobody_out(new_server, new_client):
+    server = new_server(options=ServerOptions(open_timeout=0.3, max_clients=1))
+    silent = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(200)]
+    silent[-1].sendall(b"GET / HTTP/1.1\r\n")
+    new_client(server.url).sync()
     for one in silent:
         one.settimeout(DEADLINE)
         with contextlib.suppress(ConnectionResetError):
             assert one.recv(1) == b""
         one.close()
-    new_client(server.url).sync()
 
 
-def test_it_closes_at_once_beside_sockets_that_say_nothing(new_server, certificates):
+def halted_within(server, client):
+    """How long a halt of `client` takes until it is heard [s]."""
+    heard = threading.Event()
+    unsubscribe = server.subscribe("/bam/halt", "std_msgs/Empty", lambda message, caller: heard.set())
+    began = time.monotonic()
+    client.send(op="publish", topic="/bam/halt", msg={})
+    assert heard.wait(DEADLINE)
+    unsubscribe()
+    return time.monotonic() - began
+
+
+BOMBS = {
+    "two million messages": b"{}" * 2_000_000,
+    "lists in lists": b"[" * 4_000_000,
+    "a million lists": b'{"op":"publish","topic":"/t","msg":{"data":[' + b"[]," * 1_300_000 + b"[]]}}",
+    "many objects of a type that nobody knows": (
+        b'{"op":"publish","topic":"/u","msg":{"a":[' + b'{"b":[1]},' * 30_000 + b"{}]}}" + b" " * 3_500_000
+    ),
+    "many floats": b'{"op":"publish","topic":"/t","msg":{"data":[' + b"0.123456789," * 99_000 + b"0]}}",
+}
+
+
+@pytest.mark.parametrize("bomb", BOMBS)
+def test_a_large_message_delays_no_halt(new_server, new_client, bomb):
+    server = new_server()
+    attacker, driver = new_client(server.url), new_client(server.url)
+    attacker.send(op="advertise", topic="/t", type="std_msgs/Float64MultiArray")
+    attacker.send(op="advertise", topic="/u", type="strange_msgs/Strange")
+    attacker.sync()
+    for _ in range(2):
+        attacker.socket.send(BOMBS[bomb], text=True)
+    assert max(halted_within(server, driver) for _ in range(10)) < 1.0
+    attacker.send(op="call_service", service="/rosapi/get_time")
+    while attacker.receive()["op"] != "service_response":
+        pass
+
+
+def test_unfinished_frames_of_all_clients_are_bounded(new_server, new_client):
+    server = new_server(options=ServerOptions(limits=Limits(max_incoming=2**20, unfinished=4 * 2**20)))
+    clients = [new_client(server.url, close_timeout=0.01) for _ in range(8)]
+    head = struct.pack("!BBQ4s", 0x81, 0xFF, 1_000_000, bytes(4))
+    for client in clients:
+        with contextlib.suppress(OSError):
+            client.socket.socket.sendall(head + b" " * 900_000)
+    deadline = time.monotonic() + DEADLINE
+    while len(server._sockets) > 4:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert sum(one.unfinished for one in server._sockets) <= 4 * 2**20
+    survivor = new_client(server.url)
+    survivor.sync()
+
+
+def test_it_closes_at_once_beside_sockets_that_say_nothing(threads, new_server, certificates):
     cert, _ = certificates("127.0.0.1")
     for server in (new_server(), new_server(cert=cert, key=cert.replace("cert.pem", "key.pem"))):
         with socket.create_connection(("127.0.0.1", server.port)) as silent:

@@ -200,12 +200,14 @@ def test_no_way_leads_around_the_gate(server, robot_on, start_pose):
             "measure",
             "namespace",
             "needs_clearance",
+            "not_ready",
             "num_robots",
             "profile",
             "reset",
             "spec",
             "step",
             "url",
+            "waiting",
         ]
     finally:
         robot.close()

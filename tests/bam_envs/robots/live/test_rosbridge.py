@@ -3,6 +3,7 @@
 import multiprocessing
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.live.rosbridge import RosbridgeRobot
 from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.robots.robot import Initial
-from bam_envs.robots.safety.safe import _SEAL, ClearedCommand
+from bam_envs.robots.safety.safe import _clear
 from bam_envs.robots.ur5e import JOINTS
 from bam_envs.robots.wire.codec import HALT_TOPIC, SCENE_TOPIC, RobotInfo
 from bam_envs.robots.wire.messages import tag_text, write_stamp
@@ -43,7 +44,7 @@ class OpenGate:
         self.state = robot.measure()
 
     def step(self, command):
-        return self.robot.step(ClearedCommand(np.array(command), seal=_SEAL))
+        return self.robot.step(_clear(self.robot, np.array(command)))
 
 
 def robot_at(url, profile="ur5e", **options):
@@ -184,6 +185,24 @@ def test_lockstep(server, robot_on, connect, simulation):
         np.testing.assert_array_equal(state.signals["joint_position"], command[:, :6])
 
 
+def test_a_robot_that_answers_commands_owes_an_answer_to_what_does_not_arrive(server, robot_on, connect):
+    scripted = robot_on(server, info=RobotInfo("ur5e", simulated=True, lockstep=False, period=0.05))
+    robot, gate = connect(server.url)
+    assert robot.waiting() == 0.0
+    for _ in range(3):
+        gate.step(gate.state.command)
+    assert robot.waiting() < 0.05
+    answered, now = scripted._tag, robot._clock
+    scripted.mangle = lambda topic, message: (
+        message | {"header": message["header"] | {"frame_id": answered}} if topic == "/joint_states" else message
+    )
+    gate.step(gate.state.command)
+    robot._clock = lambda: now() + 0.5
+    assert 0.5 <= robot.waiting() < 1.5
+    robot.halt()  # what has not been executed is not any more
+    assert robot.waiting() == 0.0
+
+
 def test_in_lockstep_a_command_that_cannot_be_sent_is_told_at_once(server, robot_on, connect, simulation):
     scripted = robot_on(server, info=simulation)
     robot, gate = connect(server.url)
@@ -256,21 +275,29 @@ def test_a_cut_link_delivers_nothing_afterwards(server, robot_on, connect, start
         robot.close()
 
 
-def test_a_halt_that_cannot_be_sent_is_told_once(server, robot_on, connect, caplog):
+@pytest.mark.parametrize("told", [False, True])
+def test_a_halt_that_cannot_be_sent_is_told_once(server, robot_on, connect, caplog, told):
+    """By the error of the step that found the link down, or else by a line of its own."""
     robot_on(server)
     robot, gate = connect(server.url)
     gate.step(gate.state.command)
     server.close()
-    raised(LinkLost, lambda: [gate.step(gate.state.command) for _ in range(100)])
     assert robot._cut.wait(DEADLINE)
-    robot._state.mailbox.wait_for(lambda slots: not robot._halting.is_up, DEADLINE)
+    robot._state.mailbox.wait_for(lambda slots: not (robot._halting.is_up or robot._control.is_up), DEADLINE)
+    text = "stop it by hand if it moves; a robot with a dead-man stops by itself."
+    if told:
+        assert raised(LinkLost, lambda: gate.step(gate.state.command)) == (
+            f"{server.url}: the link is down. Nothing was sent, and nothing is kept; {text}"
+        )
     for _ in range(3):
         robot.halt()
     robot.close()
-    (line,) = [record.getMessage() for record in caplog.records if "halt" in record.getMessage()]
-    assert line.startswith(f"{server.url}: the halt could not be sent, the link is down (")
-    assert line.endswith("): stop it by hand if it moves; a robot with a dead-man stops by itself.")
-    assert line.count(server.url) == 1
+    lines = [record.getMessage() for record in caplog.records if "halt" in record.getMessage()]
+    assert len(lines) == (0 if told else 1)
+    for line in lines:
+        assert line.startswith(f"{server.url}: the halt could not be sent, the link is down (")
+        assert line.endswith(f"): {text}")
+        assert line.count(server.url) == 1
 
 
 def test_a_command_that_a_halt_overtook_is_not_noted_as_sent(server, robot_on, connect, monkeypatch):
@@ -314,18 +341,24 @@ def test_what_a_halt_says(server, robot_on, connect):
     command[0, 6] = 0.03
     gate.step(command)
     scripted.wait_for(lambda: len(scripted.commands) == 4)
-    scripted.signals["gripper_width"], scripted.signals["joint_position"] = np.array([0.04]), np.arange(6.0)
-    robot._state.mailbox.wait_for(
-        lambda slots: slots["joint_position"].message["position"] == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0], DEADLINE
-    )
-    before = len(scripted.commands)
-    robot.halt()
-    scripted.wait_for(lambda: len(scripted.commands) == before + 3)
-    (halt, gripper, joints) = scripted.commands[before:]
-    assert halt[0] == HALT_TOPIC
-    assert gripper[2]["data"] == [0.03]  # it goes on holding what it holds
-    assert joints[2]["data"] == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]  # the arm stays where it is
-    assert {caller for _, caller, _ in (halt, gripper, joints)} != {scripted.commands[before - 1][1]}
+    for way, held in (
+        (0.1, 0.1),
+        (0.5, 0.0),
+    ):  # farther it cannot be: it is measured wrongly, and to go there would be a motion
+        gate.step(command)
+        there = (command[0, :6] + way).tolist()
+        scripted.signals["gripper_width"], scripted.signals["joint_position"] = np.array([0.04]), np.array(there)
+        robot._state.mailbox.wait_for(
+            lambda slots, there=there: slots["joint_position"].message["position"] == there, DEADLINE
+        )
+        before = len(scripted.commands)
+        robot.halt()
+        scripted.wait_for(lambda before=before: len(scripted.commands) == before + 3)
+        (halt, gripper, joints) = scripted.commands[before:]
+        assert halt[0] == HALT_TOPIC
+        assert gripper[2]["data"] == [0.03]  # it goes on holding what it holds
+        assert joints[2]["data"] == (command[0, :6] + held).tolist()  # the arm stays where it is
+        assert {caller for _, caller, _ in (halt, gripper, joints)} != {scripted.commands[before - 1][1]}
 
 
 def test_who_only_looks_commands_nothing(server, robot_on, connect):
@@ -592,3 +625,40 @@ def test_in_workers(server, robot_on, connect, method):
     before = len(scripted.on(JOINT_COMMANDS))
     gate.step(gate.state.command)  # this process goes on
     scripted.wait_for(lambda: len(scripted.on(JOINT_COMMANDS)) > before)
+
+
+def subscriptions(server):
+    asked = {}
+    for _, frame in server.frames:
+        if frame["op"] == "subscribe" and "/io_" not in frame["topic"] and "/speed_" not in frame["topic"]:
+            asked[frame["topic"]] = (frame["throttle_rate"], frame["queue_length"])
+    return asked
+
+
+@pytest.mark.parametrize(("period", "rate"), [(0.05, 10), (0.1, 20), (0.01, 2), (0.004, 0)])
+def test_states_are_asked_for_throttled_and_the_newest_alone(lax, robot_on, connect, period, rate):
+    """Whole milliseconds: servers in Python drop a subscription for anything else, without a word."""
+    server = lax()
+    robot_on(server)
+    connect(server.url, spec=replace(load_profile("ur5e").spec(), period=period))
+    expected = (rate, 1 if rate else 0)
+    assert subscriptions(server) == dict.fromkeys(("/joint_states", "/gripper/joint_states", "/object_pose"), expected)
+    assert all(type(number) is int for pair in subscriptions(server).values() for number in pair)
+
+
+def test_states_that_answer_commands_come_all(lax, robot_on, connect, simulation):
+    server = lax()
+    robot_on(server, info=simulation)
+    connect(server.url)
+    assert set(subscriptions(server).values()) == {(0, 0)}
+
+
+def test_a_shared_topic_comes_whole(lax, robot_on, connect):
+    server, profile = lax(), load_profile("ur5e")
+    robot_on(server)
+    shared = tuple(replace(one, partial=one.signal == "gripper_width") for one in profile.state)
+    robot = RosbridgeRobot(server.url, replace(profile, state=shared))
+    robot.connect()
+    robot.close()
+    assert subscriptions(server)["/gripper/joint_states"] == (0, 0)
+    assert subscriptions(server)["/joint_states"] == (10, 1)

@@ -67,7 +67,20 @@ def refusal(path):
 
 
 def test_shipped():
-    assert shipped_profiles() == ["mir100", "ur5e"]
+    assert shipped_profiles() == ["mir100", "ur5e", "ur5e_trajectory"]
+
+
+def test_the_ur5e_whose_controller_interpolates():
+    profile, held = load_profile("ur5e_trajectory"), load_profile("ur5e")
+    assert profile.spec() == replace(held.spec(), name="ur5e_trajectory")
+    assert (profile.state, profile.readiness, profile.limits) == (held.state, held.readiness, held.limits)
+    assert list(profile.commands) == ["trajectory"]
+    assert [sink.topic for sink in profile.sinks()] == [
+        "/gripper/commands",
+        "/scaled_joint_trajectory_controller/joint_trajectory",
+    ]
+    assert [sink.controller for sink in profile.sinks()] == ["", "scaled_joint_trajectory_controller"]
+    assert profile_for(arm_spec("ur5e", with_object=True)).name == "ur5e"
 
 
 def test_the_ur5e_is_the_simulated_arm():
@@ -239,6 +252,7 @@ ignore: [finger_joint, elbow_joint]
         ("period = 0.02", "period = true", "FILE: period must be a finite number, not True."),
         ("period = 0.02", "period = nan", "FILE: period must be a finite number, not nan."),
         ("period = 0.02", "period = -1", "FILE: period must be above 0, not -1."),
+        ("period = 0.02", "period = 0.02\ndead_man = 1e9", "FILE: dead_man may be 1 s at most, not 1e+09."),
         ("period = 0.02", "", "FILE: give robot (ur5e, mir100), or [command] with max_rate, and period."),
         ("period = 0.02", 'robot = "ur5"', "FILE: Unknown robot 'ur5'. Did you mean 'ur5e'?"),
         ("period = 0.02", "period = 0.02\nstate = 3", "FILE is not TOML: "),
@@ -316,8 +330,7 @@ ignore: [finger_joint, elbow_joint]
         (
             "[command]",
             "[limits]\ntool_speed = 25\n[command]",
-            "FILE: limits: The limit tool_speed of a profile may be 1 m/s at most, not 25. "
-            "Give a wider one in a program: live_robot(..., limits=Limits(...)).",
+            "FILE: limits: The limit tool_speed of a live robot must be 0.005 to 1 m/s, not 25.",
         ),
         (
             "[command]",
@@ -372,7 +385,9 @@ def test_no_way_and_no_state(write):
 def test_files(write, tmp_path):
     missing = tmp_path / "other.toml"
     (tmp_path / "folder.toml").mkdir()
-    assert refusal(missing) == ("There is no robot profile FILE. Give the path of a file, or one of: mir100, ur5e.")
+    assert refusal(missing) == (
+        "There is no robot profile FILE. Give the path of a file, or one of: mir100, ur5e, ur5e_trajectory."
+    )
     assert refusal(write("name =")).startswith("FILE is not TOML: ")
     for text in ("a: [", "a: 2020-13-45", "a: !!int b", "[" * 3000):
         assert refusal(write(text, "b.yaml")).startswith("FILE is not YAML: ")
@@ -385,7 +400,7 @@ def test_files(write, tmp_path):
         load_profile(write('extends = "ur5"'))
     assert refusal(write("extends = 3")) == "FILE: extends must be text, not 3."
     assert refusal(write('extends = "b.toml"')) == (
-        "FILE: extends must be a shipped profile (mir100, ur5e), not 'b.toml'."
+        "FILE: extends must be a shipped profile (mir100, ur5e, ur5e_trajectory), not 'b.toml'."
     )
     assert refusal(tmp_path / "folder.toml") == (
         "The robot profile FILE cannot be read: [Errno 21] Is a directory: 'FILE'."
@@ -400,3 +415,58 @@ def test_what_is_sent_on_a_topic_and_in_which_units():
     assert (arm.is_si, replace(arm, scale=(2.0,)).is_si, replace(arm, offset=(0.1,)).is_si) == (True, False, False)
     joints = profile.source("joint_position")
     assert (joints.is_si, replace(joints, scale=(1.0,) * 5 + (-1.0,)).is_si) == (True, False)
+
+
+def test_a_frame_of_another_name(write):
+    profile = load_profile(write('extends = "ur5e"\n[frames]\n"/object_pose" = "world"\n'))
+    assert [profile.source(f"object_{name}").frame for name in ("position", "quaternion")] == ["world", "world"]
+    assert profile.source("tool_position").frame == "base"
+    unchecked = load_profile(write('extends = "ur5e"\n[frames]\n"/object_pose" = ""\n'))
+    assert unchecked.source("object_position").frame == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            'extends = "ur5e"\n[frames]\n"/joint_states" = "world"\n',
+            "FILE: frames: Unknown topic with a frame '/joint_states'. "
+            "Choose from: /object_pose, /tcp_pose_broadcaster/pose.",
+        ),
+        (
+            OWN.replace('field = "position"', 'field = "position"\nframe = "map"').replace(
+                "sensor_msgs/msg/JointState", "geometry_msgs/Pose"
+            ),
+            "FILE: state[0]: frame needs a type with a header, such as geometry_msgs/PoseStamped.",
+        ),
+    ],
+)
+def test_frames_that_cannot_be(write, text, message):
+    assert refusal(write(text)) == message
+
+
+@pytest.mark.parametrize(
+    ("name", "way", "period", "lag"),
+    [
+        ("ur5e", None, 0.05, 0.1),
+        ("ur5e", "trajectory", 0.05, 0.1),
+        ("ur5e_trajectory", None, 0.05, 0.125),
+        ("ur5e_trajectory", None, 0.1, 0.15),
+        ("mir100", None, 0.1, 0.3),
+    ],
+)
+def test_what_takes_longer_is_farther_behind(name, way, period, lag):
+    profile = load_profile(name)
+    assert profile.spec(replace(profile.spec(), period=period), way).lag == pytest.approx(lag)
+
+
+def test_a_renamed_command_is_another_controllers(write):
+    topic = "/forward_position_controller/commands"
+    profile = load_profile(write(f'extends = "ur5e"\nreadiness = []\n[rename]\n"{topic}" = "/left/commands"\n'))
+    assert [(sink.topic, sink.controller) for sink in profile.sinks()] == [
+        ("/gripper/commands", ""),
+        ("/left/commands", ""),
+    ]
+    assert profile.sinks("trajectory")[1].controller == "scaled_joint_trajectory_controller"
+    assert profile.readiness == ()
+    assert [sink.controller for sink in load_profile("ur5e").sinks()] == ["", "forward_position_controller"]

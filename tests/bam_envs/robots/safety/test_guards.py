@@ -1,7 +1,7 @@
 """The guards one by one: what they let through, what they make of the rest, and what they say."""
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -13,19 +13,21 @@ from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.robot import RobotSpec, RobotState, SignalSpec
 from bam_envs.robots.safety import arm_guards, guards
 from bam_envs.robots.safety.arm_guards import longest_step
-from bam_envs.robots.safety.guard import Guard, Limits, Tick
+from bam_envs.robots.safety.guard import BOUNDS, Guard, Limits, Tick
 from bam_envs.robots.safety.guards import default_guards
 from bam_envs.robots.ur5e import GEOMETRY, JOINTS, arm_spec
 from bam_envs.testing import ARM_HOME
 
 ARM, BASE = arm_spec("ur5e", with_object=False), base_spec(with_scans=False)
 HOME = np.array([*ARM_HOME, 0.085])
+PERIOD = {7: ARM.period, 2: BASE.period}
 
 
 def tick_from(last, step=None, **numbers):
     """A tick of a robot that was sent `last`, which is `step` after what it was sent before."""
     last = np.array(last, dtype=np.float64)
-    given = {"goal": last.copy(), "measured": last.copy(), "age": 0.0, **numbers}
+    still = {"before": last.copy(), "velocity": np.zeros_like(last), "age": 0.0, "period": PERIOD[len(last)]}
+    given = {"goal": last.copy(), "measured": last.copy(), **still, **numbers}
     given.setdefault("command", given["goal"].copy())
     return Tick(last=last, last_step=np.zeros_like(last) if step is None else np.array(step), **given)
 
@@ -40,11 +42,16 @@ def joints(*way):
 
 
 def test_the_list_of_an_arm():
-    table = [(one.number, one.name, one.limit_value, one.unit) for one in default_guards(ARM)]
+    table = [(one.number, one.name, round(one.limit_value, 9), one.unit) for one in default_guards(ARM)]
     assert table == [
         ("G2", "shape", 7, "numbers"),
         ("G2", "finite", 3, "bad ticks in a row"),
         ("G3", "state age", 0.1, "s"),
+        ("G15", "command pace", 1.0, "s"),
+        ("G4", "answer to a command", 0.3, "s"),
+        ("G7", "measured jump", 0.05, "rad"),
+        ("G8", "measured joint speed", 1.3, "rad/s"),
+        ("G10", "measured tool speed", 0.325, "m/s"),
         ("G7", "position margin", 0.1, "rad"),
         ("G8", "gripper speed", 0.15, "m/s"),
         ("G8", "joint speed", 1.0, "rad/s"),
@@ -52,6 +59,7 @@ def test_the_list_of_an_arm():
         ("G10", "tool speed", 0.25, "m/s"),
         ("G9", "joint acceleration", 10.0, "rad/s^2"),
         ("G10", "tool speed", 0.25, "m/s"),
+        ("G23", "following", 0.05, "rad"),
         ("G7", "measured limits", 0.0, "beyond the data sheet"),
     ]
 
@@ -63,15 +71,21 @@ def test_an_arm_that_is_told_its_joints_alone_has_no_guard_of_a_gripper():
 
 
 def test_the_list_of_a_base():
-    table = [(one.number, one.name, one.limit_value, one.unit) for one in default_guards(BASE)]
+    table = [(one.number, one.name, round(one.limit_value, 9), one.unit) for one in default_guards(BASE)]
     assert table == [
         ("G2", "shape", 2, "numbers"),
         ("G2", "finite", 3, "bad ticks in a row"),
         ("G3", "state age", 0.5, "s"),
+        ("G15", "command pace", 1.0, "s"),
+        ("G4", "answer to a command", 0.3, "s"),
+        ("G11", "measured base speed", 0.65, "m/s"),
+        ("G11", "measured turn speed", 0.91, "rad/s"),
         ("G11", "base speed", 0.5, "m/s"),
         ("G11", "turn speed", 0.7, "rad/s"),
         ("G11", "base acceleration", 2.0, "m/s^2"),  # the data sheet's, which is below the limit
         ("G11", "turn acceleration", 2.5, "rad/s^2"),
+        ("G23", "base following", 0.2, "m/s"),
+        ("G23", "turn following", 0.25, "rad/s"),
         ("G7", "measured limits", 0.0, "beyond the data sheet"),
     ]
 
@@ -105,36 +119,24 @@ def test_a_margin_leaves_room():
 
 def test_limits_by_name():
     assert Limits.of({"joint_speed": 0.5}) == Limits(joint_speed=0.5)
-    assert Limits.of({"joint_speed": math.pi, "position_margin": 1e-6}).joint_speed == math.pi
     with pytest.raises(UnknownName) as caught:
         Limits.of({"joint_sped": 0.5})
     assert str(caught.value) == "Unknown limit 'joint_sped'. Did you mean 'joint_speed'?"
 
 
-@pytest.mark.parametrize(
-    ("name", "top"),
-    [
-        ("joint_speed", "3.14159 rad/s"),
-        ("joint_acceleration", "20 rad/s^2"),
-        ("tool_speed", "1 m/s"),
-        ("base_speed", "1.5 m/s"),
-        ("turn_speed", "2 rad/s"),
-        ("base_acceleration", "5 m/s^2"),
-        ("turn_acceleration", "5 rad/s^2"),
-        ("max_age", "1 s"),
-        ("bad_ticks", "10 ticks"),
-        ("reset_speed", "1 rad/s"),
-        ("reset_timeout", "300 s"),
-    ],
-)
-def test_a_profile_cannot_open_a_guard(name, top):
-    with pytest.raises(InvalidValue) as caught:
-        Limits.of({name: 1000.5})
-    assert str(caught.value) == (
-        f"The limit {name} of a profile may be {top} at most, not 1000.5. "
-        "Give a wider one in a program: live_robot(..., limits=Limits(...))."
-    )
-    assert getattr(Limits(**{name: 1000.5}), name) == 1000.5
+@pytest.mark.parametrize("name", sorted(BOUNDS))
+def test_a_profile_cannot_open_a_guard(name):
+    least, most, unit = BOUNDS[name]
+    assert Limits.of({name: least}) != Limits.of({name: most})
+    for value in (1000.5, least / 2):
+        with pytest.raises(InvalidValue) as caught:
+            Limits.of({name: value})
+        text = f"The limit {name} of a live robot must be {least:g} to {most:g} {unit}, not {value:g}."
+        assert str(caught.value) == text
+
+
+def test_every_limit_has_its_bounds():
+    assert sorted(BOUNDS) == sorted(one.name for one in fields(Limits))
 
 
 def other_arm():
@@ -148,10 +150,18 @@ def test_an_arm_without_kinematics_has_no_tool_speed_that_could_be_limited():
         default_guards(other_arm())
     assert str(caught.value) == (
         "The tool speed of other cannot be limited: its kinematics are not known. "
-        "Give tool_position=, or the limit tool_speed = inf."
+        "Give tool_position=; a simulated robot may do with the limit tool_speed = inf."
     )
-    assert len(default_guards(other_arm(), Limits(tool_speed=math.inf))) == 8
-    assert len(default_guards(other_arm(), tool_position=lambda q: np.zeros((len(q), 3)))) == 10
+    blind = [one.name for one in default_guards(other_arm(), Limits(tool_speed=math.inf))]
+    assert not [name for name in blind if "tool" in name]
+    seeing = default_guards(other_arm(), tool_position=lambda q: np.pad(q, ((0, 0), (0, 1))))
+    assert len(seeing) == len(blind) + 3
+    with pytest.raises(InvalidValue) as caught:
+        default_guards(other_arm(), tool_position=lambda q: np.zeros((len(q), 3)))
+    assert str(caught.value) == (
+        "tool_position of other must give the position of the tool [m] for joints [rad], and the tool stays within "
+        "0.01 m when each joint is turned by 0.5 rad."
+    )
 
 
 @pytest.mark.parametrize(
@@ -196,11 +206,29 @@ def test_finite():
 
 
 def test_state_age():
-    guard = guards.Freshness(0.1)
+    guard = guards.Freshness(ARM, Limits())
     assert guard.fault(arm_tick(joints(), age=0.1)) is None
     for age in (0.1004, math.inf, math.nan):
         text = f"the newest state is {age:.3f} s old, and at most 0.1 s are allowed"
         assert guard.fault(arm_tick(joints(), age=age)) == text
+
+
+@pytest.mark.parametrize(
+    ("name", "velocity", "text"),
+    [
+        ("measured joint speed", joints(0, 0, 0, 0, 0, -1.6), "1.350 rad/s were measured, and at most 1.300 rad/s"),
+        ("measured tool speed", joints(0.8), "0.339 m/s were measured, and at most 0.325 m/s"),
+    ],
+)
+def test_a_measured_speed_is_the_mean_of_two_ticks(name, velocity, text):
+    guard = next(one for one in default_guards(ARM) if one.name == name)
+    for _ in range(2):
+        assert guard.fault(arm_tick(joints(), velocity=velocity)) is None
+        assert guard.fault(arm_tick(joints(), velocity=joints())) is None
+        assert guard.fault(arm_tick(joints(), velocity=velocity * 0.6875)) is None
+        assert guard.fault(arm_tick(joints(), velocity=velocity)) == f"{text} are allowed"
+        guard.restart()
+    assert guard.fault(arm_tick(joints(), velocity=joints(math.nan))) is None
 
 
 def test_joints_keep_a_margin_and_the_gripper_its_range():

@@ -1,6 +1,7 @@
 """The gate: nothing reaches the robot but what the guards let through, at no time and by no way."""
 
 import copy
+import itertools
 import math
 import pickle
 import threading
@@ -21,7 +22,8 @@ from bam_envs.errors import (
 )
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.robot import Initial, Robot, RobotState
-from bam_envs.robots.safety.guards import Guard, Limits, default_guards
+from bam_envs.robots.safety.arm_guards import JointSpeed
+from bam_envs.robots.safety.guards import Guard, Limits
 from bam_envs.robots.safety.safe import ClearedCommand, SafeRobot
 from bam_envs.robots.simulated.mir100 import SimulatedBase
 from bam_envs.robots.ur5e import GEOMETRY
@@ -126,7 +128,8 @@ class TestSafeFakeRobot(Guarded):
 
 class TestSafeLiveArm(Guarded):
     def make(self, num_robots: int) -> Robot:
-        return SafeRobot(LiveArm())
+        arm = LiveArm()
+        return SafeRobot(arm, clock=arm.clock)
 
 
 class TestSafeBase(Guarded):
@@ -289,6 +292,7 @@ def test_what_was_altered_is_counted_by_guard_and_told_by_status():
         "limit": 10.0,
         "unit": "rad/s^2",
         "altered": 1,
+        "held": 0,
         "stopped": 0,
     }
     altered = {name: row["altered"] for name, row in robot.report().items() if row["altered"]}
@@ -310,20 +314,66 @@ def test_one_robot_only():
     assert str(caught.value) == "A SafeRobot guards one robot, not 2 stepped together."
 
 
-def test_a_live_robot_keeps_all_of_its_guards():
-    arm = LiveArm()
+class Opener(Guard):
+    """Allows everything, and more than it was asked."""
+
+    number, name, unit, limit_value = "G99", "joint speed", "", math.inf
+
+    def fault(self, tick):
+        tick.last[:] += 1.0
+        tick.age = math.inf
+
+    def limit(self, tick):
+        tick.last[:], tick.period, tick.approach = tick.goal, 100.0, True
+        tick.command = tick.goal + 1.0
+        return True
+
+
+@pytest.mark.parametrize("kind", [FakeRobot, lambda: LiveArm()])
+def test_guards_of_ones_own_are_asked_first_and_never_have_the_last_word(kind):
+    inner = kind()
+    robot = SafeRobot(inner, [Opener()])
+    robot.connect()
+    if isinstance(inner, LiveArm):
+        inner.place(ARM_HOME)
+    state = robot.reset(np.arange(1), start_at())
+    sent = robot.step(turned(state, 0.5)).command
+    assert np.abs(sent - state.command)[0, :6].max() <= 0.0125 + 1e-9
+    assert len(robot.report()) == len(SafeRobot(FakeRobot()).report())
+
+
+def test_no_attribute_opens_the_gate():
+    arm, robot, _ = live()
+    for name in ("guards", "limits", "spec", "status", "num_robots", "step", "report"):
+        with pytest.raises(AttributeError):
+            setattr(robot, name, ())
+    for kind, name in ((SafeRobot, "step"), (ClearedCommand, "command"), (JointSpeed, "limit"), (Guard, "fault")):
+        with pytest.raises(
+            AttributeError, match=rf"^{kind.__name__}\.{name} cannot be replaced: it keeps a robot safe"
+        ):
+            setattr(kind, name, lambda *_: None)
+        with pytest.raises(AttributeError, match="cannot be removed"):
+            delattr(kind, name)
+    with pytest.raises(AttributeError):
+        robot.limits.tool_speed = math.inf
     with pytest.raises(InvalidValue) as caught:
-        SafeRobot(arm, [one for one in default_guards(arm.spec) if one.name not in ("tool speed", "finite")])
-    assert str(caught.value) == (
-        "A live robot keeps all of its guards; finite, tool speed is missing. Put others between or behind those "
-        "of default_guards(spec, limits), and change how far they let it go with limits."
-    )
-    with pytest.raises(InvalidValue, match=r"^A live robot keeps all of its guards; finite, "):
-        SafeRobot(arm, [])
-    further = Guard()
-    further.name = "further"
-    assert SafeRobot(arm, [*default_guards(arm.spec), further]).guards[-1] is further
-    assert SafeRobot(FakeRobot(), [further]).guards == (further,)
+        SafeRobot(arm)
+    assert str(caught.value) == "fake stands behind a SafeRobot already; command it through that one."
+
+
+@pytest.mark.parametrize(
+    ("limits", "text"),
+    [
+        (Limits(tool_speed=math.inf), "tool_speed of a live robot must be 0.005 to 1 m/s, not inf."),
+        (Limits(joint_acceleration=math.inf), "joint_acceleration of a live robot must be 0.1 to 20 rad/s^2, not inf."),
+        (Limits(position_margin=1e-12), "position_margin of a live robot must be 0.01 to 1 rad, not 1e-12."),
+        (Limits(lag=3.0), "lag of a live robot must be 0.001 to 0.5 s, not 3."),
+    ],
+)
+def test_no_limit_of_a_live_robot_opens_a_guard(limits, text):
+    with pytest.raises(InvalidValue) as caught:
+        SafeRobot(LiveArm(), limits=limits)
+    assert str(caught.value) == f"The limit {text}"
 
 
 def test_a_joint_that_is_not_measured_is_refused():
@@ -362,7 +412,8 @@ def test_two_bad_ticks_hold_and_the_third_stops_for_good():
         "number": "G2",
         "limit": 3,
         "unit": "bad ticks in a row",
-        "altered": 3,
+        "altered": 0,
+        "held": 3,
         "stopped": 1,
     }
 
@@ -434,23 +485,45 @@ def test_a_base_holds_at_zero():
     np.testing.assert_array_equal(robot.step(np.array([[math.nan, 0.1]])).command, [[0.0, 0.0]])
 
 
-def test_stale_states_hold_and_the_third_stops():
+def test_stale_states_hold_for_half_a_second_and_then_stop():
     arm, robot, state = live()
     state = robot.step(away(state, 0.02))
     arm.old = 0.11
-    for _ in range(2):
+    for _ in range(9):
         np.testing.assert_array_equal(robot.step(away(state, 0.02)).command, state.command)
         assert robot.status == 3
     with pytest.raises(StaleState) as caught:
         robot.step(away(state, 0.02))
     assert str(caught.value) == (
         "The robot was stopped by G3 state age: the newest state is 0.110 s old, and at most 0.1 s are allowed, "
-        "3 ticks on end. When it is safe, call resume()."
+        "10 ticks on end. When it is safe, call resume()."
     )
     assert (caught.value.age, caught.value.limit) == (0.11, 0.1)
+    assert robot.report()["state age"]["held"] == 10
     with pytest.raises(SafetyStop):
         robot.step(state.command)
     assert robot.age() == 0.11
+
+
+def test_after_stale_states_it_goes_on_from_rest():
+    arm, robot, state = live()
+    state = robot.step(state.command)
+    for _ in range(20):
+        arm.old = 0.3
+        for _ in range(5):
+            state = robot.step(turned(state, 0.05))
+        arm.old = 0.0
+        after = robot.step(turned(state, 0.05))
+        np.testing.assert_allclose((after.command - state.command)[0, 5], 0.025)
+        state = after
+    assert robot.report()["state age"] | {"limit": 0, "number": ""} == {
+        "number": "",
+        "limit": 0,
+        "unit": "s",
+        "altered": 0,
+        "held": 100,
+        "stopped": 0,
+    }
 
 
 def test_no_motion_begins_at_a_stale_state():
@@ -552,18 +625,21 @@ def test_a_live_arm_that_is_there_is_sent_nothing():
     assert len(arm.sent) == count
 
 
-def test_a_start_that_is_not_reached_names_the_joints():
-    arm, robot, _ = live(limits=Limits(reset_timeout=3.0))
+def test_a_joint_that_is_blocked_on_the_way_to_the_start_stops_the_arm():
+    arm, robot, _ = live()
     arm.stuck = 1
-    halts = arm.halts
-    with pytest.raises(StartNotReached) as caught:
+    halts, count = arm.halts, len(arm.sent)
+    with pytest.raises(SafetyStop) as caught:
         robot.reset(np.arange(1), start_at(ARM_HOME + 0.2))
-    assert caught.value.joints == {"shoulder_lift_joint": pytest.approx(0.2)}
+    assert caught.value.guard == "following"
     assert str(caught.value) == (
-        "The arm did not reach its start pose in 3 s: shoulder_lift_joint is +0.200 rad from it. "
-        "Look for what holds it, or raise the limit reset_timeout."
+        "The robot was stopped by G23 following: shoulder_lift_joint does not follow its commands: it is -0.012 rad "
+        "from the last one, and beyond a lag of 0 s it may be 0.009 rad, and the tool 0.009 m: look for a protective "
+        "stop, a paused program, an inactive controller, a low speed slider, or something in its way. When it is safe, "
+        "call resume()."
     )
     assert arm.halts > halts + 1
+    assert np.abs(np.array(arm.sent[count:])[:, 0, 1] - ARM_HOME[1]).max() <= 0.0125 + 1e-9
 
 
 def test_a_way_that_is_too_long_for_the_time():
@@ -674,6 +750,9 @@ def stop(arm, robot, state, pushed):
 def pause(arm, robot, state, pushed):
     arm.now += 10.0
     arm.place(pushed)
+    with pytest.raises(SafetyStop):
+        robot.step(state.command)
+    robot.resume()
 
 
 def connect_again(arm, robot, state, pushed):
@@ -704,13 +783,128 @@ def test_no_jump_from_where_somebody_moved_it_whatever_came_between(way, kind, p
     assert tool_travel(pushed, sent) <= 0.0125 + 1e-9
 
 
-def test_a_pause_ends_a_motion():
+def test_a_late_command_is_not_executed():
     arm, robot, state = live()
     for _ in range(10):
         state = robot.step(turned(state, 0.03))
     arm.now += 0.06  # beyond two periods since the last command
+    np.testing.assert_array_equal(robot.step(turned(state, 0.03)).command, state.command)
+    assert robot.status == 15
     assert np.abs(robot.step(turned(state, 0.03)).command - state.command).max() <= 0.025 + 1e-9
-    assert robot.status == 9
+
+
+def test_a_policy_that_is_too_slow_moves_nothing_and_is_stopped():
+    arm, robot, state = live()
+    state = robot.step(turned(state, 0.02))
+    for _ in range(9):
+        arm.now += 0.3
+        np.testing.assert_array_equal(robot.step(turned(state, 0.03)).command, state.command)
+    arm.now += 0.3
+    with pytest.raises(SafetyStop) as caught:
+        robot.step(turned(state, 0.03))
+    assert str(caught.value) == (
+        "The robot was stopped by G15 command pace: the command came 0.350 s after the one before, and one is "
+        "expected every 0.05 s: the policy takes too long, or this process was paused or the computer is busy, "
+        "10 ticks on end. When it is safe, call resume()."
+    )
+
+
+@pytest.mark.parametrize("when", ["in the episode", "on the way to the start"])
+def test_after_a_pause_of_this_process_nothing_moves_before_a_person_resumes(when):
+    arm, robot, state = live()
+    for _ in range(3):
+        state = robot.step(turned(state, 0.03))
+    sent = len(arm.sent)
+
+    def pause_once():
+        arm.now, arm.during = arm.now + 10.0, None
+
+    arm.during = pause_once
+    stopped = r"^The robot was stopped by G15 command pace: the command came 10\.050 s after"
+    if when == "in the episode":
+        robot.step(turned(state, 0.03))
+        with pytest.raises(SafetyStop, match=stopped):
+            robot.step(turned(state, 0.03))
+    else:
+        with pytest.raises(SafetyStop, match=stopped):
+            robot.reset(np.arange(1), start_at(ARM_HOME + 0.3))
+    assert len(arm.sent) == sent + 1
+    with pytest.raises(SafetyStop, match=r"^The robot is still stopped by G15"):
+        robot.step(state.command)
+    robot.resume()
+    robot.step(state.command)
+
+
+def test_limits_hold_over_the_real_time_since_the_last_command():
+    """Commands that are late every second tick come 29 ms after the one before."""
+    arm, robot, state = live()
+    arm.info = type("Info", (), {"lockstep": False})
+    sent = [(arm.now, state.command[0])]
+    for tick in range(20):
+        arm.now += 0.021 if tick % 2 else -0.021
+        begun = arm.now
+        state = robot.step(away(state, 0.05, 0, 0, 0, 0, 0.2))
+        sent.append((begun, state.command[0]))
+    for (before, one), (now, other) in itertools.pairwise(sent[1:]):
+        took = min(now - before, 0.05)
+        assert tool_travel(one, other) <= 0.25 * took + 1e-9
+        assert np.abs(other - one)[:6].max() <= 1.0 * took + 1e-9
+    assert {round(now - before, 3) for (before, _), (now, _) in itertools.pairwise(sent[1:])} == {0.029, 0.071}
+
+
+def test_a_robot_that_does_not_answer_is_held_and_then_stopped():
+    arm, robot, state = live()
+    arm.waiting = lambda: arm.now
+    for _ in range(6):
+        state = robot.step(turned(state, 0.01))
+    assert robot.status == 0
+    for _ in range(10):
+        arm.now += 0.001
+        try:
+            np.testing.assert_array_equal(robot.step(turned(state, 0.01)).command, state.command)
+        except SafetyStop as stop:
+            told = str(stop)
+    assert told == (
+        "The robot was stopped by G4 answer to a command: a command that was sent 0.760 s ago is not answered, and at "
+        "most 0.3 s are allowed: commands do not arrive, or late; look at the network and at who else commands the "
+        "robot, 10 ticks on end. When it is safe, call resume()."
+    )
+
+
+def test_an_arm_that_is_measured_too_fast_is_held_and_stopped_when_it_goes_on():
+    arm, robot, state = live()
+    state = robot.step(state.command)
+    measure = arm._measure
+
+    def run_away():
+        measured = measure()
+        return RobotState(
+            {**measured.signals, "joint_velocity": np.array([[0, 0, 0, 0, 0, 1.5]])}, measured.stamp, measured.command
+        )
+
+    arm._measure = run_away
+    robot.step(turned(state, 0.01))
+    held = robot.step(turned(state, 0.02)).command
+    assert robot.status == 0
+    for _ in range(2):
+        np.testing.assert_array_equal(robot.step(turned(state, 0.03)).command, held)
+        assert robot.status == 8
+    with pytest.raises(SafetyStop) as caught:
+        robot.step(turned(state, 0.03))
+    assert caught.value.guard == "measured joint speed"
+
+
+def test_a_joint_that_is_measured_elsewhere_at_once_is_not_gone_to():
+    arm, robot, state = live()
+    for _ in range(5):
+        state = robot.step(turned(state, 0.03))
+    sent = len(arm.sent)
+    arm.place(state.command[0, :6] + np.array([0, 0, 0, 0.5, 0, 0]))
+    robot.step(state.command)  # measured before
+    with pytest.raises(SafetyStop) as caught:
+        robot.step(state.command)
+    assert caught.value.guard == "measured jump"
+    assert len(arm.sent) == sent + 1
 
 
 def test_a_robot_that_waits_for_commands_does_not_mind_a_pause():
@@ -778,7 +972,10 @@ def test_a_cleared_command_is_read_only_and_good_for_its_tick_alone():
     for copied in (copy.copy, copy.deepcopy, pickle.dumps):
         with pytest.raises(InvalidValue):
             copied(old)
-    assert not old._command.flags.writeable
+    with pytest.raises(AttributeError):
+        old._command = state.command
+    with pytest.raises(InvalidValue):
+        arm.step(object.__new__(ClearedCommand))
 
 
 def test_any_other_robot_is_handed_a_plain_array():

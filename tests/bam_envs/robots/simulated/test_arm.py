@@ -224,7 +224,7 @@ def test_the_object_is_placed_elsewhere_while_the_arm_stays(arm):
     np.testing.assert_allclose(state.signals["object_position"], [[0.4, -0.1, 0.02]])
     np.testing.assert_allclose(state.signals["object_quaternion"], [[np.cos(0.3), 0, 0, np.sin(0.3)]])
     np.testing.assert_array_equal(state.signals["joint_position"], seen["joint_position"])
-    np.testing.assert_array_equal(state.signals["joint_velocity"], seen["joint_velocity"])
+    assert not state.signals["joint_velocity"].any()
     for name, array in seen.items():
         np.testing.assert_array_equal(before.signals[name], array)
     resting = arm.step(before.command)

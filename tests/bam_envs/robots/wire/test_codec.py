@@ -1,13 +1,15 @@
 """States and commands as messages: exact dicts, exact numbers, exact complaints."""
 
+import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bam_envs.bridge.freshness import Tag
+from bam_envs.bridge.freshness import Tag, Tagger, read_tag, signature
 from bam_envs.bridge.interfaces import complete
 from bam_envs.errors import InvalidValue, ProtocolError
 from bam_envs.robots.profiles.profile import load_profile
@@ -90,7 +92,7 @@ def test_messages_of_an_arm():
     }
     w, x, y, z = state.signals["object_quaternion"][0].tolist()
     assert messages["/object_pose"] == {
-        "header": {"stamp": STAMP, "frame_id": ""},
+        "header": {"stamp": STAMP, "frame_id": "base_link"},
         "pose": {"orientation": {"w": w, "x": x, "y": y, "z": z}},
     }
 
@@ -209,10 +211,57 @@ def test_commands_come_back_exactly(name, mode, data):
     command = np.array(data.draw(st.lists(FINITE, min_size=size, max_size=size)))
     received = np.full(size, np.nan)
     for topic, kind, message in encode_command(profile, spec, command, TAG, mode):
-        places, values, tag = decode_command(profile, spec, topic, complete(kind, message))
+        places, values, tag, _ = decode_command(profile, spec, topic, complete(kind, message))
         received[places] = values
         assert tag == (None if kind == "geometry_msgs/Twist" else TAG)
     np.testing.assert_array_equal(received, command)
+
+
+YAW = """
+name: turret
+kind: arm
+period: 0.1
+command: {labels: [turn, lift], units: [rad, m], low: -3, high: 3, max_rate: 1}
+signals: [{name: turn, labels: [turn, lift], units: [rad, m], low: -3, high: 3}]
+state: [{signal: turn, topic: /turret, type: std_msgs/Float64MultiArray, field: data}]
+commands:
+  pose:
+    - topic: /go
+      type: geometry_msgs/PoseStamped
+      labels: [turn, lift]
+      fields: [yaw(pose.orientation), pose.position.z]
+"""
+
+
+@given(data=st.data())
+def test_what_is_signed_is_what_is_read_after_any_bridge(data):
+    """Some keep 64 bits, some types have 32; angles travel as quaternions."""
+    profile, mode, narrow = data.draw(
+        st.sampled_from([(ARM, "position", True), (ARM, "trajectory", False), (BASE, "stamped", False)])
+    )
+    spec, tagger = profile.spec(), Tagger(session="4f1c", key=bytes(32))
+    size = len(spec.command.labels)
+    command = np.array(data.draw(st.lists(st.floats(-1e9, 1e9), min_size=size, max_size=size)))
+    tag = tagger.next(1, 0.1)
+    for topic, kind, message in encode_command(profile, spec, command, tag, mode, sign=tagger.sign):
+        if narrow:
+            message["data"] = np.float32(message["data"]).astype(float).tolist()
+        _, _, received, content = decode_command(profile, spec, topic, complete(kind, message))
+        assert received.mac == signature(bytes(32), received, topic, content)
+        assert len(received.mac) == 32
+        assert received == replace(read_tag(tag.to_text()), mac=received.mac)
+
+
+def test_a_signed_angle(tmp_path):
+    path, tagger = tmp_path / "turret.yaml", Tagger(key=bytes(32))
+    path.write_text(YAW)
+    profile = load_profile(path)
+    for turn in np.linspace(-3.0, 3.0, 101):
+        (envelope,) = encode_command(
+            profile, profile.spec(), np.array([turn, 0.3]), tagger.next(1, 0.1), sign=tagger.sign
+        )
+        decoded = decode_command(profile, profile.spec(), "/go", json.loads(json.dumps(envelope[2])))
+        assert decoded.tag.mac == signature(bytes(32), decoded.tag, "/go", decoded.content)
 
 
 def test_commands_of_an_arm():
@@ -305,7 +354,7 @@ def test_trajectories_that_are_refused():
 def test_trajectories_are_ordered_by_name():
     topic = "/scaled_joint_trajectory_controller/joint_trajectory"
     message = {"joint_names": list(reversed(JOINTS)), "points": [{"positions": [5, 4, 3, 2, 1, 0]}]}
-    places, values, tag = decode_command(ARM, ARM.spec(), topic, message)
+    places, values, tag, _ = decode_command(ARM, ARM.spec(), topic, message)
     assert dict(zip(places, values.tolist(), strict=True)) == {0: 0.0, 1: 1.0, 2: 2.0, 3: 3.0, 4: 4.0, 5: 5.0}
     assert tag is None
 
@@ -365,3 +414,52 @@ def test_info_of_the_wrong_kind_is_not_believed(field, value, text):
     with pytest.raises(ProtocolError) as caught:
         read_info(f'{{"name": "x", "{field}": {value}}}', "/bam/robot")
     assert str(caught.value) == f"/bam/robot: {text}"
+
+
+@pytest.mark.parametrize(("period", "nanoseconds"), [(0.05, 75_000_000), (0.1, 150_000_000)])
+def test_a_trajectory_that_reaches_over_more_than_a_period(period, nanoseconds):
+    profile = load_profile("ur5e_trajectory")
+    spec = replace(profile.spec(), period=period)
+    _, (_, _, message) = encode_command(profile, spec, np.arange(7.0) / 100, None)
+    assert message["points"][0]["time_from_start"] == {"sec": 0, "nanosec": nanoseconds}
+
+
+def posed(frame):
+    header = {} if frame is None else {"header": {"stamp": STAMP, "frame_id": frame}}
+    place = {"x": 0.4, "y": -0.2, "z": 0.1}
+    return header | {"pose": {"position": place, "orientation": {"w": 0.5, "x": 0.1, "y": -0.3, "z": 0.8}}}
+
+
+@pytest.mark.parametrize("frame", ["base_link", "/base_link"])
+def test_a_pose_in_the_frame_of_the_profile(frame):
+    signals = decode_state(load_profile("ur5e"), {"object_position": posed(frame)})
+    assert signals["object_position"].tolist() == [0.4, -0.2, 0.1]
+
+
+@pytest.mark.parametrize(("frame", "found"), [("base", "'base'"), ("", "''"), (None, "null"), (7, "7")])
+@pytest.mark.parametrize("signal", ["object_position", "object_quaternion"])
+def test_a_pose_in_another_frame_or_in_none_is_refused(signal, frame, found):
+    with pytest.raises(ProtocolError) as caught:
+        decode_state(load_profile("ur5e"), {signal: posed(frame)})
+    assert str(caught.value) == (
+        f"/object_pose: header.frame_id must be 'base_link', not {found}: a pose in another frame is another place "
+        "(a UR's base is its base_link turned by 180 degrees about z). Publish it in base_link; if that frame has "
+        "another name there, give the name under [frames] of the profile."
+    )
+
+
+def test_the_tool_pose_of_the_driver_is_turned_into_base_link():
+    profile, message = load_profile("ur5e"), posed("base")
+    signals = decode_state(profile, {"tool_position": message, "tool_quaternion": message})
+    np.testing.assert_allclose(signals["tool_position"], [-0.4, 0.2, 0.1])
+    np.testing.assert_allclose(signals["tool_quaternion"], [-0.8, 0.3, 0.1, 0.5])  # (0, 0, 0, 1) times it
+    with pytest.raises(ProtocolError, match="frame_id must be 'base', not 'base_link'"):
+        decode_state(profile, {"tool_position": posed("base_link")})
+
+
+def test_a_served_pose_says_its_frame():
+    profile = load_profile("ur5e")
+    signals = {"object_position": np.zeros((1, 3)), "joint_position": np.zeros((1, 6))}
+    messages = encode_state(profile, RobotState(signals, np.zeros(1), np.zeros((1, 7))), 0, STAMP, "tag")
+    frames = [(topic, message["header"]["frame_id"]) for topic, _, message in messages]
+    assert frames == [("/object_pose", "base_link"), ("/joint_states", "tag")]

@@ -81,7 +81,7 @@ def action_there(codec, action):
 
 
 def result_back(codec, result):
-    return codec.read_result(read_response(through_json(write_response(codec.write_result(result, STAMP)))))
+    return codec.read_result(read_response(through_json(write_response(codec.write_result(result, STAMP), 0.0, STAMP))))
 
 
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])

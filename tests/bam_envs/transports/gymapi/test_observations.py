@@ -11,6 +11,7 @@ from bam_envs.bridge.interfaces import complete
 from bam_envs.errors import InvalidValue, ProtocolError
 from bam_envs.transports import images
 from bam_envs.transports.gymapi.observations import ObservationCodec
+from bam_envs.transports.gymapi.versions import JUNE_17, JUNE_22
 
 RNG = np.random.default_rng(1)
 CAMERA = spaces.Box(0, 255, (16, 12, 3), np.uint8)
@@ -21,10 +22,10 @@ def box(*shape, dtype=np.float32):
     return spaces.Box(-np.inf, np.inf, shape, dtype)
 
 
-def there_and_back(space, value, **options):
+def there_and_back(space, value, version=JUNE_22, **options):
     """The fields and trees of a value, and the value after a journey as JSON."""
     codec = ObservationCodec(space, **options)
-    fields, trees = codec.encode(value, {"sec": 1, "nanosec": 2})
+    fields, trees = codec.encode(value, {"sec": 1, "nanosec": 2}, version)
     text = json.dumps([fields, trees], allow_nan=False, default=lambda data: base64.b64encode(data).decode())
     message, sent = json.loads(text)
     return fields, trees, codec.decode(complete("bam_msgs/GymFeedback", message), sent)
@@ -53,18 +54,21 @@ def test_a_pose():
 def test_an_image_is_a_png():
     value = RNG.integers(0, 256, CAMERA.shape, dtype=np.uint8)
     fields, trees, back = there_and_back(spaces.Dict(camera=CAMERA, joints=box(2)), {"camera": value, "joints": [1, 2]})
-    assert fields["color_img"]["format"] == "png"
-    assert fields["color_img"]["header"] == {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "camera"}
+    [image] = fields["color_img"]
+    assert image["format"] == "png"
+    assert image["header"] == {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "camera"}
     assert trees == {}
-    np.testing.assert_array_equal(images.decode_image(fields["color_img"]["data"]), value)
+    np.testing.assert_array_equal(images.decode_image(image["data"]), value)
     np.testing.assert_array_equal(back["camera"], value)
 
 
-def test_the_second_image_is_exact():
+@pytest.mark.parametrize("version", [JUNE_17, JUNE_22], ids=lambda version: version.name)
+def test_two_images_where_there_is_room_for_one_and_where_there_is_a_list(version):
     values = {name: RNG.integers(0, 256, CAMERA.shape, dtype=np.uint8) for name in ("front", "wrist")}
-    fields, trees, back = there_and_back(spaces.Dict(front=CAMERA, wrist=CAMERA), values)
-    assert fields["color_img"]["header"]["frame_id"] == "front"
-    assert trees.keys() == {"wrist"}
+    fields, trees, back = there_and_back(spaces.Dict(front=CAMERA, wrist=CAMERA), values, version)
+    shown = fields["color_img"] if version is JUNE_22 else [fields["color_img"]]
+    assert [one["header"]["frame_id"] for one in shown] == ["front", "wrist"][: len(shown)]
+    assert (len(shown), [*trees]) == ((2, []) if version is JUNE_22 else (1, ["wrist"]))
     for name, value in values.items():
         np.testing.assert_array_equal(back[name], value)
 
@@ -72,7 +76,7 @@ def test_the_second_image_is_exact():
 def test_jpeg_when_asked():
     value = np.full(CAMERA.shape, 90, np.uint8)
     fields, _, back = there_and_back(CAMERA, value, image_format="jpeg")
-    assert fields["color_img"]["format"] == "jpeg"
+    assert [one["format"] for one in fields["color_img"]] == ["jpeg"]
     np.testing.assert_allclose(back, value, atol=2)
 
 

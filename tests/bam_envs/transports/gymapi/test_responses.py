@@ -7,14 +7,27 @@ import pytest
 
 from bam_envs.errors import InvalidValue, NotInCommand, ProtocolError, RemoteError
 from bam_envs.transports.gymapi.responses import read_response, write_failure, write_feedback, write_response
+from bam_envs.transports.gymapi.versions import JUNE_17, JUNE_22, MAY_24
+
+STAMP = {"sec": 7, "nanosec": 8}
+NO_IMAGES = {"color_img": [], "depth_img": [], "camera_info": []}
 
 
-def test_the_message_of_a_success():
-    feedback = write_feedback({"observation": [1.0]}, {}, (0.5, True, False), {"a": 1})
-    assert write_response([feedback], 0.25) == {
-        "header": {"duration": 0.25, "error_code": {"value": 1}, "error_msg": "", "calibrated": True},
+@pytest.mark.parametrize(
+    ("version", "times", "images"),
+    [
+        (MAY_24, {"duration": 0.25}, {}),
+        (JUNE_17, {"process_duration": 0.25, "response_stamp": STAMP}, {}),
+        (JUNE_22, {"process_duration": 0.25, "response_stamp": STAMP}, NO_IMAGES),
+    ],
+)
+def test_the_message_of_a_success(version, times, images):
+    feedback = write_feedback({"observation": [1.0]}, {}, (0.5, True, False), {"a": 1}, version)
+    assert write_response([feedback], 0.25, STAMP, version) == {
+        "header": {**times, "error_code": {"value": 1}, "error_msg": "", "calibrated": True},
         "feedback": [
             {
+                **images,
                 "observation": [1.0],
                 "executed": True,
                 "reward": 0.5,
@@ -34,12 +47,13 @@ def test_a_reward_is_finite(reward):
 
 @pytest.mark.parametrize("kind", [RemoteError, NotInCommand])
 def test_our_failures_come_back_as_they_were(kind):
-    message = json.loads(json.dumps(write_failure(kind("no, because"))))
+    message = json.loads(json.dumps(write_failure(kind("no, because"), 0.0, STAMP)))
     assert message["header"]["error_code"] == {"value": 2}
     response = read_response(message)
     assert type(response.error) is kind
     assert str(response.error) == "no, because"
     assert response.ours
+    assert response.feedback[0]["color_img"] == []
 
 
 @pytest.mark.parametrize(
@@ -118,3 +132,31 @@ def test_a_duplicate_has_the_observation_of_the_other_one_of_its_namespace():
     response = read_response({"header": {"error_code": {"value": 1}}, "feedback": [other, same, one]})
     assert [row["observation"] for row in response.feedback] == [[2.0], [1.0], [1.0]]
     assert [row["reward"] for row in response.feedback] == [0.0, 3.0, 1.0]
+
+
+def read_rows(*rows):
+    return read_response({"header": {"error_code": {"value": 1}}, "feedback": list(rows)}).feedback
+
+
+def test_a_duplicate_has_the_observation_of_the_entry_that_it_names():
+    one = {"ns": "left", "observation": [1.0], "color_img": [{"format": "png", "data": "AAAA"}], "reward": 1.0}
+    same = {"ns": "right", "duplicate_obs": True, "duplicate_index": 1, "reward": 2.0, "executed": True}
+    chained = {"duplicate_obs": True, "reward": 3.0}
+    rows = read_rows(same, one, chained)
+    assert [row["observation"] for row in rows] == [[1.0]] * 3
+    assert [row["color_img"][0]["data"] for row in rows] == [b"\0\0\0"] * 3
+    assert [(row["ns"], row["reward"], row["executed"]) for row in rows] == [
+        ("right", 2.0, True),
+        ("left", 1.0, False),
+        ("", 3.0, False),
+    ]
+
+
+@pytest.mark.parametrize("place", [0, 2, -1])
+def test_a_duplicate_of_nothing_is_named(place):
+    with pytest.raises(ProtocolError) as caught:
+        read_rows({"duplicate_obs": True, "duplicate_index": place}, {"observation": [1.0]})
+    assert str(caught.value) == (
+        "feedback[0].duplicate_index must be the place of another entry, one of 2 with an observation of its own, "
+        f"not {place}."
+    )

@@ -147,7 +147,7 @@ def test_nothing_in_any_member_is_run(checkpoint, tmp_path):
     target = tmp_path / "was here"
     payload = pickle.dumps(Payload(target))
     pickles = [name for name in checkpoint.manifest.sha256 if name.endswith(".pkl")]
-    states = [name for name in pickles if Path(name).name in state._STATES]
+    states = [name for name in pickles if Path(name).name in state.STATES]
     assert len(states) >= 4
     assert len(pickles) > len(states)
     for name in states:

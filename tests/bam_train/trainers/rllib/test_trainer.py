@@ -15,12 +15,14 @@ pytest.importorskip("ray")
 import ray
 
 from bam_train.checkpoint import Checkpoint
-from bam_train.errors import BamTrainError, CheckpointMismatch, SettingsError
+from bam_train.errors import BamTrainError, CheckpointMismatch, EnvironmentFailed, SettingsError
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.resolve import resolve, resolve_resumed
 from bam_train.trainers.rllib import hyperparameters, registration, state
 from bam_train.trainers.rllib.cluster.cluster import cluster
+from bam_train.trainers.rllib.config import envs_each
+from bam_train.trainers.rllib.foreign.export import export
 from bam_train.trainers.rllib.trainer import RLlibTrainer
 from bam_train.trainers.rllib_algorithms import ALGORITHMS
 
@@ -94,6 +96,33 @@ def test_it_goes_on_where_it_stopped(trained):
     again.close()
 
 
+@pytest.mark.parametrize(
+    ("name", "hyper"),
+    [
+        ("ppo", {"train_batch_size_per_learner": 100, "num_epochs": 1}),
+        ("dqn", {"epsilon": [[0, 1.0], [10000, 0.05]]}),
+        ("tuned", {"tau": 0.005, "n_step": 1}),  # sac, as Tune saves it
+    ],
+)
+def test_training_goes_on_from_a_directory_of_rllib(name, hyper, rllib_directories, tmp_path):
+    """Of its present API: settings, weights, filter and counters are the directory's."""
+    saved = Checkpoint.open(export(rllib_directories / name).write(tmp_path / "a.zip").path)
+    settings = resolve_resumed({"steps": saved.manifest.steps + 100}, saved)
+    assert settings.hyperparameters["model_config"]["fcnet_hiddens"] == [16, 16]
+    assert {key: settings.hyperparameters[key] for key in hyper} == hyper
+    trainer = RLlibTrainer.load(saved, settings)
+    observations = trainer._seen.observation_space.sample()[None].repeat(9, 0)
+    np.testing.assert_array_equal(
+        trainer.freeze().act_batch(observations), FrozenPolicy.load(saved.path).act_batch(observations)
+    )
+    assert trainer.steps == saved.manifest.steps == (100 if name == "ppo" else 0)
+    trainer.train(settings.steps, lambda progress: True)
+    assert settings.steps <= trainer.steps <= settings.steps + 200
+    again = trainer.save(tmp_path / "b.zip", {}, {})
+    trainer.close()
+    assert Checkpoint.open(again.path).manifest.settings == settings.to_mapping()
+
+
 def test_it_goes_on_with_other_runners_and_not_with_another_ray(trained, monkeypatch):
     _, checkpoint = trained
     given = {"num_env_runners": 1, "steps": 1000}
@@ -106,7 +135,7 @@ def test_it_goes_on_with_other_runners_and_not_with_another_ray(trained, monkeyp
 def test_one_runner_process_samples_and_counts_exactly():
     trainer = RLlibTrainer.create(settled(num_env_runners=1, normalize=True, env_kwargs={"randomize": True}))
     trainer.train(128, lambda progress: True)
-    assert trainer.steps == 128
+    assert (trainer.steps, trainer.notices) == (128, [])
     stats = trainer._env_to_module().connectors[0]._filters[None].running_stats
     assert stats.num_pushes >= 128
     trainer.close()
@@ -130,6 +159,13 @@ def test_other_algorithms_train_and_freeze(algo, env, hyper, tmp_path):
     FrozenPolicy.load(tmp_path / "a.zip")
 
 
+def test_numbers_of_the_environment_that_are_not_finite_end_the_run(spoilt):
+    trainer = RLlibTrainer.create(settled(env=spoilt))
+    with pytest.raises(EnvironmentFailed, match=r"^test/Spoilt-v0: observation\[1\] is nan at step 3 of an episode"):
+        trainer.train(128, lambda progress: True)
+    trainer.close()
+
+
 def test_a_foreign_environment_of_this_process_reaches_the_runners(corridor):
     trainer = RLlibTrainer.create(settled(env=corridor, normalize=True))
     trainer.train(128, lambda progress: True)
@@ -138,6 +174,29 @@ def test_a_foreign_environment_of_this_process_reaches_the_runners(corridor):
     assert 0 <= statistics.success_rate <= 1
     assert statistics.length_mean >= 1
     trainer.close()
+
+
+@pytest.mark.parametrize("env", ["CartPole-v1", "bam/reach"], ids=["RLlib's runner", "ours"])
+def test_an_episode_that_ends_alone_in_an_iteration_counts(env):
+    """RLlib makes a number of a list of one; with a time limit of 20 steps, few of these iterations see two ends."""
+    hyper = {**PPO, "train_batch_size_per_learner": 8, "minibatch_size": 8, "num_epochs": 1}
+    trainer = RLlibTrainer.create(
+        settled(env=env, num_envs=1, steps=80, hyper=hyper, env_kwargs={"max_episode_steps": 20})
+    )
+    lifetime = []
+    trainer.train(80, lambda _: lifetime.append(trainer._result["env_runners"]["num_episodes_lifetime"]) or True)
+    statistics = trainer._statistics()
+    trainer.close()
+    assert 1 in np.diff([0, *lifetime])
+    assert statistics.episodes == lifetime[-1] >= 4
+    assert statistics.length_mean <= 20
+    if env == "CartPole-v1":
+        assert statistics.return_mean == statistics.length_mean
+
+
+@pytest.mark.parametrize(("number", "runners", "each"), [(64, 0, 64), (64, 2, 32), (64, 3, 21), (5, 2, 2), (1, 4, 1)])
+def test_runners_share_the_environments(number, runners, each):
+    assert envs_each(TrainSettings(env="bam/reach-v0", algo="ppo", num_envs=number, num_env_runners=runners)) == each
 
 
 class Sampled(gym.Env):

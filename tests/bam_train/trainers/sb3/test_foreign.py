@@ -175,3 +175,16 @@ def test_another_algorithm_or_environment(plain, algo, env):
 def test_kinds_that_share_a_policy_load_as_each_other(plain):
     """An A2C file is not told from a PPO one by SB3 either; the frozen policy is the same."""
     assert load_trusted(plain[1], "a2c", "CartPole-v1").steps == 64
+
+
+@pytest.mark.parametrize("asked", [(), ("--set", "env_kwargs.parity=true")])
+def test_a_policy_of_robo_gyms(tmp_path, capsys, asked):
+    """Its file does not say ``parity=True``, which is tried where only its spaces fit."""
+    path, env = tmp_path / "theirs.zip", "NoObstacleNavigationMir100Sim-v0"
+    PPO("MlpPolicy", make_env(env, {"parity": True}), device="cpu").save(path)
+    status, out, err = run(
+        capsys, path, "--trust-pickle", "--env", env, "--algo", "ppo", "--episodes", 1, "--json", *asked
+    )
+    said = [] if asked else [f"bam-eval: its spaces are robo-gym's own: {env} is made with parity=True"]
+    assert (status, err.splitlines()[1:]) == (0, said)
+    assert json.loads(out)["env_kwargs"] == {"parity": True}

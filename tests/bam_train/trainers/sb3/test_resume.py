@@ -98,6 +98,19 @@ def test_half_and_half_is_the_whole(walk, tmp_path, name):
     assert everything(rest) == everything(whole)
 
 
+@pytest.mark.parametrize(
+    ("name", "fall"),
+    [("ppo-schedule", "clip_range and learning_rate change"), ("dqn", "exploration_fraction changes"), ("sac", None)],
+)
+def test_another_total_is_another_schedule_and_said(walk, tmp_path, name, fall):
+    half = SB3Trainer.create(settings(walk, name, steps=192))
+    half.train(192, lambda progress: False)
+    half.save(tmp_path / "half.zip", {}, {})
+    rest = SB3Trainer.load(Checkpoint.open(tmp_path / "half.zip"), settings(walk, name))
+    expected = f"{fall} over all of --steps, which were 192 and are 384: the result differs from an unbroken run's"
+    assert rest.notices == ([expected] if fall else [])
+
+
 def test_saving_freezing_and_looking_disturb_nothing(walk, tmp_path):
     quiet = SB3Trainer.create(settings(walk, "sac"))
     quiet.train(240, lambda progress: True)
@@ -214,6 +227,57 @@ def test_a_resume_state_of_another_network_is_refused(walk, tmp_path):
     )
     with pytest.raises(AlteredCheckpoint, match=r"bam/resume/model does not fit these settings: "):
         SB3Trainer.load(checkpoint, SB3Trainer.complete(other))
+
+
+@pytest.fixture(scope="module")
+def half(tmp_path_factory):
+    """A checkpoint that any run may go on from, once what a stranger changed is found."""
+    given = {"env": "CartPole-v1", "algo": "ppo", "hyperparameters": {"n_steps": 32, "batch_size": 32}}
+    trainer = SB3Trainer.create(SB3Trainer.complete(TrainSettings.from_mapping({**given, "steps": 64})))
+    trainer.train(64, lambda progress: False)
+    path = tmp_path_factory.mktemp("half") / "half.zip"
+    trainer.save(path, {}, {})
+    return path
+
+
+@pytest.mark.parametrize(
+    ("names", "value", "message"),
+    [
+        (["counters", "num_timesteps"], "abc", "num_timesteps: expected a count, found 'abc'"),
+        (["counters", "num_timesteps"], 1e300, "num_timesteps: expected a count, found 1e+300"),
+        (["counters", "num_timesteps"], 10**30, "num_timesteps: expected a count, found 1000000000000"),
+        (["counters", "_n_updates"], None, "_n_updates: expected a count, found None"),
+        (["counters", "_current_progress_remaining"], 1e9, "_current_progress_remaining: expected a share of the run"),
+        (["counters", "last"], [], "list indices must be integers"),
+        (["counters", "last", "_last_obs"], "x", "_last_obs: expected arrays of shape {'': (1, 4)}, found {'': ()}"),
+        (
+            ["counters", "deques", "ep_info_buffer"],
+            [{"r": "x", "l": 1}],
+            "ep_info_buffer: expected numbers",
+        ),
+        (["counters", "deques", "ep_info_buffer"], [{}], "'r'"),
+        (["counters", "deques"], {}, "'ep_info_buffer'"),
+        (["counters"], {}, "'last'"),
+        (["random"], 5, "'int' object is not subscriptable"),
+        (["random", "python"], [3, [1], None], "state vector is the wrong size"),
+        (["random", "numpy", "position"], "x", "an integer is required"),
+        (["random", "torch"], None, "'NoneType' object has no attribute 'cpu'"),
+        (["noise"], [1, 2], "zip() argument 2 is longer"),
+    ],
+)
+def test_a_state_that_no_run_has_is_refused(half, tmp_path, forge, names, value, message):
+    path = tmp_path / "forged.zip"
+    path.write_bytes(half.read_bytes())
+    tree = json.loads(Checkpoint.open(path).read("bam/resume/state.json"))
+    inner = tree
+    for name in names[:-1]:
+        inner = inner[name]
+    inner[names[-1]] = value
+    forge(path, {"bam/resume/state.json": json.dumps(tree).encode()})
+    with pytest.raises(AlteredCheckpoint) as caught:
+        SB3Trainer.load(Checkpoint.open(path)).train(128, lambda progress: False)
+    text = str(caught.value).removeprefix(f"{path}: bam/resume/state does not fit these settings: ")
+    assert text.startswith(message)
 
 
 class Evil:

@@ -16,7 +16,7 @@ from bam_envs.errors import LinkLost
 from bam_envs.serve.env_server import EnvServer
 from bam_envs.serve.tcp_server import TcpServer
 from bam_train.checkpoint import Checkpoint
-from bam_train.errors import SettingsError, TrainingFailed
+from bam_train.errors import EnvironmentFailed, SettingsError, TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.sb3.trainer import SB3Trainer
@@ -176,6 +176,14 @@ def test_a_loss_that_is_not_finite_ends_training(walk, tmp_path, algo, hyperpara
         trainer.train(1000, lambda progress: True)
     assert "expected finite numbers: try a smaller learning_rate" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("signal", ["observation", "reward"])
+def test_numbers_of_the_environment_that_are_not_finite_are_not_blamed_on_the_policy(spoilt, signal):
+    kwargs = {"signal": signal, "value": "inf"}  # as --set says it
+    trainer = SB3Trainer.create(completed(spoilt, hyperparameters=FIRST, normalize=True, env_kwargs=kwargs))
+    with pytest.raises(EnvironmentFailed, match=r"^test/Spoilt-v0: (observation\[1\]|reward) is inf at step 3 of "):
+        trainer.train(96, lambda progress: True)
 
 
 def test_weights_that_are_not_finite_are_never_saved(walk, tmp_path):

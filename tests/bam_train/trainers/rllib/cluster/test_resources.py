@@ -100,14 +100,24 @@ def test_enough(given):
             "2 env runners and 1 learner ask for 3 CPUs, 2 on this computer. "
             "Lower --num-env-runners or --num-learners, or join a cluster with --address",
         ),
-        ({"num_gpus": 1}, "num_gpus: 1 GPU asked for, 0 on this computer. Give --num-gpus 0, or unset RLLIB_NUM_GPUS"),
-        ({"num_gpus": 2}, "num_gpus: 2 GPUs asked for, 0 on this computer. Give --num-gpus 0, or unset RLLIB_NUM_GPUS"),
+        ({"num_gpus": 1}, "num_gpus: 1 GPU asked for, 0 on this computer. Give --num-gpus 0"),
+        ({"num_gpus": 2}, "num_gpus: 2 GPUs asked for, 0 on this computer. Give --num-gpus 0"),
     ],
 )
 def test_too_much(given, text):
     with pytest.raises(SettingsError) as caught:
         require_resources(settings(**given))
     assert str(caught.value) == text
+
+
+def test_gpus_of_the_variable_are_answered_with_the_variable(monkeypatch):
+    """Not with a flag, which scripts do not have."""
+    monkeypatch.setenv("RLLIB_NUM_GPUS", "2")
+    with pytest.raises(SettingsError) as caught:
+        require_resources(settings())
+    assert str(caught.value) == "RLLIB_NUM_GPUS: 2 GPUs asked for, 0 on this computer. Set it to 0, or unset it"
+    with pytest.raises(SettingsError, match=r"^RLLIB_NUM_GPUS: 3 learners use 0 or 3 GPUs, one each, found 2$"):
+        learners(settings(num_learners=3))
 
 
 def test_too_much_for_a_cluster(monkeypatch):

@@ -1,0 +1,139 @@
+"""Environments that are refused as soon as they give NaN or infinity: learning and evaluation get finite numbers only.
+
+What learns from such a number is broken by it much later, and then points at the policy or the learning rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import VectorEnv, VectorWrapper
+
+from bam_train.errors import EnvironmentFailed
+
+
+class FiniteEnv(gym.Wrapper[Any, Any, Any, Any]):
+    """One environment whose observations and rewards are finite.
+
+    Args:
+        env: The environment.
+        env_id: How errors name it.
+        row: Which of several it is; None if it is alone.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], env_id: str, row: int | None = None) -> None:
+        super().__init__(env)
+        self._name, self._row, self._steps = env_id, row, 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._steps = 0
+        self._require("observation", observation)
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Take one step."""
+        results = self.env.step(action)
+        self._steps += 1
+        self._require("reward", results[1])
+        self._require("observation", results[0])
+        return results
+
+    def _require(self, signal: str, value: Any) -> None:
+        found = _not_finite(signal, value)
+        if found is not None:
+            raise _failed(self, self._name, *found, self._steps, self._row)
+
+
+class FiniteRows(VectorWrapper):
+    """A vector environment whose observations and rewards are finite; its rows restart in the same step.
+
+    Args:
+        envs: The environment.
+        env_id: How errors name it; None for the name of its class.
+
+    Attributes:
+        episode_steps: Steps of each running episode. Shape: (n,).
+    """
+
+    def __init__(self, envs: VectorEnv[Any, Any, Any], env_id: str | None = None) -> None:
+        super().__init__(envs)
+        self._name = env_id or type(envs.unwrapped).__name__
+        self.episode_steps = np.zeros(envs.num_envs, np.int64)
+
+    def __getattr__(self, name: str) -> Any:
+        """Whatever else is asked for is the environment's own."""
+        if name == "env":  # it is being copied or unpickled
+            raise AttributeError(name)
+        return getattr(self.env, name)
+
+    def __del__(self) -> None:
+        """Nothing: the environment, which others may use too, closes itself."""
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode on every row, or on those of ``options["reset_mask"]``."""
+        observations, infos = self.env.reset(seed=seed, options=options)
+        self.episode_steps[(options or {}).get("reset_mask", slice(None))] = 0
+        self._require("observation", observations)
+        return observations, infos
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step every row; what ended rows observed last is looked at too."""
+        observations, rewards, terminated, truncated, infos = self.env.step(actions)
+        self.episode_steps += 1
+        self._require("reward", rewards)
+        ended = np.flatnonzero(terminated | truncated).tolist()
+        if ended:
+            for row in ended if "final_obs" in infos else ():
+                self._require("observation", _row_of(infos["final_obs"], row), row)
+            self.episode_steps[ended] = 0
+        self._require("observation", observations)
+        return observations, rewards, terminated, truncated, infos
+
+    def _require(self, signal: str, values: Any, row: int | None = None) -> None:
+        """Refuse a number of all rows, or of one."""
+        found = _not_finite(signal, values)
+        if found is None:
+            return
+        name, index, number = found
+        if row is None:
+            row, *index = index
+        raise _failed(self, self._name, name, index, number, int(self.episode_steps[row]), row)
+
+
+def _row_of(observations: Any, row: int) -> Any:
+    """One row of a batch, which is a mapping of arrays, or an array, of objects too."""
+    if isinstance(observations, Mapping):
+        return {key: _row_of(one, row) for key, one in observations.items()}
+    return observations[row]
+
+
+def _not_finite(name: str, value: Any) -> tuple[str, list[int], float] | None:
+    """The first number that is not finite: the name of its array, its index there, and what it is."""
+    if isinstance(value, (Mapping, tuple)):
+        parts = value.items() if isinstance(value, Mapping) else enumerate(value)
+        return next((found for key, one in parts if (found := _not_finite(f"{name}[{key!r}]", one))), None)
+    array = np.asarray(value)
+    if array.dtype.kind != "f" or np.isfinite(array).all():
+        return None
+    index = np.argwhere(~np.isfinite(array))[0].tolist()
+    return name, index, float(array[tuple(index)])
+
+
+def _failed(
+    env: Any, env_id: str, name: str, index: list[int], number: float, steps: int, row: int | None
+) -> EnvironmentFailed:
+    """The error for a number; a label of the environment's own names it, if there is one."""
+    describe = getattr(env.unwrapped, "describe", None)
+    labels = describe().get(name, ()) if describe else ()
+    label = f" {labels[index[0]]['name']!r}" if len(index) == 1 and index[0] < len(labels) else ""
+    where = label or (str(index) if index else "")
+    which = "" if row is None else f" in environment {row}"
+    return EnvironmentFailed(
+        f"{env_id}: {name}{where} is {number} at step {steps} of an episode{which}; "
+        "expected finite numbers: correct the environment"
+    )

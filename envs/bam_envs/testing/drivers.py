@@ -1,0 +1,147 @@
+"""A simulated robot as a live one, in this process and in its own time, whose driver misbehaves when it is told to."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.errors import InvalidValue
+from bam_envs.robots.robot import Initial, Robot, RobotSpec, RobotState, Rows
+from bam_envs.robots.safety.guard import is_base
+from bam_envs.robots.safety.safe import ClearedCommand
+
+Array = NDArray[np.float64]
+FAULTS = ("ignore", "slow", "delay")
+_PARTS = 5
+_ROUNDING = 1e-9
+
+
+class DrivenRobot:
+    """What a live robot is to a `SafeRobot`: it takes cleared commands, and `reset` moves nothing.
+
+    ``SafeRobot(driven, clock=driven.clock)`` is its gate; `place` it before the first `reset`.
+
+    Args:
+        robot: One simulated robot.
+    """
+
+    needs_clearance = True
+    num_robots = 1
+    info = None
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        self.now = 0.0
+        """Simulated time [s]."""
+        self.fastest = 0.0
+        """Fastest joint [rad/s], or drive [m/s] or turn [rad/s], measured since this was set to 0."""
+        self._state: RobotState | None = None
+        self._fault, self._begins, self._ends, self._number = "", math.inf, -math.inf, 0.0
+        self._told: Array = np.zeros((1, len(robot.spec.command.labels)))  # what the driver follows
+        self._late: deque[tuple[float, Array]] = deque()
+        self._is_base = is_base(robot.spec)
+
+    @property
+    def spec(self) -> RobotSpec:
+        """Of the simulated robot."""
+        return self.robot.spec
+
+    def clock(self) -> float:
+        """Simulated time [s]."""
+        return self.now
+
+    def misbehave(self, fault: str, seconds: float, number: float = 0.0, after: float = 0.0) -> None:
+        """For some time the driver does not do what it is told; then the newest command counts at once.
+
+        Args:
+            fault: ``"ignore"``: the robot stands where it is. ``"slow"``: it is no faster than `number`, a joint
+                [rad/s], a base [m/s, rad/s]. ``"delay"``: commands arrive `number` [s] late.
+            seconds: For how long [s].
+            number: See `fault`.
+            after: In what time it begins [s].
+
+        Raises:
+            InvalidValue: There is no such fault.
+        """
+        if fault not in FAULTS:
+            raise InvalidValue(f"A driver can {', '.join(FAULTS)}, not {fault!r}.")
+        self._fault, self._number = fault, number
+        self._begins = self.now + after
+        self._ends = self._begins + seconds
+        self._late.clear()
+
+    def connect(self) -> None:
+        """Connect the simulated robot."""
+        self.robot.connect()
+
+    def place(self, initial: Initial) -> None:
+        """Put the simulated robot at `initial`, at rest; a live one is wherever it is."""
+        self._state = self.robot.reset(np.zeros(1, np.int64), initial)
+        self._told = self._state.command.copy()
+
+    def reset(self, rows: Rows, initial: Initial) -> RobotState:
+        """Measure; the arm is at rest, its object where `initial` says, and nothing else moves."""
+        place: Any = getattr(self.robot, "place_object", None)
+        if place is not None:
+            self._state = place(initial.signals.get("object_pose"), initial.seeds)
+        return self.measure()
+
+    def measure(self) -> RobotState:
+        """The newest state."""
+        if self._state is None:
+            raise InvalidValue("The robot is nowhere yet. Call place(initial) first.")
+        return self._state
+
+    def age(self) -> float:
+        """0: a simulation measures at once."""
+        return 0.0
+
+    def step(self, command: ClearedCommand) -> RobotState:
+        """One period, with what the driver makes of `command`."""
+        self._told = self._driven(command.for_robot(self).copy())
+        slices: Any = getattr(self.robot, "slices", None)
+        for state in [self.robot.step(self._told)] if slices is None else slices(self._told, _PARTS):
+            speed = state.signals["base_velocity" if self._is_base else "joint_velocity"]
+            self.fastest = max(self.fastest, float(np.abs(speed).max()))
+            self._state = state
+        self.now += self.spec.period
+        return self.measure()
+
+    def _driven(self, command: Array) -> Array:
+        """What the robot is told when the driver is told `command` (1, m)."""
+        if not self._begins - _ROUNDING <= self.now < self._ends - _ROUNDING:
+            return command
+        if self._fault == "delay":
+            self._late.append((self.now + self._number, command))
+            told = self._told
+            while self._late and self._late[0][0] <= self.now + _ROUNDING:
+                told = self._late.popleft()[1]
+            return told
+        if self._fault == "slow":
+            reach, about = (self._number, 0.0) if self._is_base else (self._number * self.spec.period, self._told)
+            slow: Array = np.clip(command, about - reach, about + reach)
+            return slow
+        if self.now < self._begins + self.spec.period - _ROUNDING:
+            self._stand()
+        return self._told
+
+    def _stand(self) -> None:
+        self.robot.halt()
+        if self._is_base:
+            self._told = np.zeros_like(self._told)
+        elif self._state is not None:
+            self._told = self._told.copy()
+            self._told[:, :6] = self._state.signals["joint_position"]
+
+    def halt(self) -> None:
+        """Stand where it is; commands on their way do not arrive."""
+        self._late.clear()
+        self._stand()
+
+    def close(self) -> None:
+        """Halt, and drop the simulated robot."""
+        self.robot.close()

@@ -1,0 +1,186 @@
+"""Graphs from a stranger: refused at once, in one line, or stopped; none may take the memory or the time of a robot."""
+
+from __future__ import annotations
+
+import itertools
+import signal
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from bam_train.errors import FormatError, PolicyError
+from bam_train.policy import FrozenPolicy, onnx_session
+from bam_train.policy.golden import worst_difference
+from bam_train.policy.onnx_file import MOST_NODES, parse
+from bam_train.policy.spaces import leaf, leaves
+
+BOX = {"type": "Box", "shape": [4], "dtype": "float32", "low": "-inf", "high": "inf"}
+F = TensorProto.FLOAT
+node = helper.make_node
+
+
+def value(name: str) -> Any:
+    return helper.make_tensor_value_info(name, F, ["n", 4])
+
+
+def model(*nodes: Any, **constants: Any) -> onnx.ModelProto:
+    """Build observation (n, 4) -> action (n, 4)."""
+    arrays = [numpy_helper.from_array(np.asarray(array), name) for name, array in constants.items()]
+    graph = helper.make_graph(list(nodes), "policy", [value("observation")], [value("action")], arrays)
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+
+
+def changed(change: Callable[[onnx.ModelProto], Any]) -> bytes:
+    made = model(node("Softsign", ["observation"], ["action"]))
+    change(made)
+    data = made.SerializeToString()
+    assert isinstance(data, bytes)
+    return data
+
+
+def of(*nodes: Any, **constants: Any) -> bytes:
+    data = model(*nodes, **constants).SerializeToString()
+    assert isinstance(data, bytes)
+    return data
+
+
+BODY = helper.make_graph(
+    [node("Identity", ["go"], ["on"]), node("Tanh", ["seen"], ["then"])],
+    "body",
+    [
+        helper.make_tensor_value_info("i", TensorProto.INT64, []),
+        helper.make_tensor_value_info("go", TensorProto.BOOL, []),
+        value("seen"),
+    ],
+    [helper.make_tensor_value_info("on", TensorProto.BOOL, []), value("then")],
+)
+TWICE = of(node("Softsign", ["observation"], ["action"])) * 2
+FUNCTION = helper.make_function("", "Tanh", ["x"], ["y"], [node("Exp", ["x"], ["y"])], [helper.make_opsetid("", 17)])
+SPARSE = helper.make_sparse_tensor(
+    helper.make_tensor("w", F, [1], [1.0]), helper.make_tensor("i", TensorProto.INT64, [1], [0]), [10**9]
+)
+GROWING = [
+    node("Unsqueeze", ["observation", "axes"], ["h"]),
+    node("Add", ["h", "tall"], ["g"]),
+    node("Add", ["g", "wide"], ["action"]),
+]
+
+
+@pytest.mark.parametrize(
+    ("data", "text"),
+    [
+        (
+            of(node("Loop", ["n", "go", "observation"], ["action"], body=BODY), n=np.int64(2**62), go=np.True_),
+            "operation Loop: its 'body' is of a kind that no policy has",
+        ),
+        (
+            of(node("If", ["go"], ["action"], then_branch=BODY, else_branch=BODY), go=np.True_),
+            "operation If: its 'else",
+        ),
+        (of(node("Scan", ["observation"], ["action"], body=BODY, num_scan_inputs=1)), "operation Scan: its 'body'"),
+        (of(node("Loop", ["n", "", "observation"], ["action"]), n=np.int64(2**62)), "operation 'Loop' is none of a"),
+        (of(node("Tile", ["observation", "n"], ["action"]), n=np.array([1, 10**9])), "operation 'Tile' is none of a"),
+        (of(node("Expand", ["observation", "n"], ["action"]), n=np.array([10**9, 4])), "operation 'Expand' is none"),
+        (of(node("Tanh", ["observation"], ["action"], domain="com.microsoft")), "operation 'com.microsoft.Tanh' is"),
+        (of(node("RandomNormalLike", ["observation"], ["action"])), "operation 'RandomNormalLike' is none of a policy"),
+        (
+            of(node("Shape", ["observation"], ["s"]), node("Reshape", ["observation", "s"], ["action"])),
+            "operation 'Shape' is none of a policy's",
+        ),
+        (
+            of(
+                node("ArgMax", ["observation"], ["k"], axis=1),
+                node("Concat", ["k", "k", "k", "k"], ["pads"], axis=0),
+                node("Pad", ["observation", "pads"], ["action"]),
+            ),
+            "operation Pad: the size of its result depends on the observation",
+        ),
+        (of(*[node("Tanh", ["observation"], ["action"])] * (MOST_NODES + 1)), "it has 1001 operations, expected at mo"),
+        (TWICE, "field 7 is there twice"),
+        (changed(lambda made: made.functions.append(FUNCTION)), "it holds functions or training, expected a graph"),
+        (changed(lambda made: made.training_info.add()), "it holds functions or training, expected a graph alone"),
+        (changed(lambda made: made.graph.sparse_initializer.append(SPARSE)), "it holds sparse weights, which no"),
+        (
+            changed(lambda made: made.graph.value_info.extend([onnx.ValueInfoProto()] * 200_000)),
+            "it has more than 100000 fields, which no policy has",
+        ),
+        (of(node("Softsign", ["observation"], ["action"]), w=helper.np.zeros(0)) + b"\x3a\x00", "field 7 is there tw"),
+        (
+            changed(lambda made: made.graph.initializer.append(helper.make_tensor("w", F, [-1, -1], [1.0]))),
+            r"tensor 'w': expected 1 numbers for shape \(-1, -1\), found 1",
+        ),
+        (of(node("Gather", ["observation", "i"], ["action"], axis=1), i=np.zeros(10**8 // 3, np.int8)), "it computes"),
+        (
+            of(*GROWING, axes=np.array([2, 3]), tall=np.zeros((20_000, 1), "f4"), wide=np.zeros((1, 20_000), "f4")),
+            "it computes more than 100000000 numbers for one action, which no policy does",
+        ),
+    ],
+)
+def test_a_graph_that_no_policy_is_is_refused_at_once(data: bytes, text: str):
+    begin = time.process_time()
+    with pytest.raises(PolicyError, match=text):
+        FrozenPolicy.from_graph(data, BOX, BOX)
+    assert time.process_time() - begin < 1.0
+
+
+def test_memory_that_no_policy_takes_is_refused():
+    grown = [
+        node("Softsign", ["observation"], ["soft"]),
+        node("ConstantOfShape", ["s"], ["huge"]),
+        node("ReduceSum", ["huge"], ["sum"], keepdims=0),
+        node("Add", ["soft", "sum"], ["action"]),
+    ]
+    with pytest.raises(PolicyError, match=r"onnxruntime [\d.]+ failed: .*smaller than requested bytes"):
+        FrozenPolicy.from_graph(of(*grown, s=np.array([10**6, 10**5])), BOX, BOX)
+
+
+def slow() -> bytes:
+    """Take about a minute: products of matrices of 1000 x 1000 numbers that depend on the observation."""
+    names = ["wide", *(f"h{i}" for i in range(900))]
+    return of(
+        node("Softsign", ["observation"], ["soft"]),
+        node("ReduceSum", ["soft"], ["sum"], keepdims=0),
+        node("Add", ["w", "sum"], ["wide"]),
+        *(node("MatMul", [one, "w"], [other]) for one, other in itertools.pairwise(names)),
+        node("ReduceSum", [names[-1]], ["total"], keepdims=0),
+        node("Add", ["soft", "total"], ["action"]),
+        w=np.zeros((1000, 1000), np.float32),
+    )
+
+
+def test_a_policy_that_takes_too_long_is_stopped(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(onnx_session, "MOST_SECONDS", 0.5)
+    with pytest.raises(PolicyError, match=r"the policy takes more than 0\.5 s for one action"):
+        FrozenPolicy.from_graph(slow(), BOX, BOX)
+
+
+def test_a_policy_that_takes_long_is_interrupted_by_ctrl_c():
+    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.setitimer(signal.ITIMER_REAL, 0.5)
+    begin = time.perf_counter()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            FrozenPolicy.from_graph(slow(), BOX, BOX)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    assert time.perf_counter() - begin < 5.0
+
+
+def test_more_golden_actions_than_anybody_writes_are_refused():
+    policy = FrozenPolicy.from_graph(of(node("Tanh", ["observation"], ["action"])), BOX, BOX)
+    arrays = dict.fromkeys(("observation", "action"), np.zeros((2000, 4), np.float32))
+    with pytest.raises(PolicyError, match="expected at most 1024 rows, found 2000"):
+        worst_difference(policy, leaves(BOX), leaf("action", BOX), arrays)
+
+
+def test_a_weight_in_another_file_is_refused_however_it_is_named():
+    made = model(node("Gemm", ["observation", "w"], ["action"]), w=np.eye(4, dtype=np.float32))
+    made.graph.initializer[0].external_data.add(key="location", value="/etc/passwd")
+    with pytest.raises(FormatError, match="tensor 'w': its numbers are in another file"):
+        parse(made.SerializeToString())
