@@ -14,12 +14,12 @@ import gymnasium as gym
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 import bam_envs  # noqa: F401 - registers our environments with Gymnasium
-from bam_envs import registry
-from bam_envs.errors import InvalidValue, UnknownName
-from bam_envs.registry import entry_of, resolve_id
+from bam_envs.core import registry
+from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.registry import entry_of, resolve_id
+from bam_envs.core.spaces import space_to_json
 from bam_envs.robo_gym.options import constructor_options, require_values
 from bam_envs.robo_gym.table import ROBO_GYM
-from bam_envs.spaces import space_to_json
 from bam_envs.tasks.options import in_our_words, option_names, require_kinds
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import WHERE
@@ -132,7 +132,7 @@ def make_env(
         SettingsError: It cannot be made: a package is missing, or it does not take these arguments.
     """
     if place.transport:
-        from bam_envs.remote_env import make_remote_env
+        from bam_envs.remote.remote_env import make_remote_env
 
         return make_remote_env(env_id, require_one(place.transport), **place.link_options)
     given = dict(env_kwargs or {})
@@ -194,7 +194,7 @@ def make_rows(
         SettingsError: It cannot be made.
     """
     if place.transport:
-        from bam_envs.remote_env import make_remote_rows
+        from bam_envs.remote.remote_env import make_remote_rows
 
         return make_remote_rows(env_id, place.transport, **place.link_options)
     if is_batched(env_id):

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bam_envs.registry import entry_of
+from bam_envs.core.registry import entry_of
 from bam_train.errors import SettingsError
 
 _OF_SIMULATIONS = frozenset({"randomize"})

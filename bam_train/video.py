@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.errors import InvalidValue, MissingExtra
+from bam_envs.core.errors import InvalidValue, MissingExtra
 from bam_train.errors import OutputError, SettingsError
 
 Frame = NDArray[np.uint8]

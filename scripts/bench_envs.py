@@ -19,8 +19,8 @@ from mujoco import rollout
 from numpy.typing import NDArray
 
 import bam_envs  # noqa: F401 - registers the environments
-from bam_envs.errors import BamEnvsError
-from bam_envs.registry import ENVIRONMENTS, resolve_id
+from bam_envs.core.errors import BamEnvsError
+from bam_envs.core.registry import ENVIRONMENTS, resolve_id
 
 VECTOR_TARGET, SHARE_TARGET, SINGLE_TARGET = 15_000.0, 0.80, 2_500.0
 PHYSICS, PHYSICS_ROWS = "bam/pick-v0", 64

@@ -25,13 +25,13 @@ import numpy as np
 from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
-from bam_envs.errors import SafetyStop
-from bam_envs.registry import ENVIRONMENTS
-from bam_envs.robot_env import RobotEnv
+from bam_envs.core.errors import SafetyStop
+from bam_envs.core.registry import ENVIRONMENTS
+from bam_envs.core.robot import Initial, RobotState, Rows
+from bam_envs.core.robot_env import RobotEnv
+from bam_envs.robots.physics.arm import PHYSICS_STEPS, SimulatedArm
 from bam_envs.robots.profiles.profile import load_profile
-from bam_envs.robots.robot import Initial, RobotState, Rows
-from bam_envs.robots.safety.safe import SafeRobot
-from bam_envs.robots.simulated.arm import PHYSICS_STEPS, SimulatedArm
+from bam_envs.safety.safe import SafeRobot
 from bam_envs.tasks.pick import PickTask
 
 Array = NDArray[np.float64]

@@ -73,13 +73,13 @@ def serve_echo() -> None:
 
 def serve_robot() -> None:
     """The embedded server with a robot that moves at once, and a camera of 640 x 480 at 30 Hz."""
-    from bam_envs.bridge.server.server import BridgeServer
+    from bam_envs.core.robot import Initial
+    from bam_envs.remote.serve.command import CommandLease
+    from bam_envs.remote.serve.robot_service import RobotService
+    from bam_envs.remote.serve.served_robot import ServedRobot
     from bam_envs.robots.fake import FakeRobot
     from bam_envs.robots.profiles.profile import load_profile
-    from bam_envs.robots.robot import Initial
-    from bam_envs.serve.command import CommandLease
-    from bam_envs.serve.robot_service import RobotService
-    from bam_envs.serve.served_robot import ServedRobot
+    from bam_envs.rosbridge.server.server import BridgeServer
 
     robot = ServedRobot(FakeRobot(1), dead_man=0.1)
     robot.connect()
@@ -100,10 +100,10 @@ def serve_robot() -> None:
 
 def serve_environment(shape: tuple[int, ...]) -> None:
     """A trivial environment over GymAPI and over TCP."""
-    from bam_envs.bridge.server.server import BridgeServer
-    from bam_envs.serve.env_server import EnvServer
-    from bam_envs.serve.gymapi_service import GymApiService
-    from bam_envs.serve.tcp_server import TcpServer
+    from bam_envs.remote.serve.env_server import EnvServer
+    from bam_envs.remote.serve.gymapi_service import GymApiService
+    from bam_envs.remote.serve.tcp_server import TcpServer
+    from bam_envs.rosbridge.server.server import BridgeServer
 
     env = EnvServer(Trivial(shape), env_id="Trivial-v0")
     with BridgeServer(port=0) as server, TcpServer(env) as tcp:
@@ -116,8 +116,8 @@ def serve_environment(shape: tuple[int, ...]) -> None:
 
 def serve_joint_states() -> None:
     """The embedded server, with joint states at 100 Hz."""
-    from bam_envs.bridge.server.server import BridgeServer
     from bam_envs.robots.ur5e import JOINTS
+    from bam_envs.rosbridge.server.server import BridgeServer
 
     joints = {"name": list(JOINTS), "position": [0.1] * 6, "velocity": [0.0] * 6, "effort": []}
     with BridgeServer(port=0) as server:
@@ -239,8 +239,8 @@ def live_arm(url: str, period: float | None = None) -> tuple[Any, Any]:
     """A connected UR5e behind its guards, and its state."""
     from dataclasses import replace
 
-    from bam_envs.robots.live.building import live_robot
-    from bam_envs.robots.robot import Initial
+    from bam_envs.core.robot import Initial
+    from bam_envs.live.building import live_robot
     from bam_envs.robots.ur5e import arm_spec
 
     spec = arm_spec("ur5e", with_object=True)
@@ -304,7 +304,7 @@ def measure_link(rounds: int, count: int) -> Iterator[str]:
 
 def measure_steps(name: str, scheme: str, target: float, rounds: int, count: int) -> Iterator[str]:
     """Steps a second of a trivial environment; the median round."""
-    from bam_envs.remote_env import make_remote_env
+    from bam_envs.remote.remote_env import make_remote_env
 
     with Server(name) as server:
         port = server.ports[1 if scheme == "tcp" else 0]
@@ -322,7 +322,7 @@ def measure_steps(name: str, scheme: str, target: float, rounds: int, count: int
 
 def measure_camera(seconds: float) -> Iterator[str]:
     """What a camera beside 100 Hz control does to the time from command to state."""
-    from bam_envs.robots.live.camera import LiveCamera
+    from bam_envs.live.camera import LiveCamera
     from bam_envs.robots.profiles.profile import CameraSource
 
     with Server("robot") as server:

@@ -42,7 +42,7 @@ def contenders(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecNormalize
 
-    from bam_envs.spaces import space_to_json
+    from bam_envs.core.spaces import space_to_json
     from bam_train.policy import FrozenPolicy
     from bam_train.policy.onnx_session import OnnxSession
     from bam_train.trainers.sb3.freeze import freeze

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from bam_envs.errors import BamEnvsError
+from bam_envs.core.errors import BamEnvsError
 from bam_train.checkpoint import Checkpoint, Manifest
 from bam_train.cli.console import duration
 from bam_train.errors import BamTrainError

@@ -19,9 +19,9 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from bam_envs.registry import ENVIRONMENTS, resolve
-from bam_envs.robot_env import describe
-from bam_envs.robots.robot import SignalSpec
+from bam_envs.core.registry import ENVIRONMENTS, resolve
+from bam_envs.core.robot import SignalSpec
+from bam_envs.core.robot_env import describe
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 _PART = re.compile(r"(<!-- generated: (?P<name>\S+)(?: (?P<argument>\S+))? -->\n)(.*?)(<!-- /generated -->)", re.DOTALL)
@@ -128,9 +128,9 @@ def _default(value: object) -> str:
 
 def guards() -> str:
     """The guards of an arm and of a base, with their limits."""
-    from bam_envs.robots.live.building import profile_limits
+    from bam_envs.live.building import profile_limits
     from bam_envs.robots.profiles.profile import load_profile
-    from bam_envs.robots.safety.guards import default_guards
+    from bam_envs.safety.guards import default_guards
 
     robots: dict[tuple[str, ...], list[str]] = {}
     for name in ("ur5e", "mir100"):

@@ -18,7 +18,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from bam_envs.registry import resolve_id
+from bam_envs.core.registry import resolve_id
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.console import say, tell
 from bam_train.cli.experiment import ScriptParser, open_env, whole
@@ -39,7 +39,7 @@ def open_checkpoint(path: Path, env: str | None, env_kwargs: dict[str, Any], tru
         if env is not None:
             checkpoint.requires_env(resolve_id(env))
         return checkpoint
-    from bam_train.trainers.rllib.foreign.export import export
+    from bam_train.compat.rllib.export import export
 
     def warn(text: str) -> None:
         say(f"{NAME}: warning: {text}")

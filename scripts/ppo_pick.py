@@ -14,7 +14,7 @@ import time
 import torch
 from torch import nn
 
-from bam_envs.errors import BamEnvsError
+from bam_envs.core.errors import BamEnvsError
 from bam_train.environments import make_rows
 from bam_train.errors import BamTrainError
 from bam_train.evaluation import FIRST_SEED, evaluate

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from bam_envs.errors import BamEnvsError
+from bam_envs.core.errors import BamEnvsError
 from bam_train.checkpoint import Checkpoint
 from bam_train.environments import make_env
 from bam_train.errors import BamTrainError

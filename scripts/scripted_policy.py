@@ -9,9 +9,9 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.errors import BamEnvsError
-from bam_envs.registry import ENVIRONMENTS, resolve_id
-from bam_envs.scripted import SCRIPTED, scripted_policy
+from bam_envs.core.errors import BamEnvsError
+from bam_envs.core.registry import ENVIRONMENTS, resolve_id
+from bam_envs.tasks.scripted import SCRIPTED, scripted_policy
 
 ROWS = 64
 

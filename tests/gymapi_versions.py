@@ -10,8 +10,8 @@ import json
 
 import numpy as np
 
-from bam_envs.errors import RemoteError
-from bam_envs.transports.images import decode_image, encode_image
+from bam_envs.core.errors import RemoteError
+from bam_envs.ros.images import decode_image, encode_image
 
 MAY_24, JUNE_17, JUNE_22 = VERSIONS = ("2025-05-24", "2025-06-17", "2025-06-22")
 NONE, STEP, RESET, CLOSE = range(4)

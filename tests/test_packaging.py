@@ -44,9 +44,9 @@ def test_the_wheel_holds_two_packages_and_nothing_else(wheel):
     [
         "bam_envs/py.typed",
         "bam_train/py.typed",
-        "bam_envs/robots/simulated/models/ur5e_gripper.xml",
-        "bam_envs/robots/simulated/models/ur5e_cube.xml",
-        "bam_envs/robots/simulated/models/floor.xml",
+        "bam_envs/robots/physics/models/ur5e_gripper.xml",
+        "bam_envs/robots/physics/models/ur5e_cube.xml",
+        "bam_envs/robots/physics/models/floor.xml",
         "bam_train/trainers/presets/pick-ppo.toml",
         "bam_train/trainers/presets/reach-ppo.toml",
         "bam_train/trainers/presets/pick-place-ppo.toml",

@@ -115,7 +115,7 @@ class Checkpoint:
         Raises:
             CheckpointMismatch: Names both environments.
         """
-        from bam_envs.registry import are_same
+        from bam_envs.core.registry import are_same
 
         if not are_same(env_id, self.manifest.env):
             own = self.manifest.env

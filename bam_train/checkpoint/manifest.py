@@ -40,7 +40,7 @@ class Manifest:
     env_kwargs: dict[str, Any]
     """Keyword arguments that the environment was made with."""
     observation_space: dict[str, Any]
-    """The environment's own, as written by `bam_envs.spaces.space_to_json`."""
+    """The environment's own, as written by `bam_envs.core.spaces.space_to_json`."""
     action_space: dict[str, Any]
     """The same for actions."""
     signals: dict[str, Any]

@@ -32,8 +32,8 @@ def plan_lines(env: Any, env_id: str, address: str, episodes: int) -> list[str]:
         address: Where the robot is.
         episodes: How many.
     """
-    from bam_envs.robots.robot import RobotSpec
-    from bam_envs.robots.safety.guard import is_base
+    from bam_envs.core.robot import RobotSpec
+    from bam_envs.safety.guard import is_base
 
     spec = getattr(getattr(env.unwrapped, "robot", None), "spec", None)
     count = "1 episode" if episodes == 1 else f"{episodes} episodes, one after the other without a pause"

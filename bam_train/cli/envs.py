@@ -40,7 +40,7 @@ def _tell(facts: Any, lines: list[str], *, as_json: bool) -> None:
 
 def overview() -> list[dict[str, Any]]:
     """One row of plain values for each of our environments; imports no simulator."""
-    from bam_envs.registry import ENVIRONMENTS, resolve
+    from bam_envs.core.registry import ENVIRONMENTS, resolve
     from bam_envs.robo_gym.table import ROBO_GYM
 
     rows = []
@@ -89,9 +89,9 @@ def _robo_gym_lines(rows: list[dict[str, Any]]) -> list[str]:
 
 def details(name: str) -> dict[str, Any]:
     """Everything about one environment, as plain values; makes it, so it needs its simulator."""
-    from bam_envs.registry import entry_of, resolve_id
+    from bam_envs.core.registry import entry_of, resolve_id
+    from bam_envs.core.spaces import space_to_json
     from bam_envs.robo_gym.table import ROBO_GYM
-    from bam_envs.spaces import space_to_json
     from bam_train.environments import control_period, make_env
 
     env_id = resolve_id(name)

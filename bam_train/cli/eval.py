@@ -90,7 +90,7 @@ def _facts(path: Path, algorithm: str, steps: int, asked: dict[str, Any]) -> dic
 
 def _foreign(config: EvalConfig, path: Path) -> Subject:
     """A plain stable-baselines3 zip, if the user trusts its maker."""
-    from bam_envs.registry import resolve_id
+    from bam_envs.core.registry import resolve_id
     from bam_train.environments import parity_if_needed, require_env_kwargs
     from bam_train.errors import NotACheckpoint, SettingsError
     from bam_train.settings import read_env_kwargs

@@ -119,7 +119,7 @@ def require_place(env_id: str, robot: str | None, render: bool) -> None:
         SettingsError: The environment has no robot, or there is nothing to show, or no screen.
     """
     if robot is not None:
-        from bam_envs.robots.live.building import require_robot_address
+        from bam_envs.live.building import require_robot_address
         from bam_train.place import Place
 
         require_robot_address(robot)

@@ -14,8 +14,8 @@ from bam_train.cli.program import run_program
 
 if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
+    from bam_train.compat.rllib.export import Exported
     from bam_train.trainers.output import Output
-    from bam_train.trainers.rllib.foreign.export import Exported
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class ExportConfig:
 
 def export_directory(config: ExportConfig) -> int:
     """The program, with its arguments read."""
+    from bam_train.compat.rllib.export import export
     from bam_train.settings import read_env_kwargs
-    from bam_train.trainers.rllib.foreign.export import export
 
     exported = export(
         config.directory,

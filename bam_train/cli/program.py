@@ -206,7 +206,7 @@ def _silence(stream: TextIO) -> None:
 
 def is_expected(error: Exception) -> bool:
     """Whether an error is of our own two trees, whose text says what to do."""
-    from bam_envs.errors import BamEnvsError
+    from bam_envs.core.errors import BamEnvsError
     from bam_train.errors import BamTrainError
 
     return isinstance(error, (BamTrainError, BamEnvsError))

@@ -14,7 +14,7 @@ from bam_train.cli.program import guarded, run_program
 from bam_train.cli.signal_memory import SignalMemory
 
 if TYPE_CHECKING:
-    from bam_envs.serve.describe import Env
+    from bam_envs.remote.serve.describe import Env
     from bam_train.cli.serve_config import ServeConfig
 
 _LOOK = 1.0
@@ -38,7 +38,7 @@ def serve(config: ServeConfig) -> int:
 
     config.serving.require_sane()
     with SignalMemory() as signals:
-        from bam_envs.serve.program import ServedEnvironment
+        from bam_envs.remote.serve.program import ServedEnvironment
         from bam_train.cli.console import ShownFormatter
 
         handler = logging.StreamHandler()
@@ -88,7 +88,7 @@ def make_env(config: ServeConfig) -> Env:
         SettingsError: It cannot be made.
         UnknownName: Nothing of that name is registered.
     """
-    from bam_envs.registry import resolve_id
+    from bam_envs.core.registry import resolve_id
     from bam_train.environments import make_env, make_rows
     from bam_train.errors import SettingsError
 
@@ -103,7 +103,7 @@ def _require_known(env_id: str, kwargs: dict[str, Any]) -> None:
     """Refuse a slip of the pen with the closest match; what says where it runs may be given here."""
     from inspect import signature
 
-    from bam_envs.registry import make_env
+    from bam_envs.core.registry import make_env
     from bam_train.environments import require_env_kwargs
 
     anywhere = signature(make_env).parameters

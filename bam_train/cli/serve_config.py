@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from bam_envs.serve.options import ServeOptions
+from bam_envs.remote.serve.options import ServeOptions
 
 
 @dataclass(frozen=True)

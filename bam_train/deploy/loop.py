@@ -13,7 +13,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from bam_envs.errors import BamEnvsError, LinkLost, SafetyStop
+from bam_envs.core.errors import BamEnvsError, LinkLost, SafetyStop
 from bam_train.deploy.agents import JournalAgent, PacerAgent, StartupAgent, Watcher
 from bam_train.deploy.journal import Journal
 from bam_train.deploy.pacer import Pacer

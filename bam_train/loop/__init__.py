@@ -127,7 +127,7 @@ def __getattr__(name: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise
-        from bam_envs.errors import MissingExtra  # brings Gymnasium
+        from bam_envs.core.errors import MissingExtra  # brings Gymnasium
 
         raise MissingExtra("torch", "train", f"bam_train.loop.{name}") from error
     globals()[name] = value

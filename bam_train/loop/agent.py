@@ -254,7 +254,7 @@ def import_torch(purpose: str) -> Any:
     try:
         import torch
     except ModuleNotFoundError as error:
-        from bam_envs.errors import MissingExtra  # brings Gymnasium
+        from bam_envs.core.errors import MissingExtra  # brings Gymnasium
 
         raise MissingExtra("torch", "train", purpose) from error
     return torch

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bam_envs.errors import MissingExtra
+from bam_envs.core.errors import MissingExtra
 from bam_train.errors import WorkspaceError
 
 if TYPE_CHECKING:

@@ -60,7 +60,7 @@ def leaves(space: Mapping[str, Any]) -> list[Leaf]:
     """List the arrays of an observation space; that of a Dict are named observation.<key>.
 
     Args:
-        space: As written by `bam_envs.spaces.space_to_json`.
+        space: As written by `bam_envs.core.spaces.space_to_json`.
 
     Raises:
         PolicyError: The space is of another kind than a policy takes.

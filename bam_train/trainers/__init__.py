@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from bam_envs.errors import MissingExtra
+from bam_envs.core.errors import MissingExtra
 from bam_train.errors import SettingsError
 from bam_train.values import closest
 

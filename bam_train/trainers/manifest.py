@@ -7,7 +7,7 @@ from typing import Any
 
 from gymnasium import Space
 
-from bam_envs.spaces import space_to_json
+from bam_envs.core.spaces import space_to_json
 from bam_train.settings import TrainSettings
 from bam_train.trainers.provenance import git_commit, now, versions
 

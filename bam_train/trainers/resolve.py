@@ -161,8 +161,8 @@ def resolve_env(name: str, *, elsewhere: bool = False) -> str:
         InvalidValue: ``module:Env-v0`` whose module is not there.
     """
     import bam_envs  # noqa: F401 - registers our environments
-    from bam_envs.errors import UnknownName
-    from bam_envs.registry import resolve_id
+    from bam_envs.core.errors import UnknownName
+    from bam_envs.core.registry import resolve_id
 
     try:
         return resolve_id(name)
@@ -174,7 +174,7 @@ def resolve_env(name: str, *, elsewhere: bool = False) -> str:
 
 def _tuned_as(env: str) -> str:
     """Under which id the presets of `env` are: robo-gym's ids are names of ours."""
-    from bam_envs.registry import entry_of
+    from bam_envs.core.registry import entry_of
 
     entry = entry_of(env)
     return env if entry is None else entry.id

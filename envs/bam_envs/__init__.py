@@ -1,6 +1,6 @@
 """Gymnasium environments for robot arms, simulated and live; importing this registers them and imports no simulator."""
 
-from bam_envs.registry import ENVIRONMENTS, register
+from bam_envs.core.registry import ENVIRONMENTS, register
 
 __all__ = ["ENVIRONMENTS"]
 __version__ = "0.1.0"

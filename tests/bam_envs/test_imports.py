@@ -45,7 +45,7 @@ def test_no_environment_imports_a_learner_or_the_trainer(python):
     assert imported(python, modules(bam_envs), (*LEARNERS, "bam_train")) == ""
 
 
-MAY_LEARN = ("bam_train.trainers.", "bam_train.loop.tensors.")
+MAY_LEARN = ("bam_train.trainers.", "bam_train.compat.", "bam_train.loop.tensors.")
 
 
 def test_learners_are_imported_below_trainers_and_in_the_loops_torch_layer_only(python):

@@ -15,7 +15,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from bam_envs.spaces import space_to_json
+from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import GOLDEN, MANIFEST, POLICY, safetensors_file, write_checkpoint
 
 

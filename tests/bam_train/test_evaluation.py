@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from bam_envs.registry import ENVIRONMENTS
+from bam_envs.core.registry import ENVIRONMENTS
 from bam_train.environments import make_rows
 from bam_train.errors import PolicyError, SettingsError
 from bam_train.evaluation import (

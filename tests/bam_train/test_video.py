@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bam_envs.errors import MissingExtra
+from bam_envs.core.errors import MissingExtra
 from bam_train.errors import OutputError, SettingsError
 from bam_train.evaluation import film_episodes
 from bam_train.video import open_video, require_video_path

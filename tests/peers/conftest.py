@@ -22,8 +22,8 @@ from pathlib import Path
 import pytest
 from websockets.sync.client import connect
 
-from bam_envs.bridge.server.server import BridgeServer
-from bam_envs.errors import RemoteError
+from bam_envs.core.errors import RemoteError
+from bam_envs.rosbridge.server.server import BridgeServer
 
 HERE = Path(__file__).parent
 PEERS = HERE.parents[1] / "build" / "peers"

@@ -42,8 +42,8 @@ def plain(observation):
 
 
 def main(url, *options):
-    from bam_envs.remote_env import RemoteEnv
-    from bam_envs.transports.opening import open_transport
+    from bam_envs.remote.remote_env import RemoteEnv
+    from bam_envs.remote.transports.opening import open_transport
 
     env = RemoteEnv(open_transport(url, **dict(option.split("=") for option in options)))
     try:

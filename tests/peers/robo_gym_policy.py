@@ -13,9 +13,9 @@ import gymnasium as gym
 import numpy as np
 
 import bam_envs  # noqa: F401 - registers the ids, before robo-gym could
-from bam_envs.robots.robot import Initial
-from bam_envs.robots.simulated.mir100 import open_floor
-from bam_envs.robots.simulated.ur import reach_arm
+from bam_envs.core.robot import Initial
+from bam_envs.robots.physics.mir100 import open_floor
+from bam_envs.robots.physics.ur import reach_arm
 from bam_envs.robots.ur import ur_model
 from bam_envs.tasks.mir100_navigation import Mir100NavigationTask
 from bam_envs.tasks.ur_control import UrControl

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import bam_envs  # noqa: F401 - registers the environments
-from bam_envs.remote_env import RemoteEnv
-from bam_envs.transports.local import LocalTransport
-from bam_envs.transports.opening import open_transport
+from bam_envs.remote.remote_env import RemoteEnv
+from bam_envs.remote.transports.local import LocalTransport
+from bam_envs.remote.transports.opening import open_transport
 
 HERE = Path(__file__).parent
 play = runpy.run_path(str(HERE / "play.py"))["play"]
@@ -88,7 +88,7 @@ def test_through_the_other_server(channel, served, rosbridge, running_robot, her
 
 
 LEAVES = """
-from bam_envs.remote_env import make_remote_env
+from bam_envs.remote.remote_env import make_remote_env
 env = make_remote_env("", "ros2://native", name="leaver", channel="service")
 env.reset(seed=1)
 env.step(env.action_space.sample())

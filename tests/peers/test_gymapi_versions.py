@@ -10,12 +10,12 @@ import pytest
 from gymnasium import spaces
 from websockets.sync.client import connect
 
-from bam_envs.bridge.link.link import RosbridgeLink
-from bam_envs.remote_env import RemoteVectorEnv
-from bam_envs.serve.env_server import EnvServer
-from bam_envs.serve.gymapi_service import GymApiService
+from bam_envs.remote.remote_env import RemoteVectorEnv
+from bam_envs.remote.serve.env_server import EnvServer
+from bam_envs.remote.serve.gymapi_service import GymApiService
+from bam_envs.remote.transports.rosbridge import RosbridgeTransport
+from bam_envs.rosbridge.link.link import RosbridgeLink
 from bam_envs.testing.transports import MirrorEnv
-from bam_envs.transports.rosbridge import RosbridgeTransport
 from tests.gymapi_versions import JUNE_17, JUNE_22, RESET, STEP, VERSIONS, Client, Rack
 
 CAMERA = spaces.Box(0, 255, (8, 12, 3), np.uint8)

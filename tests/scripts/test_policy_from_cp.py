@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 import bam_envs  # noqa: F401 - registers the environments
-from bam_envs.registry import ENVIRONMENTS
-from bam_envs.serve.options import ServeOptions
-from bam_envs.serve.program import ServedEnvironment
+from bam_envs.core.registry import ENVIRONMENTS
+from bam_envs.remote.serve.options import ServeOptions
+from bam_envs.remote.serve.program import ServedEnvironment
 from bam_train.cli.program import guarded
 
 ROOT = Path(__file__).parents[2]

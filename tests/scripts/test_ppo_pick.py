@@ -133,7 +133,7 @@ def test_the_advantages_end_where_episodes_do(script, monkeypatch):
 
 def test_what_is_missing_is_one_line(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    for name in [name for name in sys.modules if name.startswith("bam_envs.robots.simulated")]:
+    for name in [name for name in sys.modules if name.startswith("bam_envs.robots.physics")]:
         monkeypatch.delitem(sys.modules, name)
     status, out, err = run()
     assert (status, out) == (1, "")

@@ -14,8 +14,8 @@ from typing import Any
 import gymnasium as gym
 
 import bam_envs  # noqa: F401 - registers our environments with Gymnasium
-from bam_envs.errors import InvalidValue
-from bam_envs.registry import ENVIRONMENTS
+from bam_envs.core.errors import InvalidValue
+from bam_envs.core.registry import ENVIRONMENTS
 from bam_train.finite import FiniteEnv
 from bam_train.trainers.from_zero import from_zero
 

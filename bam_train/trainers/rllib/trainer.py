@@ -25,7 +25,7 @@ from gymnasium.vector import VectorEnv
 from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.tune.trainable import trainable
 
-from bam_envs.spaces import space_to_json
+from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint, write_checkpoint
 from bam_train.environments import control_period, make_env, require_fit
 from bam_train.errors import SettingsError, TrainingFailed

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bam_envs.spaces import space_to_json
+from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint.manifest import MANIFEST
 from bam_train.checkpoint.zip_members import open_zip
 from bam_train.environments import make_env

@@ -20,7 +20,7 @@ from gymnasium.vector import VectorEnv
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from bam_envs.spaces import space_to_json
+from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint, write_checkpoint
 from bam_train.environments import make_env, make_rows, require_fit
 from bam_train.errors import TrainingFailed

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
-from bam_envs import registry
-from bam_envs.errors import InvalidValue
+from bam_envs.core import registry
+from bam_envs.core.errors import InvalidValue
 from bam_envs.robo_gym.options import translate
 from bam_envs.robo_gym.table import ROBO_GYM
 
 if TYPE_CHECKING:
-    from bam_envs.remote_env import RemoteVectorEnv
-    from bam_envs.robot_env import RobotVectorEnv
+    from bam_envs.core.robot_env import RobotVectorEnv
+    from bam_envs.remote.remote_env import RemoteVectorEnv
 
 
 def make_env(env_id: str, **options: Any) -> gym.Env[Any, Any]:
@@ -21,14 +21,14 @@ def make_env(env_id: str, **options: Any) -> gym.Env[Any, Any]:
 
     Args:
         env_id: Key of `ROBO_GYM`.
-        options: Those of robo-gym's class of that id, and those of `bam_envs.registry.make_env`.
+        options: Those of robo-gym's class of that id, and those of `bam_envs.core.registry.make_env`.
 
     Raises:
         UnknownName: An option that neither has.
         InvalidValue: An option that cannot be had.
     """
+    from bam_envs.core.robot_env import RobotEnv
     from bam_envs.robo_gym.robo_gym_env import RoboGymEnv
-    from bam_envs.robot_env import RobotEnv
 
     entry = ROBO_GYM[env_id]
     arguments = translate(entry, options)

@@ -1,4 +1,4 @@
-"""What robo-gym's constructor options mean here: from its arguments to those of `bam_envs.registry.make_env`."""
+"""What robo-gym's constructor options mean here: from its arguments to those of `bam_envs.core.registry.make_env`."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import inspect
 from collections.abc import Mapping
 from typing import Any
 
-from bam_envs import registry
-from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.core import registry
+from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.robot_env import render_modes
 from bam_envs.robo_gym.notices import first_told, say_once
 from bam_envs.robo_gym.table import RoboGymId
-from bam_envs.robot_env import render_modes
 from bam_envs.tasks.options import FLAGS, in_our_words, option_names, require_kinds
 
 _MANAGER = ("ip", "lower_bound_port", "upper_bound_port", "server_manager_port")
@@ -44,7 +44,7 @@ _NOT_HERE = {
 
 
 def translate(entry: RoboGymId, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Arguments of `bam_envs.registry.make_env` for `entry`; says once in a process what an option means here.
+    """Arguments of `bam_envs.core.registry.make_env` for `entry`; says once in a process what an option means here.
 
     Raises:
         UnknownName: Neither robo-gym nor we have such an option; it carries the closest match.

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from bam_envs.errors import InvalidValue
-from bam_envs.robot_env import RobotEnv
-from bam_envs.robots.robot import Robot
-from bam_envs.tasks.task import Task
+from bam_envs.core.errors import InvalidValue
+from bam_envs.core.robot import Robot
+from bam_envs.core.robot_env import RobotEnv
+from bam_envs.core.task import Task
 
 
 class RoboGymEnv(RobotEnv):

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.errors import InvalidValue
+from bam_envs.core.errors import InvalidValue
+from bam_envs.core.robot import RobotState
 from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS
-from bam_envs.robots.robot import RobotState
 from bam_envs.tasks.ur_wire import POSITIONS, VELOCITIES, frame_keys
 
 Array = NDArray[np.float64]

@@ -1,6 +1,6 @@
 """The one table of robo-gym's ids: which environment of ours each is, and what robo-gym has otherwise by default.
 
-Pure data: `bam_envs.registry` reads it to register the ids.
+Pure data: `bam_envs.core.registry` reads it to register the ids.
 """
 
 from __future__ import annotations

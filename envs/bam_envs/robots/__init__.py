@@ -4,28 +4,28 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from bam_envs.on_use import imported_on_use
+from bam_envs.core.on_use import imported_on_use
 
 if TYPE_CHECKING:
+    from bam_envs.core.robot import Initial, Robot, RobotSpec, RobotState, SignalSpec
+    from bam_envs.live.building import live_robot
+    from bam_envs.live.rosbridge import RosbridgeRobot
     from bam_envs.robots.fake import FakeRobot
-    from bam_envs.robots.live.building import live_robot
-    from bam_envs.robots.live.rosbridge import RosbridgeRobot
+    from bam_envs.robots.physics.mir100 import SimulatedBase
     from bam_envs.robots.profiles.profile import load_profile
-    from bam_envs.robots.robot import Initial, Robot, RobotSpec, RobotState, SignalSpec
-    from bam_envs.robots.safety.safe import SafeRobot
-    from bam_envs.robots.simulated.mir100 import SimulatedBase
+    from bam_envs.safety.safe import SafeRobot
 
 _MODULES = {
     "FakeRobot": "bam_envs.robots.fake",
-    "Initial": "bam_envs.robots.robot",
-    "Robot": "bam_envs.robots.robot",
-    "RobotSpec": "bam_envs.robots.robot",
-    "RobotState": "bam_envs.robots.robot",
-    "RosbridgeRobot": "bam_envs.robots.live.rosbridge",
-    "SafeRobot": "bam_envs.robots.safety.safe",
-    "SignalSpec": "bam_envs.robots.robot",
-    "SimulatedBase": "bam_envs.robots.simulated.mir100",
-    "live_robot": "bam_envs.robots.live.building",
+    "Initial": "bam_envs.core.robot",
+    "Robot": "bam_envs.core.robot",
+    "RobotSpec": "bam_envs.core.robot",
+    "RobotState": "bam_envs.core.robot",
+    "RosbridgeRobot": "bam_envs.live.rosbridge",
+    "SafeRobot": "bam_envs.safety.safe",
+    "SignalSpec": "bam_envs.core.robot",
+    "SimulatedBase": "bam_envs.robots.physics.mir100",
+    "live_robot": "bam_envs.live.building",
     "load_profile": "bam_envs.robots.profiles.profile",
 }
 """Name to the module that has it."""

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.errors import ResetNeeded
-from bam_envs.robots.robot import Initial, RobotState, Rows, checked_command
+from bam_envs.core.errors import ResetNeeded
+from bam_envs.core.robot import Initial, RobotState, Rows, checked_command
 from bam_envs.robots.ur5e import GRIPPER_OPEN, arm_spec
 
 Array = NDArray[np.float64]

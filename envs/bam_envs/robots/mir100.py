@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from bam_envs.robots.robot import RobotSpec, SignalSpec
+from bam_envs.core.robot import RobotSpec, SignalSpec
 
 PERIOD = 0.1
 """Time between two commands [s]."""

@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs import kinematics
-from bam_envs.errors import UnknownName
-from bam_envs.kinematics import ArmGeometry
-from bam_envs.robots.robot import RobotSpec, SignalSpec
+from bam_envs.core import kinematics
+from bam_envs.core.errors import UnknownName
+from bam_envs.core.kinematics import ArmGeometry
+from bam_envs.core.robot import RobotSpec, SignalSpec
 from bam_envs.robots.ur5e import COMMAND, JOINTS, arm_spec
 
 __all__ = [

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from bam_envs.kinematics import UR5E
-from bam_envs.robots.robot import RobotSpec, SignalSpec
+from bam_envs.core.kinematics import UR5E
+from bam_envs.core.robot import RobotSpec, SignalSpec
 
 JOINTS = (
     "shoulder_pan_joint",

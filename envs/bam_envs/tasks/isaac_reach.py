@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from bam_envs.errors import InvalidValue
-from bam_envs.kinematics import quaternions
-from bam_envs.robots.robot import Initial, RobotState, Rows
+from bam_envs.core.errors import InvalidValue
+from bam_envs.core.kinematics import quaternions
+from bam_envs.core.robot import Initial, RobotState, Rows
+from bam_envs.core.rotations import angle_between, from_angles
+from bam_envs.core.task import Array, Floats, Label, Score, labelled_box
 from bam_envs.robots.ur import JOINTS
 from bam_envs.robots.ur import ur_model as model_called
-from bam_envs.rotations import angle_between, from_angles
-from bam_envs.tasks.task import Array, Floats, Label, Score, labelled_box
 from bam_envs.tasks.ur_control import UrControl, collisions, joint_option, number_option
 from bam_envs.tasks.ur_wire import as_objects, frame_keys, wire_states
 

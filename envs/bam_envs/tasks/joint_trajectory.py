@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.errors import InvalidValue
-from bam_envs.robots.robot import Rows
+from bam_envs.core.errors import InvalidValue
+from bam_envs.core.robot import Rows
 
 Array = NDArray[np.float64]
 RECORDED = "ur_track.json"

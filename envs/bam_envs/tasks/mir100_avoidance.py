@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from bam_envs.core.robot import RobotState, Rows
+from bam_envs.core.task import Array, Flags, Floats, Label
 from bam_envs.robots.mir100 import BACK_RAYS, FOOTPRINT, FRONT_RAYS, SCAN_RANGE
-from bam_envs.robots.robot import RobotState, Rows
-from bam_envs.robots.simulated.room import touches
+from bam_envs.robots.physics.room import touches
 from bam_envs.tasks.mir100_drive import DriveTask
 from bam_envs.tasks.poses import spread
-from bam_envs.tasks.task import Array, Flags, Floats, Label
 
 SIDE = (2.1, 3.1)
 """Starts are drawn so far from the middle of the room along y, targets as far on the other side [m]."""

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from bam_envs.core.robot import Initial, RobotState, Rows
+from bam_envs.core.task import Array, Flags, Floats, Label, Score, labelled_box, require_inside
 from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS, SCAN_RANGE
-from bam_envs.robots.robot import Initial, RobotState, Rows
 from bam_envs.tasks.poses import floor_pose, preferred, require_at
-from bam_envs.tasks.task import Array, Flags, Floats, Label, Score, labelled_box, require_inside
 
 FASTEST = np.array([0.5, 0.7])
 """Speeds of an action of 1: forward [m/s], turning anticlockwise [rad/s]."""

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from bam_envs.robots.robot import RobotState
+from bam_envs.core.robot import RobotState
+from bam_envs.core.task import Array, Flags
 from bam_envs.tasks.mir100_drive import BOUNDARY, MIN_DISTANCE, DriveTask
 from bam_envs.tasks.poses import spread
-from bam_envs.tasks.task import Array, Flags
 
 START, TARGET = 2.0, 1.0
 """Starts and targets are drawn at most this far from the origin, along x and along y [m]."""

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.core.errors import InvalidValue, UnknownName
 
 FLAGS = frozenset({"randomize"})
 """Options of every environment that are no task's, and True or False."""

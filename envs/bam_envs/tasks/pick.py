@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from bam_envs.kinematics import cube_yaw_phase
-from bam_envs.robots.robot import Initial, RobotState, Rows
+from bam_envs.core.kinematics import cube_yaw_phase
+from bam_envs.core.robot import Initial, RobotState, Rows
+from bam_envs.core.task import Array, Floats, Label, Score, labelled_box
 from bam_envs.robots.ur5e import GEOMETRY
-from bam_envs.tasks.task import Array, Floats, Label, Score, labelled_box
 from bam_envs.tasks.tool_control import ACTION_LABELS, HAND_LABELS, WORKSPACE, ToolControl, hand_state
 
 CUBE_AREA = np.array([[0.35, -0.20], [0.65, 0.20]])

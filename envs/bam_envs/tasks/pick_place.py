@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from bam_envs.robots.robot import Initial, RobotState, Rows
+from bam_envs.core.robot import Initial, RobotState, Rows
+from bam_envs.core.task import Array, Floats, Label, Score
 from bam_envs.robots.ur5e import GRIPPER_OPEN
 from bam_envs.tasks.pick import CUBE_AREA, CUBE_EDGE, NEAR, TABLE_EDGE, CubeSense, PickTask
-from bam_envs.tasks.task import Array, Floats, Label, Score
 
 GOAL_RADIUS = 0.02
 """The object lies at the goal within this distance [m]."""

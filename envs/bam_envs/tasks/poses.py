@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from bam_envs.errors import InvalidValue
-from bam_envs.tasks.task import Array
+from bam_envs.core.errors import InvalidValue
+from bam_envs.core.task import Array
 
 START_TOLERANCE = 0.2
 """A base that is nearer than this to where it is to start is there [m], [rad]."""

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from bam_envs.robots.robot import Initial, RobotState, Rows
+from bam_envs.core.robot import Initial, RobotState, Rows
+from bam_envs.core.task import Array, Floats, Label, Score, labelled_box
 from bam_envs.robots.ur5e import GEOMETRY, GRIPPER_OPEN, JOINTS
-from bam_envs.tasks.task import Array, Floats, Label, Score, labelled_box
 from bam_envs.tasks.tool_control import JOINT_STEP, TOOL_STEP
 
 HOME = np.array([-0.27, -1.54, 1.89, -1.93, -1.57, -1.84])

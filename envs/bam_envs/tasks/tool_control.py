@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.robots.robot import RobotState, Rows
+from bam_envs.core.robot import RobotState, Rows
+from bam_envs.core.task import Array, Floats, Label
 from bam_envs.robots.ur5e import GEOMETRY, GRIPPER_OPEN
-from bam_envs.tasks.task import Array, Floats, Label
 
 TOOL_STEP = 0.0124
 """Farthest the tool target goes in 0.05 s [m]; the measured tool stays below 0.25 m/s, as in a UR's recovery mode."""

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from bam_envs.robots.robot import Initial, RobotState, Rows
-from bam_envs.robots.simulated.obstacles import wave_signals
+from bam_envs.core.robot import Initial, RobotState, Rows
+from bam_envs.core.task import Array, Floats, Score
+from bam_envs.robots.physics.obstacles import wave_signals
 from bam_envs.robots.ur import DEFAULT_MODEL, START
-from bam_envs.tasks.task import Array, Floats, Score
 from bam_envs.tasks.ur_obstacle import UrObstacleTask
 
 POSE = (-1.57, -1.31, -1.31, -2.18, 1.57, 0.0)

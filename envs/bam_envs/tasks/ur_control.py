@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from bam_envs.errors import InvalidValue
-from bam_envs.robots.robot import RobotState
+from bam_envs.core.errors import InvalidValue
+from bam_envs.core.robot import RobotState
+from bam_envs.core.task import Array, Flags, Floats, Label
 from bam_envs.robots.ur import JOINTS, UrModel
-from bam_envs.tasks.task import Array, Flags, Floats, Label
 
 SHORTEST = 0.5
 """Shortest time that a trajectory takes [s]."""

@@ -9,10 +9,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from bam_envs.robots.robot import Initial, RobotState, Rows
+from bam_envs.core.robot import Initial, RobotState, Rows
+from bam_envs.core.task import Array, Floats, Label, Score, labelled_box
 from bam_envs.robots.ur import DEFAULT_MODEL, JOINTS, START
 from bam_envs.robots.ur import ur_model as model_called
-from bam_envs.tasks.task import Array, Floats, Label, Score, labelled_box
 from bam_envs.tasks.ur_control import UrControl, collisions, joint_option, normalised
 from bam_envs.tasks.ur_wire import as_objects, wire_states
 

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from bam_envs.robots.robot import RobotState, Rows
+from bam_envs.core.robot import RobotState, Rows
+from bam_envs.core.task import Array, Flags, Floats, Label, labelled_box, require_inside
 from bam_envs.robots.ur import JOINTS
 from bam_envs.robots.ur import ur_model as model_called
-from bam_envs.tasks.task import Array, Flags, Floats, Label, labelled_box, require_inside
 from bam_envs.tasks.ur_control import (
     UrControl,
     collisions,

@@ -12,12 +12,12 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from bam_envs.errors import InvalidValue
-from bam_envs.robots.robot import Initial, RobotState, Rows
+from bam_envs.core.errors import InvalidValue
+from bam_envs.core.robot import Initial, RobotState, Rows
+from bam_envs.core.task import Array, Floats, Label, Score, labelled_box
 from bam_envs.robots.ur import DEFAULT_MODEL, JOINTS, UrModel
 from bam_envs.robots.ur import START as STRAIGHT
 from bam_envs.robots.ur import ur_model as model_called
-from bam_envs.tasks.task import Array, Floats, Label, Score, labelled_box
 from bam_envs.tasks.ur_control import (
     UrControl,
     collisions,

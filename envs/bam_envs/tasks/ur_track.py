@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from bam_envs.robots.robot import Initial, RobotState, Rows
-from bam_envs.robots.simulated.obstacles import PATH_POINTS
+from bam_envs.core.robot import Initial, RobotState, Rows
+from bam_envs.core.splines import splines_through
+from bam_envs.core.task import Array, Floats, Label, Score
+from bam_envs.robots.physics.obstacles import PATH_POINTS
 from bam_envs.robots.ur import DEFAULT_MODEL
-from bam_envs.splines import splines_through
 from bam_envs.tasks.joint_trajectory import load_trajectory
-from bam_envs.tasks.task import Array, Floats, Label, Score
 from bam_envs.tasks.ur_control import normalised
 from bam_envs.tasks.ur_obstacle import ObstacleSense, UrObstacleTask, joint_labels
 

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.kinematics import LINKS, quaternions
-from bam_envs.robots.robot import RobotState
+from bam_envs.core.kinematics import LINKS, quaternions
+from bam_envs.core.robot import RobotState
+from bam_envs.core.task import Array
 from bam_envs.robots.ur import UrModel
-from bam_envs.tasks.task import Array
 from bam_envs.tasks.ur_control import WIRE_JOINTS, collisions
 
 POSITIONS = tuple(f"{joint}_joint_position" for joint in WIRE_JOINTS)

@@ -10,7 +10,7 @@ from unittest import mock
 
 import numpy as np
 
-from bam_envs.robots.robot import RobotState
+from bam_envs.core.robot import RobotState
 
 
 @contextmanager

@@ -14,8 +14,8 @@ from unittest import SkipTest
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.errors import BamEnvsError, InvalidValue
-from bam_envs.robots.robot import Initial, Robot, RobotSpec, RobotState, Rows, SignalSpec
+from bam_envs.core.errors import BamEnvsError, InvalidValue
+from bam_envs.core.robot import Initial, Robot, RobotSpec, RobotState, Rows, SignalSpec
 from bam_envs.testing.assertions import assert_same_rows, assert_same_state, in_thread, no_io, raised
 
 Array = NDArray[np.float64]

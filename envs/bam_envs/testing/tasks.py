@@ -14,10 +14,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from bam_envs.core.robot import Robot, RobotState, Rows
+from bam_envs.core.task import Score, Task
 from bam_envs.robots.fake import FakeRobot
-from bam_envs.robots.robot import Robot, RobotState, Rows
 from bam_envs.robots.ur5e import GEOMETRY
-from bam_envs.tasks.task import Score, Task
 from bam_envs.testing.assertions import assert_same_state, assert_same_tree
 
 Array = NDArray[np.float64]

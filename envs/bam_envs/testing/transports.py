@@ -13,12 +13,12 @@ from gymnasium import Space, spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
 
-from bam_envs.errors import InvalidValue, LinkLost, RemoteError
-from bam_envs.remote_env import RemoteEnv, RemoteVectorEnv
-from bam_envs.serve.describe import Env
-from bam_envs.spaces import space_to_json
+from bam_envs.core.errors import InvalidValue, LinkLost, RemoteError
+from bam_envs.core.spaces import space_to_json
+from bam_envs.remote.remote_env import RemoteEnv, RemoteVectorEnv
+from bam_envs.remote.serve.describe import Env
+from bam_envs.remote.transports.transport import EnvSpecMessage, Info, Transport
 from bam_envs.testing.assertions import raised
-from bam_envs.transports.transport import EnvSpecMessage, Info, Transport
 
 _INF = np.inf
 _INT64 = np.iinfo(np.int64)

@@ -4,11 +4,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from bam_envs.errors import InvalidValue
-from bam_envs.serve.env_server import EnvServer
-from bam_envs.serve.options import ServeOptions
-from bam_envs.serve.program import ServedEnvironment
-from bam_envs.serve.tcp_server import TcpServer
+from bam_envs.core.errors import InvalidValue
+from bam_envs.remote.serve.env_server import EnvServer
+from bam_envs.remote.serve.options import ServeOptions
+from bam_envs.remote.serve.program import ServedEnvironment
+from bam_envs.remote.serve.tcp_server import TcpServer
 
 CASES = [
     ("NoObstacleNavigationMir100", {}, 1e-6),

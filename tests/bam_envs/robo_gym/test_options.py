@@ -5,7 +5,7 @@ import logging
 import numpy as np
 import pytest
 
-from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.robo_gym import notices, options
 from bam_envs.robo_gym.table import ROBO_GYM
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import bam_envs  # noqa: F401 - registers the ids
-from bam_envs.errors import InvalidValue
+from bam_envs.core.errors import InvalidValue
 from bam_envs.robo_gym.rs_state import UR_KEYS, read_mir, read_mir_target, read_object, read_ur, require_ur_keys
 
 ARMS = {

@@ -5,7 +5,7 @@ import gymnasium as gym
 import pytest
 
 from bam_envs import ENVIRONMENTS
-from bam_envs.registry import are_same, entry_of, resolve_id
+from bam_envs.core.registry import are_same, entry_of, resolve_id
 from bam_envs.robo_gym.table import ROBO_GYM
 
 STEMS = {
@@ -55,7 +55,7 @@ import sys, bam_envs
 print(sorted(name for name in sys.modules if name.startswith("bam_envs.")))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    modules = ["bam_envs.errors", "bam_envs.registry", "bam_envs.robo_gym", "bam_envs.robo_gym.table"]
+    modules = ["bam_envs.core.errors", "bam_envs.core.registry", "bam_envs.robo_gym", "bam_envs.robo_gym.table"]
     assert done.stdout.strip() == str(modules)
 
 

@@ -3,10 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from bam_envs.core.robot import Robot, RobotState
 from bam_envs.robots.fake import FakeRobot
-from bam_envs.robots.robot import Robot, RobotState
-from bam_envs.robots.safety.safe import SafeRobot
-from bam_envs.robots.simulated.arm import SimulatedArm
+from bam_envs.robots.physics.arm import SimulatedArm
+from bam_envs.safety.safe import SafeRobot
 from bam_envs.testing import RobotContract
 
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from bam_envs.errors import ResetNeeded
+from bam_envs.core.errors import ResetNeeded
+from bam_envs.core.robot import Initial
 from bam_envs.robots.fake import FakeRobot
-from bam_envs.robots.robot import Initial
 from bam_envs.testing import ARM_HOME
 
 

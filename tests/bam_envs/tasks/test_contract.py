@@ -2,12 +2,12 @@
 
 import pytest
 
-from bam_envs.registry import ENVIRONMENTS, resolve
-from bam_envs.robots.robot import Robot
+from bam_envs.core.registry import ENVIRONMENTS, resolve
+from bam_envs.core.robot import Robot
+from bam_envs.core.task import Task
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.pick_place import PickPlaceTask
 from bam_envs.tasks.reach import ReachTask
-from bam_envs.tasks.task import Task
 from bam_envs.testing import TaskContract
 
 

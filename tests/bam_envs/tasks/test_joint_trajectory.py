@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bam_envs.errors import InvalidValue
-from bam_envs.robots.simulated.contacts import ArmContacts
+from bam_envs.core.errors import InvalidValue
+from bam_envs.robots.physics.contacts import ArmContacts
 from bam_envs.robots.ur import UR_MODELS, ur_model
 from bam_envs.tasks.joint_trajectory import load_trajectory
 

@@ -10,9 +10,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import bam_envs  # noqa: F401 - registers the environments
-from bam_envs.errors import InvalidValue, ProtocolError
+from bam_envs.core.errors import InvalidValue, ProtocolError
+from bam_envs.core.robot import RobotState
 from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS
-from bam_envs.robots.robot import RobotState
 from bam_envs.tasks.mir100_avoidance import BEAMS, BOXES, Mir100AvoidanceTask
 
 ENV = "bam/mir100-avoidance-v0"

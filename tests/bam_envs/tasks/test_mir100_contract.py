@@ -4,9 +4,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bam_envs.registry import ENVIRONMENTS, resolve
-from bam_envs.robots.robot import Robot, RobotState
-from bam_envs.tasks.task import Array, Task
+from bam_envs.core.registry import ENVIRONMENTS, resolve
+from bam_envs.core.robot import Robot, RobotState
+from bam_envs.core.task import Array, Task
 from bam_envs.testing import TaskContract
 
 

@@ -10,8 +10,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import bam_envs  # noqa: F401 - registers the environments
-from bam_envs.errors import InvalidValue, UnknownName
-from bam_envs.robots.robot import RobotState
+from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.robot import RobotState
 from bam_envs.tasks.mir100_navigation import Mir100NavigationTask
 
 ENV = "bam/mir100-navigation-v0"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.tasks.options import option_names, require_kinds, require_options
 
 

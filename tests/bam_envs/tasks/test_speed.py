@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from bam_envs.registry import ENVIRONMENTS
+from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.robots.ur5e import GEOMETRY
-from bam_envs.scripted import SCRIPTED, scripted_policy
+from bam_envs.tasks.scripted import SCRIPTED, scripted_policy
 
 TOOL_SPEED, JOINT_SPEED = 0.25, 1.0
 """Limits [m/s] and [rad/s]."""

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from bam_envs.errors import InvalidValue, UnknownName
-from bam_envs.robots.robot import RobotState
-from bam_envs.robots.simulated.ur import obstacle_arm
+from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.robot import RobotState
+from bam_envs.robots.physics.ur import obstacle_arm
 from bam_envs.robots.ur import START, ur_model
 from bam_envs.tasks.ur_avoidance import POSE, UrAvoidanceTask
 from bam_envs.testing import TaskContract

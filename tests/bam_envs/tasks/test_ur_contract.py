@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from bam_envs.robots.robot import Robot
-from bam_envs.robots.simulated.ur import empty_arm, reach_arm
+from bam_envs.core.robot import Robot
+from bam_envs.core.task import Task
+from bam_envs.robots.physics.ur import empty_arm, reach_arm
 from bam_envs.robots.ur import UR_MODELS
-from bam_envs.tasks.task import Task
 from bam_envs.tasks.ur_empty import UrEmptyTask
 from bam_envs.tasks.ur_reach import UrReachTask
 from bam_envs.testing import TaskContract

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from bam_envs.errors import InvalidValue
-from bam_envs.robots.robot import RobotState
+from bam_envs.core.errors import InvalidValue
+from bam_envs.core.robot import RobotState
 from bam_envs.robots.ur import UR_MODELS
 from bam_envs.tasks.ur_control import (
     FIX_OPTIONS,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.core.errors import InvalidValue, UnknownName
 
 STILL = np.array([0.0, -2.5, 1.5, 0.0, -1.4]) / [2 * np.pi, 2 * np.pi, np.pi, 2 * np.pi, 2 * np.pi]
 INTO_THE_TABLE = np.array([0.0, 0.1, 0.0, 0.0, 0.0], np.float32)

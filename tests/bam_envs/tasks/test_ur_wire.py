@@ -5,7 +5,7 @@ import pickle
 
 import numpy as np
 
-from bam_envs.robots.robot import RobotState
+from bam_envs.core.robot import RobotState
 from bam_envs.robots.ur import UR_MODELS
 from bam_envs.tasks.ur_wire import as_objects, wire_states
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import gymnasium as gym
 import pytest
 
-from bam_envs.spaces import space_to_json
+from bam_envs.core.spaces import space_to_json
 
 
 @pytest.fixture

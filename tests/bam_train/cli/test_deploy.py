@@ -10,7 +10,7 @@ import weakref
 import gymnasium as gym
 import pytest
 
-from bam_envs.errors import MissingExtra
+from bam_envs.core.errors import MissingExtra
 from bam_train.cli.deploy import main
 from bam_train.deploy.report import guards_text
 

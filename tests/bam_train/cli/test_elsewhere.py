@@ -12,13 +12,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from bam_envs.errors import LinkLost
-from bam_envs.robots.live import bringup
-from bam_envs.robots.wire.codec import read_info
-from bam_envs.serve.env_server import EnvServer
-from bam_envs.serve.options import ServeOptions
-from bam_envs.serve.program import ServedEnvironment
-from bam_envs.serve.tcp_server import TcpServer
+from bam_envs.core.errors import LinkLost
+from bam_envs.live import bringup
+from bam_envs.remote.serve.env_server import EnvServer
+from bam_envs.remote.serve.options import ServeOptions
+from bam_envs.remote.serve.program import ServedEnvironment
+from bam_envs.remote.serve.tcp_server import TcpServer
+from bam_envs.ros.codec import read_info
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.deploy import main as deploy
 from bam_train.cli.program import guarded
@@ -247,7 +247,7 @@ def test_training_goes_on_elsewhere(bam_train, over_tcp):
 
 def test_a_link_that_drops_while_training_loses_nothing(bam_train, over_tcp, monkeypatch):
     url = over_tcp(gym.make("CartPole-v1"))
-    from bam_envs.transports.tcp import TcpTransport
+    from bam_envs.remote.transports.tcp import TcpTransport
 
     steps, step = [], TcpTransport.step
 

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from bam_envs.registry import ENVIRONMENTS
+from bam_envs.core.registry import ENVIRONMENTS
 from bam_train.cli.envs import main
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bam_envs.errors import LinkLost
+from bam_envs.core.errors import LinkLost
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.experiment import ScriptParser, environment_of, open_env, require_place, signals_ask, whole
 from bam_train.cli.program import Terminated

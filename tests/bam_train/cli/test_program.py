@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bam_envs.errors import MissingExtra, UnknownName
+from bam_envs.core.errors import MissingExtra, UnknownName
 from bam_train.cli import console
 from bam_train.cli.console import count, duration, number, percent
 from bam_train.cli.program import Terminated, guarded, run_program, usage_error

@@ -14,10 +14,10 @@ import pytest
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.eval import main as evaluate
 from bam_train.cli.export import main
+from bam_train.compat.rllib.directory import find_policy
+from bam_train.compat.rllib.export import export
+from bam_train.compat.rllib.reading import read_policy
 from bam_train.errors import CheckpointMismatch
-from bam_train.trainers.rllib.foreign.directory import find_policy
-from bam_train.trainers.rllib.foreign.export import export
-from bam_train.trainers.rllib.foreign.reading import read_policy
 
 THEIRS = Path(__file__).parents[1] / "robo_gym"
 OLD = "policies/default_policy"

@@ -6,11 +6,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from bam_envs.errors import LinkLost, RobotFault, SafetyStop, StaleState
-from bam_envs.robot_env import RobotEnv
+from bam_envs.core.errors import LinkLost, RobotFault, SafetyStop, StaleState
+from bam_envs.core.robot_env import RobotEnv
 from bam_envs.robots.fake import FakeRobot
-from bam_envs.robots.safety.safe import SafeRobot
-from bam_envs.robots.simulated.arm import SimulatedArm
+from bam_envs.robots.physics.arm import SimulatedArm
+from bam_envs.safety.safe import SafeRobot
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.reach import ReachTask
 from bam_envs.testing.drivers import DrivenRobot

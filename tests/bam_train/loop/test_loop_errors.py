@@ -260,7 +260,7 @@ WITHOUT_TORCH = """
 import sys
 sys.modules["torch"] = None
 import bam_train.loop as loop
-from bam_envs.errors import MissingExtra
+from bam_envs.core.errors import MissingExtra
 for use in (
     lambda: loop.ReplayBuffer,
     lambda: loop.ParallelGymAgent(None, 1),

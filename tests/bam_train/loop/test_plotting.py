@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from bam_envs.errors import MissingExtra
+from bam_envs.core.errors import MissingExtra
 from bam_train.errors import UnknownVariable, WorkspaceError
 from bam_train.loop import Workspace
 from bam_train.loop.plotting import MAX_LINES, plot, to_dataframe

@@ -2,8 +2,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from bam_envs.errors import ResetNeeded
-from bam_envs.robot_env import RobotEnv
+from bam_envs.core.errors import ResetNeeded
+from bam_envs.core.robot_env import RobotEnv
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.tasks.pick import PickTask
 from bam_train.errors import LoopError, WiringError

@@ -8,9 +8,9 @@ from dataclasses import replace
 import gymnasium as gym
 import pytest
 
-from bam_envs.errors import InvalidValue, UnknownName
-from bam_envs.serve.env_server import EnvServer
-from bam_envs.serve.tcp_server import TcpServer
+from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.remote.serve.env_server import EnvServer
+from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_train.checkpoint import Checkpoint, write_checkpoint
 from bam_train.errors import AlteredCheckpoint, CheckpointMismatch, OutputError, SettingsError
 from bam_train.settings import TrainSettings
@@ -111,7 +111,7 @@ def test_the_tables_agree():
 
 @pytest.mark.parametrize("name", list_presets())
 def test_every_preset_is_complete_and_of_an_environment_of_ours(name):
-    from bam_envs.registry import ENVIRONMENTS
+    from bam_envs.core.registry import ENVIRONMENTS
     from bam_train.trainers.presets import preset_name
     from bam_train.trainers.rllib_algorithms import ALGORITHMS as OF_RLLIB
     from bam_train.trainers.sb3.algorithms import ALGORITHMS as OF_SB3

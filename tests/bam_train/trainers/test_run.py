@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from bam_envs.errors import LinkLost
+from bam_envs.core.errors import LinkLost
 from bam_train.errors import EnvironmentFailed, OutputError, ProcessesLost, TrainingFailed
 from bam_train.evaluation import EvaluationReport, wilson_interval
 from bam_train.settings import TrainSettings

@@ -278,7 +278,7 @@ _DEFAULT_PIECES = frozenset(
 
 def _with_version(name: str) -> str:
     """The id that a name without a version means."""
-    from bam_envs.registry import resolve_id
+    from bam_envs.core.registry import resolve_id
 
     return resolve_id(name)
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import yaml
 
-from bam_envs.errors import InvalidValue, UnknownName
-from bam_envs.robots.profiles.typed_table import require_table
+from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.ros.typed_table import require_table
 
 tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 

@@ -15,16 +15,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.robot import RobotSpec, SignalSpec
 from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.profiles.files import read_profile, shipped_profiles
-from bam_envs.robots.profiles.tables import IMAGE_TYPES, CameraSource, Readiness, RobotProfile, Sink, Source
-from bam_envs.robots.profiles.typed_table import read_table, require_known, require_table, require_tables
-from bam_envs.robots.robot import RobotSpec, SignalSpec
-from bam_envs.robots.safety.guard import BOUNDS, Limits
 from bam_envs.robots.ur5e import arm_spec
-from bam_envs.robots.wire.command_messages import LISTED_TYPES
-from bam_envs.robots.wire.messages import has_header
+from bam_envs.ros.command_messages import LISTED_TYPES
+from bam_envs.ros.messages import has_header
+from bam_envs.ros.profile_tables import IMAGE_TYPES, CameraSource, Readiness, RobotProfile, Sink, Source
+from bam_envs.ros.typed_table import read_table, require_known, require_table, require_tables
+from bam_envs.safety.guard import BOUNDS, Limits
 
 __all__ = ["CameraSource", "RobotProfile", "Sink", "Source", "load_profile", "profile_for", "shipped_profiles"]
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bam_envs.errors import InvalidValue, UnknownName
+from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.profiles.profile import load_profile, profile_for, shipped_profiles

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import Autoreset, TimeLimit
 
-from bam_envs.registry import ENVIRONMENTS
+from bam_envs.core.registry import ENVIRONMENTS
 from bam_train.errors import LoopError, SettingsError, ValueMismatch
 from bam_train.loop import Agent, Agents, ParallelGymAgent, TemporalAgent, VecGymAgent, Workspace
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from ray.rllib.algorithms.ppo import PPOConfig
 
-from bam_envs.spaces import space_to_json
+from bam_envs.core.spaces import space_to_json
 from bam_train.errors import SettingsError
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.rllib.exploring import ExploringPolicy

@@ -13,9 +13,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from bam_train.errors import FormatError
-from bam_train.trainers.rllib.foreign.records import class_name, space_of
-from bam_train.trainers.rllib.pickles import (
+from bam_train.compat.rllib.pickles import (
     Record,
     RefusedPickle,
     dtype_of,
@@ -24,6 +22,8 @@ from bam_train.trainers.rllib.pickles import (
     read_state,
     unpacked_array,
 )
+from bam_train.compat.rllib.records import class_name, space_of
+from bam_train.errors import FormatError
 
 READERS = [read_state, read_record]
 
@@ -242,13 +242,13 @@ def test_functions_of_the_reader_keep_their_state():
 
 
 def test_too_many_instructions(monkeypatch):
-    monkeypatch.setattr("bam_train.trainers.rllib.pickles._MOST_INSTRUCTIONS", 10)
+    monkeypatch.setattr("bam_train.compat.rllib.pickles._MOST_INSTRUCTIONS", 10)
     with pytest.raises(FormatError, match=r"^has more than 10 instructions"):
         read_state(dumped(list(range(20))))
 
 
 def test_too_many_names(monkeypatch):
-    monkeypatch.setattr("bam_train.trainers.rllib.pickles._MOST_NAMES", 1)
+    monkeypatch.setattr("bam_train.compat.rllib.pickles._MOST_NAMES", 1)
     data = b"\x80\x04(cray.rllib.a\nA\ncray.rllib.b\nB\ncray.rllib.c\nC\nl."
     with pytest.raises(FormatError, match=r"^has more than 1 names"):
         read_record(data)
@@ -284,7 +284,7 @@ def test_packed_arrays_that_are_none(text, message):
 
 
 def test_a_packed_array_that_unpacks_to_more_than_there_is(monkeypatch):
-    monkeypatch.setattr("bam_train.trainers.rllib.pickles._MOST_NPY", 1000)
+    monkeypatch.setattr("bam_train.compat.rllib.pickles._MOST_NPY", 1000)
     with pytest.raises(FormatError, match="not whole, or more than 1000 bytes"):
         unpacked_array(packed(np.zeros(10_000)))
 

@@ -15,6 +15,7 @@ pytest.importorskip("ray")
 import ray
 
 from bam_train.checkpoint import Checkpoint
+from bam_train.compat.rllib.export import export
 from bam_train.errors import BamTrainError, CheckpointMismatch, EnvironmentFailed, SettingsError
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
@@ -22,7 +23,6 @@ from bam_train.trainers.resolve import resolve, resolve_resumed
 from bam_train.trainers.rllib import hyperparameters, registration, state
 from bam_train.trainers.rllib.cluster.cluster import cluster
 from bam_train.trainers.rllib.config import envs_each
-from bam_train.trainers.rllib.foreign.export import export
 from bam_train.trainers.rllib.trainer import RLlibTrainer
 from bam_train.trainers.rllib_algorithms import ALGORITHMS
 

@@ -20,7 +20,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage
 
-from bam_envs.spaces import space_to_json
+from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import safetensors_file, write_checkpoint
 from bam_train.errors import PolicyError
 from bam_train.policy import FrozenPolicy, onnx_file

@@ -12,9 +12,9 @@ import pytest
 import torch
 from stable_baselines3 import PPO
 
-from bam_envs.errors import LinkLost
-from bam_envs.serve.env_server import EnvServer
-from bam_envs.serve.tcp_server import TcpServer
+from bam_envs.core.errors import LinkLost
+from bam_envs.remote.serve.env_server import EnvServer
+from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_train.checkpoint import Checkpoint
 from bam_train.errors import EnvironmentFailed, SettingsError, TrainingFailed
 from bam_train.policy import FrozenPolicy

@@ -1,6 +1,0 @@
-"""The rosbridge server: a core without I/O, and the sockets around it."""
-
-from bam_envs.bridge.server.options import ServerOptions
-from bam_envs.bridge.server.server import BridgeServer
-
-__all__ = ["BridgeServer", "ServerOptions"]

@@ -1,0 +1,1 @@
+"""What everything stands on: robots, tasks, environments, errors, spaces and time."""

@@ -1,0 +1,138 @@
+"""The Robot protocol: commands in, states out, n robots stepped together (n == 1 for a live one)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.core.errors import InvalidValue
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class SignalSpec:
+    """One named signal: what its numbers are called, their unit and their limits."""
+
+    name: str
+    """Key in `RobotState.signals`, or ``"command"``."""
+    labels: tuple[str, ...]
+    """Name of each number."""
+    units: tuple[str, ...]
+    """Unit of each number: rad, rad/s, m, or 1 for none."""
+    low: tuple[float, ...]
+    """Lowest value of each number."""
+    high: tuple[float, ...]
+    """Highest value of each number."""
+    max_rate: tuple[float, ...] | None = None
+    """Fastest change of each number [unit/s]; None for what is only measured."""
+
+    def part(self, labels: tuple[str, ...]) -> SignalSpec:
+        """The numbers called `labels`, each of which it has, in their order."""
+        places = [self.labels.index(label) for label in labels]
+        low, high = tuple(self.low[one] for one in places), tuple(self.high[one] for one in places)
+        rate = None if self.max_rate is None else tuple(self.max_rate[one] for one in places)
+        return SignalSpec(self.name, labels, tuple(self.units[one] for one in places), low, high, rate)
+
+
+@dataclass(frozen=True)
+class RobotSpec:
+    """What is known of a robot before it is connected."""
+
+    name: str
+    signals: tuple[SignalSpec, ...]
+    """What it measures."""
+    command: SignalSpec
+    """What it is sent."""
+    period: float
+    """Time between two commands [s]."""
+    lag: float = field(default=0.0, compare=False)
+    """How far a joint that moves steadily is behind its commands, at the end of a period [s]."""
+
+    def describe(self) -> dict[str, list[dict[str, Any]]]:
+        """Labels, units and limits of state and command, as plain values."""
+        state = [row for signal in self.signals for row in describe_signal(signal)]
+        return {"state": state, "command": describe_signal(self.command)}
+
+
+def describe_signal(signal: SignalSpec) -> list[dict[str, Any]]:
+    """One row of plain values for each number of `signal`."""
+    rows = zip(signal.labels, signal.units, signal.low, signal.high, strict=True)
+    return [{"name": label, "unit": unit, "low": low, "high": high} for label, unit, low, high in rows]
+
+
+@dataclass
+class RobotState:
+    """What n robots measured at one time."""
+
+    signals: dict[str, Array]
+    """Each signal in the order of its labels. Shape: (n, k)."""
+    stamp: Array
+    """When it was measured [s]: the robot's monotonic clock, or simulated time. Shape: (n,)."""
+    command: Array
+    """The command that was really sent before this was measured. Shape: (n, m)."""
+    truth: dict[str, Array] = field(default_factory=dict)
+    """What only a simulation knows, such as contacts; {} of a live robot. Shape: (n, ...) each."""
+
+
+@dataclass(frozen=True)
+class Initial:
+    """Where an episode starts, for k rows.
+
+    A simulated robot is set to it; a live one goes to ``signals["joint_position"]`` slowly, and its object is
+    where it is.
+    """
+
+    signals: Mapping[str, Array]
+    """Start values of signals. Shape: (k, ...)."""
+    seeds: NDArray[np.int64]
+    """Seeds for what the robot itself draws (noise, masses), one a row. Shape: (k,)."""
+
+
+def checked_command(command: Array, shape: tuple[int, int]) -> Array:
+    """A copy of `command`, which must have `shape` and be finite; what every robot asks of a command first.
+
+    Raises:
+        InvalidValue: It has another shape, or is not finite.
+    """
+    array = np.array(command, dtype=np.float64)
+    if array.shape != shape:
+        raise InvalidValue(f"The command must have shape {shape}, not {array.shape}.")
+    finite = np.isfinite(array)
+    if not finite.all():
+        rows = np.flatnonzero(~finite.all(axis=1)).tolist()
+        raise InvalidValue(f"The command must be finite numbers; those of rows {rows} are not.")
+    return array
+
+
+@runtime_checkable
+class Robot(Protocol):
+    """n robots stepped together. The constructor does no I/O; `spec` is known before `connect`."""
+
+    @property
+    def spec(self) -> RobotSpec:
+        """What is known of it."""
+
+    @property
+    def num_robots(self) -> int:
+        """How many are stepped together."""
+
+    def connect(self) -> None:
+        """Make the robot ready for `reset`. Moves nothing; doing it twice is once."""
+
+    def reset(self, rows: Rows, initial: Initial) -> RobotState:
+        """Bring `rows` to `initial` and return the state of all rows."""
+
+    def step(self, command: Array) -> RobotState:
+        """Send `command` (n, m), SI units, and return the state one period later."""
+
+    def halt(self) -> None:
+        """Stop moving and keep the link. From any thread, as often as one likes; never raises."""
+
+    def close(self) -> None:
+        """Halt, then drop the link. As often as one likes."""

@@ -1,0 +1,91 @@
+"""The one function that builds a live robot: a `RosbridgeRobot` behind the guards of a `SafeRobot`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from bam_envs.core.errors import InvalidValue
+from bam_envs.core.robot import RobotSpec
+from bam_envs.live.rosbridge import RosbridgeRobot
+from bam_envs.robots.profiles.profile import load_profile, profile_for
+from bam_envs.ros.profile_tables import RobotProfile
+from bam_envs.rosbridge.addresses import require_tls
+from bam_envs.rosbridge.tokens import read_token
+from bam_envs.safety.arm_guards import ToolPosition
+from bam_envs.safety.guards import Limits
+from bam_envs.safety.safe import SafeRobot
+
+DEFAULT_PROFILE = "ur5e"
+
+
+def live_robot(
+    url: str,
+    spec: RobotSpec | None = None,
+    *,
+    profile: RobotProfile | str | Path | None = None,
+    limits: Limits | None = None,
+    tool_position: ToolPosition | None = None,
+    command: str | None = None,
+    ca_file: str | None = None,
+    token_file: str | None = None,
+) -> SafeRobot:
+    """A live robot behind its guards. Nothing is connected yet.
+
+    Args:
+        url: ``ws://host:port`` or ``wss://host:port``, with a namespace behind it if its topics have one.
+        spec: What the task needs of it, such as the spec of its simulated robot; None: everything it measures.
+        profile: Its topics; a shipped name or a file. None: the shipped one that takes the commands of `spec`. What
+            takes others only is left alone.
+        limits: How far the guards let it go; None: those of the profile.
+        tool_position: Forward kinematics of an arm that is no UR5e, (n, k) [rad] to (n, 3) [m].
+        command: Way of sending commands, such as ``"trajectory"``; None: the profile's default.
+        ca_file: PEM file of the authorities to trust instead of the system's.
+        token_file: File with the server's shared secret.
+
+    Raises:
+        InvalidValue: The address is none of a robot, a file cannot be read, or the robot does not measure, or take,
+            what `spec` names.
+        UnknownName: There is no such profile, or no such way of sending commands.
+    """
+    require_robot_address(url)
+    require_tls(url, ca_file)
+    chosen = _profile(profile, spec)
+    robot = RosbridgeRobot(
+        url, chosen, spec=spec, ca_file=ca_file, token=read_token(token_file) if token_file else None, command=command
+    )
+    return SafeRobot(robot, limits=limits or profile_limits(chosen), tool_position=tool_position)
+
+
+def profile_limits(profile: RobotProfile) -> Limits:
+    """How far the guards let the robot of `profile` go."""
+    limits = Limits.of(profile.limits)
+    return limits if limits.max_age is not None else replace(limits, max_age=profile.max_age)
+
+
+def _profile(profile: RobotProfile | str | Path | None, spec: RobotSpec | None) -> RobotProfile:
+    if isinstance(profile, RobotProfile):
+        return profile
+    if profile is not None:
+        return load_profile(profile)
+    return load_profile(DEFAULT_PROFILE) if spec is None else profile_for(spec)
+
+
+def require_robot_address(url: str) -> None:
+    """Refuse what is no address of a live robot, by its form alone.
+
+    Raises:
+        InvalidValue: Says what was expected.
+    """
+    scheme, separator, _ = url.partition("://")
+    if separator and scheme in ("ws", "wss"):
+        return
+    expected = "A live robot's address is ws://host:port or wss://host:port"
+    if scheme in ("tcp", "ros2"):
+        raise InvalidValue(
+            f"{expected}; {url!r} is that of a whole environment. Give it as transport={url!r} (--transport)."
+        )
+    address = url.partition("://")[2] if separator else url
+    if not address:
+        raise InvalidValue(f"{expected}, such as ws://10.0.0.5:9090, not {url!r}.")
+    raise InvalidValue(f"{expected}, not {url!r}. Did you mean {f'ws://{address}'!r}?")

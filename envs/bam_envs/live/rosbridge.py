@@ -1,0 +1,510 @@
+"""A live robot behind a rosbridge server, driven over topics at a fixed rate.
+
+Two connections: one carries states and commands; the other one carries nothing but the halt, since a ROS 2 bridge holds
+back everything behind a call that is running. While a connection is down nothing is sent and nothing is kept.
+
+Longer than other modules because it is one object with one lifecycle: connect, reset, step, halt, close.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.core.at_exit import close_at_exit
+from bam_envs.core.errors import (
+    BamEnvsError,
+    InvalidValue,
+    LinkLost,
+    NotInCommand,
+    NotReady,
+    RemoteError,
+    ResetNeeded,
+    StaleState,
+)
+from bam_envs.core.robot import Initial, RobotSpec, RobotState, Rows
+from bam_envs.live.bringup import (
+    TopicTypes,
+    ask_info,
+    await_first,
+    info_by_profile,
+    require_period,
+    tagged_sinks,
+    throttle,
+)
+from bam_envs.live.grid import Grid
+from bam_envs.live.mailbox import Letter
+from bam_envs.live.readiness import LiveReadiness
+from bam_envs.live.rest import hold_command, places_of, rest_command
+from bam_envs.live.session import DrivingSession
+from bam_envs.live.state import LiveState
+from bam_envs.ros.codec import HALT_TOPIC, SCENE_TOPIC, RobotInfo, encode_sink
+from bam_envs.ros.command_messages import has_room
+from bam_envs.ros.freshness import Tag
+from bam_envs.ros.profile_tables import RobotProfile
+from bam_envs.rosbridge.addresses import parse_address
+from bam_envs.rosbridge.link.connection import bare_reason
+from bam_envs.rosbridge.link.link import RosbridgeLink
+from bam_envs.rosbridge.sessions import is_over
+from bam_envs.rosbridge.string_rpc import StringRpc
+from bam_envs.safety.safe import ClearedCommand
+
+Array = NDArray[np.float64]
+_LOG = logging.getLogger(__name__)
+_HEARTBEAT, _LOST_AFTER = 0.2, 1.0
+ANSWER_TIMEOUT = 5.0
+"""Longest that a robot in lockstep takes for a period [s]."""
+_RESET_TIMEOUT = 3.0
+"""Longest that a fresh state, or a scene, is waited for [s]."""
+_HALT_WAITS = 0.05
+"""Longest that a halt waits for a command that is being sent, so as to come after it [s]."""
+_BY_HAND = "stop it by hand if it moves; a robot with a dead-man stops by itself"
+_HALT_NOT_SENT = f"%s: the halt could not be sent, %s: {_BY_HAND}."
+_AS_SAID = ". Nothing was sent, and nothing is kept"
+_FAR, _CANNOT_BE_FAR = 0.3, 1.0
+"""An arm that was commanded in the last second cannot be farther than this [rad] from its command."""
+_LATE = ("expired", "old message", "old connection")
+"""How the robot's side says that a command came too late: it holds, and the next one counts."""
+
+
+class RosbridgeRobot:
+    """One robot behind a rosbridge server; commands reach it only through a `SafeRobot`, which `live_robot` builds.
+
+    Args:
+        url: ``ws://host:port`` or ``wss://host:port``, with a namespace behind it if its topics have one.
+        profile: Its topics.
+        spec: What the task needs; only these signals are subscribed, only these commands sent. None: everything that
+            is not optional.
+        ca_file: PEM file of the authorities to trust instead of the system's.
+        token: Shared secret of the server.
+        command: Way of sending commands, such as ``"trajectory"``; None: the profile's default.
+        clock: Monotonic clock [s].
+
+    Raises:
+        InvalidValue: The address is none, or the robot does not measure, or take, what `spec` names.
+        UnknownName: The profile has no such way of sending commands.
+    """
+
+    needs_clearance = True
+    num_robots = 1
+
+    def __init__(
+        self,
+        url: str,
+        profile: RobotProfile,
+        *,
+        spec: RobotSpec | None = None,
+        ca_file: str | None = None,
+        token: str | None = None,
+        command: str | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._spec = profile.spec(spec, command)
+        self.profile = profile.narrowed(self.spec.command.labels, command)
+        self.url = url
+        self.namespace = parse_address(url).namespace
+        self._info = RobotInfo(self.profile.name)
+        self._hears_halts = False
+        self._way, self._sinks = command, self.profile.sinks(command)
+        self._ca_file, self._token = ca_file, token
+        self._clock, self._state = clock, LiveState(self.profile, self.spec, clock)
+        self._readiness: LiveReadiness | None = None  # of a robot that is real
+        self._grid, self._session = Grid(self.spec.period), DrivingSession()
+        self._command_life = profile.command_life(self.spec.period)
+        self._control: RosbridgeLink | None = None
+        self._halting: RosbridgeLink | None = None
+        self._epoch = 0  # of the connection that was verified; another one needs a reset
+        self._cut = threading.Event()
+        self._sending, self._halts = threading.Lock(), 0
+        self._halt_failed = False  # and somebody was told
+        self._commanded = False  # since `connect`
+        self._drove = False  # since the session was opened
+        self._session_over = False  # by the words of the robot's side
+        self._refusals: list[BamEnvsError] = []
+        self._sent: Array | None = None
+        self._sent_at = -math.inf
+        self._answers = False  # whether it says which command it has executed, while its time goes on
+        self._owed: dict[int, float] = {}  # number of the command -> when it was sent [s], of those without an answer
+
+    @property
+    def spec(self) -> RobotSpec:
+        """The signals and commands of the task."""
+        return self._spec
+
+    @property
+    def info(self) -> RobotInfo:
+        """What it says of itself; known after `connect`."""
+        return self._info
+
+    def connect(self) -> None:
+        """Open both connections, learn who is there, and see that every topic is what the profile says.
+
+        It is closed when Python ends, which halts it.
+
+        Raises:
+            NoServer: There is no usable server.
+            ProtocolError: A topic has another type, nobody listens to commands, or a first message is not what the
+                profile says.
+            StaleState: A topic is silent.
+        """
+        if self._control is not None:
+            return
+        control, halting = self._new_link("control"), self._new_link("halt")
+        self._state.restart()
+        try:
+            self._open(control, halting)
+            self._begin(control)
+            self._control, self._halting = control, halting
+        except BaseException:
+            halting.close()
+            control.close()
+            raise
+        close_at_exit(self)
+
+    def _new_link(self, name: str) -> RosbridgeLink:
+        return RosbridgeLink(self.url, name=name, ca_file=self._ca_file, token=self._token)
+
+    def _open(self, control: RosbridgeLink, halting: RosbridgeLink) -> None:
+        control.on_down(self._on_down)
+        control.on_status(self._on_status)
+        control.connect()
+        halting.connect()
+        halting.heartbeat(_HEARTBEAT, _LOST_AFTER)
+        said = ask_info(control)
+        self._hears_halts, self._info = said is not None, said or info_by_profile(self.url, self.profile)
+        if said is not None:
+            self._sinks = tagged_sinks(self.profile, self._way, said)
+            require_period(said, self.spec.period)
+            tagged = all(sink.tag and has_room(sink.type) for sink in self._sinks)
+            self._answers = tagged and not said.lockstep
+        self._state.server_offset = lambda: control.clock_offset
+        types = TopicTypes(control, self.profile)
+        self._declare(control, halting, types)
+        self._readiness = None
+        if said is None:
+            self._readiness = LiveReadiness(self.profile, self._sinks, types)
+
+    def _declare(self, control: RosbridgeLink, halting: RosbridgeLink, types: TopicTypes) -> None:
+        """Subscribe states and advertise commands, with the types that they have there."""
+        for topic, kind in self._state.topics.items():
+            name = self.namespace + topic
+            # What describes itself sends no more than is needed; in lockstep every state is the answer to a command.
+            least = 0 if self._hears_halts else throttle(self.profile, topic, self.spec.period)
+            listener, kind = self._state.listener(topic), types.check(name, kind)
+            control.subscribe(name, kind, listener, throttle_ms=least, queue_length=1 if least else 0)
+        for sink in self._sinks:
+            name = self.namespace + sink.topic
+            kind = types.check_listened(name, sink)
+            control.advertise(name, kind)
+            halting.advertise(name, kind)
+        halting.advertise(self.namespace + HALT_TOPIC, "std_msgs/Empty")
+
+    def _begin(self, control: RosbridgeLink) -> None:
+        """From now on this connection counts; what came over an older one does not."""
+        self._cut.clear()
+        self._epoch = control.epoch
+        self._state.forget_ages()
+        await_first(control, self._state, self.profile)
+        if self._readiness is not None:
+            self._readiness.begin(control)
+            self._info = info_by_profile(self.url, self.profile, self._readiness.unknown)
+        self._open_session(control)
+        self._refusals.clear()
+        self._state.read()
+        self._sent = None
+
+    def _open_session(self, control: RosbridgeLink) -> None:
+        """From now on commands are signed for a new session, where the robot's side has such."""
+        if self._hears_halts:
+            self._session.open(control)
+        self._drove = self._session_over = False
+
+    def _answered_session(self) -> str | None:
+        echo = self._state.echo()
+        return None if echo is None else echo[0]
+
+    def _on_down(self, error: LinkLost) -> None:
+        self._cut.set()
+        self._state.mailbox.clear()
+        if self._readiness is not None:
+            self._readiness.forget()
+        self._state.stop_waiting()
+
+    def _on_status(self, status: Mapping[str, Any]) -> None:
+        """The server, or the robot's side behind it, says that something does not work."""
+        if self._readiness is not None and self._readiness.owns(status, self.namespace):
+            return
+        if status.get("level") == "error":
+            text = str(status.get("msg"))
+            _LOG.debug("%s: %s", self.url, text)
+            if not any(reason in text for reason in _LATE):
+                refusal = NotInCommand if " in command" in text else RemoteError
+                error = refusal(f"{self.url}: {text}")
+                self._session_over |= is_over(error)
+                self._on_refusal(error)
+
+    def _on_refusal(self, error: BamEnvsError) -> None:
+        """The command that was sent last is refused, there or here."""
+        if not self._refusals:  # the first one is told, however many a server sends
+            self._refusals.append(error)
+        self._state.stop_waiting()
+
+    def reset(self, rows: Rows, initial: Initial) -> RobotState:
+        """A fresh state. Nothing real moves; a simulated robot is at rest, its object where `initial` says.
+
+        After the link dropped and is back, this is what makes the robot usable again.
+
+        Raises:
+            LinkLost: The link is down.
+            NotReady: The robot says that it cannot move now.
+            RemoteError: The other end refused the scene.
+            StaleState: No fresh state came.
+        """
+        control = self._connected()
+        control.wait_up(_RESET_TIMEOUT)
+        if control.epoch != self._epoch or self._cut.is_set():
+            self._begin(control)
+        elif self._session_over or (self._drove and self._answered_session() != self._session.tagger.session):
+            self._open_session(control)  # the robot's side began anew, and does not know the old one
+        self._refusals.clear()
+        self._require_ready(self.not_ready())
+        if self.info.simulated:
+            self._set_scene(control, initial)
+        self._await(lambda slots: self._state.age() <= self.profile.max_age)
+        self._grid.restart()
+        return self.measure()
+
+    def _set_scene(self, control: RosbridgeLink, initial: Initial) -> None:
+        pose = initial.signals.get("object_pose")
+        scene = {"object_pose": None if pose is None else pose.tolist(), "seeds": np.asarray(initial.seeds).tolist()}
+        rpc = StringRpc(control, self.namespace + SCENE_TOPIC, self._session.tagger)
+        self._drove = True
+        self._session.drive()
+        try:
+            rpc.call(scene, _RESET_TIMEOUT)
+        finally:
+            rpc.close()
+        before = {name: letter.number for name, letter in self._state.mailbox.newest().items()}
+        # Two more of each: one may have been on its way when the scene was set.
+        self._await(lambda slots: all(slots[name].number >= number + 2 for name, number in before.items()))
+
+    def _await(self, ready: Callable[[Mapping[str, Letter]], bool]) -> None:
+        """Wait until the messages are what `ready` wants, or the link drops."""
+        if not self._state.mailbox.wait_for(lambda slots: self._cut.is_set() or ready(slots), _RESET_TIMEOUT):
+            age, limit = self._state.age(), self.profile.max_age
+            raise StaleState(f"{self.url}: no fresh state in {_RESET_TIMEOUT:g} s. Does the robot run?", age, limit)
+        self._require_link()
+
+    def step(self, command: Array | ClearedCommand) -> RobotState:
+        """Send a command that passed the guards (any other is refused), and return the state at the end of the period.
+
+        A simulated robot whose time goes on only with commands is waited for; else the period ends when it ends.
+
+        Raises:
+            ResetNeeded: Not connected.
+            InvalidValue: The command did not pass the guards.
+            LinkLost: A connection dropped, before or during this step; nothing more is sent until `reset`.
+            NotReady: The robot says that it cannot move now.
+            NotInCommand: Another client is in command of the robot.
+            RemoteError: The robot's side refused a command.
+            StaleState: The robot did not answer in time.
+            ProtocolError: The state is not what the profile says.
+        """
+        control = self._connected()
+        if not isinstance(command, ClearedCommand):
+            raise InvalidValue("Commands reach a live robot only through SafeRobot. Build it with live_robot(...).")
+        told = command.for_robot(self)[0]
+        self._require_link()
+        self._require_accepted()
+        end = self._grid.next(self._clock())
+        # Where no time passes between commands, a late one does no harm before it is given up.
+        tag = self._session.tagger.next(self._epoch, ANSWER_TIMEOUT if self.info.lockstep else self._command_life)
+        if self.info.lockstep:
+            self._ask(control, told, tag)
+        else:
+            self._send(control, told, tag)
+            self._cut.wait(max(0.0, end - self._clock()))
+        self._require_link()
+        self._require_accepted()
+        return self.measure()
+
+    def _send(self, control: RosbridgeLink, command: Array, tag: Tag) -> None:
+        """Every part of `command` (m,); nothing after a halt."""
+        halts, messages = self._halts, self._messages(control, command, tag)
+        with self._sending:
+            if self._halts == halts:
+                self._note_driving()
+                control.publish_all(messages)
+                self._sent, self._sent_at = command.copy(), self._clock()
+                if self._answers:
+                    self._owed[tag.sequence] = self._sent_at
+
+    def _ask(self, control: RosbridgeLink, command: Array, tag: Tag) -> None:
+        """Send as `_send`, and wait for the answer; that they were sent need not be waited for before."""
+        halts, messages, take_back = self._halts, self._messages(control, command, tag), _nothing
+        self._state.expect(tag.echo)
+        try:
+            with self._sending:
+                if self._halts == halts:
+                    self._note_driving()
+                    take_back = control.begin_publishing(messages, self._on_refusal)
+                    self._sent = command.copy()
+            self._await_answer()
+        finally:
+            take_back()
+
+    def _note_driving(self) -> None:
+        self._commanded = self._drove = True
+        self._session.drive()
+
+    def _messages(self, control: RosbridgeLink, command: Array, tag: Tag) -> list[tuple[str, dict[str, Any]]]:
+        """Topics and messages that send `command` (m,)."""
+        ros1 = control.ros == "ros1"
+        sign = self._session.tagger.sign
+        envelopes = [encode_sink(sink, self.spec, command, tag, sign=sign, ros1=ros1) for sink in self._sinks]
+        return [(self.namespace + topic, message) for topic, _, message in envelopes]
+
+    def _await_answer(self) -> None:
+        if not self._state.await_answer(lambda: self._cut.is_set() or bool(self._refusals), ANSWER_TIMEOUT):
+            raise StaleState(
+                f"{self.url}: no state answered the command in {ANSWER_TIMEOUT:g} s. Does the simulation run?",
+                self.age(),
+                self.profile.max_age,
+            )
+
+    def measure(self) -> RobotState:
+        """The newest state, and what was sent last.
+
+        Raises:
+            ResetNeeded: Not connected.
+            StaleState: Nothing came yet.
+            ProtocolError: A message is not what the profile says.
+        """
+        self._connected()
+        signals, stamp = self._state.read()
+        command = rest_command(self.spec, self._sinks, signals) if self._sent is None else self._sent
+        return RobotState(signals, np.array([stamp]), command[None].copy())
+
+    def age(self) -> float:
+        """Age of the state [s]: the oldest of its sources, by stamp or by arrival; infinite if one never came.
+
+        In lockstep it is 0: between two commands no time passes there.
+        """
+        age = self._state.age()
+        return 0.0 if self.info.lockstep and math.isfinite(age) else age
+
+    def waiting(self) -> float:
+        """For how long the robot has owed the answer to a command [s]; 0 where it owes none, or gives none."""
+        echo = self._state.echo()
+        if echo is not None and echo[0] == self._session.tagger.session:
+            for number in list(self._owed):
+                if number <= echo[1]:  # executed, or replaced by one that was
+                    self._owed.pop(number, None)
+        owed = list(self._owed.values())  # a halt in another thread clears it
+        return self._clock() - owed[0] if owed else 0.0
+
+    def halt(self) -> None:
+        """Stop moving and keep the link, on the connection that does nothing else. From any thread; never raises."""
+        self._halts += 1
+        halting = self._halting
+        self._owed.clear()  # what has not been executed is not any more
+        if halting is None:
+            return
+        first = self._sending.acquire(timeout=_HALT_WAITS)
+        try:
+            self._publish_halt(halting)
+            self._halt_failed = False
+        except BamEnvsError as error:  # told once: several threads and `close` try it too
+            if not self._halt_failed:
+                _LOG.warning(_HALT_NOT_SENT, self.url, bare_reason(halting.url, error).removesuffix(_AS_SAID))
+            self._halt_failed = True
+        finally:
+            if first:
+                self._sending.release()
+
+    def _publish_halt(self, halting: RosbridgeLink) -> None:
+        halting.publish(self.namespace + HALT_TOPIC, {})
+        if self._hears_halts:
+            return
+        hold = self._hold()
+        tag = self._session.tagger.next(self._epoch, self._command_life)
+        for sink in self._sinks:
+            if np.isfinite(hold[places_of(self.spec, sink)]).all():  # what is not known is not commanded
+                topic, _, message = encode_sink(sink, self.spec, hold, tag, ros1=halting.ros == "ros1")
+                halting.publish(self.namespace + topic, message)
+
+    def _hold(self) -> Array:
+        """What a halt sends, NaN for nothing. Shape: (m,)."""
+        try:
+            # To go back to where it was some time ago would be a motion.
+            signals = self._state.signals() if self._state.age() <= self.profile.max_age else {}
+        except BamEnvsError:  # what it measures cannot be read: it holds what it was sent
+            signals = {}
+        hold = hold_command(self.spec, self._sinks, signals, self._sent)
+        if self._sent is None or self._clock() - self._sent_at > _CANNOT_BE_FAR:
+            return hold
+        joints = np.array([unit == "rad" for unit in self.spec.command.units])
+        if (np.abs(hold - self._sent)[joints] > _FAR).any():  # guards let no joint get so far: it is measured wrongly
+            hold[joints] = self._sent[joints]
+        return hold
+
+    def close(self) -> None:
+        """Halt what was commanded from here, then drop both connections. As often as one likes."""
+        if self._commanded:  # who only looked moves nothing, and stops nobody else
+            self.halt()
+        self._session.leave()
+        control, halting = self._control, self._halting
+        self._control = self._halting = None
+        self._commanded = False
+        self._cut.set()
+        for link in (control, halting):
+            if link is not None:
+                link.close()
+
+    def _connected(self) -> RosbridgeLink:
+        if self._control is None:
+            raise ResetNeeded(f"{self.profile.name} at {self.url} is not connected. Call connect() first.")
+        return self._control
+
+    def _require_link(self) -> None:
+        """Both connections are up, and have been since `connect` or `reset`."""
+        control, halting = self._connected(), self._halting
+        if not control.is_up:
+            self._halt_failed = self._commanded  # as is said here
+            advice = f"; {_BY_HAND}" if self._commanded else ""
+            raise LinkLost(f"{self.url}: the link is down. Nothing was sent, and nothing is kept{advice}.")
+        if self._cut.is_set() or control.epoch != self._epoch:
+            raise LinkLost(f"{self.url}: the link dropped, and is back. Nothing is sent before reset().")
+        if halting is None or not halting.is_up:
+            raise LinkLost(f"{self.url}: the connection that halts the robot is down. Nothing is sent without it.")
+
+    def not_ready(self) -> str | None:
+        """Why the robot cannot move now, by its own words; None if it does not say so, or is not connected.
+
+        Not while commands are sent: it may ask the server, which takes a while.
+        """
+        control = self._control
+        return None if control is None or self._readiness is None else self._readiness.not_ready(control)
+
+    def _require_ready(self, why: str | None) -> None:
+        if why is not None:
+            raise NotReady(f"{self.url}: not ready: {why}. Nothing moves before it is ready and reset() is called.")
+
+    def _require_accepted(self) -> None:
+        if self._readiness is not None:
+            self._require_ready(self._readiness.fault(moving=True))
+        if self._refusals:
+            refusal = self._refusals[0]
+            self._refusals.clear()
+            raise refusal
+
+
+def _nothing() -> None:
+    """Take nothing back: nothing was sent."""

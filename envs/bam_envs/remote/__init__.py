@@ -1,0 +1,1 @@
+"""Environments and robots that another process has, and what serves them."""

@@ -1,0 +1,237 @@
+"""How a Gymnasium space lies in the flat lists of a GymAPI message: one leaf for each number array, pose and image.
+
+Both ends find the same leaves from the space alone, so numbers need no other description than their names:
+
+============  =================================================  ============================================
+kind          spaces                                             names
+============  =================================================  ============================================
+``NUMBERS``   Box, Discrete, MultiDiscrete, MultiBinary          ``arm/joints[2]``; without [i] for one number
+``POSE``      Dict of position (3,) [m] and orientation (4,),    ``pick``
+              x, y, z, w as in ROS; in an action perhaps with
+              gripper_width [m]
+``IMAGE``     Box of uint8, (height, width) or with 1, 3 or 4    ``camera``
+              channels
+``EXACT``     everything else, very long arrays                  ``goal``
+============  =================================================  ============================================
+
+Keys of Dict and places in Tuple are joined with ``/``. A space where two names would be the same is one exact leaf.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import Space, spaces
+
+from bam_envs.core.errors import ProtocolError
+
+NUMBERS, POSE, IMAGE, EXACT = "numbers", "pose", "image", "exact"
+GRIPPER_WIDTH = "gripper_width"
+_MOST_NUMBERS = 4096
+_SMALLEST_IMAGE = 8
+"""Fewer pixels a side are a table of numbers, which people want to read."""
+_WHOLE = 2**53
+"""Every integer up to this is itself as a float64."""
+_CHANNELS = ((), (1,), (3,), (4,))
+_POSE_SHAPES: dict[str, list[tuple[int, ...]]] = {"position": [(3,)], "orientation": [(4,)], GRIPPER_WIDTH: [(), (1,)]}
+
+Path = tuple[str | int, ...]
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One part of a value."""
+
+    kind: str
+    """See the head of the module."""
+    name: str
+    """Unique in its space; the name of the space itself where it has no parts."""
+    path: Path
+    """Keys and places that lead to it."""
+    space: Space[Any]
+    """Of this part."""
+    labels: tuple[str, ...] = ()
+    """Names of its numbers."""
+
+
+def leaves_of(space: Space[Any], name: str, *, gripper: bool = False) -> tuple[Leaf, ...]:
+    """The leaves of `space`, which is called `name`; with `gripper`, a pose may have a gripper width."""
+    leaves = tuple(_walk(space, (), name, gripper))
+    names = [leaf.name for leaf in leaves]
+    taken = [label for leaf in leaves for label in (leaf.labels or (leaf.name,))]
+    unique = len({*names}) == len(names) and len({*taken}) == len(taken)
+    return leaves if unique else (Leaf(EXACT, name, (), space),)
+
+
+def _walk(space: Space[Any], path: Path, name: str, gripper: bool) -> list[Leaf]:
+    parts = _parts(space)
+    if _is_pose(space, gripper) or not parts:
+        return [_leaf(space, path, "/".join(map(str, path)) or name)]
+    return [leaf for key, part in parts.items() for leaf in _walk(part, (*path, key), name, gripper)]
+
+
+def _parts(space: Space[Any]) -> Mapping[Any, Space[Any]]:
+    if isinstance(space, spaces.Dict) and all(isinstance(key, str) for key in space.spaces):
+        return space.spaces
+    return dict(enumerate(space.spaces)) if isinstance(space, spaces.Tuple) else {}
+
+
+def _leaf(space: Space[Any], path: Path, name: str) -> Leaf:
+    if _is_pose(space, gripper=True):
+        return Leaf(POSE, name, path, space)
+    if _is_image(space):
+        return Leaf(IMAGE, name, path, space)
+    if not _is_numbers(space):
+        return Leaf(EXACT, name, path, space)
+    indices = np.ndindex(*(space.shape or ()))
+    labels = tuple(f"{name}[{', '.join(map(str, index))}]" if index else name for index in indices)
+    return Leaf(NUMBERS, name, path, space, labels)
+
+
+def _is_pose(space: Space[Any], gripper: bool) -> bool:
+    if not isinstance(space, spaces.Dict) or not {"position", "orientation"} <= space.spaces.keys():
+        return False
+    keys = _POSE_SHAPES.keys() if gripper else _POSE_SHAPES.keys() - {GRIPPER_WIDTH}
+    return space.spaces.keys() <= keys and all(
+        _is_float_box(part) and (part.shape or ()) in _POSE_SHAPES[key] for key, part in space.spaces.items()
+    )
+
+
+def _is_float_box(space: Space[Any]) -> bool:
+    dtype = np.dtype(space.dtype)
+    return isinstance(space, spaces.Box) and dtype.kind == "f" and dtype.itemsize <= 8
+
+
+def _is_image(space: Space[Any]) -> bool:
+    if not isinstance(space, spaces.Box) or space.dtype != np.uint8 or len(space.shape) not in (2, 3):
+        return False
+    return min(space.shape[:2]) >= _SMALLEST_IMAGE and space.shape[2:] in _CHANNELS
+
+
+def _is_numbers(space: Space[Any]) -> bool:
+    if isinstance(space, spaces.Discrete):
+        return True
+    if not isinstance(space, (spaces.Box, spaces.MultiDiscrete, spaces.MultiBinary)):
+        return False
+    size = int(np.prod(space.shape))
+    return 0 < size <= _MOST_NUMBERS and np.dtype(space.dtype).itemsize <= 8
+
+
+def is_depth(space: Space[Any]) -> bool:
+    """Whether values of `space` may be depth images: floats, (height, width) or (height, width, 1)."""
+    return _is_float_box(space) and len(space.shape or ()) in (2, 3) and (space.shape or ())[2:] in ((), (1,))
+
+
+def part_of(value: Any, path: Path) -> Any:
+    """The part of a checked value to which `path` leads."""
+    for key in path:
+        value = value[key]
+    return value
+
+
+def joined(space: Space[Any], values: Mapping[Path, Any], path: Path = ()) -> Any:
+    """The value of `space` whose leaves are `values`, by path."""
+    if path in values:
+        return values[path]
+    parts = {key: joined(part, values, (*path, key)) for key, part in _parts(space).items()}
+    return tuple(parts.values()) if isinstance(space, spaces.Tuple) else parts
+
+
+def to_numbers(value: Any) -> list[Any] | None:
+    """A number or array as a flat list of floats or ints, or None if such a list would not be exactly it."""
+    array = np.asarray(value)
+    if array.dtype.kind == "f":
+        return array.ravel().tolist() if np.isfinite(array).all() else None
+    plain = [int(one) for one in array.ravel().tolist()]
+    return plain if all(-_WHOLE <= one <= _WHOLE for one in plain) else None
+
+
+def from_numbers(leaf: Leaf, numbers: Sequence[Any]) -> Any:
+    """The value of `leaf` that `to_numbers` was given, from checked finite numbers.
+
+    Raises:
+        ProtocolError: One of them does not fit the dtype.
+    """
+    dtype = np.dtype(leaf.space.dtype)
+    wide = np.asarray(numbers, np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        array = wide.astype(dtype)
+        bad = ~np.isfinite(array) if dtype.kind == "f" else array.astype(np.float64) != wide
+    if bad.any():
+        place = int(np.argmax(bad))
+        raise ProtocolError(f"{leaf.labels[place]} must be a number that {dtype} can hold, not {numbers[place]!r}.")
+    return array[0] if isinstance(leaf.space, spaces.Discrete) else array.reshape(leaf.space.shape or ())
+
+
+def to_pose(value: Mapping[str, Any]) -> dict[str, Any] | None:
+    """geometry_msgs/PoseStamped of a pose, or None if it is not finite."""
+    if not all(np.isfinite(part).all() for part in value.values()):
+        return None
+    pose = {
+        "position": dict(zip("xyz", value["position"].tolist(), strict=True)),
+        "orientation": dict(zip("xyzw", value["orientation"].tolist(), strict=True)),
+    }
+    return {"pose": pose}
+
+
+def from_pose(leaf: Leaf, message: Mapping[str, Any], width: float = 0.0) -> dict[str, Any]:
+    """The pose in a checked PoseStamped, with a gripper `width` [m] if its space has one."""
+    pose = message["pose"]
+    numbers = {
+        "position": [pose["position"][axis] for axis in "xyz"],
+        "orientation": [pose["orientation"][axis] for axis in "xyzw"],
+        GRIPPER_WIDTH: [width],
+    }
+    parts = leaf.space.spaces.items()  # type: ignore[attr-defined]
+    return {key: np.array(numbers[key], part.dtype).reshape(part.shape) for key, part in parts}
+
+
+def in_order(
+    values: Sequence[Any], names: Sequence[str], expected: tuple[str, ...], field: str, *, extra: bool = False
+) -> Sequence[Any]:
+    """`values` in the order of the names `expected`: by their `names` if there are any, else as they come.
+
+    Names of somebody else's own, none of which is expected, are no names: then only the number of values counts.
+
+    Args:
+        values: As they came.
+        names: As they came; perhaps none.
+        expected: What they should be.
+        field: What they are called in the message, for errors.
+        extra: Whether there may be more than expected.
+
+    Raises:
+        ProtocolError: One is missing, or there is one too many.
+    """
+    known = set(expected) & set(names)
+    if not known:
+        if len(values) != len(expected):
+            raise ProtocolError(f"{field} must have {len(expected)} values ({_listed(expected)}), not {len(values)}.")
+        return values
+    if len(names) != len(values) or len(known) < len(expected) or (len(names) > len(expected) and not extra):
+        raise ProtocolError(
+            f"The names of {field} must be {_listed(expected)}, one for each value, "
+            f"not {_listed(names)} for {len(values)} values."
+        )
+    if tuple(names) == expected:
+        return values
+    table = dict(zip(names, values, strict=True))
+    return [table[name] for name in expected]
+
+
+def _listed(names: Sequence[str], most: int = 8) -> str:
+    text = ", ".join(names[:most])
+    return (f"{text}, … ({len(names)})" if len(names) > most else text) or "none"
+
+
+def split(leaves: Sequence[Leaf], values: Sequence[Any]) -> dict[Path, Any]:
+    """The values of numbers leaves, by path, from all their numbers in one list."""
+    parts, at = {}, 0
+    for leaf in leaves:
+        count = len(leaf.labels)
+        parts[leaf.path] = from_numbers(leaf, values[at : at + count])
+        at += count
+    return parts

@@ -1,0 +1,123 @@
+"""The versions of bam_msgs/GymAPI in the field, by the day on which they appeared, and what tells them apart.
+
+=====================  ==================  ============================================  ====================
+what                   2025-05-24          2025-06-17                                    2025-06-22 and later
+=====================  ==================  ============================================  ====================
+request header         force_if_busy       force_busy                                    as before
+response header        duration            process_duration, transport_duration,         as before
+                                           response_stamp
+color_img, depth_img,  one message each    one message each                              a list each
+camera_info
+what detectors saw     detections, masks   detections, masks                             segments
+shared observation     duplicate_obs_ns    duplicate_obs, duplicate_index                as before
+=====================  ==================  ============================================  ====================
+
+Where the types are compiled (ROS 2), a field that the version there lacks is refused, and not ignored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from bam_envs.core.errors import InvalidValue, LinkLost, ProtocolError, RemoteError
+from bam_envs.rosbridge.bus import Bus
+
+_FEEDBACK = "bam_msgs/GymFeedback"
+_DETAILS = "/rosapi/message_details"
+_LOOK = 1.0
+"""How long rosapi may take to answer [s]."""
+
+
+@dataclass(frozen=True)
+class Version:
+    """One version of the messages."""
+
+    name: str
+    """The day on which it appeared."""
+    busy: str
+    """What the request header calls the flag that interrupts a busy rack."""
+    lists: bool
+    """Whether an entry has lists of images, and not one of each kind."""
+
+    @property
+    def june(self) -> bool:
+        """Whether it is of June: with a stamp in the response header, and racks that reset themselves."""
+        return self.busy == "force_busy"
+
+    @property
+    def no_images(self) -> dict[str, Any]:
+        """What an entry says where there is no image; the default of a single one needs no words."""
+        return {"color_img": [], "depth_img": [], "camera_info": []} if self.lists else {}
+
+
+MAY_24 = Version("2025-05-24", "force_if_busy", lists=False)
+JUNE_17 = Version("2025-06-17", "force_busy", lists=False)
+JUNE_22 = Version("2025-06-22", "force_busy", lists=True)
+VERSIONS = {one.name: one for one in (MAY_24, JUNE_17, JUNE_22)}
+
+
+def version_named(name: str) -> Version:
+    """The version of that day.
+
+    Raises:
+        InvalidValue: There is none.
+    """
+    if name not in VERSIONS:
+        raise InvalidValue(f"A version of GymAPI must be one of {', '.join(VERSIONS)}, not {name!r}.")
+    return VERSIONS[name]
+
+
+def version_of_request(message: object) -> Version | None:
+    """The version of a request; None where it could be of several."""
+    return MAY_24 if MAY_24.busy in _header(message) else None
+
+
+def version_of_response(message: object) -> Version | None:
+    """The version of a response, as far as requests to who made it are concerned; None where it does not show."""
+    header = _header(message)
+    if "process_duration" in header:
+        return JUNE_22
+    return MAY_24 if "duration" in header else None
+
+
+def version_of_bus(bus: Bus) -> Version | None:
+    """The version of the types that `bus` was compiled with; None where it has none, or does not say."""
+    fields = getattr(bus, "fields", None)  # of a ROS 2 node
+    if fields is not None:
+        return _version_of_fields(fields(_FEEDBACK))
+    call = getattr(bus, "call", None)  # of a link to a rosbridge server
+    if call is None:
+        return None
+    try:
+        found = call(_DETAILS, "", {"type": _FEEDBACK}, _LOOK)
+    except (RemoteError, LinkLost, ProtocolError):  # no rosapi there
+        return None
+    return _version_of_fields(_lists_by_name(found))
+
+
+def _header(message: object) -> Mapping[str, Any]:
+    header = message.get("header") if isinstance(message, Mapping) else None
+    return header if isinstance(header, Mapping) else {}
+
+
+def _lists_by_name(details: Mapping[str, Any]) -> dict[str, bool]:
+    """Whether each field is a list, of the first type in an answer of rosapi: there a length of -1 is no list."""
+    definitions = details.get("typedefs")
+    first = definitions[0] if isinstance(definitions, list) and definitions else None
+    if not isinstance(first, Mapping):
+        return {}
+    names, lengths = first.get("fieldnames"), first.get("fieldarraylen")
+    if not isinstance(names, list) or not isinstance(lengths, list):
+        return {}
+    return {name: length != -1 for name, length in zip(names, lengths, strict=False) if isinstance(name, str)}
+
+
+def _version_of_fields(fields: Mapping[str, bool]) -> Version | None:
+    """The version whose GymFeedback has these fields; to each, whether it is a list."""
+    if fields.get("color_img"):
+        return JUNE_22
+    if "duplicate_obs" in fields:
+        return JUNE_17
+    return MAY_24 if "duplicate_obs_ns" in fields else None

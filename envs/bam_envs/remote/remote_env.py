@@ -1,0 +1,162 @@
+"""RemoteEnv: an environment that runs somewhere else, as a normal `gymnasium.Env`; and how to make one of a URL."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+from gymnasium import Space
+
+from bam_envs.core.at_exit import close_at_exit
+from bam_envs.core.errors import InvalidValue, ResetNeeded
+from bam_envs.remote.remote_vector_env import RemoteVectorEnv
+from bam_envs.remote.transports.opening import open_transport
+from bam_envs.remote.transports.transport import EnvSpecMessage, Info, Transport
+
+__all__ = ["RemoteEnv", "RemoteVectorEnv", "make_remote_env", "make_remote_rows"]
+
+Where = str | Transport
+"""A URL of `open_transport`, or a transport."""
+
+
+class RemoteEnv(gym.Env[Any, Any]):
+    """One environment behind a transport. Spaces, period and labels are those of the other end.
+
+    It connects when something of the other end is first needed. `LinkLost` and the other faults of the transport go
+    through: a lost link is no end of an episode. The next `reset` connects again. It is closed when Python ends.
+
+    Args:
+        transport: Not connected yet, or connected.
+    """
+
+    def __init__(self, transport: Transport) -> None:
+        self.transport = transport
+        self.metadata = {"render_modes": []}
+        self._there: EnvSpecMessage | None = None
+        self._running = False
+        self._steps, self._told = 0, False
+        close_at_exit(self)
+
+    def connect(self) -> EnvSpecMessage:
+        """What is there.
+
+        Raises:
+            NoServer: Nobody, or nobody who has this environment.
+            InvalidValue: An environment of rows, which `RemoteVectorEnv` is for.
+        """
+        if self._there is None:
+            there = self.transport.connect()
+            if there.vector:
+                raise InvalidValue(
+                    f"{there.env_id} has {there.num_envs} rows there, and one is wanted. Make it with "
+                    f"num_envs={there.num_envs}, or serve one (bam-serve without --num-envs)."
+                )
+            self._there = there
+        return self._there
+
+    @property
+    def observation_space(self) -> Space[Any]:  # type: ignore[override]
+        """What observations are."""
+        return self.connect().observation_space
+
+    @property
+    def action_space(self) -> Space[Any]:  # type: ignore[override]
+        """What actions are."""
+        return self.connect().action_space
+
+    @property
+    def env_id(self) -> str:
+        """The Gymnasium id there."""
+        return self.connect().env_id
+
+    @property
+    def period(self) -> float | None:
+        """Time between two actions [s]; None if the other end does not say."""
+        return self.connect().period
+
+    @property
+    def max_episode_steps(self) -> int | None:
+        """Steps after which the other end truncates an episode."""
+        return self.connect().max_episode_steps
+
+    def describe(self) -> dict[str, Any]:
+        """What every number of observation, action, state and command means; empty if the other end does not say."""
+        return dict(self.connect().signals)
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
+        """Begin an episode; seed and options are for the other end."""
+        super().reset(seed=seed)
+        self.connect()
+        self._tell_if_cut()
+        self._running, self._steps = False, 0
+        observation, info = self.transport.reset(seed, options)
+        self._running = True
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
+        """One step there."""
+        if not self._running:
+            raise ResetNeeded("No episode is running: it ended, or never began. Call reset() first.")
+        observation, reward, terminated, truncated, info = self.transport.step(action)
+        self._running, self._steps = not (terminated or truncated), self._steps + 1
+        return observation, reward, terminated, truncated, info
+
+    def _tell_if_cut(self) -> None:
+        """Warn once when the limit of the id here, which `gymnasium.make` puts around this, ended an episode early.
+
+        It is seen only then: whether there is that wrapper, and with which limit, is not known in here.
+        """
+        entry = gym.registry.get(self.spec.id) if self.spec is not None else None
+        if entry is None or self._told or not self._running or self._steps != entry.max_episode_steps:
+            return
+        if self._steps < (self.max_episode_steps or 0):
+            self._told = True
+            gym.logger.warn(
+                f"Episodes of {entry.id} are cut after {self._steps} steps here, and last {self.max_episode_steps} "
+                f"there; for those: gymnasium.make(..., max_episode_steps=-1)."
+            )
+
+    def render(self) -> None:
+        """Pictures are not carried; observations that are images are."""
+
+    def close(self) -> None:
+        """Let go of the environment there and drop the link."""
+        self._running = False
+        self.transport.close()
+
+
+def make_remote_env(env_id: str, transport: Where, **options: Any) -> RemoteEnv:
+    """The environment `env_id` that runs at `transport`; connects on first use.
+
+    Args:
+        env_id: Which one; a server that has another one refuses. "" for whatever is there.
+        transport: A URL such as ``tcp://10.0.0.5:5555`` (see `open_transport`), or a transport.
+        options: What `open_transport` takes, such as ``timeout`` and ``token_file``.
+
+    Raises:
+        InvalidValue: A URL that is none, or an option that its transport does not have.
+    """
+    return RemoteEnv(_opened(env_id, transport, options))
+
+
+def make_remote_rows(
+    env_id: str, transport: Where | Sequence[Where], num_envs: int | None = None, **options: Any
+) -> RemoteVectorEnv:
+    """The environments `env_id` that run at `transport`, as rows stepped together; connects on first use.
+
+    Args:
+        env_id: As for `make_remote_env`.
+        transport: One, or several, which are stepped at the same time.
+        num_envs: Rows in all, if they must be so many; one transport may have many.
+        options: As for `make_remote_env`.
+
+    Raises:
+        InvalidValue: A URL that is none, or an option that its transport does not have.
+    """
+    several = [transport] if isinstance(transport, (str, Transport)) else transport
+    return RemoteVectorEnv([_opened(env_id, one, options) for one in several], num_envs)
+
+
+def _opened(env_id: str, transport: Where, options: Mapping[str, Any]) -> Transport:
+    return open_transport(transport, env_id=env_id, **options) if isinstance(transport, str) else transport

@@ -1,0 +1,221 @@
+"""RemoteVectorEnv: environments that run somewhere else, as rows of one `gymnasium.vector.VectorEnv`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from itertools import accumulate
+from typing import Any, TypeVar
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import Space
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space, iterate
+from numpy.typing import NDArray
+
+from bam_envs.core.at_exit import close_at_exit
+from bam_envs.core.errors import InvalidValue, ResetNeeded
+from bam_envs.core.spaces import space_to_json
+from bam_envs.remote.transports.rack import Rack, ResetOrder, Seeds
+from bam_envs.remote.transports.rows import join_final, join_infos, join_observations
+from bam_envs.remote.transports.transport import EnvSpecMessage, Info, Transport
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+class RemoteVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
+    """The rows of one or several transports, stepped at the same time.
+
+    n rows of one transport are one request. A row whose episode ends starts the next one in the same step
+    (`AutoresetMode.SAME_STEP`), as in `RobotVectorEnv`. The arms of a rack that is not ours have one reset: when an
+    episode of one ends, those of its others are truncated. It connects when something of the other end is first
+    needed. Faults go through, once every transport has answered; a `reset` is needed then. It is closed when Python
+    ends.
+
+    Args:
+        transports: One, or several with the same spaces.
+        num_envs: Rows in all, if they must be so many.
+    """
+
+    def __init__(self, transports: Transport | Sequence[Transport], num_envs: int | None = None) -> None:
+        self.transports = [transports] if isinstance(transports, Transport) else list(transports)
+        self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+        self._wanted, self._racks = num_envs, list[Rack]()
+        self._threads: ThreadPoolExecutor | None = None
+        self._process = 0
+        self._rows: list[Any] | None = None
+        """The last observation of each row; None while a reset is needed."""
+        self._batched: tuple[Space[Any], Space[Any]] | None = None
+        if not self.transports:
+            raise InvalidValue("There must be at least one transport.")
+        close_at_exit(self)
+
+    def connect(self) -> list[EnvSpecMessage]:
+        """What is there, for each transport.
+
+        Raises:
+            NoServer: Nobody, or nobody who has this environment.
+            InvalidValue: The spaces differ, or the number of rows is not `num_envs`.
+        """
+        if not self._racks:
+            specs = self._at_once(lambda transport: transport.connect(), self.transports)
+            _require_alike(specs)
+            firsts = [0, *accumulate(spec.num_envs for spec in specs)]
+            if self._wanted not in (None, firsts[-1]):
+                raise InvalidValue(f"num_envs must be {firsts[-1]}, as many rows as there are, not {self._wanted}.")
+            self._racks = [Rack(*one) for one in zip(self.transports, specs, firsts, strict=False)]
+        return [rack.spec for rack in self._racks]
+
+    @property
+    def _there(self) -> EnvSpecMessage:
+        return self.connect()[0]
+
+    @property
+    def num_envs(self) -> int:  # type: ignore[override]
+        """Rows in all."""
+        return sum(spec.num_envs for spec in self.connect())
+
+    @property
+    def single_observation_space(self) -> Space[Any]:  # type: ignore[override]
+        """What observations of one row are."""
+        return self._there.observation_space
+
+    @property
+    def single_action_space(self) -> Space[Any]:  # type: ignore[override]
+        """What actions of one row are."""
+        return self._there.action_space
+
+    @property
+    def observation_space(self) -> Space[Any]:  # type: ignore[override]
+        """What observations are."""
+        return self._spaces()[0]
+
+    @property
+    def action_space(self) -> Space[Any]:  # type: ignore[override]
+        """What actions are."""
+        return self._spaces()[1]
+
+    def _spaces(self) -> tuple[Space[Any], Space[Any]]:
+        if self._batched is None:
+            there, rows = self._there, self.num_envs
+            self._batched = batch_space(there.observation_space, rows), batch_space(there.action_space, rows)
+        return self._batched
+
+    @property
+    def env_id(self) -> str:
+        """The Gymnasium id there."""
+        return self._there.env_id
+
+    @property
+    def period(self) -> float | None:
+        """Time between two actions [s]; None if the other end does not say."""
+        return self._there.period
+
+    @property
+    def max_episode_steps(self) -> int | None:
+        """Steps after which the other end truncates an episode."""
+        return self._there.max_episode_steps
+
+    def describe(self) -> dict[str, Any]:
+        """What every number of observation, action, state and command means; empty if the other end does not say."""
+        return dict(self._there.signals)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: Info | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode on every row, or on those of ``options["reset_mask"]`` (n,) bool.
+
+        Args:
+            seed: Row i is seeded with ``seed + i``, or with ``seed[i]``; a rack that is not ours is told that of its
+                first arm.
+            options: ``reset_mask``, and what the other ends take.
+        """
+        seeds = self._row_seeds(seed)
+        rest = {key: value for key, value in (options or {}).items() if key != "reset_mask"}
+        mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)), dtype=bool)
+        if mask.shape != (self.num_envs,):
+            raise InvalidValue(f"reset_mask must have shape ({self.num_envs},), not {mask.shape}.")
+        if self._rows is None and not mask.all():
+            raise ResetNeeded("No episode is running. Call reset() without a reset_mask first.")
+        before, self._rows = self._rows or [None] * self.num_envs, None
+        order = ResetOrder(seeds, mask, rest or None, before)
+        parts = self._at_once(lambda rack: rack.reset(order), self._racks)
+        self._rows = [row for observations, _ in parts for row in observations]
+        return self._joined(self._rows), join_infos([info for _, infos in parts for info in infos])
+
+    def _row_seeds(self, seed: int | list[int | None] | None) -> Seeds:
+        if seed is None:
+            return [None] * self.num_envs
+        rows = range(self.num_envs)
+        seeds: Seeds = [int(seed) + row for row in rows] if isinstance(seed, (int, np.integer)) else list(seed)
+        if len(seeds) != self.num_envs:
+            raise InvalidValue(f"seed must be one number or {self.num_envs} of them, not {len(seeds)}.")
+        return seeds
+
+    def step(
+        self, actions: Any
+    ) -> tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """Step every row; rows whose episode ended begin the next one."""
+        if self._rows is None:
+            raise ResetNeeded("No episode is running. Call reset() first.")
+        rows = self._row_actions(actions)
+        self._rows = None  # until it went well
+        steps = self._at_once(lambda rack: rack.step(rows[rack.rows]), self._racks)
+        self._rows = [row for one in steps for row in one.observations]
+        infos = [info for one in steps for info in one.infos]
+        joined = join_infos(infos)
+        if "final_obs" in joined:
+            joined["final_obs"] = join_final(self.single_observation_space, self._rows, infos)
+        rewards = np.array([reward for one in steps for reward in one.rewards], np.float64)
+        terminated = np.array([flag for one in steps for flag in one.terminated], np.bool_)
+        truncated = np.array([flag for one in steps for flag in one.truncated], np.bool_)
+        return self._joined(self._rows), rewards, terminated, truncated, joined
+
+    def _row_actions(self, actions: Any) -> list[Any]:
+        if isinstance(self.action_space, gym.spaces.Box):
+            array = np.asarray(actions)
+            if array.shape != self.action_space.shape:
+                raise InvalidValue(f"The actions must have shape {self.action_space.shape}, not {array.shape}.")
+            return list(array)
+        rows = list(iterate(self.action_space, actions))
+        if len(rows) != self.num_envs:
+            raise InvalidValue(f"There must be one action for each of {self.num_envs} rows, not {len(rows)}.")
+        return rows
+
+    def _joined(self, rows: list[Any]) -> Any:
+        return join_observations(self.single_observation_space, rows)
+
+    def _at_once(self, call: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+        """`call` of every item at the same time; the first fault, once all have ended."""
+        if len(items) == 1:
+            return [call(items[0])]
+        if self._threads is None or self._process != os.getpid():  # a forked child has no threads of its parent's
+            self._threads = ThreadPoolExecutor(len(items), thread_name_prefix="bam-racks")
+            self._process = os.getpid()
+        futures = [self._threads.submit(call, item) for item in items]
+        wait(futures)
+        return [future.result() for future in futures]
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Let go of the environments there and drop the links."""
+        self._rows = None
+        for transport in self.transports:
+            transport.close()
+        threads, self._threads = self._threads, None
+        if threads is not None and self._process == os.getpid():
+            threads.shutdown()
+
+
+def _require_alike(specs: Sequence[EnvSpecMessage]) -> None:
+    """Prove that all racks take and give the same."""
+    for name in ("observation_space", "action_space"):
+        first = getattr(specs[0], name)
+        for number, spec in enumerate(specs[1:], start=2):
+            if space_to_json(getattr(spec, name)) != space_to_json(first):
+                raise InvalidValue(
+                    f"The {name} of transport {number} is {getattr(spec, name)}, and that of the first {first}; "
+                    f"rows must be alike."
+                )

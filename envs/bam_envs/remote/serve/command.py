@@ -1,0 +1,140 @@
+"""Who is in command: one client at a time; the others are told who."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from bam_envs.core.errors import NotInCommand
+
+Change = Callable[[str | None, str | None], None]
+"""Called with who was in command and who is, as others are told; None is nobody."""
+
+
+LEASE_SECONDS = 2.0
+"""Usual time without a sign of life after which another client may take command [s]."""
+
+
+def _unknown() -> float:
+    return math.inf
+
+
+class CommandLease:
+    """Command of one robot or environment. The first to ask has it, until it leaves or another one may take it.
+
+    Who gives no sign of life for longer than `seconds` keeps command until another one asks. A sign of life is a
+    request, a word that says so (`renew`), or what the connection shows by itself. Safe to call from any thread.
+
+    Args:
+        seconds: Time without a sign of life after which another client may take command [s].
+        clock: A monotonic clock [s].
+    """
+
+    def __init__(self, seconds: float = LEASE_SECONDS, clock: Callable[[], float] = time.monotonic) -> None:
+        self.seconds = seconds
+        self._clock, self._lock = clock, threading.Lock()
+        self._holder: str | None = None
+        self._shown: str | None = None  # what the holder is called where others read it
+        self._heard, self._silence = 0.0, _unknown
+        self._running = 0
+        self._listeners: list[Change] = []
+
+    @property
+    def holder(self) -> str | None:
+        """The client in command, or None."""
+        return self._holder
+
+    def on_change(self, listener: Change) -> None:
+        """Call `listener` whenever command changes, in the thread that changes it, which holds no lock of this."""
+        self._listeners.append(listener)
+
+    def take(
+        self,
+        client: str,
+        *,
+        force: bool = False,
+        shown: str | None = None,
+        silence: Callable[[], float] = _unknown,
+    ) -> bool:
+        """Put `client` in command; whether it was not before.
+
+        Args:
+            client: Its name.
+            force: Take it from whoever has it.
+            shown: What the others are told instead of its name, where that is a secret.
+            silence: How long its connection has given no sign of life [s].
+
+        Raises:
+            NotInCommand: Another client has it, and gave a sign of life within `seconds`.
+        """
+        with self._lock:
+            if self._holder not in (None, client) and not force and not self._lapsed():
+                raise NotInCommand(self._refusal(shown or client))
+            self._heard, self._silence = self._clock(), silence
+            if self._holder == client:
+                return False
+            before, self._shown = self._shown, shown or client
+            self._holder, self._running = client, 0
+        return self._told(before, shown or client)
+
+    def renew(self, client: str) -> None:
+        """Take note that `client` was heard of, if it is in command."""
+        with self._lock:
+            if self._holder == client:
+                self._heard = self._clock()
+
+    def require(self, client: str) -> None:
+        """Take note that `client` was heard of.
+
+        Raises:
+            NotInCommand: It is not in command: another client is, or nobody.
+        """
+        with self._lock:
+            self._hear(client)
+
+    def _hear(self, client: str) -> None:
+        if self._holder != client:
+            raise NotInCommand(self._refusal(client))
+        self._heard = self._clock()
+
+    @contextmanager
+    def busy(self, client: str) -> Iterator[None]:
+        """While a request of `client` runs, however long it takes, it does not count as silent."""
+        with self._lock:
+            self._hear(client)
+            self._running += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                if self._holder == client:
+                    self._running, self._heard = max(0, self._running - 1), self._clock()
+
+    def release(self, client: str) -> bool:
+        """Take command from `client`; whether it had it."""
+        with self._lock:
+            if self._holder != client:
+                return False
+            before, self._shown = self._shown, None
+            self._holder, self._running = None, 0
+        return self._told(before, None)
+
+    def _lapsed(self) -> bool:
+        silence = min(self._clock() - self._heard, self._silence())
+        return not self._running and silence > self.seconds
+
+    def _refusal(self, client: str) -> str:
+        if self._holder is None:
+            return f"Nobody is in command, {client} neither; reset() takes command."
+        return (
+            f"{self._shown} is in command, not {client}; it passes on when {self._shown} leaves or is silent for "
+            f"{self.seconds:g} s."
+        )
+
+    def _told(self, before: str | None, after: str | None) -> bool:
+        for listener in self._listeners:
+            listener(before, after)
+        return True

@@ -1,0 +1,222 @@
+"""The service bam_msgs/GymAPI of an environment, as a BAM rack offers it; and the same over a pair of topics."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import TimeoutError as NoAnswer  # not the builtin before Python 3.11
+from contextlib import suppress
+from typing import Any
+
+from bam_envs.core.errors import BamEnvsError, RemoteError
+from bam_envs.remote.gymapi.codec import EnvCodec
+from bam_envs.remote.gymapi.info import write_info
+from bam_envs.remote.gymapi.requests import (
+    KIND,
+    GymRequest,
+    RequestType,
+    base_name,
+    read_request,
+    service_name,
+)
+from bam_envs.remote.gymapi.responses import write_failure, write_response
+from bam_envs.remote.gymapi.versions import JUNE_22, Version, version_named, version_of_bus, version_of_request
+from bam_envs.remote.serve.env_server import EnvServer
+from bam_envs.remote.transports.trees import spec_to_json
+from bam_envs.ros.freshness import FreshnessCheck
+from bam_envs.rosbridge.answers import RecentAnswers
+from bam_envs.rosbridge.bus import Bus, Caller, Message
+from bam_envs.rosbridge.sessions import Sessions
+from bam_envs.rosbridge.string_rpc import StringRpcService
+
+Feedback = list[dict[str, Any]]
+_log = logging.getLogger(__name__)
+_ANSWERS = 8
+"""Kept for requests that come twice; with images they are large."""
+_PATIENCE = 60.0
+"""Longest wait for the answer to a request that came twice while the first one is executed [s]."""
+_MOST_CLIENTS = 1024
+_LONGEST_NAME = 100
+"""Characters of a client's name that are kept, and told to others."""
+
+
+class GymApiService:
+    """Answers GymAPI requests for an `EnvServer`: those of racks' own clients, and of `RosbridgeTransport`.
+
+    A request with a tag is executed once and only in time; without one, which is a rack's own client, it is executed
+    as it comes, and a step after the end of an episode begins the next one. One client is in command; its name is
+    ``client_id`` with its session, or with its connection.
+
+    Answers are in the version of the request where that shows it; else in `version`, in that of the compiled types on
+    the other side of `bus`, or in the newest.
+
+    Args:
+        env: What is served.
+        bus: Where.
+        namespace: Put before every name.
+        image_format: ``"png"``, which keeps every bit, or ``"jpeg"``.
+        depth: Name of the part of the observation that is a depth image, to be sent in whole millimetres; or nothing.
+        version: Of the messages, such as ``"2025-06-17"``; None to find out.
+        clock: Wall clock [s], for stamps.
+
+    Raises:
+        InvalidValue: `image_format`, `depth` or `version` is not possible.
+    """
+
+    def __init__(
+        self,
+        env: EnvServer,
+        bus: Bus,
+        namespace: str = "",
+        *,
+        image_format: str = "png",
+        depth: Sequence[str] = (),
+        version: str | None = None,
+        clock: Callable[[], float] = time.time,
+    ) -> None:
+        self.env, self.bus, self.namespace = env, bus, namespace
+        self._spec = env.spec()
+        self._codec = EnvCodec(self._spec, image_format=image_format, depth=depth)
+        self._clock = clock
+        self._version = None if version is None else version_named(version)
+        self._freshness, self._answers = FreshnessCheck(), RecentAnswers[Feedback](_ANSWERS)
+        self._lock = threading.Lock()
+        self._connections: OrderedDict[str, str] = OrderedDict()
+        self._leaving = ThreadPoolExecutor(1, "bam-gymapi-leaving")
+        self._sessions = Sessions()
+        self._topics = StringRpcService(bus, base_name(namespace), self._handle_published, self._sessions)
+
+    def start(self) -> GymApiService:
+        """Offer the service and the topics; itself."""
+        if self._version is None:
+            self._version = version_of_bus(self.bus)
+        self.bus.on_leave(self._on_leave)
+        self.bus.serve(service_name(self.namespace), KIND, self.handle)
+        self.bus.serve(f"{base_name(self.namespace)}/session", "std_srvs/Trigger", self._sessions.open)
+        self._topics.start()
+        return self
+
+    def close(self) -> None:
+        """Answer on the topics no more. The service ends with its bus."""
+        self._topics.close()
+        self._leaving.shutdown()
+
+    def _handle_published(self, message: Message, caller: Caller) -> dict[str, Any]:
+        """As `handle`, for what everybody could read: the tag in it proves nothing."""
+        return self.handle(message, caller, published=True)
+
+    def handle(self, message: Message, caller: Caller, *, published: bool = False) -> dict[str, Any]:
+        """The response to a request; never raises: what goes wrong is the text of a failure."""
+        begun, version = time.monotonic(), version_of_request(message) or self._version or JUNE_22
+        try:
+            feedback = self._once(read_request(message), version, caller, begun, published)
+            return write_response(feedback, time.monotonic() - begun, self._stamp(), version)
+        except BamEnvsError as error:
+            failure = error
+        except Exception as error:  # a service always answers, whatever the environment does
+            _log.exception("%s failed", service_name(self.namespace))
+            failure = RemoteError(f"{type(error).__name__}: {error}")
+        return write_failure(failure, time.monotonic() - begun, self._stamp(), version)
+
+    def _once(self, request: GymRequest, version: Version, caller: Caller, begun: float, published: bool) -> Feedback:
+        """The feedback; that of before if the request came before."""
+        tag = request.tag
+        if tag is None:
+            return self._perform(request, version, caller, None)
+        if published:  # what carries it has looked at a tag of its own
+            return self._perform(request, version, caller, begun + tag.deadline - tag.sent, published=True)
+        future, new = self._answers.claim((tag.session, tag.epoch, tag.sequence))
+        if new:
+            try:
+                self._freshness.require(tag)
+                future.set_result(self._perform(request, version, caller, begun + tag.deadline - tag.sent))
+            except Exception as error:  # whatever it was, it is the answer
+                future.set_exception(error)
+        try:
+            return future.result(_PATIENCE)
+        except NoAnswer:
+            raise RemoteError("The same request came before, and is still being executed.") from None
+
+    def _perform(
+        self, request: GymRequest, version: Version, caller: Caller, deadline: float | None, *, published: bool = False
+    ) -> Feedback:
+        self.env.require_name(request.env_name)
+        client = self._client(request, caller, published)
+        if request.type is RequestType.STEP:
+            action = self._codec.read_actions(request.actions)
+            if request.tag is None and self.env.has_ended(client):
+                begun = self.env.reset(client, caller=caller, shown=_shown(request, caller))
+                return self._codec.write_result(begun, self._stamp(), version, executed=False)
+            stepped = self.env.step(client, action, deadline=deadline)
+            return self._codec.write_result(stepped, self._stamp(), version)
+        if request.type is RequestType.RESET:
+            self._remember(client, caller)
+            begun = self.env.reset(
+                client,
+                request.seed,
+                request.options,
+                take=request.take,
+                deadline=deadline,
+                caller=caller,
+                shown=_shown(request, caller),
+            )
+            return self._codec.write_result(begun, self._stamp(), version)
+        if request.type is RequestType.CLOSE:
+            self.env.leave(client)
+            return []
+        return [{**version.no_images, "info": write_info({}, {"spec": spec_to_json(self._spec)})}]
+
+    def _stamp(self) -> dict[str, int]:
+        stamp: Callable[[float], dict[str, int]] = getattr(self.bus, "stamp", _ros2_stamp)
+        return stamp(self._clock())
+
+    def _client(self, request: GymRequest, caller: Caller, published: bool) -> str:
+        """Name of who asks, by which a client is known again when it comes back on another connection.
+
+        The session in the tag of a service call is known to nobody else, so others are never told of it.
+        """
+        tag, name = None if published else request.tag, _name(request)
+        mark = (caller.session or caller.name) if tag is None else tag.session
+        return f"{name}#{mark}" if mark else name
+
+    def _remember(self, client: str, caller: Caller) -> None:
+        """On which connection `client` began its episode, to know who leaves when that ends."""
+        if caller.name:
+            with self._lock:
+                self._connections[client] = caller.name
+                self._connections.move_to_end(client)
+                if len(self._connections) > _MOST_CLIENTS:
+                    self._connections.popitem(last=False)
+
+    def _on_leave(self, caller: Caller) -> None:
+        self._sessions.left(caller)
+        # A client that is back on another connection stays: the end of the old one may come late.
+        with self._lock:
+            clients = [client for client, name in self._connections.items() if name == caller.name]
+            for client in clients:
+                del self._connections[client]
+        # Elsewhere: it waits for a step that is under way, and this is the thread of the network.
+        with suppress(RuntimeError):  # closed meanwhile
+            self._leaving.submit(self._let_go, clients)
+
+    def _let_go(self, clients: list[str]) -> None:
+        for client in clients:
+            self.env.leave(client)
+
+
+def _name(request: GymRequest) -> str:
+    return request.client_id[:_LONGEST_NAME] or "somebody"
+
+
+def _shown(request: GymRequest, caller: Caller) -> str:
+    """What others are told of who asks."""
+    return f"{_name(request)} ({caller.address})" if caller.address else _name(request)
+
+
+def _ros2_stamp(now: float) -> dict[str, int]:
+    seconds, nanoseconds = divmod(round(now * 1e9), 1_000_000_000)
+    return {"sec": seconds, "nanosec": nanoseconds}

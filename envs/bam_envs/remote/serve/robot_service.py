@@ -1,0 +1,299 @@
+"""A served robot's topics: its states out, commands in, from one client at a time; halt, scene, and who it is.
+
+Commands are checked where they arrive, in the thread of the network, and what is refused is told to who sent it. What
+passes goes into one slot; the clock's thread takes it from there, moves the robot and publishes. In lockstep a robot
+that is quick enough is moved where its command arrives: the way to another thread and back costs more than its step.
+
+The file is long because everything that moves the robot, or keeps it from moving, is in it: that a halt wins over each
+of them is to be seen here.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from bam_envs.core.errors import LinkLost, ProtocolError, RemoteError, RobotFault
+from bam_envs.remote.serve.clock import Clock
+from bam_envs.remote.serve.command import CommandLease
+from bam_envs.remote.serve.command_slot import CommandSlot, Order
+from bam_envs.remote.serve.served_robot import ServedRobot
+from bam_envs.ros.codec import (
+    HALT_TOPIC,
+    INFO_SERVICE,
+    SCENE_TOPIC,
+    RobotInfo,
+    decode_command,
+    encode_state,
+)
+from bam_envs.ros.freshness import read_tag
+from bam_envs.ros.messages import numbers, write_stamp
+from bam_envs.ros.profile_tables import RobotProfile
+from bam_envs.rosbridge.bus import Bus, Caller, Listener, Message
+from bam_envs.rosbridge.sessions import LEASE_TOPIC, LEAVE, RENEW, SESSION_SERVICE, Sessions
+from bam_envs.rosbridge.string_rpc import StringRpcService
+
+_log = logging.getLogger(__name__)
+
+IDLE_PERIOD = 0.05
+"""Time between two states when time goes on only with commands, and none come [s]."""
+QUICK = 2e-4
+"""A robot whose last period took no longer than this to compute [s] may hold up the thread of the network for it."""
+_ROUNDING = 1e-9
+"""How far beyond a limit a number may be that went through text and other units."""
+
+
+class RobotService:
+    """Puts one robot on a bus.
+
+    Args:
+        robot: The robot; whoever else moves it does so through this object, too.
+        profile: Its topics; those of commands that `robot` does not take are not offered.
+        bus: Carries them.
+        lease: Who is in command; shared with whoever else moves the robot.
+        namespace: Before every topic, such as ``/cell_1``; or nothing.
+        simulated: Whether nothing real moves; then a scene can be set.
+        clock: Wall clock [s], for stamps.
+    """
+
+    def __init__(
+        self,
+        robot: ServedRobot,
+        profile: RobotProfile,
+        bus: Bus,
+        lease: CommandLease,
+        *,
+        namespace: str = "",
+        simulated: bool = True,
+        clock: Callable[[], float] = time.time,
+    ) -> None:
+        profile = profile.narrowed(robot.spec.command.labels)
+        self._robot, self._profile, self._bus, self._lease = robot, profile, bus, lease
+        self._namespace, self._clock = namespace, clock
+        lockstep = not robot.realtime
+        self.info = RobotInfo(profile.name, simulated, lockstep, robot.spec.period, _text(robot, profile))
+        """What it says of itself."""
+        self._slot = CommandSlot()
+        self._sessions = Sessions(lambda name: lease.holder == Caller("", session=name).client)
+        self._completing = {way[-1].topic for way in profile.commands.values()}
+        self._low, self._high = np.array(robot.spec.command.low), np.array(robot.spec.command.high)
+        self._answered = ""  # `Tag.echo` of the last command that was executed
+        self._connected = True
+        self._moving = threading.Lock()  # an order that was taken is begun before a halt, or not at all
+        self._ticking, self._took = threading.Lock(), math.inf  # how long the last period took to compute [s]
+        self._unsubscribe: list[Callable[[], None]] = []
+        self._scene = (
+            StringRpcService(bus, namespace + SCENE_TOPIC, self._set_scene, self._sessions) if simulated else None
+        )
+        self.clock = Clock(
+            self._tick_lockstep if lockstep else self._tick, IDLE_PERIOD if lockstep else robot.tick_period
+        )
+        """Moves the robot and publishes."""
+
+    def start(self) -> None:
+        """Advertise, listen, and let time go on."""
+        measured = {signal.name for signal in self._robot.spec.signals}
+        for topic, kind in {(one.topic, one.type) for one in self._profile.state if one.signal in measured}:
+            self._bus.advertise(self._namespace + topic, kind)
+        for topic, kind in {(sink.topic, sink.type) for way in self._profile.commands.values() for sink in way}:
+            self._listen(topic, kind, self._command_listener(topic))
+        self._listen(HALT_TOPIC, "std_msgs/Empty", self._on_halt)
+        self._listen(LEASE_TOPIC, "std_msgs/String", self._on_lease)
+        self._bus.serve(self._namespace + SESSION_SERVICE, "std_srvs/Trigger", self._sessions.open)
+        self._bus.serve(self._namespace + INFO_SERVICE, "std_srvs/Trigger", self._say_who)
+        self._bus.on_leave(self._on_leave)
+        self._lease.on_change(self._on_change)
+        if self._scene is not None:
+            self._scene.start()
+        self.clock.start()
+
+    def close(self) -> None:
+        """Stop listening, halt, and let time stand still. As often as one likes."""
+        while self._unsubscribe:
+            self._unsubscribe.pop()()
+        self.clock.stop()
+        self._robot.halt()
+        if self._scene is not None:
+            self._scene.close()
+
+    def _listen(self, topic: str, kind: str, listener: Listener) -> None:
+        self._unsubscribe.append(self._bus.subscribe(self._namespace + topic, kind, listener))
+
+    def _command_listener(self, topic: str) -> Listener:
+        def listen(message: Message, caller: Caller) -> None:
+            places, values, tag, content = decode_command(self._profile, self._robot.spec, topic, message)
+            told = values.tolist()
+            self._require_within(topic, places, told)
+            self._require_sound()
+            if tag is not None:
+                self._sessions.require(tag, topic, content, caller)
+                caller = replace(caller, session=tag.session)
+            self._lease.take(caller.client, shown=caller.shown, silence=caller.silence)
+            echo, complete = "" if tag is None else tag.echo, topic in self._completing
+            self._slot.put(caller.client, places, told, complete=complete, tag=echo)
+            if complete and self.info.lockstep:
+                self._go_on()
+
+        return listen
+
+    def _on_lease(self, message: Message, caller: Caller) -> None:
+        """Who drives is there, or leaves: over any of its connections, and whoever does not drive says nothing."""
+        word, _, text = str(message.get("data")).partition(" ")
+        tag = read_tag(text)
+        if tag is None or word not in (RENEW, LEAVE):
+            raise ProtocolError(f"{LEASE_TOPIC}: expected {RENEW} or {LEAVE} and a signed tag.")
+        self._sessions.require(tag, LEASE_TOPIC, word.encode(), caller, anywhere=word == LEAVE)
+        client = replace(caller, session=tag.session).client
+        if word == RENEW:
+            self._lease.renew(client)
+        else:
+            self._sessions.end(tag.session)
+            self._lease.release(client)
+
+    def _require_within(self, topic: str, places: list[int], values: list[float]) -> None:
+        """Every number is one that the robot can be told at all; how fast it goes there is its own affair."""
+        command = self._robot.spec.command
+        for place, value in zip(places, values, strict=True):
+            low, high = command.low[place], command.high[place]
+            if not low - _ROUNDING <= value <= high + _ROUNDING:
+                label, unit = command.labels[place], command.units[place]
+                raise ProtocolError(f"{topic}: {label} must be {low:g} to {high:g} {unit}, not {value:g} {unit}.")
+
+    def _require_sound(self) -> None:
+        if self._robot.fault is not None:
+            raise RemoteError(f"{self._profile.name} failed, and needs a reset: {self._robot.fault}")
+
+    def _on_halt(self, message: Message, caller: Caller) -> None:
+        """Anybody may halt; it waits for nothing but the part of a period that is being computed.
+
+        In lockstep the one whose command it overtook waits for an answer, and gets it: nothing moved.
+        """
+        if self._rest().complete and self.info.lockstep:
+            self.clock.wake()
+
+    def _rest(self) -> Order:
+        """What was to be executed next, and is not."""
+        with self._moving:
+            order = self._slot.clear()
+            self._robot.halt()
+            if order.complete and self.info.lockstep:
+                self._answered = order.tag
+        return order
+
+    def _on_leave(self, caller: Caller) -> None:
+        for name in self._sessions.left(caller):
+            self._lease.release(replace(caller, session=name).client)
+        self._lease.release(caller.client)
+
+    def _on_change(self, before: str | None, after: str | None) -> None:
+        if before is not None:  # what it sent is not to go on under another one
+            self._rest()
+            self._answered = ""
+
+    def _say_who(self, request: Message, caller: Caller) -> Message:
+        return {"success": True, "message": self.info.to_json()}
+
+    def _set_scene(self, request: Message, caller: Caller) -> Message:
+        pose, seeds = _pose(request.get("object_pose")), _seeds(request.get("seeds"))
+        self._lease.take(caller.client, shown=caller.shown, silence=caller.silence)
+        self._robot.place_object(pose, seeds)
+        return {}
+
+    def _tick(self) -> None:
+        """Real time: one part of a period."""
+        with self._moving:
+            order = self._slot.take()
+            if order is not None and order.client == self._lease.holder:  # it may have changed since
+                self._robot.follow(self._merged(order), at_once=order.complete)
+                self._answered = order.tag
+        self._robot.tick()
+        self._publish()
+
+    def _go_on(self) -> None:
+        """A complete command came: a period in this thread, if it is short and nobody is at it, or in the clock's."""
+        if self._took > QUICK or not self._ticking.acquire(blocking=False):
+            self.clock.wake()
+            return
+        try:
+            self._pass_period()
+        finally:
+            self._ticking.release()
+
+    def _tick_lockstep(self) -> None:
+        with self._ticking:
+            self._pass_period()
+
+    def _pass_period(self) -> None:
+        """A whole period, if a command is there; else the state that has not changed."""
+        with self._moving:
+            order = self._slot.take_complete()
+            if order is not None and order.client == self._lease.holder:
+                self._execute(order)
+        self._publish()
+
+    def _execute(self, order: Order) -> None:
+        began = time.perf_counter()
+        try:
+            self._robot.step(self._merged(order))
+            self._answered = order.tag
+        except RobotFault as fault:
+            _log.warning("%s: %s", self._profile.name, fault)
+        self._took = time.perf_counter() - began
+
+    def _merged(self, order: Order) -> Any:
+        command = self._robot.target()
+        for place, value in order.values.items():
+            command[0, place] = value
+        return np.minimum(np.maximum(command, self._low), self._high)  # as np.clip, in a third of the time
+
+    def _publish(self) -> None:
+        state = self._robot.state
+        if state is None or self._robot.fault is not None:  # who listens sees that it has become stale
+            return
+        if getattr(self._bus, "clients", 1) == 0:  # an embedded server knows that nobody listens
+            return
+        stamp: Callable[[float], Mapping[str, int]] = getattr(self._bus, "stamp", write_stamp)
+        try:
+            envelopes = encode_state(self._profile, state, 0, stamp(self._clock()), self._answered)
+            self._bus.publish_all([(self._namespace + topic, message) for topic, _, message in envelopes])
+            self._connected = True
+        except LinkLost as error:  # nobody hears it, and the dead-man holds the robot
+            if self._connected:
+                _log.warning("%s: %s", self._profile.name, error)
+            self._connected = False
+
+
+def _text(robot: ServedRobot, profile: RobotProfile) -> str:
+    if robot.realtime:
+        return f"{profile.name}, served in real time; it rests {robot.dead_man:g} s after the last command"
+    return f"{profile.name}, served in lockstep: its time goes on with commands, {robot.spec.period:g} s each"
+
+
+def _pose(value: object) -> Any:
+    """x, y [m] and yaw [rad] of the object, or None if it is to stay. Shape: (1, 3)."""
+    if value is None:
+        return None
+    pose = numbers(_only_row(value), "object_pose")
+    if len(pose) != 3:
+        raise ProtocolError(f"object_pose must be 3 numbers (x, y [m], yaw [rad]), not {len(pose)}.")
+    return pose[None]
+
+
+def _seeds(value: object) -> Any:
+    """The seed of the one robot; 0 if none is given. Shape: (1,) int64."""
+    seed = _only_row(0 if value is None else value)
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
+        raise ProtocolError(f"seeds must be one number, 0 or more, not {value!r}.")
+    return np.array([seed], dtype=np.int64)
+
+
+def _only_row(value: object) -> object:
+    """A list of one row is that row."""
+    return value[0] if isinstance(value, list) and len(value) == 1 else value

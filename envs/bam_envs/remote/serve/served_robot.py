@@ -1,0 +1,250 @@
+"""One robot that an environment, topics and a clock use together: how time passes for it, and its dead-man.
+
+Two ways time passes. Fast: a period passes at once with each step, and none between steps. In real time: a clock calls
+`ServedRobot.tick`, a command is executed over the period that follows it, and without fresh commands the robot rests.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.core.errors import RemoteError, ResetNeeded, RobotFault
+from bam_envs.core.robot import Initial, Robot, RobotState, Rows, checked_command
+
+Array = NDArray[np.float64]
+
+PARTS = 5
+"""Ticks a period, of robots that can be stepped in parts (`slices`); others are stepped a period at a time."""
+_LONGEST_WAIT = 10.0
+"""When a step is given up because no clock ticks [s]."""
+
+
+class ServedRobot:
+    """A Robot around a Robot, for several threads.
+
+    Args:
+        robot: What moves.
+        dead_man: For how long a command means something [s].
+        zero_rests: Whether a command of zeros is rest, as for speeds; else it rests where it is.
+        realtime: How time passes; see the module.
+        now: Monotonic clock [s].
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        dead_man: float,
+        zero_rests: bool = False,
+        realtime: bool = False,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.spec, self.num_robots = robot.spec, robot.num_robots
+        self.dead_man, self.realtime = dead_man, realtime
+        self.tick_period = robot.spec.period / (PARTS if hasattr(robot, "slices") else 1)
+        """Time between two ticks [s]."""
+        self.state: RobotState | None = None
+        """The newest one; None before the first `reset`."""
+        self.fault: RobotFault | None = None
+        """What went wrong; cleared by `reset`."""
+        self._robot, self._zero_rests, self._now = robot, zero_rests, now
+        self._changed = threading.Condition(threading.RLock())
+        self._target: Array = np.zeros((self.num_robots, len(robot.spec.command.labels)))
+        self._expires = -math.inf  # when the dead-man lets go; never while a step is waited for
+        self._resting = True
+        self._parts: Iterator[RobotState] = iter(())
+        self._left = 0  # parts of this period still to come
+        self._midway = False  # whether the last period was not executed to its end
+        self._orders = self._begun = self._done = 0  # commands given, begun, executed over a whole period
+
+    def __getattr__(self, name: str) -> Any:
+        """Whatever else this robot can: pictures, `state_dict`."""
+        if name.startswith("_"):
+            raise AttributeError(name)
+        value = getattr(self._robot, name)
+
+        def call(*arguments: Any, **options: Any) -> Any:
+            with self._changed:
+                return value(*arguments, **options)
+
+        return call if callable(value) else value
+
+    def connect(self) -> None:
+        """Make the robot ready for `reset`."""
+        with self._changed:
+            self._robot.connect()
+
+    def reset(self, rows: Rows, initial: Initial) -> RobotState:
+        """Bring `rows` to `initial`; what was being executed is over, and so is a fault."""
+        with self._changed:
+            self._drop_parts()
+            self.fault = None
+            self.state = self._robot.reset(rows, initial)
+            self._target, self._resting, self._expires = self.state.command.copy(), True, -math.inf
+            return self.state
+
+    def step(self, command: Array) -> RobotState:
+        """Send `command` (n, m) and return the state one period later; in real time, when that has passed.
+
+        Raises:
+            RobotFault: The robot failed; `reset` brings it back.
+        """
+        with self._changed:
+            command = checked_command(command, self._target.shape)
+            if not self.realtime:
+                return self._step_now(command)
+            self.follow(command)
+            self._expires, order = math.inf, self._orders
+            if not self._changed.wait_for(lambda: self._over(order), _LONGEST_WAIT):
+                raise RemoteError(f"The clock of {self.spec.name} has stood still for {_LONGEST_WAIT:g} s.")
+            self._expires = self._now() + self.dead_man
+            return self._newest()
+
+    def _over(self, order: int) -> bool:
+        """Whether there is nothing to wait for any more."""
+        return self._done >= order or self.fault is not None or self.state is None
+
+    def _step_now(self, command: Array) -> RobotState:
+        try:
+            self.state = self._robot.step(command)
+        except RobotFault as fault:
+            self.fault = fault
+            raise
+        self._target, self._resting = command, False
+        return self.state
+
+    def _newest(self) -> RobotState:
+        if self.fault is not None:
+            raise self.fault
+        if self.state is None:
+            raise ResetNeeded("The served robot was closed.")
+        return self.state
+
+    def follow(self, command: Array, *, at_once: bool = True) -> None:
+        """Execute `command` (n, m) from the next tick on, for no longer than the dead-man lasts.
+
+        Args:
+            command: Finite. Shape: (n, m).
+            at_once: Not to wait for the end of the period that runs.
+        """
+        with self._changed:
+            self._target = command
+            self._expires, self._resting = self._now() + self.dead_man, False
+            self._orders += 1
+            # With one part to go, a command that came a little early is not worth losing that part for.
+            if at_once and self._left != 1:
+                self._drop_parts()
+
+    def target(self) -> Array:
+        """A copy of what the robot is told to do now. Shape: (n, m)."""
+        with self._changed:
+            return self._target + 0.0
+
+    def tick(self) -> None:
+        """In real time: one part of a period passes. Never raises what the robot raises: see `fault`."""
+        with self._changed:
+            if self.state is None or self.fault is not None:
+                return
+            if not self._resting and self._now() > self._expires:
+                self.halt()
+            try:
+                self.state = self._next_part()
+            except RobotFault as fault:
+                self.fault, self._left = fault, 0
+            if not self._left:
+                self._done = self._begun
+                self._changed.notify_all()
+
+    def _next_part(self) -> RobotState:
+        if not self._left:
+            self._begin_period()
+        self._left -= 1
+        return next(self._parts)
+
+    def _begin_period(self) -> None:
+        slices, command = getattr(self._robot, "slices", None), self._reachable()
+        if slices is None:
+            self._parts, self._left = (self._robot.step(command) for _ in range(1)), 1
+        else:
+            self._parts, self._left = iter(slices(command, PARTS)), PARTS
+        self._begun, self._midway = self._orders, False
+
+    def _reachable(self) -> Array:
+        """The target, no farther than the robot may go in a period from where it is.
+
+        The robot itself counts from its last command, which one that comes early finds half executed.
+        """
+        rate, setpoint = self.spec.command.max_rate, self._setpoint()
+        if not self._midway or rate is None or setpoint is None:
+            return self._target
+        reach = np.array(rate) * self.spec.period
+        near: Array = np.clip(self._target, setpoint - reach, setpoint + reach)
+        return near
+
+    def _setpoint(self) -> Array | None:
+        """Where the controllers of the robot pull now, if it says so. Shape: (n, m)."""
+        return getattr(self._robot, "setpoint", None)
+
+    def _drop_parts(self) -> None:
+        """Whoever waits for them is told when the next period is over."""
+        self._midway = self._left > 0
+        self._parts, self._left = iter(()), 0
+
+    def place_object(self, pose: Array | None, seeds: NDArray[np.int64]) -> None:
+        """Set the scene of a simulated robot, which stays as it is.
+
+        Args:
+            pose: Where its object is to lie: x, y [m], yaw [rad]; None leaves it. Shape: (n, 3).
+            seeds: For what the robot itself draws. Shape: (n,).
+
+        Raises:
+            RemoteError: This robot has no scene.
+        """
+        with self._changed:
+            place = getattr(self._robot, "place_object", None)
+            if self.state is None or (place is None and pose is not None):
+                raise RemoteError(f"{self.spec.name} has no object that could be placed.")
+            self.state = self.state if place is None else place(pose, seeds)
+
+    def halt(self) -> None:
+        """Rest: where it is, or at speed zero. Time goes on, and a step that is waited for ends in time."""
+        with self._changed:
+            if self._resting:
+                return  # each time it would begin from where gravity has pulled it since
+            self._robot.halt()
+            if self.state is None:
+                return
+            self._drop_parts()
+            self._target, self._resting = self._rest(self.state), True
+
+    def _rest(self, state: RobotState) -> Array:
+        """The command that keeps the robot as it was halted. Shape: (n, m)."""
+        if self._zero_rests:
+            return np.zeros_like(self._target)
+        setpoint = self._setpoint()  # which also says how hard a gripper holds
+        return self._measured(state) if setpoint is None else setpoint
+
+    def _measured(self, state: RobotState) -> Array:
+        """The target, with what is measured in place of what was commanded. Shape: (n, m)."""
+        measured = {
+            (label, unit): state.signals[signal.name][:, place]
+            for signal in self.spec.signals
+            for place, (label, unit) in enumerate(zip(signal.labels, signal.units, strict=True))
+        }
+        wanted = zip(self.spec.command.labels, self.spec.command.units, strict=True)
+        return np.stack([measured.get(one, self._target[:, i]) for i, one in enumerate(wanted)], axis=1)
+
+    def close(self) -> None:
+        """Halt, and let go of the robot."""
+        with self._changed:
+            self._drop_parts()
+            self.state = None
+            self._robot.close()
+            self._changed.notify_all()

@@ -1,0 +1,295 @@
+"""TcpServer: an `EnvServer` for the clients of `TcpTransport`, with a thread for each connection."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, ProtocolError, RemoteError
+from bam_envs.remote.serve.env_server import EnvServer
+from bam_envs.remote.transports.frames import FrameSocket, encode
+from bam_envs.remote.transports.tcp_messages import (
+    Hello,
+    Request,
+    SpecCodec,
+    action_size,
+    read_hello,
+    read_request,
+    refusal,
+)
+from bam_envs.remote.transports.trees import spec_to_json
+from bam_envs.remote.transports.values import Tree
+from bam_envs.ros.freshness import FreshnessCheck, Tag
+from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
+from bam_envs.rosbridge.tokens import Guesses, Tokens
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+_LOG = logging.getLogger(__name__)
+_POLL = 0.2  # seconds between two looks at whether the server is closing
+_HELLO_TIMEOUT, _HELLO_LIMIT = 5.0, 65536  # [s], [bytes]: all that a stranger gets
+_STRANGERS, _STRANGERS_OF_ONE = 64, 16
+"""Connections that said no hello yet: of all, and of one address. The oldest gives way."""
+_ROOM = 2**20
+"""What a request may hold beside an action [bytes]."""
+
+
+class TcpServer:
+    """Listens on one port. Whatever a client sends or leaves undone, the others and the environment do not notice.
+
+    Args:
+        server: What is served.
+        host: The interface; 127.0.0.1 is this computer alone.
+        port: 0 for any that is free.
+        token: A secret that clients must know. Nothing is encrypted: it keeps strangers out, not those who listen in.
+        operator_token: Who shows this one instead may take command from others.
+        max_clients: How many may be connected.
+        patience: Longest time for the rest of a message, and for a client to take its answer [s].
+    """
+
+    def __init__(
+        self,
+        server: EnvServer,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        *,
+        token: str | None = None,
+        operator_token: str | None = None,
+        max_clients: int = 64,
+        patience: float = 10.0,
+    ) -> None:
+        self.server, self.host, self.port = server, host, port
+        self.max_clients, self.patience = max_clients, patience
+        self.codec = SpecCodec(server.spec())
+        self.most = _ROOM + 2 * action_size(server.spec())
+        """Largest request [bytes]."""
+        self._tokens, self._guesses = Tokens(token, operator_token), Guesses()
+        self.freshness = FreshnessCheck()
+        self._listener: socket.socket | None = None
+        self._thread: threading.Thread | None = None
+        self._lock = threading.Lock()
+        self._connections: dict[_Connection, None] = {}  # the oldest first
+
+    @property
+    def url(self) -> str:
+        """What clients connect to."""
+        return f"tcp://{f'[{self.host}]' if ':' in self.host else self.host}:{self.port}"
+
+    def start(self) -> None:
+        """Listen.
+
+        Raises:
+            InvalidValue: The port is in use, or the address not of this computer.
+        """
+        family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
+        try:
+            self._listener = socket.create_server((self.host, self.port), family=family, backlog=128)
+        except OSError as error:
+            raise InvalidValue(
+                f"Cannot listen on {self.host} port {self.port}: {error.strerror or error}. "
+                f"Give another port; 0 takes any that is free."
+            ) from error
+        self.port = self._listener.getsockname()[1]
+        self._listener.settimeout(_POLL)
+        self._thread = threading.Thread(target=self._accept, args=(self._listener,), name="bam-tcp", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Drop every client and stop listening. As often as one likes."""
+        listener, self._listener = self._listener, None
+        if listener is None or self._thread is None:
+            return
+        with suppress(OSError):  # wakes the thread on some systems; on others it looks up by itself
+            listener.shutdown(socket.SHUT_RDWR)
+        self._thread.join()
+        listener.close()
+        with self._lock:
+            connections = list(self._connections)
+        for connection in connections:
+            connection.drop()
+        for connection in connections:
+            connection.join()
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _accept(self, listener: socket.socket) -> None:
+        while self._listener is listener:
+            try:
+                sock, address = listener.accept()
+            except TimeoutError:
+                continue
+            except OSError as error:  # such as no file descriptors left; clients that leave give some back
+                if self._listener is listener:
+                    _LOG.warning("A client could not be accepted: %s", error)
+                    time.sleep(_POLL)
+                continue
+            try:
+                self._begin(_Connection(self, sock, address[0], address[1]))
+            except (OSError, RuntimeError) as error:  # it went away at once, or there is no room for another thread
+                _LOG.warning("A client could not be served: %s", error)
+                sock.close()
+
+    def _begin(self, connection: _Connection) -> None:
+        with self._lock:
+            self._connections[connection] = None
+            strangers = [one for one in self._connections if one.caller is None]
+            mine = [one for one in strangers if one.host == connection.host]
+        # What says nothing keeps nobody out: whoever comes is listened to.
+        if len(mine) > _STRANGERS_OF_ONE:
+            mine[0].drop()
+        elif len(strangers) > _STRANGERS:
+            host, _ = Counter(one.host for one in strangers).most_common(1)[0]
+            next(one for one in strangers if one.host == host).drop()
+        try:
+            connection.start()
+        except RuntimeError:
+            with self._lock:
+                del self._connections[connection]
+            raise
+
+    def admit(self, hello: Hello, connection: _Connection) -> None:
+        """Let a client in; its own older connections are dropped.
+
+        Raises:
+            RemoteError: It does not know the token, wants another environment, or there is no room.
+        """
+        operator = self._is_operator(hello, connection)
+        self.server.require_name(hello.env_id)
+        with self._lock:
+            older = [one for one in self._connections if one is not connection and one.session == hello.session]
+            present = sum(one.caller is not None for one in self._connections) - len(older)
+            if present >= self.max_clients:
+                raise RemoteError(f"All {self.max_clients} places for clients are taken; try again when one has left.")
+            # As long as the connection is there, the system at its other end is: that is its sign of life.
+            connection.caller = Caller(connection.client, connection.client, operator=operator, silence=lambda: 0.0)
+        for one in older:
+            one.drop()
+            self.server.leave(one.client)
+
+    def _is_operator(self, hello: Hello, connection: _Connection) -> bool:
+        """Whether the token is the operator's.
+
+        Raises:
+            RemoteError: It is none that lets anybody in.
+        """
+        if not (self._tokens.needed or (hello.token and self._tokens.exist)):
+            return False
+        if not self._guesses.may_try(connection.host):
+            raise RemoteError("Too many wrong tokens came from this address; try again in a second.")
+        role = self._tokens.role([hello.token])
+        if role is None:
+            if hello.token:
+                self._guesses.wrong(connection.host)
+            what = "wrong" if hello.token else "missing"
+            raise RemoteError(f"The token is {what}; give the one that the server was started with (--token-file).")
+        return role == "operator"
+
+    def forget(self, connection: _Connection) -> None:
+        """A connection has ended."""
+        self.server.leave(connection.client)
+        with self._lock:
+            self._connections.pop(connection, None)
+
+
+class _Connection:
+    """One client, in a thread of its own."""
+
+    def __init__(self, owner: TcpServer, sock: socket.socket, host: str, port: int) -> None:
+        self.host, self.client, self.session = host, f"{host}:{port}", ""
+        self.caller: Caller | None = None  # known when it is let in
+        self._owner, self._frames = owner, FrameSocket(sock)
+        self._answered: tuple[Tag, list[bytes | memoryview]] | None = None
+        self._thread = threading.Thread(target=self._run, name=f"bam-tcp {self.client}", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def drop(self) -> None:
+        self._frames.close()
+
+    def join(self) -> None:
+        self._thread.join()
+
+    def refuse(self, text: str) -> None:
+        """Say why, and hang up."""
+        with suppress(LinkLost):
+            self._frames.send(encode(refusal(0, RemoteError(text))), time.monotonic() + _POLL)
+        self.drop()
+
+    def _run(self) -> None:
+        try:
+            self._greet()
+            while True:
+                tree = self._frames.receive(limit=self._owner.most, patience=self._owner.patience)
+                self._send(self._answer(read_request(tree)))
+        except (ProtocolError, RemoteError) as error:
+            self.refuse(str(error))
+        except LinkLost:
+            pass  # it went away
+        finally:
+            self.drop()
+            self._owner.forget(self)
+
+    def _greet(self) -> None:
+        hello = read_hello(self._frames.receive(time.monotonic() + _HELLO_TIMEOUT, _HELLO_LIMIT))
+        self.client = f"{hello.name} ({self.client})"
+        self._owner.admit(hello, self)
+        self.session = hello.session
+        self._send(encode([0, "ok", spec_to_json(self._owner.server.spec())]))
+
+    def _send(self, parts: list[bytes | memoryview]) -> None:
+        self._frames.send(parts, time.monotonic() + self._owner.patience)
+
+    def _answer(self, request: Request) -> list[bytes | memoryview]:
+        """The frame that answers `request`; one that came before gets the answer of before, and nothing moves."""
+        if self._answered is not None and _same(self._answered[0], request.tag):
+            return self._answered[1]
+        try:
+            self._owner.freshness.require(request.tag)
+            parts = encode([request.tag.sequence, "ok", self._do(request)])
+        except BamEnvsError as error:
+            parts = encode(refusal(request.tag.sequence, error))
+        self._answered = (request.tag, parts)
+        return parts
+
+    def _do(self, request: Request) -> Tree:
+        deadline = time.monotonic() + request.tag.deadline - request.tag.sent
+        return _ACTIONS[request.kind](self, request, deadline)
+
+    def _reset(self, request: Request, deadline: float) -> Tree:
+        seed, options, take = request.values
+        server, codec = self._owner.server, self._owner.codec
+        caller = self.caller or UNKNOWN_CALLER
+        begun = server.reset(self.client, seed, options, take=take is True, deadline=deadline, caller=caller)
+        return codec.pack_result(begun)
+
+    def _step(self, request: Request, deadline: float) -> Tree:
+        server, codec = self._owner.server, self._owner.codec
+        action = codec.unpack_action(request.values[0])
+        return codec.pack_result(server.step(self.client, action, deadline=deadline))
+
+    def _leave(self, request: Request, deadline: float) -> Tree:
+        self._owner.server.leave(self.client)
+
+
+_ACTIONS: dict[str, Callable[[_Connection, Request, float], Tree]] = {
+    "reset": _Connection._reset,
+    "step": _Connection._step,
+    "leave": _Connection._leave,
+}
+
+
+def _same(one: Tag, other: Tag) -> bool:
+    return (one.session, one.epoch, one.sequence) == (other.session, other.epoch, other.sequence)

@@ -1,5 +1,0 @@
-"""Live robots behind rosbridge, and the one function that builds them."""
-
-from bam_envs.robots.live.building import live_robot, profile_limits
-
-__all__ = ["live_robot", "profile_limits"]

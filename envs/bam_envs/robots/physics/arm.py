@@ -1,0 +1,262 @@
+"""A UR5e with a parallel gripper, simulated: position control, 20 Hz commands, 5 ms physics."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.core.errors import InvalidValue, PhysicsDiverged, ResetNeeded
+from bam_envs.core.robot import Initial, RobotState, Rows, checked_command
+from bam_envs.robots.ur5e import COMMAND, GRIPPER_OPEN, GRIPPER_SPEED, arm_spec
+
+if TYPE_CHECKING:
+    from bam_envs.robots.physics.imperfection import Imperfection
+    from bam_envs.robots.physics.physics import Physics
+    from bam_envs.robots.physics.rendering import SceneRenderer
+
+Array = NDArray[np.float64]
+
+LOWEST, HIGHEST = np.array(COMMAND.low), np.array(COMMAND.high)
+MAX_RATE = np.array(COMMAND.max_rate)
+GRIPPER_LEASH = 0.011
+"""Farthest the gripper's set point runs ahead of its fingers [m]: what full force needs, so that it opens at once."""
+LAG = 0.05
+"""How far the joints are behind their set points [s]: damping by stiffness of the actuators."""
+PHYSICS_STEPS = 10
+"""Physics steps a control period."""
+
+
+class SimulatedArm:
+    """n simulated UR5e arms, each on a table of its own.
+
+    The joint set points move linearly from the last command to the new one within a period, as a UR controller
+    interpolates; the gripper's set point moves at `GRIPPER_SPEED`.
+
+    Args:
+        num_robots: How many are stepped together.
+        with_object: Whether there is a cube, seen by a tracker.
+        randomize: Masses, friction, sizes and gains that differ each episode, a noisy tracker and late commands.
+    """
+
+    def __init__(self, num_robots: int = 1, *, with_object: bool = True, randomize: bool = False) -> None:
+        self.num_robots = num_robots
+        self.randomize = randomize
+        self.spec = replace(arm_spec("ur5e", with_object=with_object), lag=LAG)
+        self._with_object = with_object
+        self._scene = "ur5e_cube.xml" if with_object else "ur5e_gripper.xml"
+        self._physics: Physics | None = None
+        self._imperfection: Imperfection | None = None
+        self._renderer: SceneRenderer | None = None
+        self._all_rows = np.arange(num_robots)
+        self._setpoint = np.zeros((num_robots, 7))
+        self._command = np.zeros((num_robots, 7))
+        self._ramp = (np.arange(1, PHYSICS_STEPS + 1) / PHYSICS_STEPS)[None, :, None]
+
+    def connect(self) -> None:
+        """Build the physics."""
+        if self._physics is not None:
+            return
+        from bam_envs.robots.physics.imperfection import Imperfection
+        from bam_envs.robots.physics.physics import Physics
+
+        self._physics = Physics(self._scene, self.num_robots, varied=self.randomize)
+        self._imperfection = Imperfection(self._physics) if self.randomize else None
+
+    @property
+    def physics(self) -> Physics:
+        """The physics behind the robot; `ResetNeeded` before `connect`."""
+        if self._physics is None:
+            raise ResetNeeded("The simulated robot is not connected. Call reset() first.")
+        return self._physics
+
+    @property
+    def setpoint(self) -> Array:
+        """Where the controllers pull now: joint positions [rad] and the gripper's width [m]. Shape: (n, 7)."""
+        setpoint: Array = self._setpoint.copy()
+        return setpoint
+
+    def reset(self, rows: Rows, initial: Initial) -> RobotState:
+        """Set `rows` to the initial joint positions and object pose, at rest, the gripper open."""
+        physics, signals = self.physics, initial.signals
+        physics.state = physics.state.copy()  # states handed out earlier are views of the old array
+        physics.time[rows], physics.qvel[rows] = 0.0, 0.0
+        physics.qpos[rows, :6] = signals["joint_position"]
+        physics.qpos[rows, 6:8] = GRIPPER_OPEN / 2
+        self._setpoint[rows, :6], self._setpoint[rows, 6] = signals["joint_position"], GRIPPER_OPEN
+        self._command = self._command.copy()  # so does the command
+        self._command[rows] = self._setpoint[rows]
+        if self._imperfection is not None:
+            for row, seed in zip(rows, initial.seeds, strict=True):
+                self._imperfection.reset(int(row), int(seed), self._setpoint[row])
+        if self._with_object:
+            self._lay_object(rows, signals["object_pose"])
+        return self._measure(rows)
+
+    def place_object(self, pose: Array | None, seeds: NDArray[np.int64]) -> RobotState:
+        """Put the object elsewhere, draw a new episode's differences; all is at rest, and the arms stay where they are.
+
+        A drive whose force saturates can swing about its set point for good; an arm at rest has no such swing.
+
+        Args:
+            pose: x, y [m] and yaw [rad] on the table; None leaves it where it is. Shape: (n, 3).
+            seeds: Seeds for what the robot itself draws. Shape: (n,).
+
+        Raises:
+            InvalidValue: There is no object.
+        """
+        physics = self.physics
+        if pose is not None and not self._with_object:
+            raise InvalidValue(f"The robot {self.spec.name!r} has no object that could be placed.")
+        if self._imperfection is not None:
+            for row, seed in enumerate(seeds):
+                self._imperfection.reset(row, int(seed), self._command[row])
+        physics.state = physics.state.copy()  # states handed out earlier are views of the old array
+        physics.qvel[:, : 8 if pose is None else None] = 0.0
+        if pose is not None:
+            self._lay_object(self._all_rows, pose)
+        return self._measure(self._all_rows)
+
+    def _lay_object(self, rows: Rows, pose: Array) -> None:
+        """Put the object flat on the table at x, y [m] and yaw [rad] of `pose` (k, 3)."""
+        physics = self.physics
+        qpos = physics.qpos
+        qpos[rows, 8:10] = pose[:, :2]
+        geom = physics.model.geom("object").id
+        qpos[rows, 10] = [physics.model_of(int(row)).geom_size[geom, 2] for row in rows]
+        qpos[rows, 11], qpos[rows, 12:14], qpos[rows, 14] = np.cos(pose[:, 2] / 2), 0.0, np.sin(pose[:, 2] / 2)
+
+    def step(self, command: Array) -> RobotState:
+        """Send `command` (n, 7): six joint positions [rad] and the gripper's width [m]; one period later, measure."""
+        return next(self.slices(command, 1))
+
+    def slices(self, command: Array, parts: int) -> Iterator[RobotState]:
+        """Send `command` (n, 7), and give the state after each of `parts` equal parts of the period.
+
+        Set points are those of `step`, and so is the last state, but for the last bits: where bodies touch, the solver
+        of the physics starts anew with each part. A halt between two parts holds for the rest of the period; whoever
+        stops asking leaves the robots in the middle of the period, where the next command begins.
+
+        Args:
+            command: As for `step`.
+            parts: 1, 2, 5 or 10.
+
+        Raises:
+            InvalidValue: The period cannot be divided so.
+        """
+        if parts not in range(1, PHYSICS_STEPS + 1) or PHYSICS_STEPS % parts:
+            raise InvalidValue(f"A period has {PHYSICS_STEPS} physics steps; it cannot be divided into {parts!r}.")
+        return self._slices(self._travel(checked_command(command, (self.num_robots, 7))), parts)
+
+    def _travel(self, command: Array) -> Array:
+        """How far the set points go in this period, if `command` is sent now. Shape: (n, 7)."""
+        reach = MAX_RATE * self.spec.period
+        within = np.clip(command, self._command - reach, self._command + reach)  # no faster than the arm can
+        within[:, 6] = command[:, 6]  # the gripper takes a width and goes there at its own speed
+        self._command = np.clip(within, LOWEST, HIGHEST)
+        arriving = self._command if self._imperfection is None else self._imperfection.delayed(self._command)
+        travel = arriving - self._setpoint
+        travel[:, 6] = self._gripper_travel(arriving[:, 6])
+        return travel
+
+    def _slices(self, travel: Array, parts: int) -> Iterator[RobotState]:
+        start = here = self._setpoint
+        for ramp in np.split(self._ramp, parts, axis=1):
+            if self._setpoint is not here:  # halted between two parts
+                start, travel = self._setpoint, np.zeros_like(travel)
+            self.physics.step(start[:, None] + travel[:, None] * ramp)
+            self._setpoint = here = start + travel * ramp[:, -1]
+            last = ramp[0, -1, 0] == 1.0
+            yield self._measure(self._all_rows if last else self._all_rows[:0])
+
+    def _gripper_travel(self, width: Array) -> Array:
+        """How far the gripper's set point goes towards `width` (n,) [m]: at its speed, and near the fingers."""
+        measured, limit = self.physics.qpos[:, 6] + self.physics.qpos[:, 7], GRIPPER_SPEED * self.spec.period
+        setpoint = self._setpoint[:, 6] + np.clip(width - self._setpoint[:, 6], -limit, limit)
+        travel: Array = np.clip(setpoint, measured - GRIPPER_LEASH, measured + GRIPPER_LEASH) - self._setpoint[:, 6]
+        return travel
+
+    def _measure(self, fresh: Rows) -> RobotState:
+        """The state of all rows; a noisy tracker looks again at the `fresh` ones only."""
+        physics = self.physics
+        qpos, qvel = physics.qpos, physics.qvel
+        if not np.isfinite(physics.state.sum()):
+            rows = np.flatnonzero(~np.isfinite(physics.state).all(axis=1)).tolist()
+            raise PhysicsDiverged(f"The simulated state of rows {rows} is not finite. Reset these rows.")
+        signals = {
+            "joint_position": qpos[:, :6],
+            "joint_velocity": qvel[:, :6],
+            "gripper_width": qpos[:, 6:7] + qpos[:, 7:8],
+        }
+        if self._with_object:
+            pose = qpos[:, 8:15]
+            if self._imperfection is not None:
+                self._imperfection.look(fresh, pose[fresh])
+                pose = self._imperfection.seen.copy()
+            signals |= {"object_position": pose[:, :3], "object_quaternion": pose[:, 3:]}
+        return RobotState(signals, physics.time, self._command)
+
+    def halt(self) -> None:
+        """Hold the measured joint positions; commands that are on their way do not arrive."""
+        physics, imperfection = self._physics, self._imperfection  # `close` may come from another thread
+        if physics is None:
+            return
+        setpoint = self._setpoint.copy()
+        setpoint[:, :6] = physics.qpos[:, :6]
+        self._setpoint, self._command = setpoint, setpoint.copy()
+        if imperfection is not None:
+            imperfection.forget(setpoint)
+
+    def close(self) -> None:
+        """Halt, drop the physics and the window."""
+        self.halt()
+        if self._renderer is not None:
+            self._renderer.close()
+        if self._physics is not None:
+            self._physics.close()
+        self._renderer = self._physics = self._imperfection = None
+
+    def render(
+        self, mode: str, marks: list[tuple[Array, tuple[float, float, float, float]]]
+    ) -> NDArray[np.uint8] | None:
+        """Show row 0: an image (480, 640, 3) for ``rgb_array``, a window for ``human``.
+
+        Args:
+            mode: ``"rgb_array"`` or ``"human"``.
+            marks: Spheres to draw: position (3,) [m] and colour (red, green, blue, alpha).
+        """
+        from bam_envs.robots.physics.rendering import SceneRenderer
+
+        if self._renderer is None:
+            self._renderer = SceneRenderer(self.physics, mode)
+        return self._renderer.render(marks)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything the future of the simulated robots depends on."""
+        state: dict[str, Any] = {"physics": self.physics.state.copy()}
+        state |= {"setpoint": self._setpoint.copy(), "command": self._command.copy()}
+        if self._imperfection is not None:
+            state["imperfection"] = self._imperfection.state_dict()
+        return state
+
+    def load_state_dict(self, state: dict[str, Any]) -> RobotState:
+        """Go to what `state_dict` returned; the state there."""
+        self.connect()
+        if self._imperfection is not None:
+            self._imperfection.load_state_dict(state["imperfection"])
+        self.physics.state = np.array(state["physics"])
+        self._setpoint, self._command = np.array(state["setpoint"]), np.array(state["command"])
+        return self._measure(self._all_rows[:0])
+
+
+def cube_scene(num_robots: int = 1, *, randomize: bool = False) -> SimulatedArm:
+    """The arm with a cube in front of it."""
+    return SimulatedArm(num_robots, with_object=True, randomize=randomize)
+
+
+def arm_scene(num_robots: int = 1, *, randomize: bool = False) -> SimulatedArm:
+    """The arm alone."""
+    return SimulatedArm(num_robots, with_object=False, randomize=randomize)

@@ -1,0 +1,135 @@
+"""What differs between a simulated robot and a real one, drawn anew for each episode: domain randomisation.
+
+Everything a row draws follows from one seed, so an episode can be repeated exactly. The noise of a whole episode is
+drawn at its start (a tape of `TAPE` steps, read in a circle), which costs one call of the generator an episode
+instead of one a row and step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.core.robot import Rows
+from bam_envs.robots.physics.physics import Physics
+
+Array = NDArray[np.float64]
+ARM_COORDINATES = 8
+"""Six joints and two fingers; what comes after is the object."""
+TAPE = 256
+"""Steps of noise drawn at once."""
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """How far a randomised robot differs from the nominal one."""
+
+    mass: tuple[float, float] = (0.5, 2.0)
+    """Factor on the object's mass."""
+    friction: tuple[float, float] = (0.7, 1.3)
+    """Factor on the sliding friction of object and pads."""
+    size: tuple[float, float] = (0.85, 1.15)
+    """Factor on the object's edge."""
+    gain: tuple[float, float] = (0.8, 1.2)
+    """Factor on the stiffness and damping of each actuator."""
+    position_noise: float = 0.002
+    """Standard deviation of the tracked object position [m]."""
+    angle_noise: float = 0.02
+    """Standard deviation of the tracked object yaw [rad]."""
+    max_delay: int = 2
+    """Commands arrive 0 to this many periods late; drawn once an episode."""
+    drop: float = 0.05
+    """Probability that the tracker gives no new object pose in a step; the last one is seen again."""
+
+
+class Imperfection:
+    """Varied models, late commands and a noisy tracker for the rows of one `Physics`."""
+
+    def __init__(self, physics: Physics, ranges: Ranges | None = None) -> None:
+        self.ranges = ranges or Ranges()
+        self._physics = physics
+        rows, nu = physics.rows, physics.model.nu
+        self.seeds = np.zeros(rows, dtype=np.int64)
+        self.delay = np.zeros(rows, dtype=np.int64)
+        self.step_count = np.zeros(rows, dtype=np.int64)
+        self._noise = np.zeros((rows, TAPE, 4))
+        self._dropped = np.zeros((rows, TAPE), dtype=bool)
+        self._sent = np.zeros((rows, self.ranges.max_delay + 1, nu))
+        self.seen = np.zeros((rows, 7))
+        """Object poses as the tracker says. Shape: (n, 7)."""
+        self._has_object = physics.model.nq > ARM_COORDINATES
+
+    def reset(self, row: int, seed: int, command: Array) -> None:
+        """Draw the differences of one row for a new episode; `command` (m,) is what the robot holds at its start."""
+        rng = np.random.default_rng(seed)
+        self.seeds[row], self.step_count[row] = seed, 0
+        self.delay[row] = rng.integers(self.ranges.max_delay + 1)
+        self._vary(row, rng)
+        self._noise[row] = rng.standard_normal((TAPE, 4))
+        self._dropped[row] = rng.random(TAPE) < self.ranges.drop
+        self._dropped[row, 0] = False
+        self._sent[row] = command
+
+    def _vary(self, row: int, rng: np.random.Generator) -> None:
+        ranges, nominal, model = self.ranges, self._physics.model, self._physics.model_of(row)
+        gain = rng.uniform(*ranges.gain, size=model.nu)
+        model.actuator_gainprm[:, 0] = nominal.actuator_gainprm[:, 0] * gain
+        model.actuator_biasprm[:, 1:3] = nominal.actuator_biasprm[:, 1:3] * gain[:, None]
+        mass, friction, size = (rng.uniform(*span) for span in (ranges.mass, ranges.friction, ranges.size))
+        if self._has_object:
+            self._vary_object(model, nominal, mass, friction, size)
+            self._physics.recompute(row)
+
+    @staticmethod
+    def _vary_object(model: Any, nominal: Any, mass: float, friction: float, size: float) -> None:
+        body, geom = model.body("object").id, model.geom("object").id
+        model.body_mass[body] = nominal.body_mass[body] * mass
+        model.body_inertia[body] = nominal.body_inertia[body] * mass * size**2
+        model.geom_size[geom] = nominal.geom_size[geom] * size
+        model.geom_rbound[geom] = nominal.geom_rbound[geom] * size
+        model.geom_aabb[geom] = nominal.geom_aabb[geom] * size
+        for name in ("object", "left_pad", "right_pad"):
+            index = model.geom(name).id
+            model.geom_friction[index, 0] = nominal.geom_friction[index, 0] * friction
+
+    def delayed(self, command: Array) -> Array:
+        """What reaches the robot now when `command` (n, m) is sent."""
+        self._sent = np.roll(self._sent, 1, axis=1)
+        self._sent[:, 0] = command
+        arrived: Array = self._sent[np.arange(len(command)), self.delay]
+        return arrived
+
+    def forget(self, command: Array) -> None:
+        """Drop the commands that are on their way; `command` (n, m) is what the robots hold."""
+        self._sent = np.repeat(command[:, None], self._sent.shape[1], axis=1)
+
+    def look(self, rows: Rows, pose: Array) -> None:
+        """Let the tracker see the objects of `rows` at `pose` (k, 7): position [m] and quaternion, w first."""
+        now = self.step_count[rows] % TAPE
+        noise = self._noise[rows, now]
+        half = 0.5 * self.ranges.angle_noise * noise[:, 3]
+        w, x, y, z = pose[:, 3:].T
+        c, s = np.cos(half), np.sin(half)
+        turned = np.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], axis=1)  # Rz(angle) * q
+        fresh = np.concatenate([pose[:, :3] + self.ranges.position_noise * noise[:, :3], turned], axis=1)
+        self.seen[rows] = np.where(self._dropped[rows, now][:, None], self.seen[rows], fresh)
+        self.step_count[rows] += 1
+
+    def state_dict(self) -> dict[str, Array | NDArray[np.int64]]:
+        """What `load_state_dict` needs to go on exactly; the draws themselves follow from the seeds."""
+        return {
+            "seeds": self.seeds.copy(),
+            "step_count": self.step_count.copy(),
+            "sent": self._sent.copy(),
+            "seen": self.seen.copy(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Draw each row again from its seed, then go to where it was."""
+        for row, seed in enumerate(state["seeds"]):
+            self.reset(row, int(seed), self._sent[row, 0])
+        self.step_count = np.asarray(state["step_count"]).copy()
+        self._sent, self.seen = np.asarray(state["sent"]).copy(), np.asarray(state["seen"]).copy()

@@ -1,0 +1,229 @@
+"""MiR100 bases in NumPy, many stepped together: the drive and its limits, walls, boxes, contacts and lasers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.core.errors import InvalidValue, ResetNeeded
+from bam_envs.core.robot import Initial, RobotState, Rows, checked_command
+from bam_envs.robots.mir100 import BACK_MASKED, BACK_MOUNT, BACK_RAYS, FRONT_MASKED, FRONT_MOUNT, FRONT_RAYS, base_spec
+from bam_envs.robots.physics.lasers import LaserScanner, measured, mixed, noise
+from bam_envs.robots.physics.room import LAB, NOWHERE, Room, touches
+from bam_envs.robots.physics.shapes import Drawn, Shape, View
+
+Array = NDArray[np.float64]
+GAIN_SPREAD = 0.05
+"""A randomised drive goes at most this much faster or slower than it is told."""
+
+
+def open_floor(num_robots: int = 1, *, randomize: bool = False) -> SimulatedBase:
+    """Bases on a floor without end, whose lasers are off."""
+    return SimulatedBase(num_robots, room=None, with_scans=False, randomize=randomize)
+
+
+def lab(num_robots: int = 1, *, randomize: bool = False) -> SimulatedBase:
+    """Bases with their lasers in a room of 5.7 x 7.7 m and three boxes each."""
+    return SimulatedBase(num_robots, boxes=3, randomize=randomize)
+
+
+class SimulatedBase(Drawn):
+    """Bases with the signals of a MiR100, each in a room of its own.
+
+    Speeds change no faster than the `max_rate` of the spec, at the beginning of a period; then the base goes along an
+    arc. One that would touch a wall or a box stands still instead, and ``truth["collision"]`` says so until `reset`.
+
+    Args:
+        num_robots: How many are stepped together.
+        room: The walls; None for none.
+        boxes: How many boxes there are in each room.
+        with_scans: Whether the laser scanners are on.
+        randomize: Whether the drive of each episode is a little off.
+    """
+
+    def __init__(
+        self,
+        num_robots: int = 1,
+        *,
+        room: Room | None = LAB,
+        boxes: int = 0,
+        with_scans: bool = True,
+        randomize: bool = False,
+    ) -> None:
+        self.num_robots, self.room, self.randomize = num_robots, room, randomize
+        self.mark_radius = 0.2
+        self.spec = base_spec(with_scans=with_scans)
+        self.boxes: Array = np.tile(np.array(NOWHERE), (num_robots, boxes, 1))
+        """x, y [m] and yaw [rad] of each box. Shape: (n, b, 3)."""
+        self.pose: Array = np.zeros((num_robots, 3))
+        """x, y [m] and yaw [rad]. Shape: (n, 3)."""
+        self._connected = False
+        self._low, self._high = np.array(self.spec.command.low), np.array(self.spec.command.high)
+        self._change = np.array(self.spec.command.max_rate) * self.spec.period
+        self._velocity, self._command = np.zeros((num_robots, 2)), np.zeros((num_robots, 2))
+        self._gain = np.ones((num_robots, 2))
+        self._stamp, self._collision = np.zeros(num_robots), np.zeros(num_robots, dtype=bool)
+        self._seeds, self._scans = np.zeros(num_robots, np.uint64), np.zeros(num_robots, np.uint64)
+        self._scanners = (LaserScanner(FRONT_MOUNT, FRONT_MASKED), LaserScanner(BACK_MOUNT, BACK_MASKED))
+        self._seen = np.zeros((num_robots, FRONT_RAYS + BACK_RAYS if with_scans else 0))
+
+    def connect(self) -> None:
+        """There is nothing to connect to; commands are taken from now on."""
+        self._connected = True
+
+    def reset(self, rows: Rows, initial: Initial) -> RobotState:
+        """Put `rows` at rest at ``base_pose`` (k, 3), and their boxes at ``obstacle_pose`` (k, b, 3).
+
+        Poses are x, y [m] and yaw [rad]. Without them the base is at the origin, and the boxes are nowhere.
+
+        Raises:
+            InvalidValue: A base would touch a wall or a box there.
+        """
+        self._require_link()
+        pose = initial.signals.get("base_pose", np.zeros((len(rows), 3)))
+        boxes = initial.signals.get("obstacle_pose", np.tile(np.array(NOWHERE), (len(rows), self.boxes.shape[1], 1)))
+        self._require_free(pose, boxes)
+        self._own()
+        self.pose[rows], self.boxes[rows] = pose, boxes
+        self._velocity[rows], self._stamp[rows], self._command[rows] = 0.0, 0.0, 0.0
+        self._collision[rows], self._scans[rows] = False, 0
+        self._seeds[rows] = mixed(initial.seeds.astype(np.uint64))
+        if self.randomize:
+            self._gain[rows] = 1.0 + GAIN_SPREAD * _uniform(self._seeds[rows], 2)
+        self._scan(rows)
+        return self._state()
+
+    def _own(self) -> None:
+        """States that were handed out keep their arrays; go on with copies."""
+        self.pose, self.boxes, self._velocity = self.pose.copy(), self.boxes.copy(), self._velocity.copy()
+        self._stamp, self._command, self._seen = self._stamp.copy(), self._command.copy(), self._seen.copy()
+        self._collision = self._collision.copy()
+
+    def _require_free(self, pose: Array, boxes: Array) -> None:
+        touching = np.flatnonzero(touches(pose, self.room, boxes))
+        if len(touching):
+            where = np.round(pose[touching[0]], 3).tolist()
+            raise InvalidValue(
+                f"The base cannot start at {where} (x, y [m], yaw [rad]): it touches a wall or a box there."
+                f"{_inside(self.room)}"
+            )
+
+    def step(self, command: Array) -> RobotState:
+        """Drive with `command` (n, 2), forward [m/s] and turning anticlockwise [rad/s]; one period later, measure."""
+        return next(self.slices(command, 1))
+
+    def slices(self, command: Array, parts: int) -> Iterator[RobotState]:
+        """Send `command` (n, 2), and give the state after each of `parts` equal parts of the period."""
+        self._require_link()
+        self._command = checked_command(command, (self.num_robots, 2))
+        target = np.clip(self._command, self._low, self._high) * self._gain
+        self._velocity = self._velocity + np.clip(target - self._velocity, -self._change, self._change)
+        return self._slices(parts)
+
+    def _slices(self, parts: int) -> Iterator[RobotState]:
+        began = self._stamp
+        for part in range(1, parts + 1):
+            self._drive(self.spec.period / parts)
+            self._stamp = began + self.spec.period * part / parts
+            self._scans = self._scans + np.uint64(1)
+            self._seen = np.empty_like(self._seen)
+            self._scan(np.arange(self.num_robots))
+            yield self._state()
+
+    def _drive(self, seconds: float) -> None:
+        """Go along the arc of the present speeds; where that would touch something, stand still."""
+        v, w = np.ascontiguousarray(self._velocity.T)
+        x, y, yaw = np.ascontiguousarray(self.pose.T)
+        turn = w * seconds
+        chord = v * seconds * np.sinc(turn / (2 * np.pi))  # sinc(x) is sin(pi x) / (pi x)
+        middle = yaw + turn / 2
+        yaw = np.mod(yaw + turn + np.pi, 2 * np.pi) - np.pi
+        pose = np.stack([x + chord * np.cos(middle), y + chord * np.sin(middle), yaw], axis=1)
+        stuck = touches(pose, self.room, self.boxes)
+        if stuck.any():
+            pose[stuck] = self.pose[stuck]
+            self._velocity = np.where(stuck[:, None], 0.0, self._velocity)
+            self._collision = self._collision | stuck
+        self.pose = pose
+
+    def _scan(self, rows: Rows) -> None:
+        """Measure what the scanners of `rows` see."""
+        if not self._seen.shape[1]:
+            return
+        pose, boxes = self.pose[rows], self.boxes[rows]
+        true = np.concatenate([scanner.cast(pose, self.room, boxes) for scanner in self._scanners], axis=1)
+        self._seen[rows] = measured(true, noise(self._seeds[rows], self._scans[rows], true.shape[1]))
+
+    def _state(self) -> RobotState:
+        signals = {"base_pose": self.pose, "base_velocity": self._velocity}
+        if self._seen.shape[1]:
+            signals |= {"f_scan": self._seen[:, :FRONT_RAYS], "b_scan": self._seen[:, FRONT_RAYS:]}
+        truth: dict[str, Any] = {"collision": self._collision, "obstacle_pose": self.boxes}
+        return RobotState(signals, self._stamp, self._command, truth)
+
+    def _require_link(self) -> None:
+        if not self._connected:
+            raise ResetNeeded("The simulated base is not connected. Call connect() first.")
+
+    def halt(self) -> None:
+        """Stand still."""
+        self._velocity, self._command = np.zeros_like(self._velocity), np.zeros_like(self._command)
+
+    def close(self) -> None:
+        """Halt; no command is taken until `connect`."""
+        self.halt()
+        self.close_picture()
+        self._connected = False
+
+    def picture(self) -> tuple[list[Shape], View]:
+        """The base of row 0, its room and boxes, and what its lasers see."""
+        from bam_envs.robots.physics import mir100_picture as draw
+
+        pose, seen = self.pose[0], self._seen[0]
+        scans = draw.scan_shapes(pose, seen[:FRONT_RAYS], seen[FRONT_RAYS:]) if len(seen) else []
+        shapes = [*draw.base_shapes(pose), *draw.wall_shapes(self.room), *draw.box_shapes(self.boxes[0]), *scans]
+        return shapes, draw.view_of(pose, self.room)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything the future of the bases depends on."""
+        return {name: getattr(self, attribute).copy() for name, attribute in _MEMORY.items()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> RobotState:
+        """Go to what `state_dict` returned; the state there."""
+        self.connect()
+        for name, attribute in _MEMORY.items():
+            setattr(self, attribute, np.array(state[name]))
+        self._seen = np.empty_like(self._seen)
+        self._scan(np.arange(self.num_robots))
+        return self._state()
+
+
+_MEMORY = {
+    "pose": "pose",
+    "boxes": "boxes",
+    "velocity": "_velocity",
+    "command": "_command",
+    "stamp": "_stamp",
+    "collision": "_collision",
+    "gain": "_gain",
+    "seeds": "_seeds",
+    "scans": "_scans",
+}
+"""Name in a saved state -> attribute."""
+
+
+def _inside(room: Room | None) -> str:
+    """What to say of the walls."""
+    if room is None:
+        return ""
+    (left, bottom), (right, top) = room.low, room.high
+    return f" The walls are at x {left:g} and {right:g} m, y {bottom:g} and {top:g} m."
+
+
+def _uniform(seeds: NDArray[np.uint64], count: int) -> Array:
+    """`count` numbers from -1 to 1 for each seed. Shape: (n,) -> (n, count)."""
+    columns = [mixed(seeds ^ np.uint64(column + 1)) for column in range(count)]
+    return np.stack(columns, axis=1) / 2.0**63 - 1.0

@@ -1,0 +1,135 @@
+"""Batched MuJoCo physics: n rows of one model, or of n varied copies of it, stepped on all cores.
+
+The whole physical state is one array of shape (n, nstate): it can be set, saved and restored row by row, and a row's
+future depends on its own state and controls only (`mujoco.rollout` starts the solver from zero at each call). So row
+i of many equals one alone, bit for bit.
+"""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.robots.physics.engine import load_mujoco
+
+mujoco = load_mujoco("A simulated robot")
+rollout: Any = importlib.import_module("mujoco.rollout")
+Array = NDArray[np.float64]
+FULL = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
+MODELS = Path(__file__).parent / "models"
+
+
+class Physics:
+    """Rows of one MJCF model.
+
+    Args:
+        scene: File name of a model in ``models/``.
+        rows: How many rows are stepped together.
+        varied: Whether each row has a model of its own, to be changed with `model_of`.
+    """
+
+    def __init__(self, scene: str, rows: int, *, varied: bool = False) -> None:
+        self.model: Any = mujoco.MjModel.from_xml_path(str(MODELS / scene))
+        self.rows = rows
+        self._models = [copy.copy(self.model) if varied else self.model for _ in range(rows)]
+        threads = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, rows)
+        self._threads = threads
+        self._chunk = max(1, rows // (4 * threads))
+        self._start()
+        self._buffers: dict[int, tuple[Array, Array]] = {}
+        self.state: Array = np.tile(self._default_state(), (rows, 1))
+        """Time, joint positions, joint velocities. Shape: (n, 1 + nq + nv)."""
+
+    def _start(self) -> None:
+        """Make what belongs to this process: the threads and their working memory."""
+        self._data = [mujoco.MjData(self.model) for _ in range(self._threads)]
+        self._scratch = mujoco.MjData(self.model)
+        self._rollout: Any = rollout.Rollout(nthread=self._threads if self._threads > 1 else 0)
+
+    def _default_state(self) -> Array:
+        state = np.empty(mujoco.mj_stateSize(self.model, FULL))
+        mujoco.mj_getState(self.model, self._scratch, state, FULL)
+        return state
+
+    @property
+    def time(self) -> Array:
+        """Simulated time [s]. Shape: (n,). A view."""
+        return self.state[:, 0]
+
+    @property
+    def qpos(self) -> Array:
+        """Generalised positions. Shape: (n, nq). A view."""
+        return self.state[:, 1 : 1 + self.model.nq]
+
+    @property
+    def qvel(self) -> Array:
+        """Generalised velocities. Shape: (n, nv). A view."""
+        return self.state[:, 1 + self.model.nq : 1 + self.model.nq + self.model.nv]
+
+    def model_of(self, row: int) -> Any:
+        """The model of `row`; its own where rows are varied."""
+        return self._models[row]
+
+    def recompute(self, row: int) -> None:
+        """Bring what MuJoCo derives from masses and sizes up to date after `model_of(row)` was changed."""
+        mujoco.mj_setConst(self.model_of(row), self._scratch)
+
+    def step(self, control: Array) -> None:
+        """Advance all rows by ``control.shape[1]`` physics steps.
+
+        Args:
+            control: Actuator set points for each physics step. Shape: (n, steps, nu).
+        """
+        states, sensors = self._output(control.shape[1])
+        self._rollout.rollout(
+            self._models,
+            self._data,
+            self.state,
+            control,
+            nstep=control.shape[1],
+            state=states,
+            sensordata=sensors,
+            skip_checks=True,
+            chunk_size=self._chunk,
+        )
+        after = states[:, -1].copy()
+        self._mark_diverged(after, self.time + control.shape[1] * self.model.opt.timestep)
+        self.state = after
+
+    @staticmethod
+    def _mark_diverged(state: Array, time: Array) -> None:
+        """Fill rows that did not get to `time` (n,) [s] with NaN: MuJoCo puts a diverged row back to its default."""
+        late = ~(np.abs(state[:, 0] - time) < 1e-6)  # also where time is NaN
+        if late.any():
+            state[late] = np.nan
+
+    def _output(self, steps: int) -> tuple[Array, Array]:
+        if steps not in self._buffers:
+            states = np.empty((self.rows, steps, self.state.shape[1]))
+            self._buffers[steps] = states, np.empty((self.rows, steps, self.model.nsensordata))
+        return self._buffers[steps]
+
+    def data_of(self, row: int) -> Any:
+        """An `MjData` with the state of `row` and all that follows from it; overwritten by the next call."""
+        mujoco.mj_setState(self.model_of(row), self._scratch, np.ascontiguousarray(self.state[row]), FULL)
+        mujoco.mj_forward(self.model_of(row), self._scratch)
+        return self._scratch
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what belongs to this process."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("_rollout", "_data", "_scratch")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Go to what `__getstate__` returned."""
+        self.__dict__.update(state)
+        self._start()
+
+    def close(self) -> None:
+        """Stop the threads."""
+        self._rollout.close()

@@ -1,0 +1,235 @@
+"""Pictures of a simulated robot: off screen through EGL or OSMesa, or in a window.
+
+MuJoCo picks its OpenGL backend when it is imported, from the variable ``MUJOCO_GL``, and without it takes one that
+needs a display. Here the first backend that works is found when the first picture is asked for; ``MUJOCO_GL`` still
+wins where it is set.
+"""
+
+from __future__ import annotations
+
+import atexit
+import importlib
+import os
+import subprocess
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.core.errors import BamEnvsError
+from bam_envs.robots.physics.engine import load_mujoco
+from bam_envs.robots.physics.shapes import Colour
+
+if TYPE_CHECKING:
+    from bam_envs.robots.physics.physics import Physics
+
+mujoco = load_mujoco("A picture of a robot")
+
+Array = NDArray[np.float64]
+Mark = tuple[Array, Colour]
+Draw = Callable[[Any], None]
+"""Appends bodies that are in no model to an ``MjvScene``."""
+WIDTH, HEIGHT = 640, 480
+CAMERA = "front"
+MARK_RADIUS = 0.02
+MOST_GEOMS = 1000
+BACKENDS = ("egl", "osmesa")
+_PROBE = "import sys, importlib; importlib.import_module('mujoco.' + sys.argv[1]).GLContext(16, 16).make_current()"
+
+
+class RenderingUnavailable(BamEnvsError, RuntimeError):  # noqa: N818 - reads as what happened
+    """No OpenGL backend works here; the text says what to install."""
+
+
+class SceneRenderer:
+    """Row 0 of a `Physics`, off screen or in a window."""
+
+    def __init__(self, physics: Physics, mode: str) -> None:
+        model = physics.model_of(0)
+        self._physics, self._view = physics, open_view(model, mode)
+        self._view.camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._view.camera.fixedcamid = model.camera(CAMERA).id
+
+    def render(self, marks: list[Mark]) -> NDArray[np.uint8] | None:
+        """An image (480, 640, 3), or None from a window."""
+        return self._view.show(self._physics.data_of(0), lambda scene: add_marks(scene, marks))
+
+    def close(self) -> None:
+        """Free the OpenGL context or close the window."""
+        self._view.close()
+
+
+def open_view(model: Any, mode: str) -> OffScreen | Window:
+    """Where `model` is drawn: in memory for ``rgb_array``, else in a window."""
+    return OffScreen(model) if mode == "rgb_array" else Window(model)
+
+
+class OffScreen:
+    """Draws into memory."""
+
+    def __init__(self, model: Any) -> None:
+        self._model = model
+        self._gl: Any = gl_context(find_backend())
+        self._gl.make_current()
+        self._scene = mujoco.MjvScene(model, maxgeom=MOST_GEOMS)
+        self._option = mujoco.MjvOption()
+        self.camera: Any = mujoco.MjvCamera()
+        """From where it is seen; to be set."""
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        atexit.register(self.close)  # while OpenGL is still there
+
+    def show(self, data: Any, draw: Draw) -> NDArray[np.uint8]:
+        """Draw the model as `data` says and what `draw` adds; read back an image (480, 640, 3)."""
+        self._gl.make_current()
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(self._model, data, self._option, None, self.camera, everything, self._scene)
+        draw(self._scene)
+        view, image = mujoco.MjrRect(0, 0, WIDTH, HEIGHT), np.empty((HEIGHT, WIDTH, 3), dtype=np.uint8)
+        mujoco.mjr_render(view, self._scene, self._context)
+        mujoco.mjr_readPixels(image, None, view, self._context)
+        return np.ascontiguousarray(image[::-1])  # OpenGL's first line is the lowest
+
+    def close(self) -> None:
+        """Free the context; doing it twice is once."""
+        if self._gl is None:
+            return
+        atexit.unregister(self.close)
+        self._gl.make_current()
+        self._context.free()
+        self._gl.free()
+        self._gl = None
+
+
+class Window:
+    """Draws into a window of MuJoCo's own viewer."""
+
+    def __init__(self, model: Any) -> None:
+        require_display()
+        viewer = importlib.import_module("mujoco.viewer")
+        self._model, self._data = model, mujoco.MjData(model)
+        before = set(threading.enumerate())
+        self._viewer: Any = viewer.launch_passive(model, self._data, show_left_ui=False, show_right_ui=False)
+        self._threads = set(threading.enumerate()) - before
+        self.camera: Any = self._viewer.cam
+        """From where it is seen; the mouse moves it too."""
+
+    def show(self, data: Any, draw: Draw) -> None:
+        """Bring the window up to date."""
+        with self._viewer.lock():
+            self._data.qpos[:], self._data.qvel[:], self._data.time = data.qpos, data.qvel, data.time
+            mujoco.mj_forward(self._model, self._data)
+            self._viewer.user_scn.ngeom = 0
+            draw(self._viewer.user_scn)
+        self._viewer.sync()
+
+    def close(self) -> None:
+        """Close the window, and wait for the viewer's thread: a process that ends before it crashes."""
+        self._viewer.close()
+        for thread in self._threads:
+            thread.join(timeout=5)
+
+
+def require_display() -> None:
+    """Try the display first: MuJoCo's viewer ends the whole process when it cannot open one."""
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise RenderingUnavailable(
+            'A window needs a display, and DISPLAY is not set. Use render_mode="rgb_array", or run under xvfb-run.'
+        )
+    glfw = importlib.import_module("glfw")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        opened = glfw.init()
+    if not opened:
+        display = os.environ.get("WAYLAND_DISPLAY") or os.environ.get("DISPLAY")
+        raise RenderingUnavailable(f'The display {display} cannot be opened. Check it, or use render_mode="rgb_array".')
+    glfw.terminate()
+
+
+def add_marks(scene: Any, marks: Sequence[Mark], radius: float = MARK_RADIUS) -> None:
+    """Append a sphere of `radius` [m] for each mark to `scene`."""
+    for position, colour in marks:
+        add_geom(scene, "sphere", position, (radius, 0.0, 0.0), colour)
+
+
+_UPRIGHT = np.eye(3).ravel()
+
+
+def add_geom(
+    scene: Any,
+    kind: str,
+    position: Array,
+    size: Sequence[float],
+    colour: Colour,
+    rotation: Array = _UPRIGHT,
+) -> Any:
+    """Append a body to `scene`; it is left out where there is no room for more.
+
+    Args:
+        scene: An ``MjvScene``.
+        kind: "box" or "sphere" or another of MuJoCo's ``mjtGeom``.
+        position: Its middle [m]. Shape: (3,).
+        size: MuJoCo's sizes of the kind [m]: half edges of a box, radius of a sphere. Length 3.
+        colour: Its colour.
+        rotation: From its frame to the world's, row by row. Shape: (9,).
+
+    Returns:
+        The ``MjvGeom``, or None without room.
+    """
+    if scene.ngeom >= scene.maxgeom:
+        return None
+    geom, type_ = scene.geoms[scene.ngeom], getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
+    mujoco.mjv_initGeom(
+        geom,
+        type_,
+        np.asarray(size, np.float64),
+        np.asarray(position, np.float64),
+        rotation,
+        np.array(colour, np.float32),
+    )
+    scene.ngeom += 1
+    return geom
+
+
+def gl_context(backend: str) -> Any:
+    """An OpenGL context of `backend`, for images of `WIDTH` x `HEIGHT`."""
+    try:
+        return importlib.import_module(f"mujoco.{backend}").GLContext(WIDTH, HEIGHT)
+    except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
+        raise RenderingUnavailable(f"MUJOCO_GL={backend} does not work here: {error}. Unset it, or try egl.") from error
+
+
+@cache
+def find_backend() -> str:
+    """The backend that ``MUJOCO_GL`` names, else the first that works here.
+
+    Raises:
+        RenderingUnavailable: None does; the text says what to install.
+    """
+    named = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if named == "glfw":
+        require_display()
+    if named in ("glfw", *BACKENDS):
+        return named
+    for backend in BACKENDS:
+        if works(backend):
+            return backend
+    raise RenderingUnavailable(
+        "Pictures need OpenGL without a display, and neither EGL nor OSMesa works here. "
+        "Run: apt-get install libegl1 libgl1-mesa-dri (or libosmesa6), or set MUJOCO_GL."
+    )
+
+
+def works(backend: str) -> bool:
+    """Try `backend` in a process of its own: PyOpenGL keeps the first platform that it was given."""
+    environment = {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
+    command = [sys.executable, "-c", _PROBE, backend]
+    try:
+        return subprocess.run(command, env=environment, capture_output=True, timeout=60, check=False).returncode == 0
+    except subprocess.TimeoutExpired:
+        return False

@@ -1,0 +1,92 @@
+"""What robots without a MuJoCo model look like: boxes, capsules and spheres. The first picture imports MuJoCo."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from bam_envs.robots.physics.pictures import ShapeRenderer
+
+Array = NDArray[np.float64]
+Colour = tuple[float, float, float, float]
+"""Red, green, blue and alpha, each from 0 to 1."""
+GREY: Colour = (0.80, 0.82, 0.85, 1.0)
+BLUE: Colour = (0.25, 0.45, 0.68, 1.0)
+DARK: Colour = (0.18, 0.19, 0.21, 1.0)
+WOOD: Colour = (0.86, 0.82, 0.76, 1.0)
+RED: Colour = (0.85, 0.30, 0.25, 1.0)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One body of a picture, in the world's frame [m]."""
+
+    kind: Literal["box", "capsule", "sphere"]
+    position: Array
+    """The middle; of a capsule the middle of one end's half sphere. Shape: (3,)."""
+    size: tuple[float, ...]
+    """Edges of a box; radius of a capsule or sphere, alone."""
+    colour: Colour = GREY
+    rotation: Array | None = None
+    """From a box's frame to the world's; None for upright. Shape: (3, 3)."""
+    to: Array | None = None
+    """The other end of a capsule. Shape: (3,)."""
+
+
+@dataclass(frozen=True)
+class View:
+    """From where a picture is seen: MuJoCo's free camera."""
+
+    target: tuple[float, float, float]
+    """What is in the middle [m]."""
+    distance: float
+    """How far away the camera is [m]."""
+    azimuth: float
+    """Where it looks to, seen from above: 0 along x, 90 along y [deg]."""
+    elevation: float
+    """-90 looks straight down [deg]."""
+
+
+class Drawn:
+    """A simulated robot that says what it looks like, and so has pictures; a subclass defines `picture`."""
+
+    floor: float = 0.0
+    """Height of the floor [m]."""
+    mark_radius: float = 0.02
+    """Radius of the task's marks [m]."""
+    _renderer: ShapeRenderer | None = None
+
+    def picture(self) -> tuple[list[Shape], View]:
+        """What row 0 looks like, and from where."""
+        raise NotImplementedError
+
+    def render(self, mode: str, marks: Sequence[tuple[Array, Colour]]) -> NDArray[np.uint8] | None:
+        """Show row 0: an image (480, 640, 3) for ``rgb_array``, a window for ``human``.
+
+        Args:
+            mode: ``"rgb_array"`` or ``"human"``.
+            marks: Spheres to draw: position (3,) [m] and colour.
+        """
+        from bam_envs.robots.physics.pictures import ShapeRenderer
+
+        if self._renderer is None:
+            self._renderer = ShapeRenderer(mode, floor=self.floor, mark_radius=self.mark_radius)
+        shapes, view = self.picture()
+        return self._renderer.render(shapes, marks, view)
+
+    def close_picture(self) -> None:
+        """Close the window, or free what pictures needed."""
+        if self._renderer is not None:
+            self._renderer.close()
+        self._renderer = None
+
+
+def turned(yaw: float) -> Array:
+    """The rotation by `yaw` [rad] about the vertical. Shape: (3, 3)."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

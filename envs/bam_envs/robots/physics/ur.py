@@ -1,0 +1,197 @@
+"""Universal Robots arms without dynamics: in a period the joints reach their set points, no faster than they can.
+
+What makes an arm slow is in its commands (`bam_envs.tasks.ur_control`), so that a live arm is as slow. Contacts are
+looked for, and nothing stops at them: they are told in ``state.truth["collision"]``, until the next reset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.core.errors import InvalidValue, ResetNeeded
+from bam_envs.core.robot import Initial, RobotState, Rows, checked_command
+from bam_envs.robots.physics.contacts import GROUND, ArmContacts
+from bam_envs.robots.physics.obstacles import Obstacles
+from bam_envs.robots.physics.shapes import Drawn, Shape, View
+from bam_envs.robots.ur import DEFAULT_MODEL, START, UrModel, ur_spec
+from bam_envs.robots.ur import ur_model as model_called
+from bam_envs.robots.ur5e import TOOL_LENGTH
+
+Array = NDArray[np.float64]
+LEAST_SHARE = 0.7
+"""Where arms differ: the least share of the way to its set point that one goes in a period."""
+
+
+class KinematicArm(Drawn):
+    """n arms of one model on a table, which move exactly.
+
+    Args:
+        num_robots: How many are stepped together.
+        model: Which arm.
+        period: Time between two commands [s].
+        obstacle: Whether a ball flies about, seen by a tracker.
+        randomize: Each episode the arm lags behind its set points by another share, 0 to 0.3 of the way.
+    """
+
+    def __init__(
+        self, num_robots: int, model: UrModel, period: float, obstacle: bool = False, *, randomize: bool = False
+    ) -> None:
+        self.num_robots, self.model, self.randomize = num_robots, model, randomize
+        self.floor, self.mark_radius = GROUND, 0.025
+        self.spec = ur_spec(model, period, obstacle)
+        self._tool = replace(model.geometry, tool=TOOL_LENGTH)
+        self._contacts = ArmContacts(model)
+        self._with_obstacle = obstacle
+        self._obstacles: Obstacles | None = None
+        self._connected, self._halts = False, 0
+        self._low, self._high = np.array(self.spec.command.low), np.array(self.spec.command.high)
+        self._reach = np.array(self.spec.command.max_rate) * period
+        self._position = np.tile(START, (num_robots, 1))
+        self._velocity = np.zeros((num_robots, 6))
+        self._share = np.ones((num_robots, 1))
+        self._stamp = np.zeros(num_robots)
+        self._collided = np.zeros(num_robots, dtype=bool)
+        self._command = self._position
+
+    def connect(self) -> None:
+        """Commands are taken from now on."""
+        if self._with_obstacle and self._obstacles is None:
+            self._obstacles = Obstacles(self.num_robots)
+        self._connected = True
+
+    @property
+    def setpoint(self) -> Array:
+        """Where the joints are told to be now [rad]. Shape: (n, 6)."""
+        setpoint: Array = self._position.copy()
+        return setpoint
+
+    def tool_position(self, q: Array) -> Array:
+        """Position of the pads of a gripper [m], were there one. Shape: (n, 6) [rad] -> (n, 3)."""
+        return self._tool.tool_position(q)
+
+    def reset(self, rows: Rows, initial: Initial) -> RobotState:
+        """Set `rows` to the initial joint positions, at rest, and begin the way of their obstacles."""
+        self._require_link()
+        self._position, self._velocity = self._position.copy(), self._velocity.copy()  # states of before keep theirs
+        self._stamp, self._command = self._stamp.copy(), self._command.copy()
+        self._collided = self._collided.copy()
+        self._position[rows] = initial.signals["joint_position"]
+        self._velocity[rows], self._stamp[rows] = 0.0, 0.0
+        self._command[rows] = self._position[rows]
+        if self.randomize:
+            draws = [np.random.default_rng(int(seed)).random() for seed in initial.seeds]
+            self._share[rows, 0] = 1.0 - (1.0 - LEAST_SHARE) * np.array(draws)
+        if self._obstacles is not None:
+            self._obstacles.begin(rows, initial.signals, initial.seeds)
+        self._collided[rows] = self._touching()[rows]
+        return self._measure()
+
+    def step(self, command: Array) -> RobotState:
+        """Send `command` (n, 6), joint positions [rad], and measure one period later."""
+        return next(self.slices(command, 1))
+
+    def slices(self, command: Array, parts: int) -> Iterator[RobotState]:
+        """Send `command` (n, 6), and give the state after each of `parts` equal parts of the period.
+
+        A halt between two parts holds for the rest of the period.
+        """
+        self._require_link()
+        if parts < 1:
+            raise InvalidValue(f"A period cannot be divided into {parts!r} parts.")
+        self._command = checked_command(command, (self.num_robots, 6))
+        return self._slices(np.clip(self._command, self._low, self._high), parts)
+
+    def _slices(self, target: Array, parts: int) -> Iterator[RobotState]:
+        start, began, halts, period = self._position, self._stamp, self._halts, self.spec.period
+        travel = np.clip(target - start, -self._reach, self._reach)
+        goal = np.where(np.abs(target - start) <= self._reach, target, start + travel)  # exact where it is in reach
+        if self.randomize:
+            travel = travel * self._share
+            goal = start + travel
+        for part in range(1, parts + 1):
+            if self._halts == halts:
+                self._position = goal if part == parts else start + travel * (part / parts)
+                self._velocity = travel / period
+            else:
+                self._velocity = np.zeros_like(self._velocity)
+            self._stamp = began + period * part / parts
+            self._collided = self._collided | self._touching()
+            yield self._measure()
+
+    def _touching(self) -> NDArray[np.bool_]:
+        obstacle = None if self._obstacles is None else self._obstacles.position(self._stamp)
+        return self._contacts.touching(self._position, obstacle)
+
+    def _measure(self) -> RobotState:
+        signals = {"joint_position": self._position, "joint_velocity": self._velocity}
+        if self._obstacles is not None:
+            signals["object_position"] = self._obstacles.position(self._stamp)
+            signals["object_quaternion"] = np.tile([1.0, 0.0, 0.0, 0.0], (self.num_robots, 1))
+        return RobotState(signals, self._stamp, self._command, {"collision": self._collided})
+
+    def _require_link(self) -> None:
+        if not self._connected:
+            raise ResetNeeded("The simulated robot is not connected. Call reset() first.")
+
+    def halt(self) -> None:
+        """Hold where it is."""
+        self._halts += 1
+
+    def close(self) -> None:
+        """Halt; no command is taken until `connect`."""
+        self.halt()
+        self.close_picture()
+        self._connected = False
+
+    def picture(self) -> tuple[list[Shape], View]:
+        """The arm of row 0, its table and its ball."""
+        from bam_envs.robots.physics import ur_picture as draw
+
+        shapes = [draw.table_shape(), *draw.arm_shapes(self._contacts.capsules(self._position[:1]))]
+        if self._obstacles is not None:
+            shapes.append(draw.ball_shape(self._obstacles.position(self._stamp)[0]))
+        return shapes, draw.view_of(self.model.workspace_radius)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything the future of the simulated robots depends on."""
+        state: dict[str, Any] = {name: getattr(self, "_" + name).copy() for name in _ARRAYS}
+        if self._obstacles is not None:
+            state["obstacles"] = self._obstacles.state_dict()
+        return state
+
+    def load_state_dict(self, state: dict[str, Any]) -> RobotState:
+        """Go to what `state_dict` returned; the state there."""
+        self.connect()
+        for name in _ARRAYS:
+            setattr(self, "_" + name, np.array(state[name]))
+        if self._obstacles is not None:
+            self._obstacles.load_state_dict(state["obstacles"])
+        return self._measure()
+
+
+_ARRAYS = ("position", "velocity", "share", "stamp", "collided", "command")
+
+
+def reach_arm(num_robots: int = 1, *, randomize: bool = False, ur_model: str = DEFAULT_MODEL) -> KinematicArm:
+    """The arm at 10 Hz."""
+    return KinematicArm(num_robots, model_called(ur_model), 0.1, randomize=randomize)
+
+
+def empty_arm(num_robots: int = 1, *, randomize: bool = False, ur_model: str = DEFAULT_MODEL) -> KinematicArm:
+    """The arm at 20 Hz."""
+    return KinematicArm(num_robots, model_called(ur_model), 0.05, randomize=randomize)
+
+
+def obstacle_arm(num_robots: int = 1, *, randomize: bool = False, ur_model: str = DEFAULT_MODEL) -> KinematicArm:
+    """The arm at 20 Hz, and a ball that flies about."""
+    return KinematicArm(num_robots, model_called(ur_model), 0.05, obstacle=True, randomize=randomize)
+
+
+def isaac_arm(num_robots: int = 1, *, randomize: bool = False, ur_model: str = "ur10") -> KinematicArm:
+    """The arm at 30 Hz."""
+    return KinematicArm(num_robots, model_called(ur_model), 1 / 30, randomize=randomize)

@@ -1,0 +1,207 @@
+"""Old messages are refused: tags that say who sent what when, their check on the robot's side, and clock offsets.
+
+A tag travels as text in a field that the message type has anyway: ``header.frame_id``, or the label of the first
+dimension of a multi-array. It looks like ``bam1 s=4f1c e=2 q=17 t=1700000000.250000 d=1700000000.350000``, and with a
+signature behind it, ``m=`` and 32 hexadecimal digits, where its session was opened (`bam_envs.rosbridge.sessions`).
+Everybody may read a tag; the state that answers a command repeats its session and number alone (`echo`).
+"""
+
+from __future__ import annotations
+
+import hmac
+import math
+import threading
+import time
+import uuid
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+from bam_envs.core.errors import RemoteError
+
+_MARK = "bam1"
+_MOST_SESSIONS = 1024
+_LONGEST = 256  # characters of a tag: what is read is kept for a while
+
+
+@dataclass(frozen=True)
+class Tag:
+    """Who sent a message, and for how long it means anything."""
+
+    session: str
+    """One client, from its start to its end; without blanks."""
+    epoch: int
+    """Counts the connections of the session."""
+    sequence: int
+    """Counts its messages over all epochs."""
+    sent: float
+    """When it was sent [s], on the sender's steady clock (any zero: the receiver works out the offset)."""
+    deadline: float
+    """From when on it must not be executed [s], same clock."""
+
+    mac: str = ""
+    """The signature that came with it; empty without one."""
+
+    def to_text(self) -> str:
+        """As it travels, without a signature."""
+        return self._text
+
+    @property
+    def echo(self) -> str:
+        """What the state that answers it repeats of it; see `read_echo`."""
+        return f"{_MARK} s={self.session} q={self.sequence}"
+
+    @cached_property
+    def _text(self) -> str:
+        return f"{_MARK} s={self.session} e={self.epoch} q={self.sequence} t={self.sent:.6f} d={self.deadline:.6f}"
+
+
+def read_tag(text: object) -> Tag | None:
+    """The tag that `text` is, or None for anything else: other people's messages have none."""
+    if not isinstance(text, str) or len(text) > _LONGEST or not text.startswith(_MARK + " "):
+        return None
+    return _read_tag(text)
+
+
+@lru_cache(maxsize=64)  # every message of a command has the same one
+def _read_tag(text: str) -> Tag | None:
+    fields = dict(part.split("=", 1) for part in text.split()[1:] if "=" in part)
+    try:
+        numbers = int(fields["e"]), int(fields["q"]), float(fields["t"]), float(fields["d"])
+        tag = Tag(fields["s"], *numbers, fields.get("m", ""))
+    except (KeyError, ValueError):
+        return None
+    if tag.mac:  # it is of the text as it came
+        tag.__dict__["_text"] = text.rpartition(" m=")[0]
+    return tag if math.isfinite(tag.sent) and math.isfinite(tag.deadline) else None
+
+
+def read_echo(text: object) -> tuple[str, int] | None:
+    """Session and number of the command that a state with the text `text` answers; None if it answers none."""
+    if not isinstance(text, str) or len(text) > _LONGEST:
+        return None
+    mark, *fields = text.split(" ")
+    if mark != _MARK or len(fields) != 2 or not fields[0].startswith("s=") or not fields[1].startswith("q="):
+        return None
+    number = fields[1][2:]
+    return (fields[0][2:], int(number)) if number.isascii() and number.isdigit() else None
+
+
+def signature(key: bytes, tag: Tag, channel: str, content: bytes) -> str:
+    """What only who knows `key` can say: that `content` is sent on `channel` under `tag`. 32 hexadecimal digits."""
+    return hmac.digest(key, f"{tag.to_text()}\n{channel}\n".encode() + content, "sha256")[:16].hex()
+
+
+def new_session() -> str:
+    """A name that no other session has."""
+    return uuid.uuid4().hex[:12]
+
+
+class Tagger:
+    """Makes the tags of one session.
+
+    Args:
+        clock: Steady clock [s]: a step of the wall clock must not make commands old.
+        session: Its name; None: a new one.
+        key: What its messages are signed with; empty: they are not.
+    """
+
+    def __init__(
+        self, clock: Callable[[], float] = time.monotonic, *, session: str | None = None, key: bytes = b""
+    ) -> None:
+        self.session = new_session() if session is None else session
+        self._key = key
+        self._clock, self._sequence, self._lock = clock, 0, threading.Lock()
+
+    @property
+    def signs(self) -> bool:
+        """Whether it has a key."""
+        return bool(self._key)
+
+    def sign(self, tag: Tag, channel: str, content: bytes) -> str:
+        """The text of `tag` as it travels with `content` on `channel`."""
+        return f"{tag.to_text()} m={signature(self._key, tag, channel, content)}" if self._key else tag.to_text()
+
+    def next(self, epoch: int, lifetime: float) -> Tag:
+        """A new tag, for a message that means something for `lifetime` [s]."""
+        with self._lock:
+            self._sequence += 1
+            now = self._clock()
+            return Tag(self.session, epoch, self._sequence, now, now + lifetime)
+
+
+class ClockOffset:
+    """How far a clock over there is ahead of ours, from one-way messages: the quickest one was about instant.
+
+    It is the smallest difference seen, so a message's age is how much longer it took than the quickest; a drift of
+    the clocks is followed by forgetting the smallest slowly (`drift`).
+    """
+
+    def __init__(self, drift: float = 1e-4) -> None:
+        self.drift = drift
+        """Largest drift between two clocks [s/s]."""
+        self.offset: float | None = None
+        """Our clock minus theirs [s]; None before the first message."""
+        self._at = 0.0
+
+    def age(self, sent: float, arrived: float) -> float:
+        """Age [s] of a message at its arrival; `sent` on their clock, `arrived` on ours."""
+        difference = arrived - sent
+        if self.offset is not None:
+            self.offset += self.drift * max(0.0, arrived - self._at)
+        if self.offset is None or difference < self.offset:
+            self.offset = difference
+        self._at = arrived
+        return difference - self.offset
+
+
+class Freshness:
+    """What is fresh of one session, whatever a bridge kept in its queues. Any thread.
+
+    Args:
+        clock: Steady clock [s]: a step of the wall clock must not make commands old.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock, self._offset, self._lock = clock, ClockOffset(), threading.Lock()
+        self._latest: dict[str, tuple[int, int]] = {}
+
+    def require(self, tag: Tag, channel: str = "") -> None:
+        """Take note of a message of `channel`.
+
+        Raises:
+            RemoteError: It is of an old connection, not newer than one before it, or too late.
+        """
+        with self._lock:
+            epoch, sequence = self._latest.get(channel, (0, 0))
+            late = self._offset.age(tag.sent, self._clock()) - (tag.deadline - tag.sent)
+            newest = max(self._latest.values(), default=(0, 0))[0]
+            if tag.epoch < newest:
+                raise RemoteError(f"old connection: epoch {tag.epoch}, and epoch {newest} is there")
+            if tag.sequence <= sequence:
+                raise RemoteError(f"old message: number {tag.sequence} after number {sequence}")
+            self._latest[channel] = (max(epoch, tag.epoch), tag.sequence)
+            if late > 0:
+                raise RemoteError(f"expired: {late:.3f} s after its deadline")
+
+
+class FreshnessCheck:
+    """The robot's side: `Freshness` of the sessions that were heard of last. Any thread.
+
+    Args:
+        clock: As of `Freshness`.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock, self._lock = clock, threading.Lock()
+        self._sessions: OrderedDict[str, Freshness] = OrderedDict()
+
+    def require(self, tag: Tag, channel: str = "") -> None:
+        """As `Freshness.require`, of the session of `tag`."""
+        with self._lock:
+            fresh = self._sessions.setdefault(tag.session, Freshness(self._clock))
+            self._sessions.move_to_end(tag.session)
+            if len(self._sessions) > _MOST_SESSIONS:
+                self._sessions.popitem(last=False)
+        fresh.require(tag, channel)

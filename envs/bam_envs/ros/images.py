@@ -1,0 +1,244 @@
+"""Camera images as ROS messages: colour as sensor_msgs/CompressedImage, depth as a PNG of uint16 millimetres.
+
+With OpenCV if it is installed, else with Pillow: PNG is the same bits either way. Arrays are RGB here, also where a
+library thinks in BGR. Message data are `bytes`, or base64 text as a JSON bridge sends them.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import importlib
+import io
+from collections.abc import Mapping
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.core.errors import InvalidValue, MissingExtra, ProtocolError
+
+FORMATS = ("png", "jpeg")
+JPEG_QUALITY = 90
+MAX_DEPTH = 65.535
+"""Farthest that a depth image can say [m]."""
+_PNG = b"\x89PNG\r\n\x1a\n"
+_JPEG = b"\xff\xd8\xff"
+_DEPTH_ENCODING = "16UC1; png"
+_PIXEL_DTYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+_CHANNELS = (1, 3, 4)
+
+
+def encode_image(image: NDArray[np.uint8], kind: str = "png") -> bytes:
+    """`image` as a file.
+
+    Args:
+        image: Shape (height, width), (height, width, 1), (height, width, 3) RGB or (height, width, 4) RGBA.
+        kind: ``"png"``, which keeps every bit, or ``"jpeg"``, which is smaller and has no alpha.
+
+    Raises:
+        InvalidValue: Another kind, dtype or shape.
+        MissingExtra: Neither OpenCV nor Pillow is installed.
+    """
+    if kind not in FORMATS:
+        raise InvalidValue(f"The image format must be png or jpeg, not {kind!r}.")
+    return _encode(_pixels(image, kind), kind)
+
+
+def decode_image(data: bytes) -> NDArray[np.uint8]:
+    """The image in a PNG or JPEG file: uint8, (height, width) if grey, else (height, width, 3 or 4) RGB or RGBA.
+
+    Raises:
+        ProtocolError: It is not such a file, or its pixels are not 8 bits.
+        MissingExtra: Neither OpenCV nor Pillow is installed.
+    """
+    image = _decode(data)
+    if image.dtype != np.uint8:
+        raise ProtocolError(f"A colour image must have 8 bits, not {image.dtype}.")
+    return image
+
+
+def encode_depth(depth: NDArray[np.floating[Any]]) -> bytes:
+    """`depth` as a PNG of uint16 millimetres.
+
+    Args:
+        depth: Shape (height, width) or (height, width, 1) [m]. What is not finite or below 0 becomes 0, which means
+            that nothing was measured; what is farther than `MAX_DEPTH` becomes that.
+    """
+    metres = np.nan_to_num(np.asarray(depth, np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+    millimetres = np.rint(np.clip(metres, 0.0, MAX_DEPTH) * 1000.0).astype(np.uint16)
+    return _encode(_flat(millimetres), "png")
+
+
+def decode_depth(data: bytes) -> NDArray[np.float32]:
+    """Metres in a PNG of uint16 millimetres: float32, (height, width).
+
+    Raises:
+        ProtocolError: It is not a grey PNG of 16 bits.
+    """
+    image = _decode(data)
+    if image.dtype != np.uint16 or image.ndim != 2:
+        raise ProtocolError(f"A depth image must be grey with 16 bits, not {image.dtype} of shape {image.shape}.")
+    return _metres(image)
+
+
+def color_message(
+    image: NDArray[np.uint8], kind: str = "png", frame_id: str = "", stamp: Mapping[str, int] | None = None
+) -> dict[str, Any]:
+    """sensor_msgs/CompressedImage of `image`; see `encode_image`."""
+    return {"header": _header(frame_id, stamp), "format": kind, "data": encode_image(image, kind)}
+
+
+def depth_message(
+    depth: NDArray[np.floating[Any]], frame_id: str = "", stamp: Mapping[str, int] | None = None
+) -> dict[str, Any]:
+    """sensor_msgs/Image of `depth` [m], whose data are a PNG; see `encode_depth`."""
+    height, width = np.shape(depth)[:2]
+    size = {"height": height, "width": width, "encoding": _DEPTH_ENCODING, "is_bigendian": 0, "step": 2 * width}
+    return {"header": _header(frame_id, stamp), **size, "data": encode_depth(depth)}
+
+
+def read_color_message(message: Mapping[str, Any]) -> NDArray[np.uint8] | None:
+    """The image in a CompressedImage, or None if it is empty. Raises as `decode_image` does."""
+    data = message_bytes(message)
+    return decode_image(data) if data else None
+
+
+def read_depth_message(message: Mapping[str, Any]) -> NDArray[np.float32] | None:
+    """Metres in an Image or CompressedImage, PNG or raw (16UC1 in mm, 32FC1 in m), or None if it is empty.
+
+    Raises:
+        ProtocolError: Its data are neither.
+    """
+    data = message_bytes(message)
+    if not data:
+        return None
+    return decode_depth(data) if data.startswith(_PNG) else _raw_depth(message, data)
+
+
+def message_bytes(message: Mapping[str, Any]) -> bytes:
+    """The data of an image message, which a JSON bridge makes base64 text.
+
+    Raises:
+        ProtocolError: It is neither text nor bytes, or not base64.
+    """
+    data = message.get("data", b"")
+    if isinstance(data, (bytes, bytearray, memoryview)):
+        return bytes(data)
+    try:
+        return base64.b64decode(data, validate=True)
+    except (TypeError, ValueError, binascii.Error) as error:
+        raise ProtocolError(f"data of an image must be bytes or base64: {error}.") from error
+
+
+def _header(frame_id: str, stamp: Mapping[str, int] | None) -> dict[str, Any]:
+    return {"stamp": dict(stamp or {"sec": 0, "nanosec": 0}), "frame_id": frame_id}
+
+
+def _raw_depth(message: Mapping[str, Any], data: bytes) -> NDArray[np.float32]:
+    dtype = _PIXEL_DTYPES.get(str(message.get("encoding")))
+    if dtype is None:
+        known = ", ".join(_PIXEL_DTYPES)
+        raise ProtocolError(f"A depth image must be a PNG or one of {known}, not {message.get('encoding')!r}.")
+    order = ">" if message.get("is_bigendian") else "<"
+    try:
+        pixels = np.frombuffer(data, order + dtype).reshape(message["height"], -1)[:, : message["width"]]
+    except (KeyError, TypeError, ValueError) as error:
+        raise ProtocolError(f"A depth image must have height x width pixels: {error}.") from error
+    if dtype != "f4":
+        return _metres(pixels)
+    # As in a PNG, 0 is where nothing was measured.
+    return np.nan_to_num(pixels.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def _metres(millimetres: NDArray[Any]) -> NDArray[np.float32]:
+    # Not in place: uint16 cannot hold metres.
+    metres: NDArray[np.float32] = millimetres.astype(np.float32) / np.float32(1000.0)
+    return metres
+
+
+def _pixels(image: NDArray[np.uint8], kind: str) -> NDArray[np.uint8]:
+    array = np.asarray(image)
+    channels = array.shape[2] if array.ndim == 3 else 1
+    fits = array.dtype == np.uint8 and array.ndim in (2, 3) and channels in _CHANNELS and array.size
+    if not fits or (kind == "jpeg" and channels == 4):
+        raise InvalidValue(
+            f"A {kind} image must be uint8 of shape (height, width, 3), not {array.dtype} of {array.shape}."
+        )
+    return _flat(array)
+
+
+def _flat(image: NDArray[Any]) -> NDArray[Any]:
+    return image[:, :, 0] if image.ndim == 3 and image.shape[2] == 1 else image
+
+
+def _encode(image: NDArray[Any], kind: str) -> bytes:
+    cv2 = _library("cv2")
+    return _encode_pillow(image, kind) if cv2 is None else _encode_cv2(cv2, image, kind)
+
+
+def _decode(data: bytes) -> NDArray[Any]:
+    if not data.startswith((_PNG, _JPEG)):
+        raise ProtocolError(f"An image must be a PNG or JPEG file, not one that begins with {data[:8]!r}.")
+    cv2 = _library("cv2")
+    return _decode_pillow(data) if cv2 is None else _decode_cv2(cv2, data)
+
+
+def _library(name: str) -> ModuleType | None:
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        return None
+
+
+def _pillow() -> Any:
+    pillow = _library("PIL.Image")
+    if pillow is None:
+        raise MissingExtra("PIL", "video", "Sending camera images")
+    return pillow
+
+
+def _encode_cv2(cv2: Any, image: NDArray[Any], kind: str) -> bytes:
+    quick = [cv2.IMWRITE_PNG_COMPRESSION, 1] if kind == "png" else [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    done, data = cv2.imencode(f".{kind}", _swapped(image), quick)
+    if not done:
+        raise InvalidValue(f"OpenCV cannot write a {kind} of shape {image.shape}.")
+    return bytes(data)
+
+
+def _decode_cv2(cv2: Any, data: bytes) -> NDArray[Any]:
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise ProtocolError(f"An image cannot be read: {str(error).strip().splitlines()[-1]}.") from error
+    if image is None:
+        raise ProtocolError(f"An image of {len(data)} bytes cannot be read; it is damaged.")
+    return _swapped(image)
+
+
+def _swapped(image: NDArray[Any]) -> NDArray[Any]:
+    """RGB as BGR, and back."""
+    if image.ndim == 2:
+        return np.ascontiguousarray(image)
+    order = [2, 1, 0, 3][: image.shape[2]]
+    return np.ascontiguousarray(image[:, :, order])
+
+
+def _encode_pillow(image: NDArray[Any], kind: str) -> bytes:
+    file, options = io.BytesIO(), {"compress_level": 1} if kind == "png" else {"quality": JPEG_QUALITY}
+    _pillow().fromarray(np.ascontiguousarray(image)).save(file, kind, **options)
+    return file.getvalue()
+
+
+def _decode_pillow(data: bytes) -> NDArray[Any]:
+    pillow = _pillow()
+    # SyntaxError is what a broken PNG is to Pillow, and a DecompressionBombError what would fill the memory.
+    errors = (OSError, SyntaxError, ValueError, pillow.DecompressionBombError)
+    try:
+        with pillow.open(io.BytesIO(data)) as image:
+            wide = image.mode.startswith("I")
+            array = np.asarray(image.convert("RGB") if image.mode in ("P", "CMYK", "1") else image)
+    except errors as error:
+        raise ProtocolError(f"An image cannot be read: {error}.") from error
+    return array.astype(np.uint16) if wide else array

@@ -1,0 +1,245 @@
+"""Plain finite numbers out of ROS messages, and into them: message dicts only, no profile, no socket.
+
+Every error names what was looked at, what was expected and what was found.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.core.errors import ProtocolError
+from bam_envs.ros.interfaces import variants
+
+Array = NDArray[np.float64]
+Message = Mapping[str, Any]
+_YAW = re.compile(r"yaw\((.+)\)")
+_NANO = 1_000_000_000
+_OBJECT = (dict, Mapping)  # dict first: asking whether something is a Mapping takes ten times as long
+
+
+@cache
+def has_header(kind: str) -> bool:
+    """Whether messages of type `kind` have a stamp and a frame_id."""
+    fields = {field.name for spelling in variants(bare_type(kind)) for field in spelling}
+    return "header" in fields or kind.endswith("Stamped")
+
+
+def same_type(one: str, other: str) -> bool:
+    """Whether two types are alike here: ``pkg/Type`` is ``pkg/msg/Type``, and stamped or not is the same."""
+    return bare_type(one).removesuffix("Stamped") == bare_type(other).removesuffix("Stamped")
+
+
+def bare_type(kind: str) -> str:
+    """``pkg/Type`` for ``pkg/msg/Type`` too."""
+    return kind.replace("/msg/", "/")
+
+
+def require_message(message: object, where: str) -> Message:
+    """`message`, which must be an object with fields."""
+    if not isinstance(message, _OBJECT):
+        raise ProtocolError(f"{where}: a message must be an object with fields, not {shown(message)}.")
+    return message
+
+
+def value_at(message: Message, path: str, where: str) -> Any:
+    """What is at `path`, e.g. ``pose.position.x``; inside of what is stamped where the message is."""
+    steps = _steps(path)
+    value: Any = _body(message, steps[0])
+    for name in steps:
+        if not isinstance(value, _OBJECT) or name not in value:
+            found = ", ".join(map(str, value)) if isinstance(value, _OBJECT) else shown(value)
+            raise ProtocolError(f"{where}: the field {path} is missing; found: {found}.")
+        value = value[name]
+    return value
+
+
+@cache
+def _steps(path: str) -> tuple[str, ...]:
+    return tuple(path.split("."))
+
+
+@cache
+def _quaternion(path: str) -> tuple[str, ...]:
+    """For ``yaw(path)`` the places of x, y, z, w; for any other path nothing."""
+    angle = _YAW.fullmatch(path)
+    return () if angle is None else tuple(f"{angle.group(1)}.{axis}" for axis in "xyzw")
+
+
+def _body(message: Message, first: str) -> Message:
+    """`message`, or what it stamps (a PoseStamped is a header and a Pose) if `first` is not a field of its own."""
+    if first in message or len(message) != 2 or "header" not in message:
+        return message
+    body = next(value for name, value in message.items() if name != "header")
+    return body if isinstance(body, _OBJECT) else message
+
+
+def number_at(message: Message, path: str, where: str) -> float:
+    """The finite number at `path`; for ``yaw(path)`` the angle about z [rad] of the quaternion there."""
+    quaternion = _quaternion(path)
+    if not quaternion:
+        value = value_at(message, path, where)
+        # What comes a thousand times a second is not to make a text that nobody reads.
+        return value if type(value) is float and math.isfinite(value) else number(value, f"{where}: {path}")
+    x, y, z, w = (number_at(message, axis, where) for axis in quaternion)
+    return math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
+
+
+def number(value: object, where: str) -> float:
+    """`value`, which must be a plain finite number."""
+    if isinstance(value, (float, int, np.integer, np.floating)) and not isinstance(value, bool):
+        try:
+            found = float(value)
+        except OverflowError:
+            found = math.inf
+        if math.isfinite(found):
+            return found
+    raise ProtocolError(f"{where} must be a finite number, not {shown(value)}.")
+
+
+def shown(value: object) -> str:
+    """`value` as a message writes it, shortened."""
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def usual_numbers(value: object) -> Array | None:
+    """The list `value` if all of it is finite plain numbers, as it nearly always is; else None. Shape: (k,)."""
+    if type(value) is not list or not value or not set(map(type, value)) <= {float, int}:
+        return None
+    try:
+        return np.array(value, dtype=np.float64) if math.isfinite(sum(value)) else None  # finite terms, too
+    except OverflowError:
+        return None
+
+
+def numbers(value: object, where: str, *, missing: float | None = None) -> Array:
+    """The list `value` of plain finite numbers; `missing`, if given, is what the others become. Shape: (k,)."""
+    usual = usual_numbers(value)
+    if usual is not None:
+        return usual
+    if isinstance(value, np.ndarray) and value.ndim == 1:
+        value = value.tolist()
+    if not isinstance(value, Sequence) or isinstance(value, (str, bytes, bytearray)):
+        raise ProtocolError(f"{where} must be a list of numbers, not {shown(value)}.")
+    if missing is not None:
+        value = [missing if _is_missing(one) else one for one in value]
+    if not set(map(type, value)) <= {int, float}:
+        value = [number(one, f"{where}[{place}]") for place, one in enumerate(value)]
+    try:
+        array = np.array(value, dtype=np.float64)
+    except OverflowError:
+        array = np.array([number(one, f"{where}[{place}]") for place, one in enumerate(value)])
+    if not np.isfinite(array).all():
+        place = int(np.flatnonzero(~np.isfinite(array))[0])
+        number(value[place], f"{where}[{place}]")
+    return array
+
+
+def _is_missing(value: object) -> bool:
+    return value is None or (isinstance(value, float) and not math.isfinite(value))
+
+
+def names_of(message: Message, field: str, where: str) -> list[str]:
+    """The list of names in `field`, each once."""
+    names = value_at(message, field, where)
+    if not isinstance(names, Sequence) or isinstance(names, str) or not all(isinstance(name, str) for name in names):
+        raise ProtocolError(f"{where}: {field} must be a list of names, not {shown(names)}.")
+    for name in names if len(set(names)) < len(names) else ():
+        if names.count(name) > 1:
+            raise ProtocolError(f"{where}: {name} comes twice in {field}.")
+    return list(names)
+
+
+def require_names(names: Sequence[str], found: list[str], where: str, ignore: Sequence[str] = ()) -> None:
+    """`found` are `names`, in any order, and at most what is to `ignore`."""
+    missing = [name for name in names if name not in found]
+    if missing:
+        raise ProtocolError(f"{where}: {', '.join(missing)} missing; found: {', '.join(found) or 'no name'}.")
+    extra = [name for name in found if name not in names and name not in ignore]
+    if extra:
+        raise ProtocolError(
+            f"{where}: {', '.join(extra)} not expected; expected: {', '.join(names)}. "
+            f"List what is not ours in ignore of the profile."
+        )
+
+
+def require_frame(frame: str, message: Message, where: str) -> None:
+    """The header of `message` names `frame`; ROS 1 may write a slash before it.
+
+    Raises:
+        ProtocolError: It names another frame, or none: where its numbers are is not known.
+    """
+    header = message.get("header")
+    found = header.get("frame_id") if isinstance(header, _OBJECT) else None
+    if found == frame or (isinstance(found, str) and found.lstrip("/") == frame):
+        return
+    raise ProtocolError(
+        f"{where}: header.frame_id must be {frame!r}, not {shown(found)}: a pose in another frame is another place "
+        f"(a UR's base is its base_link turned by 180 degrees about z). Publish it in {frame}; if that frame has "
+        f"another name there, give the name under [frames] of the profile."
+    )
+
+
+def put_at(message: dict[str, Any], path: str, value: float) -> None:
+    """Write `value` at `path`; at ``yaw(path)`` the quaternion of that angle about z."""
+    quaternion = _quaternion(path)
+    if quaternion:
+        for axis, part in zip(quaternion, (0.0, 0.0, math.sin(value / 2), math.cos(value / 2)), strict=True):
+            put_at(message, axis, part)
+        return
+    *above, name = _steps(path)
+    for step in above:
+        message = message.setdefault(step, {})
+    message[name] = value
+
+
+def read_stamp(message: Message, where: str) -> float | None:
+    """When the message says it was measured [s]; None if it says nothing, or 0.
+
+    Both spellings are read: ``secs``, ``nsecs`` of ROS 1 and ``sec``, ``nanosec`` of ROS 2.
+    """
+    header = message.get("header")
+    stamp = header.get("stamp") if isinstance(header, _OBJECT) else None
+    if stamp is None:
+        return None
+    if not isinstance(stamp, _OBJECT):
+        require_message(stamp, f"{where}: header.stamp")
+    seconds, nano = _either(stamp, "sec", "secs", where), _either(stamp, "nanosec", "nsecs", where)
+    if seconds < 0 or not 0 <= nano < _NANO:
+        raise ProtocolError(f"{where}: header.stamp must be seconds and nanoseconds, not {shown(stamp)}.")
+    return seconds + nano / _NANO or None
+
+
+def _either(stamp: Message, ros2: str, ros1: str, where: str) -> float:
+    name = ros2 if ros2 in stamp else ros1
+    if name not in stamp:
+        raise ProtocolError(f"{where}: header.stamp has no {ros2}; found: {', '.join(stamp)}.")
+    value = stamp[name]
+    # What comes a thousand times a second is not to make a text that nobody reads.
+    return value if type(value) is int and value < 2**63 else number(value, f"{where}: header.stamp.{name}")
+
+
+def write_stamp(seconds: float, *, ros1: bool = False) -> dict[str, int]:
+    """A stamp as ROS 2 spells it, or ROS 1."""
+    whole, nano = divmod(round(seconds * _NANO), _NANO)
+    return {"secs": whole, "nsecs": nano} if ros1 else {"sec": whole, "nanosec": nano}
+
+
+def tag_text(message: Message) -> object:
+    """The text that may be a tag: ``header.frame_id``, or the label of the first dimension of an array."""
+    header, layout = message.get("header"), message.get("layout")
+    if isinstance(header, _OBJECT):
+        return header.get("frame_id")
+    dimensions = layout.get("dim") if isinstance(layout, _OBJECT) else None
+    if isinstance(dimensions, Sequence) and dimensions and isinstance(dimensions[0], _OBJECT):
+        return dimensions[0].get("label")
+    return None

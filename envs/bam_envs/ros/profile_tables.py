@@ -1,0 +1,315 @@
+"""What a robot profile holds: sources of its signals, sinks of its commands, cameras, ages and limits."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.robot import RobotSpec, SignalSpec
+
+_TRAJECTORY = "trajectory_msgs/JointTrajectory"
+_LAGS = {"arm": 0.1, "base": 0.3}
+"""How far live robots are behind their commands [s], network and controller together; the limit `lag` changes it."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where the numbers of one signal come from."""
+
+    signal: str
+    """Which signal."""
+    topic: str
+    """Absolute name, without namespace."""
+    type: str
+    """Message type, ``pkg/Type``. What is stamped (``pkg/TypeStamped``) is read too where `type` is not."""
+    field: str = ""
+    """Where the list of its numbers is, e.g. ``position``; or `fields`."""
+    fields: tuple[str, ...] = ()
+    """Where each number is, e.g. ``pose.position.x``; ``yaw(orientation)`` is the angle about z of a quaternion."""
+    names: tuple[str, ...] = ()
+    """Names of the numbers at the robot, in the order of the signal's labels; they are looked up in the message's
+    ``name``, whatever their order there. Empty: the numbers come in order, without names."""
+    ignore: tuple[str, ...] = ()
+    """Names that may come too, and are not ours."""
+    partial: bool = False
+    """Whether several publishers share the topic, so that messages without any of `names` are somebody else's."""
+    scale: tuple[float, ...] = (1.0,)
+    """SI value = number x scale + offset; one for all, or one for each."""
+    offset: tuple[float, ...] = (0.0,)
+    """See `scale`."""
+    skip: tuple[int, int] = (0, 0)
+    """How many numbers of `field` to leave out at the beginning and at the end."""
+    missing: float | None = None
+    """What null, NaN and infinities in `field` mean; None: they are errors."""
+    within: tuple[float, float] | None = None
+    """Least and greatest that its numbers can be, as they travel: what is beyond is cut. None: as they come."""
+    frame: str = ""
+    """Frame that ``header.frame_id`` must name, or the message is refused; empty: not looked at."""
+    max_age: float | None = None
+    """Oldest that is acted on [s]; None: the profile's."""
+    optional: bool = False
+    """Whether it is measured only when it is asked for."""
+    constants: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Further fields of the message, as a simulated robot sends them."""
+
+    @cached_property
+    def is_si(self) -> bool:
+        """Whether its numbers travel in SI units, as they are."""
+        return set(self.scale) == {1.0} and set(self.offset) == {0.0}
+
+
+@dataclass(frozen=True)
+class Sink:
+    """Where some of the numbers of a command go."""
+
+    topic: str
+    """Absolute name, without namespace."""
+    type: str
+    """Message type, ``pkg/Type``."""
+    labels: tuple[str, ...]
+    """Which numbers of the command, by label, in the order of the message."""
+    names: tuple[str, ...] = ()
+    """Names of the numbers at the robot, for types that have names; the labels by default."""
+    fields: tuple[str, ...] = ()
+    """Where each number goes, for types without a list, e.g. ``linear.x``."""
+    scale: tuple[float, ...] = (1.0,)
+    """SI value = number x scale + offset; one for all, or one for each."""
+    offset: tuple[float, ...] = (0.0,)
+    """See `scale`."""
+    reach: float | None = None
+    """When a trajectory's point is to be reached [s]; None: `reach_periods` after it was sent."""
+    reach_periods: float = 1.0
+    """The same, in periods of the task; above 1 an arm does not stop where the next command is late."""
+    hold: Literal["measured", "last", "zero"] = "measured"
+    """What a halt sends: where it is, what was sent last, or zeros."""
+    tag: bool = True
+    """Whether the message says who sent it when, if its type has room for a text: ``header.frame_id``, or the label of
+    an array's first dimension."""
+    controller: str = ""
+    """The controller of ros2_control that takes it, which must be active; empty, and where the topic is renamed: it is
+    not asked for."""
+
+    def reach_at(self, period: float) -> float:
+        """When a trajectory's point is to be reached [s], where a command is sent every `period` [s]."""
+        return period * self.reach_periods if self.reach is None else self.reach
+
+    @cached_property
+    def is_si(self) -> bool:
+        """Whether its numbers travel in SI units, as they are."""
+        return set(self.scale) == {1.0} and set(self.offset) == {0.0}
+
+
+@dataclass(frozen=True)
+class Readiness:
+    """A topic on which a robot says whether it can move. A robot that does not have it is driven without."""
+
+    topic: str
+    """Absolute name, without namespace."""
+    type: str
+    """Message type, ``pkg/Type``."""
+    field: tuple[str, ...]
+    """Where the value is, e.g. ``mode``; of several names the first that the message has."""
+    ready: tuple[float | bool | str, ...] = ()
+    """The values with which it can move; or `at_least`."""
+    at_least: float | None = None
+    """The least number with which it can begin to move."""
+    words: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """What other values mean, e.g. ``3 = "protective stop"``."""
+    otherwise: str = ""
+    """What all further values mean; ``{}`` stands for the value. Empty: the value itself is said."""
+
+    def value(self, message: Any) -> Any:
+        """The value in `message`; None if it has none."""
+        for path in self.field:
+            found = message
+            for name in path.split("."):
+                found = found.get(name) if isinstance(found, Mapping) else None
+            if found is not None:
+                return found
+        return None
+
+    def trouble(self, message: Any) -> str | None:
+        """Why the robot cannot move, by `message`; None if it can, or does not say."""
+        value = self.value(message)
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        enough = self.at_least is not None and not (number and value < self.at_least)
+        if value is None or value in self.ready or enough:
+            return None
+        text = f"{value:g}" if number else str(value).lower() if isinstance(value, bool) else str(value)
+        return self.words.get(text) or self.otherwise.replace("{}", text) or f"{self.field[0]} is {text}"
+
+
+IMAGE_TYPES = ("sensor_msgs/CompressedImage", "sensor_msgs/Image")
+"""What a camera may send: JPEG or PNG, or raw pixels, which come on a CBOR connection of their own."""
+
+
+@dataclass(frozen=True)
+class CameraSource:
+    """A camera."""
+
+    name: str
+    """What it is called here."""
+    topic: str
+    """Absolute name, without namespace."""
+    type: str = "sensor_msgs/CompressedImage"
+    """One of `IMAGE_TYPES`."""
+    max_age: float = 0.5
+    """Oldest image that is handed out [s]."""
+
+
+@dataclass(frozen=True)
+class RobotProfile:
+    """A live robot, as one file describes it."""
+
+    name: str
+    """What it is called."""
+    kind: Literal["arm", "base"]
+    """What moves."""
+    signals: tuple[SignalSpec, ...]
+    """Every signal that has a source."""
+    command: SignalSpec
+    """What it is sent."""
+    state: tuple[Source, ...]
+    """One source for each of `signals`, in their order."""
+    commands: Mapping[str, tuple[Sink, ...]]
+    """Ways of sending a command, by name, the default first. The last sink of a way makes a command complete."""
+    period: float
+    """Time between two commands [s]."""
+    max_age: float
+    """Oldest state that is acted on [s]."""
+    dead_man: float
+    """For how long a command means something [s]; see `command_life`."""
+    limits: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Limits of the guards that differ from their defaults, by their names in `bam_envs.safety.guards`."""
+    cameras: tuple[CameraSource, ...] = ()
+    """Its cameras."""
+    readiness: tuple[Readiness, ...] = ()
+    """Where it says whether it can move; the first one that says no is told."""
+    controllers: str = ""
+    """The service that lists its controllers and their states (``list_controllers``); empty: there is none."""
+
+    @cached_property
+    def sinks_by_topic(self) -> Mapping[str, Sink]:
+        """What is sent on each topic, in the first way that uses it."""
+        return {sink.topic: sink for way in reversed([*self.commands.values()]) for sink in reversed(way)}
+
+    def command_life(self, period: float) -> float:
+        """For how long a command means something to who sends one every `period` [s]: two periods at least.
+
+        The robot would else rest in the middle of a slow task whenever the next command is a little late.
+        """
+        return max(self.dead_man, 2.0 * period)
+
+    def source(self, signal: str) -> Source:
+        """Where `signal` comes from."""
+        return next(source for source in self.state if source.signal == signal)
+
+    def signal(self, name: str) -> SignalSpec:
+        """The signal called `name`."""
+        return next(signal for signal in self.signals if signal.name == name)
+
+    def camera(self, name: str) -> CameraSource:
+        """The camera called `name`.
+
+        Raises:
+            UnknownName: There is none of that name.
+        """
+        cameras = {camera.name: camera for camera in self.cameras}
+        if name not in cameras:
+            raise UnknownName(f"camera of {self.name}", name, cameras)
+        return cameras[name]
+
+    def age_limit(self, source: Source) -> float:
+        """Oldest state of `source` that is acted on [s]."""
+        return self.max_age if source.max_age is None else source.max_age
+
+    def sinks(self, mode: str | None = None) -> tuple[Sink, ...]:
+        """Where the parts of a command go; `mode` None is the default way.
+
+        Raises:
+            UnknownName: There is no such way.
+        """
+        if mode is None:
+            return next(iter(self.commands.values()))
+        if mode not in self.commands:
+            raise UnknownName(f"way of sending commands to {self.name}", mode, self.commands)
+        return self.commands[mode]
+
+    def narrowed(self, labels: tuple[str, ...], mode: str | None = None) -> RobotProfile:
+        """The same robot, for a task that commands only the numbers `labels`, in their order.
+
+        Sinks that take none of them are not in it: nothing is ever sent there. Nor are ways that would cut a message,
+        and that is an error of the way `mode` (None: the default one).
+
+        Raises:
+            InvalidValue: It does not take one of them, or a sink of `mode` takes some of its numbers only.
+            UnknownName: There is no such way.
+        """
+        if labels == self.command.labels:
+            return self
+        if not labels or not set(labels) <= set(self.command.labels):
+            expected, found = ", ".join(labels) or "nothing", ", ".join(self.command.labels)
+            raise InvalidValue(f"Commands are {expected}, and {self.name} takes {found}. Choose another profile.")
+        wanted = self.sinks(mode)
+        for sink in wanted:
+            self._require_whole(sink, labels)
+        commands = {
+            way: tuple(sink for sink in sinks if set(sink.labels) <= set(labels))
+            for way, sinks in self.commands.items()
+            if sinks is wanted or not any(_missing(sink, labels) for sink in sinks)
+        }
+        return dataclasses.replace(self, command=self.command.part(labels), commands=commands)
+
+    def _require_whole(self, sink: Sink, labels: tuple[str, ...]) -> None:
+        missing = _missing(sink, labels)
+        if missing:
+            taken, absent, alone = (", ".join(one) for one in (sink.labels, missing, labels))
+            raise InvalidValue(
+                f"{sink.topic} takes {taken} in one message, and {absent} is not commanded. "
+                f"Give the profile of {self.name} a way of sending commands with a topic for {alone} alone."
+            )
+
+    def spec(self, wanted: RobotSpec | None = None, mode: str | None = None) -> RobotSpec:
+        """What this robot measures and is sent; only the signals and commands of `wanted`, at its period, if given.
+
+        Args:
+            wanted: What a task needs.
+            mode: As of `narrowed`, and so are its errors.
+
+        Raises:
+            InvalidValue: It does not measure a signal of `wanted`, or does not take its commands.
+        """
+        if wanted is None:
+            signals = tuple(signal for signal in self.signals if not self.source(signal.name).optional)
+            return RobotSpec(self.name, signals, self.command, self.period, self._lag(self.period, mode))
+        self._require_measured(wanted)
+        signals = tuple(self.signal(signal.name) for signal in wanted.signals)
+        command = self.narrowed(wanted.command.labels, mode).command
+        return RobotSpec(self.name, signals, command, wanted.period, self._lag(wanted.period, mode))
+
+    def _lag(self, period: float, mode: str | None) -> float:
+        """How far it is behind commands that are sent every `period` [s]: more where a trajectory takes longer."""
+        longest = max((sink.reach_at(period) for sink in self.sinks(mode) if sink.type == _TRAJECTORY), default=0.0)
+        return _LAGS[self.kind] + max(0.0, longest - period)
+
+    def _require_measured(self, wanted: RobotSpec) -> None:
+        known = {signal.name: signal for signal in self.signals}
+        for signal in wanted.signals:
+            if signal.name not in known:
+                raise InvalidValue(
+                    f"{signal.name} is needed, and {self.name} measures only {', '.join(known)}. "
+                    f"Give its profile a [[state]] table for it."
+                )
+            if signal.labels != known[signal.name].labels:
+                found = ", ".join(known[signal.name].labels)
+                raise InvalidValue(f"{signal.name} must be {', '.join(signal.labels)}; that of {self.name} is {found}.")
+
+
+def _missing(sink: Sink, labels: tuple[str, ...]) -> list[str]:
+    """What `sink` needs beside `labels`; nothing where it takes none of them."""
+    missing = [label for label in sink.labels if label not in labels]
+    return missing if len(missing) < len(sink.labels) else []

@@ -1,0 +1,89 @@
+"""The Bus protocol: topics and services, whoever carries them.
+
+Three carry them: the embedded server inside its own process (`bam_envs.rosbridge.server`), a link to a rosbridge
+server (`bam_envs.rosbridge.link`), and a native ROS 2 node (`bam_envs.remote.serve.rclpy_bus`). Messages are plain
+dicts in the JSON form of rosbridge; a byte array is `bytes`. Types are written ``pkg/Type``; ``pkg/msg/Type`` and
+``pkg/srv/Type`` are taken too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+Message = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Who published a message, or calls a service."""
+
+    name: str
+    """Unique among the callers of a bus; the same as long as the connection lives."""
+    address: str = ""
+    """Where it is, for people."""
+    session: str = ""
+    """The session whose signature the message bears; empty without one."""
+    operator: bool = False
+    """Whether it showed the operator's token."""
+    silence: Callable[[], float] = field(default=lambda: math.inf, compare=False)
+    """How long its connection has given no sign of life [s]; infinite where the bus does not know."""
+
+    @property
+    def shown(self) -> str:
+        """What others are told of it."""
+        return self.address or self.name or (f"session {self.session}" if self.session else "a sender without a name")
+
+    @property
+    def client(self) -> str:
+        """Who it is to a `CommandLease`: its session, else its connection."""
+        return f"session {self.session}" if self.session else self.shown
+
+
+UNKNOWN_CALLER = Caller("")
+"""Where the bus does not say who it is (a real ROS graph)."""
+
+Listener = Callable[[Message, Caller], None]
+"""Takes a message. Must return at once: it runs in the thread of the network. Never raises."""
+Handler = Callable[[Message, Caller], Message]
+"""Answers a service request with its response; runs in a thread of its own. What it raises of our errors is the text of
+a failed response."""
+
+
+def refusal_of(topic: str, reason: object) -> str:
+    """Why a listener refuses a message on `topic`, with its name once: listeners may say it, without a namespace."""
+    head, colon, rest = str(reason).partition(": ")
+    named = bool(colon) and head.startswith("/") and topic.endswith(head)
+    return f"{topic}: {rest if named else reason}"
+
+
+class Bus(Protocol):
+    """Publish, subscribe, serve. From any thread."""
+
+    def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
+        """Say that `topic` of type `kind` will be published; a latched one repeats its last message to newcomers."""
+
+    def publish(self, topic: str, message: Message) -> None:
+        """Send `message` now, or not at all.
+
+        Raises:
+            LinkLost: There is no link; nothing is kept.
+            InvalidValue: A number in it is not finite, or is not a plain number.
+        """
+
+    def publish_all(self, messages: Sequence[tuple[str, Message]]) -> None:
+        """Send several messages, each with its topic, in this order; quicker than one by one. Raises as `publish`."""
+
+    def subscribe(self, topic: str, kind: str, listener: Listener) -> Callable[[], None]:
+        """Call `listener` for each message, until what is returned is called. Other listeners are not touched."""
+
+    def serve(self, service: str, kind: str, handler: Handler) -> None:
+        """Answer `service` of type `kind`: always, also when the handler fails."""
+
+    def on_leave(self, callback: Callable[[Caller], None]) -> None:
+        """Call `callback` when a caller's connection ends, where the bus knows; elsewhere never."""
+
+    def close(self) -> None:
+        """Stop serving and let go of everything. As often as one likes."""

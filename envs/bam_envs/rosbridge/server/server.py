@@ -1,0 +1,347 @@
+"""The embedded rosbridge server: the protocol of `core` on WebSockets, in a thread of its own.
+
+The thread of the network runs the protocol and the listeners; handlers of services run in a pool of threads, and what
+is long is read in a thread of its own, so that nobody's halt waits for it. A client that sends nonsense, does not read,
+or opens sockets and says nothing costs a bounded amount of memory and time.
+
+The file is long because the two sides of the server, its bus for this process and its connections, meet in one loop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import itertools
+import logging
+import ssl
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from types import TracebackType
+from typing import Any, TypeVar
+
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
+
+from bam_envs.core.errors import InvalidValue, LinkLost
+from bam_envs.rosbridge.bus import Caller, Handler, Listener, Message
+from bam_envs.rosbridge.server.connection import BridgeConnection
+from bam_envs.rosbridge.server.core import Bridge, Incoming
+from bam_envs.rosbridge.server.door import Door, listening_error, tls_context
+from bam_envs.rosbridge.server.loop_thread import LoopThread
+from bam_envs.rosbridge.server.options import ServerOptions
+from bam_envs.rosbridge.server.packets import Publication
+from bam_envs.rosbridge.server.session import Invoke, Send, Session
+from bam_envs.rosbridge.server.workers import Workers
+from bam_envs.rosbridge.tokens import Tokens
+
+__all__ = ["BridgeServer", "ServerOptions"]
+
+T = TypeVar("T")
+
+_HANDLER_THREADS = 32
+_SHORT = 4096
+"""A frame up to this is read in the thread of the network [bytes]."""
+_TURN = 4
+_QUEUE = 2
+"""Messages of a client that are taken from its socket before they are done."""
+_logger = logging.getLogger(__name__)
+# Of `websockets`, to which every port scanner is worth a traceback.
+_quiet = logging.getLogger(f"{__name__}.websockets")
+_quiet.setLevel(logging.CRITICAL)
+
+
+class BridgeServer:
+    """A rosbridge server, and in its own process a `Bus`.
+
+    Args:
+        host: Address to listen on; others than this computer reach it only if it is not loopback.
+        port: 0 takes a free one, `port` says which.
+        cert: File with the certificate chain in PEM, for ``wss://``.
+        key: File with its key, if it is not the same one.
+        token: Clients must show it: ``Authorization: Bearer TOKEN``, or ``?token=TOKEN`` in the URL; a page in a
+            browser also by its first message, ``{"op": "auth", "token": TOKEN}``. Without one no page comes in.
+        operator_token: Who shows this one instead is an operator (`Caller.operator`).
+        options: The rest.
+    """
+
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        port: int = 9090,
+        *,
+        cert: str | None = None,
+        key: str | None = None,
+        token: str | None = None,
+        operator_token: str | None = None,
+        options: ServerOptions | None = None,
+    ) -> None:
+        if not 0 <= port <= 65535:
+            raise InvalidValue(f"Port: expected an integer in [0, 65535], found {port}.")
+        if key is not None and cert is None:
+            raise InvalidValue("A key needs its certificate; name the file of that too.")
+        self.host, self.port = host, port
+        self.options = options or ServerOptions()
+        self._cert, self._key = cert, key
+        self._bridge = Bridge(self.options.limits)
+        self._connections: dict[Session, BridgeConnection] = {}
+        self._sockets: set[BridgeConnection] = set()
+        self._door = Door(Tokens(token, operator_token), self.options.max_clients, lambda: len(self._connections))
+        self._numbers = itertools.count(1)
+        self._thread = LoopThread("bam-bridge-server")
+        self._workers = Workers(_HANDLER_THREADS, "bam-bridge-handler")
+        self._reader = Workers(1, "bam-bridge-reader")  # one: each more would leave the network less of the interpreter
+        self._timer: asyncio.TimerHandle | None = None
+        self._stop: asyncio.Event | None = None
+
+    @property
+    def url(self) -> str:
+        """Where clients find it."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{'wss' if self._cert else 'ws'}://{host}:{self.port}"
+
+    @property
+    def clients(self) -> int:
+        """How many there are."""
+        return len(self._connections)
+
+    def start(self) -> BridgeServer:
+        """Listen; returns when clients can connect.
+
+        Raises:
+            InvalidValue: The port is in use, the address is not of this computer, the certificate is not usable, or
+                the server was started before.
+        """
+        if self._thread.was_started:
+            raise InvalidValue("A server starts once; make a new one.")
+        tls = tls_context(self._cert, self._key) if self._cert else None
+        try:
+            self._thread.start(functools.partial(self._main, tls))
+        except (OSError, UnicodeError) as error:
+            raise listening_error(self.host, self.port, error) from error
+        return self
+
+    def close(self) -> None:
+        """Say goodbye to all clients (1001), and end the threads. As often as one likes."""
+        if self._stop is not None:
+            self._thread.post(self._stop.set)
+        self._thread.join()
+        self._workers.close()
+        self._reader.close()
+
+    def __enter__(self) -> BridgeServer:
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # The Bus. See there.
+
+    def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
+        """Say that `topic` of type `kind` will be published; a latched one repeats its last message to newcomers."""
+        self._do(lambda: self._bridge.advertise(topic, kind, latch=latch))
+
+    def publish(self, topic: str, message: Message) -> None:
+        """Send `message` now, or not at all."""
+        self.publish_all([(topic, message)])
+
+    def publish_all(self, messages: Sequence[tuple[str, Message]]) -> None:
+        """Send several messages, each with its topic, in this order."""
+        publications = [self._bridge.publication(topic, message) for topic, message in messages]
+        if self._thread.is_current:  # in a listener: what made that run flushes afterwards
+            self._publish(publications)
+        elif not self._post(lambda: self._publish(publications)):
+            raise LinkLost(f"{messages[0][0]}: the server is not running; nothing was sent.")
+
+    def subscribe(self, topic: str, kind: str, listener: Listener) -> Callable[[], None]:
+        """Call `listener` in the thread of the network for each message, until what is returned is called."""
+        unsubscribe = self._do(lambda: self._bridge.subscribe(topic, kind, listener))
+        return lambda: self._do(unsubscribe)
+
+    def serve(self, service: str, kind: str, handler: Handler) -> None:
+        """Answer `service` of type `kind`: always, also when the handler fails."""
+        self._do(lambda: self._bridge.serve(service, kind, handler))
+
+    def on_leave(self, callback: Callable[[Caller], None]) -> None:
+        """Call `callback` in the thread of the network when a client's connection ends."""
+        self._do(lambda: self._bridge.on_leave(callback))
+
+    # The thread of the network.
+
+    async def _main(self, tls: ssl.SSLContext | None, listening: Future[None]) -> None:
+        self._stop = asyncio.Event()
+        server = await self._listen(tls)
+        self.port = server.sockets[0].getsockname()[1]
+        listening.set_result(None)
+        await self._stop.wait()
+        await self._shut(server)
+
+    async def _listen(self, tls: ssl.SSLContext | None) -> Server:
+        options = self.options
+        extra: dict[str, Any] = {"ssl": tls, "ssl_handshake_timeout": options.open_timeout} if tls else {}
+        server: Server = await serve(
+            self._serve,
+            self.host,
+            self.port,
+            process_request=self._door.check,
+            compression=None,
+            open_timeout=options.open_timeout,
+            ping_interval=options.ping_interval,
+            ping_timeout=options.ping_timeout,
+            close_timeout=options.close_timeout,
+            max_size=options.limits.max_incoming,
+            max_queue=_QUEUE,
+            logger=_quiet,
+            create_connection=self._connection_type(),
+            **extra,
+        )
+        return server
+
+    def _connection_type(self) -> Any:
+        """What makes a connection; `websockets` calls it, and only says that it is a class."""
+        return functools.partial(
+            BridgeConnection,
+            sockets=self._sockets,
+            most_unfinished=self.options.limits.unfinished,
+            most_unsent=self.options.limits.max_message + self.options.outbox.size,
+            outbox_limits=self.options.outbox,
+        )
+
+    async def _shut(self, server: Server) -> None:
+        # asyncio leaks a socket that was accepted just before its server is closed: accept no more, let those become
+        # connections in the next turns of the loop, and close then.
+        for listener in server.sockets:
+            asyncio.get_running_loop().remove_reader(listener.fileno())
+        await _turns()
+        self._abort(lambda connection: connection.is_opening)
+        server.close(reason="the server is closing")
+        await _turns()
+        # Not for server.wait_closed(): it waits for sockets in the middle of their TLS handshake, too.
+        goodbyes = [asyncio.create_task(connection.wait_closed()) for connection in self._sockets]
+        if goodbyes:
+            await asyncio.wait(goodbyes, timeout=2 * self.options.close_timeout + 1.0)
+        self._abort(lambda connection: True)
+        await _turns()
+
+    def _abort(self, condition: Callable[[BridgeConnection], bool]) -> None:
+        for connection in [one for one in self._sockets if condition(one)]:
+            connection.transport.abort()
+
+    async def _serve(self, connection: ServerConnection) -> None:
+        """Read one client's frames until its connection ends."""
+        if not isinstance(connection, BridgeConnection):
+            raise TypeError(f"Expected a BridgeConnection, found {connection!r}.")
+        try:
+            await self._door.greet(connection)
+        except ConnectionClosed:
+            return
+        if connection.role is None:
+            return
+        session = self._bridge.open(self._caller(connection))
+        self._connections[session] = connection
+        try:
+            await self._read(connection, session)
+        except ConnectionClosed as end:
+            _logger.debug("%s at %s left: %s", session.caller.name, session.caller.address, end)
+        finally:
+            del self._connections[session]
+            self._bridge.lost(session)
+            self._flush()
+
+    def _caller(self, connection: BridgeConnection) -> Caller:
+        host, port = connection.remote_address[:2]
+        return Caller(
+            f"client{next(self._numbers)}",
+            f"{host}:{port}",
+            operator=connection.role == "operator",
+            silence=lambda: time.monotonic() - connection.heard,
+        )
+
+    async def _read(self, connection: BridgeConnection, session: Session) -> None:
+        for number in itertools.count(1):
+            text: bytes | str | None = await connection.next_frame()
+            joined = False
+            while text is not None:
+                incoming = await self._incoming(text, joined)
+                text, joined = self._bridge.take(session, incoming, time.monotonic()), True
+            self._flush()
+            # Frames that are there already come without a pause; the other clients must not wait for them all.
+            if number % _TURN == 0:
+                await asyncio.sleep(0)
+
+    async def _incoming(self, text: bytes | str, joined: bool) -> Incoming:
+        """What a frame says; a long one is read elsewhere, and its client's next one waits for it."""
+        if len(text) <= _SHORT:
+            return self._bridge.read(text, joined=joined)
+        loop = asyncio.get_running_loop()
+        done: asyncio.Future[Incoming] = loop.create_future()
+
+        def read() -> None:
+            incoming = self._bridge.read(text, joined=joined, check=True)
+            self._thread.post(lambda: None if done.cancelled() else done.set_result(incoming))
+
+        self._reader.submit(read)
+        return await done
+
+    def _publish(self, publications: Sequence[Publication]) -> None:
+        now = time.monotonic()
+        for publication in publications:
+            self._bridge.publish(publication, now)
+
+    def _flush(self) -> None:
+        """Do what the protocol wants done."""
+        written: dict[BridgeConnection, None] = {}
+        for event in self._bridge.events():
+            if isinstance(event, Send):
+                connection = self._connections.get(event.session)
+                if connection is not None:
+                    connection.put(event.packet, event.keep)
+                    written[connection] = None
+            else:
+                self._workers.submit(functools.partial(self._work, event))
+        for connection in written:
+            connection.flush()
+        self._arm()
+
+    def _work(self, invoke: Invoke) -> None:
+        """In a thread of the pool: answer one call."""
+        packet = self._bridge.packed_answer(invoke)
+        self._post(lambda: self._bridge.finish(invoke, packet))
+
+    def _arm(self) -> None:
+        deadline = self._bridge.next_deadline
+        if deadline is None:
+            return
+        if self._timer is not None and self._timer.when() > deadline:
+            self._timer.cancel()
+            self._timer = None
+        if self._timer is None:
+            # The loop's clock is the monotonic one.
+            self._timer = asyncio.get_running_loop().call_at(deadline, self._tick)
+
+    def _tick(self) -> None:
+        self._timer = None
+        self._bridge.tick(time.monotonic())
+        self._flush()
+
+    def _post(self, work: Callable[[], object]) -> bool:
+        """Have `work` done in the thread of the network, and what follows from it; False if it is not running."""
+        return self._thread.post(lambda: self._then_flush(work))
+
+    def _do(self, work: Callable[[], T]) -> T:
+        """The same, and wait for its result. While the server is not running, `work` is done here."""
+        return self._thread.do(lambda: self._then_flush(work))
+
+    def _then_flush(self, work: Callable[[], T]) -> T:
+        result = work()
+        if self._thread.is_current:
+            self._flush()
+        return result
+
+
+async def _turns() -> None:
+    """Let what is ready happen, and what follows from it."""
+    for _ in range(5):
+        await asyncio.sleep(0)

@@ -1,0 +1,180 @@
+"""One client of the rosbridge server: what it has advertised, subscribed and asked; and how its fields are read."""
+
+from __future__ import annotations
+
+import re
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+from bam_envs.core.errors import ProtocolError
+from bam_envs.ros.interfaces import describe
+from bam_envs.rosbridge.bus import Caller, Handler, Message
+from bam_envs.rosbridge.encoding import COMPRESSIONS, LARGEST_ID, LONGEST_ID, Fragments
+from bam_envs.rosbridge.server.packets import NEVER_SPLIT, Packet, Wire, pack
+
+if TYPE_CHECKING:
+    from bam_envs.rosbridge.server.topics import Stream
+
+LEVELS = ("none", "error", "warning", "info")
+"""Of status messages: each one includes those before it."""
+_NAME = re.compile(r"/?[A-Za-z_~][\w~]*(?:/[\w~]+)*", re.ASCII)
+_LONGEST = 256
+_LARGEST = 2**53
+
+Id = str | int | None
+"""What a client calls an interaction; None if it does not."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one client may use. Beyond it, it is told so; the others do not notice."""
+
+    service_timeout: float = 30.0
+    """A client that offers a service must have answered by then [s], if the caller names no other time."""
+    handler_timeout: float = 300.0
+    """The same for services offered inside this process [s]: a robot's motion may take its time."""
+    max_message: int = 64 * 2**20
+    """Largest answer to a client [bytes]."""
+    max_incoming: int = 16 * 2**20
+    """Largest message from a client [bytes], and most that its unfinished fragments may hold together."""
+    unfinished: int = 64 * 2**20
+    """Most that the unfinished fragments of all clients may hold together, and their unfinished frames [bytes]: who
+    holds most gives way."""
+    topics: int = 1024
+    """Most subscriptions, and most advertisements."""
+    services: int = 256
+    """Most services that it offers."""
+    calls: int = 256
+    """Most unanswered calls."""
+    at_once: int = 4
+    """Most of its calls that handlers of this process work on at the same time; the others wait their turn."""
+    fragment_lifetime: float = 10.0
+    """A message that comes in fragments must be whole by then [s]."""
+
+
+@dataclass(frozen=True)
+class Send:
+    """To do: send a packet to a client."""
+
+    session: Session
+    packet: Packet
+    keep: int = 0
+    """Most packets of the same stream that may wait for a slow client; 0: as many as there is room for."""
+
+
+@dataclass(frozen=True)
+class Invoke:
+    """To do: call `handler`, off the network's thread, and give what `Bridge.packed_answer` makes of it to `finish`."""
+
+    session: Session
+    number: int
+    handler: Handler
+    request: Message
+    caller: Caller
+
+
+Event = Send | Invoke
+
+
+@dataclass(eq=False)
+class Session:
+    """The state of one connection."""
+
+    caller: Caller
+    limits: Limits
+    level: str = "error"
+    """The status messages it wants: this one of LEVELS and those before it."""
+    advertised: dict[str, set[Id]] = field(default_factory=dict)
+    """Its topics, with the ids of its advertisements of each."""
+    streams: dict[str, Stream] = field(default_factory=dict)
+    """What it has subscribed, by topic."""
+    services: set[str] = field(default_factory=set)
+    """What it offers."""
+    calls: set[int] = field(default_factory=set)
+    """Numbers of its unanswered calls."""
+    running: int = 0
+    """How many of its calls are with handlers."""
+    waiting: deque[Invoke] = field(default_factory=deque)
+    """Its calls that wait for their turn."""
+
+    def __post_init__(self) -> None:
+        self.fragments = Fragments(self.limits.max_incoming, self.limits.fragment_lifetime)
+
+    def status(self, level: str, text: str, name: Id = None) -> list[Send]:
+        """What tells it `text`: nothing if it does not want to hear of that level."""
+        if LEVELS.index(level) > LEVELS.index(self.level):
+            return []
+        message = {"op": "status", "level": level, "msg": text}
+        return [Send(self, pack(message if name is None else {**message, "id": name}, Wire(), stream="status"))]
+
+
+def read_name(message: Mapping[str, Any], what: str) -> str:
+    """The topic or service that a message is about, with a leading slash."""
+    return canonical(read_text(message, what))
+
+
+@lru_cache(maxsize=1024)
+def canonical(name: str) -> str:
+    """A name with its leading slash.
+
+    Raises:
+        ProtocolError: It is not the name of a topic or service.
+    """
+    if len(name) > _LONGEST or not _NAME.fullmatch(name):
+        raise ProtocolError(f"Name: expected one such as '/joint_states', found {describe(name)}.")
+    return name if name.startswith("/") else f"/{name}"
+
+
+def read_text(message: Mapping[str, Any], name: str) -> str:
+    """A field that must be there."""
+    value = message.get(name)
+    if not isinstance(value, str) or not value:
+        raise ProtocolError(f"{name}: expected a text, found {describe(value)}.")
+    return value
+
+
+def read_id(message: Mapping[str, Any]) -> Id:
+    """The id: a text or an integer, if there is one."""
+    value = message.get("id")
+    if isinstance(value, bool) or not (value is None or isinstance(value, (str, int))):
+        raise ProtocolError(f"id: expected a text or an integer, found {describe(value)}.")
+    if isinstance(value, str) and len(value) > LONGEST_ID:
+        raise ProtocolError(f"id: expected at most {LONGEST_ID} characters, found {len(value)}.")
+    if isinstance(value, int) and abs(value) > LARGEST_ID:
+        raise ProtocolError(f"id: expected an integer of 53 bits, found {describe(value)}.")
+    return value
+
+
+def read_number(message: Mapping[str, Any], name: str, otherwise: float) -> float:
+    """A number >= 0, or `otherwise` if it is left out."""
+    value = message.get(name)
+    if value is None:
+        return otherwise
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value <= _LARGEST:
+        raise ProtocolError(f"{name}: expected a number >= 0, found {describe(value)}.")
+    return value
+
+
+def read_flag(message: Mapping[str, Any], name: str, otherwise: bool) -> bool:
+    """True or false, or `otherwise` if it is left out."""
+    value = message.get(name)
+    if value is None:
+        return otherwise
+    if not isinstance(value, bool):
+        raise ProtocolError(f"{name}: expected true or false, found {describe(value)}.")
+    return value
+
+
+def read_wire(message: Mapping[str, Any]) -> Wire:
+    """How the client wants what it asks for packed."""
+    compression = message.get("compression") or "none"
+    if compression not in COMPRESSIONS:
+        expected = ", ".join(COMPRESSIONS)
+        raise ProtocolError(f"compression: expected one of {expected}, found {describe(compression)}.")
+    size = read_number(message, "fragment_size", NEVER_SPLIT)
+    if size < 1:
+        raise ProtocolError(f"fragment_size: expected an integer >= 1, found {describe(size)}.")
+    return Wire(compression, min(int(size), NEVER_SPLIT))

@@ -1,0 +1,223 @@
+"""The topics of a rosbridge server: who publishes, who listens, how often and how many may wait."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+from bam_envs.core.errors import ProtocolError
+from bam_envs.ros.interfaces import describe, normal_name
+from bam_envs.rosbridge.bus import Listener
+from bam_envs.rosbridge.encoding import COMPRESSIONS
+from bam_envs.rosbridge.server.packets import Publication, Wire
+from bam_envs.rosbridge.server.session import Id, Send, Session
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What one subscription asks for."""
+
+    throttle: float = 0.0
+    """Least time between two messages [s]."""
+    queue_length: int = 0
+    """How many messages may wait; 0 says nothing about it."""
+    wire: Wire = field(default_factory=Wire)
+    """How they are packed."""
+
+
+class Stream:
+    """All subscriptions of one client to one topic: it gets each message once, as the most demanding of them wants it.
+
+    Args:
+        session: The client.
+        topic: With a leading slash.
+        name: The topic as the client spells it.
+    """
+
+    def __init__(self, session: Session, topic: str, name: str) -> None:
+        self.session, self.topic, self.name = session, topic, name
+        self.wishes: dict[Id, Wish] = {}
+        self._waiting: deque[Publication] = deque(maxlen=1)
+        self._next = -math.inf
+        self._merged = Wish()
+
+    def wish(self, name: Id, wish: Wish | None) -> None:
+        """Add a subscription, or take it away with None."""
+        if wish is None:
+            self.wishes.pop(name, None)
+        else:
+            self.wishes[name] = wish
+        if self.wishes:
+            self._merged = _merge(list(self.wishes.values()))
+            self._waiting = deque(self._waiting, maxlen=max(1, self._merged.queue_length))
+
+    @property
+    def wire(self) -> Wire:
+        """How its messages are packed."""
+        return self._merged.wire
+
+    @property
+    def is_prompt(self) -> bool:
+        """Whether it gets every message as it comes."""
+        return self._merged.throttle == 0.0
+
+    @property
+    def deadline(self) -> float | None:
+        """When a waiting message may go [s]; None if none waits."""
+        return self._next if self._waiting else None
+
+    def offer(self, publication: Publication, now: float) -> Send | None:
+        """A new message: what to send now, if anything. What comes too early waits; the oldest gives way."""
+        if self.is_prompt:
+            return self._send(publication)
+        self._waiting.append(publication)
+        return self.due(now)
+
+    def due(self, now: float) -> Send | None:
+        """What waited long enough, if anything."""
+        if not self._waiting or now < self._next:
+            return None
+        # On a grid, so that a topic of just this rate does not lose every second message to jitter.
+        on_grid = self._next + self._merged.throttle
+        self._next = on_grid if on_grid > now else now + self._merged.throttle
+        return self._send(self._waiting.popleft())
+
+    def _send(self, publication: Publication) -> Send:
+        return Send(self.session, publication.packet(self.name, self._merged.wire), self._merged.queue_length)
+
+
+def _merge(wishes: list[Wish]) -> Wish:
+    compression = max((one.wire.compression for one in wishes), key=COMPRESSIONS.index)
+    return Wish(
+        min(one.throttle for one in wishes),
+        min(one.queue_length for one in wishes),
+        Wire(compression, min(one.wire.fragment_size for one in wishes)),
+    )
+
+
+@dataclass(eq=False)
+class Topic:
+    """One topic."""
+
+    name: str
+    kind: str
+    """Normal name of its type."""
+    publishers: set[Session | None] = field(default_factory=set)
+    """None is this process."""
+    streams: dict[Session, Stream] = field(default_factory=dict)
+    listeners: list[Listener] = field(default_factory=list)
+    """Those of this process."""
+    latching: set[Session | None] = field(default_factory=set)
+    """The publishers whose last message is repeated to newcomers."""
+    latched: tuple[Session | None, Publication] | None = None
+    """That message, and whose it is."""
+
+    def packed(self, publication: Publication) -> Publication:
+        """`publication`, packed for who gets it at once, which nobody else is to wait for. From any thread."""
+        for stream in list(self.streams.values()):
+            if stream.is_prompt:
+                publication.packet(stream.name, stream.wire)
+        return publication
+
+    @property
+    def is_used(self) -> bool:
+        """Whether anyone publishes or listens."""
+        return bool(self.publishers or self.streams or self.listeners)
+
+
+class Topics:
+    """Every topic of a server. A topic has the type of who came first, and ends when nobody uses it.
+
+    Args:
+        emit: Takes what is to be sent.
+    """
+
+    def __init__(self, emit: Callable[[Send], None]) -> None:
+        self._emit = emit
+        self._topics: dict[str, Topic] = {}
+        self._delayed: set[Stream] = set()
+
+    def __iter__(self) -> Iterator[Topic]:
+        return iter(self._topics.values())
+
+    def find(self, name: str) -> Topic | None:
+        """The topic `name`, if there is one."""
+        return self._topics.get(name)
+
+    def require(self, name: str, kind: str | None) -> Topic:
+        """The topic `name`; a new one if there is none.
+
+        Raises:
+            ProtocolError: It has another type, or is not there and no type was given.
+        """
+        topic = self._topics.get(name)
+        if topic is None and kind is None:
+            raise ProtocolError(f"Topic {name} does not exist yet; its type is needed.")
+        if topic is None:
+            topic = self._topics[name] = Topic(name, normal_name(kind or ""))
+        if kind is not None and normal_name(kind) != topic.kind:
+            raise ProtocolError(f"Topic {name} is of type {topic.kind}, found {describe(kind)}.")
+        return topic
+
+    def subscribe(self, stream: Stream, topic: Topic, now: float) -> None:
+        """Let a new stream have the messages of `topic`, the latched one at once."""
+        topic.streams[stream.session] = stream
+        if topic.latched is not None:
+            self._offer(stream, topic.latched[1], now)
+
+    def unsubscribe(self, stream: Stream) -> None:
+        """Let a stream have no more messages."""
+        self._delayed.discard(stream)
+        topic = self._topics.get(stream.topic)
+        if topic is not None and topic.streams.pop(stream.session, None) is not None:
+            self.forget(topic)
+
+    def publish(self, publication: Publication, topic: Topic, publisher: Session | None, now: float) -> None:
+        """Send to every subscriber that is a client."""
+        if publisher in topic.latching:
+            topic.latched = (publisher, publication)
+        for stream in topic.streams.values():
+            self._offer(stream, publication, now)
+
+    @property
+    def deadline(self) -> float | None:
+        """When a message that came too early for a subscriber may go [s]; None if none waits."""
+        return min((one.deadline for one in self._delayed if one.deadline is not None), default=None)
+
+    def tick(self, now: float) -> None:
+        """Send what waited long enough."""
+        for stream in list(self._delayed):
+            self._note(stream, stream.due(now))
+
+    def retire(self, topic: Topic, publisher: Session | None) -> None:
+        """`publisher` publishes no more."""
+        topic.publishers.discard(publisher)
+        topic.latching.discard(publisher)
+        if topic.latched is not None and topic.latched[0] is publisher:
+            topic.latched = None
+        self.forget(topic)
+
+    def forget(self, topic: Topic) -> None:
+        """Let go of a topic that nobody uses."""
+        if not topic.is_used and self._topics.get(topic.name) is topic:
+            del self._topics[topic.name]
+
+    def leave(self, session: Session) -> None:
+        """A client left."""
+        for name in session.advertised:
+            self.retire(self._topics[name], session)
+        for stream in session.streams.values():
+            self.unsubscribe(stream)
+
+    def _offer(self, stream: Stream, publication: Publication, now: float) -> None:
+        self._note(stream, stream.offer(publication, now))
+
+    def _note(self, stream: Stream, event: Send | None) -> None:
+        if event is not None:
+            self._emit(event)
+        if stream.deadline is not None:
+            self._delayed.add(stream)
+        else:
+            self._delayed.discard(stream)

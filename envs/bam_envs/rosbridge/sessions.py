@@ -1,0 +1,136 @@
+"""Sessions: who drives is proven by a key that is never published.
+
+A client that wants to drive calls the service `SESSION_SERVICE` (std_srvs/Trigger), whose answer only it gets: a public
+name and a secret key. Every command is signed with the key, over its tag (number, deadline), its topic and its numbers.
+Whoever reads the topics learns the name and the signatures, and cannot make another one; what was heard once is
+refused when it comes again. Where the server knows connections, a session is also of the one that opened it.
+"""
+
+from __future__ import annotations
+
+import hmac
+import json
+import secrets
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from bam_envs.core.errors import ProtocolError, RemoteError
+from bam_envs.ros.freshness import Freshness, Tag, Tagger, new_session, signature
+from bam_envs.rosbridge.bus import Caller, Message
+
+SESSION_SERVICE = "/bam/session"
+"""Where a session is opened (std_srvs/Trigger)."""
+LEASE_TOPIC = "/bam/lease"
+"""Where who drives says that it is there, or leaves (std_msgs/String: `RENEW` or `LEAVE`, a blank, a signed tag)."""
+RENEW, LEAVE = "renew", "leave"
+_NOT_OPEN, _ELSEWHERE = "is not open here", "is of another connection"
+_MOST = 64
+"""Sessions of one caller; its oldest gives way."""
+
+
+class _Session:
+    """One that is open."""
+
+    def __init__(self, caller: str, clock: Callable[[], float]) -> None:
+        self.caller, self.key, self.fresh = caller, secrets.token_bytes(32), Freshness(clock)
+
+
+class Sessions:
+    """The robot's side: every open session. Any thread.
+
+    Args:
+        is_driving: Whether the session of that name is in command: it never gives way to a new one.
+        clock: Steady clock [s].
+    """
+
+    def __init__(
+        self, is_driving: Callable[[str], bool] = lambda name: False, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._is_driving, self._clock, self._lock = is_driving, clock, threading.Lock()
+        self._sessions: OrderedDict[str, _Session] = OrderedDict()
+
+    def open(self, request: Message, caller: Caller) -> Message:
+        """Answer `SESSION_SERVICE`: a new session of `caller`."""
+        name = new_session()
+        with self._lock:
+            mine = [one for one, session in self._sessions.items() if session.caller == caller.name]
+            if len(mine) >= _MOST:
+                del self._sessions[next(one for one in mine if not self._is_driving(one))]
+            self._sessions[name] = session = _Session(caller.name, self._clock)
+        return {"success": True, "message": json.dumps({"session": name, "key": session.key.hex()})}
+
+    def prove(self, tag: Tag, channel: str, content: bytes, caller: Caller, *, anywhere: bool = False) -> Freshness:
+        """What is fresh of the session of `tag`, with whose key somebody signed `content` for `channel`.
+
+        Args:
+            tag: With its signature.
+            channel: Where it came.
+            content: What is signed beside the tag.
+            caller: On whose connection it came.
+            anywhere: It may come over another connection than the one that opened the session.
+
+        Raises:
+            RemoteError: That session is not open, or nobody of it sent this.
+        """
+        with self._lock:
+            session = self._sessions.get(tag.session)
+            if session is None:
+                raise RemoteError(
+                    f"session {tag.session} {_NOT_OPEN}: reset(), which opens one at {SESSION_SERVICE}; "
+                    "both sides must be of one version of bam-train"
+                )
+            self._sessions.move_to_end(tag.session)
+        if not hmac.compare_digest(_bytes(tag.mac), signature(session.key, tag, channel, content).encode()):
+            raise RemoteError(f"session {tag.session}: the signature of a message on {channel} is wrong")
+        if not anywhere and session.caller != caller.name:
+            raise RemoteError(f"session {tag.session} {_ELSEWHERE}")
+        return session.fresh
+
+    def require(self, tag: Tag, channel: str, content: bytes, caller: Caller, *, anywhere: bool = False) -> None:
+        """Take note of a message. Arguments as of `prove`.
+
+        Raises:
+            RemoteError: As `prove`; or it is old, as `Freshness.require` says.
+        """
+        self.prove(tag, channel, content, caller, anywhere=anywhere).require(tag, channel)
+
+    def left(self, caller: Caller) -> list[str]:
+        """End the sessions of `caller`, whose connection ended; their names."""
+        with self._lock:
+            gone = [name for name, session in self._sessions.items() if session.caller == caller.name]
+            for name in gone:
+                del self._sessions[name]
+        return gone
+
+    def end(self, name: str) -> None:
+        """End one session."""
+        with self._lock:
+            self._sessions.pop(name, None)
+
+
+def _bytes(text: str) -> bytes:
+    return text.encode(errors="surrogatepass")
+
+
+def is_over(error: RemoteError) -> bool:
+    """Whether `error` is a refusal after which a new session is needed."""
+    return _NOT_OPEN in str(error) or _ELSEWHERE in str(error)
+
+
+def read_session(response: Mapping[str, Any], where: str) -> Tagger:
+    """What signs for the session that `response` of `SESSION_SERVICE` opened.
+
+    Raises:
+        ProtocolError: It is something else.
+    """
+    try:
+        said = json.loads(response["message"])
+        name, key = said["session"], bytes.fromhex(said["key"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ProtocolError(f"{where}: expected a session and its key, found something else.") from error
+    if not isinstance(name, str) or not name.isalnum() or len(key) < 16:
+        raise ProtocolError(f"{where}: expected a session and its key, found something else.")
+    return Tagger(session=name, key=key)

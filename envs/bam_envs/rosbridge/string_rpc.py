@@ -1,0 +1,229 @@
+"""Requests and replies over a pair of topics, as JSON in std_msgs/String.
+
+Every ROS graph has std_msgs, and a topic pair goes through a bridge several times faster than a service. On
+``<name>/request`` goes ``{"id": …, "tag": …, "payload": {…}}``; on ``<name>/reply`` comes ``{"id": …, "payload": {…}}``
+or ``{"id": …, "error": text, "kind": name}``. A request without a tag is somebody else's and as good; one whose tag is
+signed is of its session.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as NoAnswer  # not the builtin before Python 3.11
+from dataclasses import replace
+from typing import Any
+
+from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, ProtocolError, RemoteError
+from bam_envs.ros.freshness import FreshnessCheck, Tagger, read_tag
+from bam_envs.rosbridge.answers import RecentAnswers
+from bam_envs.rosbridge.bounds import MOST_ITEMS
+from bam_envs.rosbridge.bus import Bus, Caller, Handler, Message
+from bam_envs.rosbridge.sessions import Sessions
+from bam_envs.rosbridge.strict_json import dump_json, load_json
+
+_log = logging.getLogger(__name__)
+_STRING = "std_msgs/String"
+_RESEND = 0.5
+"""Until a first reply came, a request is said again so often [s]: a ROS graph loses what is published before the two
+ends of a topic found each other. The service executes one id once."""
+_MOST_WAITING = 64
+"""Requests of a service that may be under way together."""
+_WORKERS = 8
+
+
+class StringRpc:
+    """Calls what a `StringRpcService` of the same name answers. Any thread; the first call opens the topics.
+
+    Args:
+        bus: Carries the topics. If it knows when its link drops (`on_down`), calls under way fail at once.
+        name: Such as ``/bam/scene``.
+        tagger: Of the session to ask for; None: of none.
+    """
+
+    def __init__(self, bus: Bus, name: str, tagger: Tagger | None = None) -> None:
+        self.name = name
+        """See above."""
+        self._bus, self._tagger, self._lock = bus, tagger or Tagger(), threading.Lock()
+        self._pending: dict[str, Future[dict[str, Any]]] = {}
+        self._unsubscribe: Callable[[], None] | None = None
+        self._watched, self._answered = False, -1
+
+    def call(self, payload: dict[str, Any], timeout: float) -> dict[str, Any]:
+        """Send `payload` and wait at most `timeout` [s] for the reply.
+
+        Raises:
+            InvalidValue: `payload` is not plain finite JSON; nothing was sent.
+            LinkLost: The link is down or dropped, or there was no reply in time: whether it was executed is unknown.
+            RemoteError: The other end refused or failed; `NotInCommand` if somebody else is in command there.
+        """
+        tag = self._tagger.next(self._epoch(), timeout)
+        identity = f"{tag.session}-{tag.sequence}"
+        content = _content(identity, payload, f"A request to {self.name}")
+        signed = dump_json({"tag": self._tagger.sign(tag, self.name, content.encode())}, self.name)
+        text = f"{signed[:-1]},{content[1:]}"
+        self._open()
+        future = self._pending[identity] = Future()
+        try:
+            return self._wait(future, text, time.monotonic() + timeout, timeout)
+        finally:
+            self._pending.pop(identity, None)
+
+    def close(self) -> None:
+        """Let go of the topics; calls under way fail."""
+        with self._lock:
+            unsubscribe, self._unsubscribe = self._unsubscribe, None
+        if unsubscribe is not None:
+            unsubscribe()
+        self._fail(f"the calls to {self.name} were closed")
+
+    def _wait(self, future: Future[dict[str, Any]], text: str, deadline: float, timeout: float) -> dict[str, Any]:
+        epoch = self._epoch()
+        while (left := deadline - time.monotonic()) > 0:
+            self._bus.publish(f"{self.name}/request", {"data": text})
+            try:
+                reply = future.result(left if self._answered == epoch else min(left, _RESEND))
+            except NoAnswer:
+                continue
+            self._answered = epoch
+            return _payload_of(reply, self.name)
+        raise LinkLost(f"{self.name} did not answer in {timeout:g} s; whether it did what was asked is unknown.")
+
+    def _open(self) -> None:
+        with self._lock:
+            if self._unsubscribe is None:
+                self._bus.advertise(f"{self.name}/request", _STRING)
+                self._unsubscribe = self._bus.subscribe(f"{self.name}/reply", _STRING, self._on_reply)
+            if not self._watched and (on_down := getattr(self._bus, "on_down", None)) is not None:
+                on_down(lambda *_: self._fail(f"the link dropped while {self.name} was to answer"))
+            self._watched = True
+
+    def _epoch(self) -> int:
+        return int(getattr(self._bus, "epoch", 1))
+
+    def _on_reply(self, message: Message, _caller: Caller) -> None:
+        reply = load_json(message.get("data"), f"{self.name}/reply")
+        future = self._pending.pop(str(reply.get("id")), None)
+        if future is not None:  # the replies to everybody else come here too
+            future.set_result(reply)
+
+    def _fail(self, reason: str) -> None:
+        for identity in list(self._pending):
+            future = self._pending.pop(identity, None)
+            if future is not None:
+                future.set_exception(LinkLost(f"No reply: {reason}. Whether it did what was asked is unknown."))
+
+
+def _content(identity: str, payload: object, what: str) -> str:
+    """What the tag of a request signs."""
+    return dump_json({"id": identity, "payload": payload}, what)
+
+
+def _payload_of(reply: dict[str, Any], name: str) -> dict[str, Any]:
+    if "error" in reply:
+        raise (NotInCommand if reply.get("kind") == NotInCommand.__name__ else RemoteError)(str(reply["error"]))
+    payload = reply.get("payload")
+    if not isinstance(payload, dict):
+        raise ProtocolError(f"{name}/reply: payload must be an object, not {type(payload).__name__}.")
+    return payload
+
+
+class StringRpcService:
+    """Answers requests, each once, in threads of its own; what is old is refused.
+
+    Args:
+        bus: Carries the topics.
+        name: Such as ``/bam/scene``.
+        handler: Makes the reply's payload. What it raises of our errors is the text of the reply's error.
+        sessions: Those that requests may be signed for; None: a signature means nothing.
+    """
+
+    def __init__(self, bus: Bus, name: str, handler: Handler, sessions: Sessions | None = None) -> None:
+        self.name = name
+        """See above."""
+        self._bus, self._handler, self._sessions = bus, handler, sessions
+        self._freshness, self._answers = FreshnessCheck(), RecentAnswers[str]()
+        self._workers = ThreadPoolExecutor(_WORKERS, thread_name_prefix=f"rpc{name.replace('/', '-')}")
+        self._room = threading.BoundedSemaphore(_MOST_WAITING)
+        self._unsubscribe: Callable[[], None] | None = None
+
+    def start(self) -> StringRpcService:
+        """Advertise and listen; itself, so that one line makes and starts it."""
+        self._bus.advertise(f"{self.name}/reply", _STRING)
+        self._unsubscribe = self._bus.subscribe(f"{self.name}/request", _STRING, self._on_request)
+        return self
+
+    def close(self) -> None:
+        """Listen no more and wait for what is being answered. As often as one likes."""
+        unsubscribe, self._unsubscribe = self._unsubscribe, None
+        if unsubscribe is not None:
+            unsubscribe()
+        self._workers.shutdown()
+
+    def _on_request(self, message: Message, caller: Caller) -> None:
+        request = load_json(message.get("data"), f"{self.name}/request", MOST_ITEMS)
+        identity = request.get("id")
+        if not isinstance(identity, str):
+            raise ProtocolError(f"{self.name}/request: id must be a string, not {type(identity).__name__}.")
+        if not self._room.acquire(blocking=False):
+            raise RemoteError(f"{self.name} is busy: {_MOST_WAITING} requests are waiting.")
+        caller, refused = self._proven(request, identity, caller)
+        try:
+            self._workers.submit(self._answer, request, caller, refused, time.monotonic())
+        except RuntimeError as error:  # shut down meanwhile
+            self._room.release()
+            raise RemoteError(f"{self.name} is closed.") from error
+
+    def _proven(self, request: dict[str, Any], identity: str, caller: Caller) -> tuple[Caller, str]:
+        """Who asks, and why a request that is new here must not be executed, found at arrival; empty if it may."""
+        tag = read_tag(request.get("tag"))
+        if tag is None or not identity.startswith(tag.session):
+            return caller, ""
+        try:
+            if self._sessions is None or not tag.mac:
+                self._freshness.require(tag, self.name)
+                return caller, ""
+            content = _content(identity, request.get("payload"), self.name).encode()
+            fresh = self._sessions.prove(tag, self.name, content, caller)
+            caller = replace(caller, session=tag.session)
+            fresh.require(tag, self.name)
+        except BamEnvsError as error:
+            return caller, str(error)
+        return caller, ""
+
+    def _answer(self, request: dict[str, Any], caller: Caller, refused: str, arrived: float) -> None:
+        try:
+            future, new = self._answers.claim((caller.session, request["id"]))
+            if new:
+                future.set_result(self._reply(request, caller, refused, arrived))
+            if new or future.done():  # while the first one is being answered, nothing
+                self._bus.publish(f"{self.name}/reply", {"data": future.result()})
+        except LinkLost as error:
+            _log.warning("%s: a reply was dropped: %s", self.name, error)
+        finally:
+            self._room.release()
+
+    def _reply(self, request: dict[str, Any], caller: Caller, refused: str, arrived: float) -> str:
+        identity, what = request["id"], f"The reply of {self.name}"
+        try:
+            if refused:
+                raise RemoteError(refused)
+            payload = self._handle(request, caller, arrived)
+            return dump_json({"id": identity, "payload": payload}, what)
+        except BamEnvsError as error:
+            return dump_json({"id": identity, "error": str(error), "kind": type(error).__name__}, what)
+        except Exception as error:  # a service always answers, whatever its handler does
+            _log.exception("%s: the handler failed", self.name)
+            text = f"{type(error).__name__}: {error}"
+            return dump_json({"id": identity, "error": text, "kind": "RemoteError"}, what)
+
+    def _handle(self, request: dict[str, Any], caller: Caller, arrived: float) -> Message:
+        tag, payload = read_tag(request.get("tag")), request.get("payload")
+        if not isinstance(payload, dict):
+            raise ProtocolError(f"{self.name}/request: payload must be an object, not {type(payload).__name__}.")
+        if tag is not None and (waited := time.monotonic() - arrived) > tag.deadline - tag.sent:
+            raise RemoteError(f"expired: it waited {waited:.3f} s for others")
+        return self._handler(payload, caller)

@@ -1,0 +1,137 @@
+"""Shared secrets: what servers ask for, and clients show; and how often somebody may guess."""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import os
+import stat
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Literal
+
+from bam_envs.core.errors import InvalidValue
+
+Role = Literal["client", "operator"]
+_WINDOW = 1.0
+_OF_ONE, _OF_ALL = 4, 32
+"""Wrong tokens from one address, and from all that were wrong lately, in `_WINDOW` [s]."""
+_LATELY = 60.0
+_MOST_ADDRESSES = 4096
+
+
+def read_token(path: str | Path, *, private: bool = False) -> str:
+    """The secret in a file, without the white space around it.
+
+    Args:
+        path: The file.
+        private: Refuse a file that other users of this computer may read, where the system says so (POSIX).
+
+    Raises:
+        InvalidValue: The file cannot be read, is empty, or is not private.
+    """
+    try:
+        if private and os.name == "posix" and os.stat(path).st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+            raise InvalidValue(f"The token file {path} is open to other users of this computer. Run: chmod 600 {path}")
+        token = Path(path).read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not text"
+        raise InvalidValue(f"The token file {path} cannot be read: {reason}.") from error
+    if not token:
+        raise InvalidValue(f"The token file {path} is empty; put a secret into it.")
+    return token
+
+
+class Tokens:
+    """The secrets of one server.
+
+    Args:
+        client: What clients must show; None: nothing.
+        operator: What an operator shows, who may take command from others; None: nobody is one.
+
+    Raises:
+        InvalidValue: One is empty, or both are the same.
+    """
+
+    def __init__(self, client: str | None = None, operator: str | None = None) -> None:
+        if "" in (client, operator):
+            raise InvalidValue("Token: expected a text, found an empty one.")
+        if operator is not None and operator == client:
+            raise InvalidValue("The operator's token must be another one than that of the clients.")
+        self._client, self._operator = client, operator
+        self.needed = client is not None
+        """Whether nobody comes in without one."""
+
+    @property
+    def exist(self) -> bool:
+        """Whether there is anything to show."""
+        return self._client is not None or self._operator is not None
+
+    def role(self, shown: Iterable[str]) -> Role | None:
+        """What who shows these is; None for nobody who is known."""
+        found: Role | None = None
+        # In constant time: how long a refusal takes must not tell how much of the token was right.
+        for text in shown:
+            if _same(text, self._client):
+                found = found or "client"
+            if _same(text, self._operator):
+                found = "operator"
+        return found
+
+
+def _same(shown: str, secret: str | None) -> bool:
+    # A stranger may send anything, also what is no text.
+    return secret is not None and hmac.compare_digest(shown.encode("utf-8", "surrogatepass"), secret.encode())
+
+
+class Guesses:
+    """How often wrong tokens are looked at: a few a second from one address, and some more from all together.
+
+    An address that was not wrong lately is looked at whatever the others do, so nobody can keep it out. Any thread.
+
+    Args:
+        clock: Steady clock [s].
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock, self._lock = clock, threading.Lock()
+        self._wrong: dict[str, deque[float]] = {}  # the oldest address first
+        self._all: deque[float] = deque(maxlen=_OF_ALL)
+
+    def may_try(self, address: str) -> bool:
+        """Whether a token from the IP address `address` is to be looked at."""
+        with self._lock:
+            now, mine = self._clock(), self._wrong.get(_network(address))
+            if mine is None or now - mine[-1] > _LATELY:
+                return True
+            return not (_is_full(mine, _OF_ONE, now) or _is_full(self._all, _OF_ALL, now))
+
+    def wrong(self, address: str) -> None:
+        """One from there was wrong."""
+        with self._lock:
+            network = _network(address)
+            mine = self._wrong.pop(network, None) or deque(maxlen=_OF_ONE)
+            self._wrong[network] = mine
+            for times in (mine, self._all):
+                times.append(self._clock())
+            if len(self._wrong) > _MOST_ADDRESSES:
+                del self._wrong[next(iter(self._wrong))]
+
+
+def _is_full(times: deque[float], most: int, now: float) -> bool:
+    return len(times) == most and now - times[0] < _WINDOW
+
+
+def _network(address: str) -> str:
+    """What one attacker surely has: an address, of IPv6 a network of 64 bits."""
+    try:
+        parsed = ipaddress.ip_address(address.partition("%")[0])
+    except ValueError:
+        return address
+    if isinstance(parsed, ipaddress.IPv6Address):
+        mapped = parsed.ipv4_mapped
+        return str(mapped) if mapped is not None else str(ipaddress.ip_network((parsed, 64), strict=False))
+    return str(parsed)

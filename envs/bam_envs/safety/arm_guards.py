@@ -1,0 +1,224 @@
+"""The guards of an arm.
+
+They keep three promises, whatever the arm is told: it stays inside its position limits; no joint goes beyond the
+farthest place that it was told to go to; and what slows one joint slows all of them, so that the arm keeps its
+direction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.core.robot import RobotSpec
+from bam_envs.safety.guard import Guard, Limits, Tick, joint_columns, max_rate, position_range
+
+Array = NDArray[np.float64]
+ToolPosition = Callable[[Array], Array]
+"""Forward kinematics: joints (n, k) [rad] to tool positions (n, 3) [m]."""
+ROUNDING = 1 + 1e-9
+"""A step as long as its limit is not beyond it for the last bits of its ends."""
+
+
+class PositionLimits(Guard):
+    """Joints keep a margin from the ends of their travel, the gripper stays in its range.
+
+    A joint that is already nearer to an end may go back or stay, and not come nearer.
+    """
+
+    number, name, unit = "G7", "position margin", "rad"
+
+    def __init__(self, spec: RobotSpec, limits: Limits) -> None:
+        self.limit_value = limits.position_margin
+        self.low, self.high = position_range(spec, limits)
+
+    def limit(self, tick: Tick) -> bool:
+        """Clip the goal, joint by joint."""
+        goal = np.clip(tick.goal, np.minimum(self.low, tick.last), np.maximum(self.high, tick.last))
+        changed = bool((goal != tick.goal).any())
+        tick.goal, tick.command = goal, goal.copy()
+        return changed
+
+
+class JointSpeed(Guard):
+    """No joint is faster than the limit nor than its data sheet; the others slow down with it."""
+
+    number, name, unit = "G8", "joint speed", "rad/s"
+
+    def __init__(self, spec: RobotSpec, limits: Limits) -> None:
+        self._joints = joint_columns(spec)
+        fastest = np.minimum(limits.joint_speed, max_rate(spec.command)[self._joints])
+        self.limit_value, self._fastest = float(fastest.max()), fastest
+
+    def limit(self, tick: Tick) -> bool:
+        """Shorten the step of all joints."""
+        return _shorten(tick, self._joints, self._fastest * tick.period)
+
+
+class RampIn(Guard):
+    """A first command that is farther than one step from the arm is gone to slowly, at most for a while."""
+
+    number, name, unit = "G14", "ramp-in speed", "rad/s"
+
+    def __init__(self, spec: RobotSpec, limits: Limits) -> None:
+        self.limit_value = limits.reset_speed
+        self._joints = joint_columns(spec)
+        fastest = np.minimum(limits.joint_speed, max_rate(spec.command)[self._joints])
+        # Where nothing limits a joint's speed, a first step of any length would be near.
+        free = np.where(np.isfinite(fastest), fastest, limits.reset_speed)
+        self._one_step = free * spec.period * ROUNDING
+        self._longest = math.ceil(limits.ramp_time / spec.period)
+        self._left: int | None = None
+
+    def restart(self) -> None:
+        """Look at the next command."""
+        self._left = None
+
+    def limit(self, tick: Tick) -> bool:
+        """Shorten the step until the command is caught up with."""
+        reach = self.limit_value * tick.period
+        if tick.approach:
+            return _shorten(tick, self._joints, reach)
+        if self._left == 0:
+            return False
+        far = bool((np.abs(tick.goal - tick.last)[self._joints] > self._one_step).any())
+        self._left = 0 if not far else self._longest - 1 if self._left is None else self._left - 1
+        return far and _shorten(tick, self._joints, reach)
+
+
+class ToolSpeed(Guard):
+    """The tool is never faster than the limit, along a straight line from command to command."""
+
+    number, name, unit = "G10", "tool speed", "m/s"
+    _ROUNDS = 8
+
+    def __init__(self, spec: RobotSpec, limits: Limits, tool_position: ToolPosition) -> None:
+        self.limit_value = limits.tool_speed
+        self._joints = joint_columns(spec)
+        self._tool = tool_position
+        self._known: dict[bytes, Array] = {}
+
+    def limit(self, tick: Tick) -> bool:
+        """Shorten the step of all joints."""
+        last = tick.last[self._joints]
+        step, share = tick.command[self._joints] - last, 1.0
+        here, reach = self._position(last), self.limit_value * tick.period
+        for _ in range(self._ROUNDS):
+            travel = math.dist(here, self._position(last + share * step))
+            if travel <= reach * ROUNDING:
+                break
+            share *= 0.999 * reach / travel
+        else:
+            share = 0.0
+        if share == 1.0:
+            return False
+        tick.command[self._joints] = last + share * step
+        return True
+
+    def _position(self, joints: Array) -> Array:
+        """Of the tool [m]. Kinematics cost the most of a tick, and each command is the next one's last."""
+        key = joints.tobytes()
+        if key not in self._known:
+            if len(self._known) >= 2 * self._ROUNDS:
+                self._known.clear()
+            self._known[key] = self._tool(joints[None])[0]
+        return self._known[key]
+
+
+class JointAcceleration(Guard):
+    """Joints gain and lose speed gradually, and begin to brake early enough to stop at their goal.
+
+    So a joint never passes the goal of a command unless a later command calls it back sooner than it can brake, and
+    then it passes the later one only. Where the change of direction is too sharp for all joints to go together, each
+    goes as far towards it as it may.
+    """
+
+    number, name, unit = "G9", "joint acceleration", "rad/s^2"
+
+    def __init__(self, spec: RobotSpec, limits: Limits) -> None:
+        self.limit_value = limits.joint_acceleration
+        self._joints = joint_columns(spec)
+        self._period = spec.period
+
+    def limit(self, tick: Tick) -> bool:
+        """Bring the step near to the last one."""
+        last = tick.last[self._joints]
+        wanted, before = tick.command[self._joints] - last, tick.last_step[self._joints]
+        distance = np.abs(tick.goal[self._joints] - last)
+        change = self.limit_value * tick.period**2
+        longest = longest_step(distance, self.limit_value * self._period**2) * (tick.period / self._period)
+        slowed = wanted * _least_share(np.where(distance <= change, distance, longest), np.abs(wanted))
+        step = self._near(slowed, before, change * ROUNDING)
+        if (step == wanted).all():
+            return False
+        tick.command[self._joints] = last + step
+        return True
+
+    @staticmethod
+    def _near(wanted: Array, before: Array, change: float) -> Array:
+        """The longest part of `wanted` within reach of the step `before`; where there is none, each joint by itself."""
+        low, high = before - change, before + change
+        if (wanted >= low).all() and (wanted <= high).all():
+            return wanted
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            ends = np.sort(np.stack([low / wanted, high / wanted]), axis=0)
+        ends = np.where(wanted == 0, np.where((low <= 0) & (high >= 0), [[0.0], [1.0]], [[2.0], [-1.0]]), ends)
+        least, most = max(0.0, float(ends[0].max())), min(1.0, float(ends[1].min()))
+        return wanted * most if least <= most else np.clip(wanted, low, high)
+
+
+class GripperSpeed(Guard):
+    """The gripper's width is sent no farther ahead than it can go in a period: ahead of the fingers or of the last."""
+
+    number, name, unit = "G8", "gripper speed", "m/s"
+
+    def __init__(self, spec: RobotSpec) -> None:
+        self._columns = np.flatnonzero([unit == "m" for unit in spec.command.units])
+        rate = max_rate(spec.command)[self._columns]
+        self.limit_value, self._rate = float(rate.min()), rate
+
+    def limit(self, tick: Tick) -> bool:
+        """Clip the width."""
+        reach = self._rate * tick.period
+        wanted = tick.command[self._columns]
+        last, measured = tick.last[self._columns], tick.measured[self._columns]
+        # Around a held object the last width is far below the fingers: opening begins at the fingers.
+        low, high = np.fmin(last, measured) - reach, np.fmax(last, measured) + reach
+        tick.command[self._columns] = width = np.clip(wanted, low, high)
+        return bool((width != wanted).any())
+
+
+def longest_step(distance: Array, change: float) -> Array:
+    """The longest next step after which a joint can still stop within `distance`.
+
+    Each step may be shorter than the one before by `change`: n of them, the last of which is at most `change`, cover
+    ``n s - change n (n - 1) / 2`` when the first is s.
+
+    Args:
+        distance: Not negative. Shape: (k,).
+        change: Above 0, in the unit of `distance`.
+    """
+    steps = np.maximum(1.0, np.ceil((np.sqrt(1.0 + 8.0 * distance / change) - 1.0) / 2.0))
+    longest: Array = distance / steps + change * (steps - 1.0) / 2.0
+    return longest
+
+
+def _shorten(tick: Tick, joints: Any, reach: Any) -> bool:
+    """Shorten the step of all `joints` until none is longer than its `reach`; whether one was."""
+    last = tick.last[joints]
+    step = tick.command[joints] - last
+    share = _least_share(reach, np.abs(step))
+    if share == 1.0:
+        return False
+    tick.command[joints] = last + share * step
+    return True
+
+
+def _least_share(allowed: Any, wanted: Array) -> float:
+    """The largest number, at most 1, that makes all of `wanted` as small as `allowed`."""
+    over = wanted > allowed * ROUNDING
+    return float((allowed / np.where(over, wanted, 1.0))[over].min()) if over.any() else 1.0

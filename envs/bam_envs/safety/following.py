@@ -1,0 +1,190 @@
+"""G23: the robot follows its commands. Where it does not, they wait where it is; where it goes on so, it is stopped.
+
+A joint that is behind its commands by no more than the known lag at its measured speed follows. What is beyond that is
+the way that it would jump when it is let go: at rest at most what it may go in a period, so that it never goes faster
+than it may.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.core.robot import RobotSpec
+from bam_envs.safety.arm_guards import ToolPosition
+from bam_envs.safety.guard import Guard, Limits, Tick, columns_in, joint_columns, max_rate, ticks_of
+
+Array = NDArray[np.float64]
+_ROUNDS = 8
+SHARE = 0.75
+"""The part of the way that a robot may go in a period by which it may be off."""
+STRIKES = 3
+"""A robot that was held so often because it did not follow is stopped."""
+FORGIVEN = 2.0
+"""A robot that has followed for so long [s] begins anew."""
+LIKELY = (
+    "look for a protective stop, a paused program, an inactive controller, a low speed slider, or something in its way"
+)
+
+
+class Following(Guard):
+    """What arms and bases share: the last commands, and how often the robot did not follow them."""
+
+    number = "G23"
+
+    def __init__(self, spec: RobotSpec, limits: Limits) -> None:
+        self._lag = spec.lag if limits.lag is None else limits.lag
+        # A command counts for a period from when it is sent, and the robot is behind it by its lag.
+        self._sent: deque[Array] = deque(maxlen=2 + ticks_of(self._lag, spec))
+        self._strikes, self._good, self._forgiven = 0, 0, ticks_of(FORGIVEN, spec)
+
+    def restart(self) -> None:
+        """The next command begins where the robot is."""
+        self._sent.clear()
+
+    def forgive(self) -> None:
+        """An episode begins, or a person resumed it."""
+        self.restart()
+        self._strikes = self._good = 0
+
+    def off(self, sent: Array, measured: Array) -> Array:
+        """How far every command of the last time is from what is measured, 0 where one is there. Shape: (k,)."""
+        self._sent.append(sent)
+        commands = np.stack(self._sent)
+        off: Array = np.clip(measured, commands.min(axis=0), commands.max(axis=0)) - measured
+        return off
+
+    def is_struck(self, over: bool) -> bool:
+        """Take note of whether the robot was too far `over`; a third time within a while is one too many."""
+        if not over:
+            self._good += 1
+            self._strikes = 0 if self._good >= self._forgiven else self._strikes
+            return False
+        self._strikes, self._good = self._strikes + 1, 0
+        self.patience = 1 if self._strikes >= STRIKES else math.inf
+        self._sent.clear()
+        return True
+
+
+class JointFollowing(Following):
+    """A command is no farther from the measured joint than its lag explains; a joint that does not follow is held."""
+
+    name, unit = "following", "rad"
+
+    def __init__(self, spec: RobotSpec, limits: Limits, tool_position: ToolPosition | None) -> None:
+        super().__init__(spec, limits)
+        self._joints, self._period = joint_columns(spec), spec.period
+        self._tool, self._tool_reach = tool_position, limits.tool_speed * spec.period
+        self._labels = np.array(spec.command.labels)[self._joints]
+        fastest = np.minimum(limits.joint_speed, max_rate(spec.command)[self._joints])
+        self._fastest = np.where(np.isfinite(fastest), fastest, limits.reset_speed)
+        self._slowest = np.minimum(self._fastest, limits.reset_speed)
+        self._tolerance = limits.follow_tolerance
+        self.limit_value = float(self._fastest.max()) * (self._lag + self._period)
+
+    def _reach(self, tick: Tick) -> Array:
+        """Farthest that a command may be from a joint at rest [rad]. Shape: (k,)."""
+        fastest = self._slowest if tick.approach else self._fastest
+        reach: Array = np.maximum(fastest * self._period, self._tolerance)
+        return reach
+
+    def fault(self, tick: Tick) -> str | None:
+        """Names the joint, the gap, and what may be the cause."""
+        sent, measured = tick.last[self._joints], tick.measured[self._joints]
+        off, allowed = self.off(sent, measured), SHARE * self._reach(tick)
+        over = bool((np.abs(off) > allowed).any())  # NaN: it is not measured
+        if not over and (np.abs(off) > self._tolerance).any():
+            over = self._travel(measured, measured + off) > SHARE * self._tool_reach
+        if not self.is_struck(over):
+            return None
+        at = int(np.argmax(np.abs(off) / allowed))
+        return (
+            f"{self._labels[at]} does not follow its commands: it is {measured[at] - sent[at]:+.3f} rad from the last "
+            f"one, and beyond a lag of {self._lag:g} s it may be {allowed[at]:.3f} rad, and the tool "
+            f"{SHARE * self._tool_reach:.3f} m: {LIKELY}"
+        )
+
+    def hold(self, tick: Tick) -> Array:
+        """Where the joints are, gone to no faster than they may go."""
+        held: Array = tick.last.copy()
+        held[self._joints] = self._near(tick, tick.measured[self._joints])
+        return held
+
+    def limit(self, tick: Tick) -> bool:
+        """Bring the command so near that a joint that is let go does not jump: as if the command went from there."""
+        wanted, measured = tick.command[self._joints], tick.measured[self._joints]
+        ahead = np.clip(np.nan_to_num(tick.velocity[self._joints]), -self._fastest, self._fastest) * self._lag
+        explained = measured + np.clip(wanted - measured, np.minimum(ahead, 0.0), np.maximum(ahead, 0.0))
+        jump = np.abs(wanted - explained)
+        reach = self._reach(tick)
+        near = np.clip(wanted, explained - reach, explained + reach)
+        if (jump > np.abs(wanted - tick.last[self._joints]) + self._tolerance).any():
+            near = self._slow_tool(explained, near)
+        if (near == wanted).all():
+            return False
+        tick.command[self._joints] = self._near(tick, near)
+        return True
+
+    def _slow_tool(self, here: Array, there: Array) -> Array:
+        """The part of the way that the tool may go in a period. Shapes: (k,)."""
+        for _ in range(_ROUNDS):
+            travel = self._travel(here, there)
+            if travel <= self._tool_reach:
+                break
+            there = here + (there - here) * (0.999 * self._tool_reach / travel)
+        return there
+
+    def _travel(self, here: Array, there: Array) -> float:
+        """Of the tool [m]; 0 where its kinematics are not known."""
+        return 0.0 if self._tool is None else math.dist(*self._tool(np.stack([here, there])))
+
+    def _near(self, tick: Tick, wanted: Array) -> Array:
+        """`wanted`, as far as the joints may go to it from the last command: what is measured may be wrong."""
+        last, step = tick.last[self._joints], (self._slowest if tick.approach else self._fastest) * self._period
+        near: Array = np.clip(wanted, last - step, last + step)
+        return near
+
+
+class BaseFollowing(Following):
+    """A base that does not go as it is told is told no more speed than it can gain, then to stand."""
+
+    def __init__(self, name: str, unit: str, acceleration: float, spec: RobotSpec, limits: Limits) -> None:
+        super().__init__(spec, limits)
+        self.name, self.unit = name, unit
+        self._columns = columns_in(spec.command, unit)
+        self._fastest = np.minimum(acceleration, max_rate(spec.command)[self._columns])
+        self._ahead = self._fastest * (self._lag + spec.period)
+        self.limit_value = float(self._ahead.max())
+        self._change = self._fastest * spec.period
+        self._allowed = SHARE * self._change
+        self._reached: Array | None = None  # what a base that gains and loses speed as it may has reached
+
+    def restart(self) -> None:
+        """As of any; it need not stand yet."""
+        super().restart()
+        self._reached = None
+
+    def fault(self, tick: Tick) -> str | None:
+        """Says how fast it is, and how fast it was told to be."""
+        sent, measured = tick.last[self._columns], tick.measured[self._columns]
+        before = measured if self._reached is None else self._reached
+        self._reached = np.clip(sent, before - self._change, before + self._change)
+        off = np.abs(self.off(self._reached, measured))
+        if not self.is_struck(bool((off > self._allowed).any())):
+            return None
+        at = int(np.argmax(off))
+        return (
+            f"the base does not follow its commands: it goes at {measured[at]:.3f} {self.unit}, and was told "
+            f"{sent[at]:.3f} {self.unit}; beyond a lag of {self._lag:g} s it may be off by {self._allowed[at]:.3f} "
+            f"{self.unit}: {LIKELY}"
+        )
+
+    def limit(self, tick: Tick) -> bool:
+        """Clip it around the measured speed; slower is always allowed."""
+        wanted, measured = tick.command[self._columns], tick.measured[self._columns]
+        low, high = np.minimum(0.0, measured - self._ahead), np.maximum(0.0, measured + self._ahead)
+        tick.command[self._columns] = speed = np.clip(wanted, low, high)
+        return bool((speed != wanted).any())

@@ -1,0 +1,614 @@
+"""SafeRobot: the one gate between whoever commands a live robot and the robot.
+
+Every command goes through the guards of `bam_envs.safety`. A command or state that cannot be used makes the
+robot hold at once: an arm is sent its last command again, a base zero. Several such ticks in a row, or a measurement
+beyond the data sheet, stop the robot until a person calls `resume`.
+
+Longer than most files here: the gate and the seal of what it lets through stand side by side, so that nobody else can
+make one.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+import weakref
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, NoReturn, Protocol, cast, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.core.errors import InvalidValue, ResetNeeded, RobotFault, SafetyStop, StaleState
+from bam_envs.core.robot import Initial, Robot, RobotSpec, RobotState, Rows
+from bam_envs.safety.arm_guards import ToolPosition
+from bam_envs.safety.following import Following
+from bam_envs.safety.guard import Guard, Limits, Sealed, Tick, is_base, joint_columns, require_bounded
+from bam_envs.safety.guards import LATE, Freshness, Shape, default_guards
+from bam_envs.safety.start_pose import StartPose
+
+__all__ = ["ClearedCommand", "Limits", "LiveRobot", "SafeRobot"]
+
+Array = NDArray[np.float64]
+GRIPPER_TIME = 1.0
+"""Longest that the gripper is waited for before an arm goes to its start pose [s]."""
+FRESH_LOOKS, FRESH_PAUSE = 50, 0.005
+"""How often a fresh state is looked for before a motion begins, and the time between two looks [s]."""
+
+
+@final
+class ClearedCommand(metaclass=Sealed):
+    """A command that passed the guards, for one robot and one tick. Only a `SafeRobot` makes one.
+
+    It has nothing that could be set: what it says is kept apart from it.
+    """
+
+    __slots__ = ("__weakref__",)
+
+    def __init__(self, *arguments: object, **options: object) -> None:
+        raise InvalidValue("Only a SafeRobot clears commands. Build the robot with live_robot(...).")
+
+    def __init_subclass__(cls) -> None:
+        raise InvalidValue("Only a SafeRobot clears commands; there is no other kind of ClearedCommand.")
+
+    def __reduce_ex__(self, protocol: Any) -> NoReturn:
+        raise InvalidValue("A cleared command cannot be copied: it is good for one tick.")
+
+    @property
+    def command(self) -> Array:
+        """What to send; read-only. Shape: (1, m).
+
+        Raises:
+            InvalidValue: Its tick is over, or it was never cleared.
+        """
+        return self._entry()[1]
+
+    def for_robot(self, robot: object) -> Array:
+        """The same, for the robot that it was cleared for.
+
+        Raises:
+            InvalidValue: As of `command`, or it was cleared for another robot.
+        """
+        cleared_for, command = self._entry()
+        if cleared_for is not robot:
+            raise InvalidValue("The command was cleared for another robot, with that one's limits.")
+        return command
+
+    def _entry(self) -> tuple[object, Array]:
+        if self not in _CLEARED:
+            raise InvalidValue(
+                "The tick that this command was cleared for is over. Give the next one to the SafeRobot."
+            )
+        return _CLEARED[self]
+
+
+_CLEARED: weakref.WeakKeyDictionary[ClearedCommand, tuple[object, Array]] = weakref.WeakKeyDictionary()
+_GUARDED: weakref.WeakKeyDictionary[Any, weakref.ref[SafeRobot]] = weakref.WeakKeyDictionary()
+
+
+def _clear(robot: object, command: Array) -> ClearedCommand:
+    """`command` (1, m) for `robot`, until it is taken out of `_CLEARED`."""
+    cleared = object.__new__(ClearedCommand)
+    kept = command.copy()
+    kept.flags.writeable = False
+    _CLEARED[cleared] = robot, kept
+    return cleared
+
+
+class LiveRobot(Protocol):
+    """A `Robot` that takes cleared commands only, and whose `reset` moves nothing: it measures.
+
+    One that answers commands has ``waiting() -> float`` too: for how long it has owed the answer to one [s].
+    """
+
+    @property
+    def spec(self) -> RobotSpec:
+        """As of any robot."""
+
+    @property
+    def num_robots(self) -> int:
+        """1."""
+
+    needs_clearance: bool
+    """True."""
+
+    def connect(self) -> None:
+        """As of any robot."""
+
+    def reset(self, rows: Rows, initial: Initial) -> RobotState:
+        """Measure; put the object of a simulated robot where `initial` says."""
+
+    def step(self, command: ClearedCommand) -> RobotState:
+        """Send `command`, and return the state one period later."""
+
+    def measure(self) -> RobotState:
+        """The newest state."""
+
+    def age(self) -> float:
+        """Age of the newest state [s]."""
+
+    def halt(self) -> None:
+        """As of any robot."""
+
+    def close(self) -> None:
+        """As of any robot."""
+
+
+@final
+class SafeRobot(metaclass=Sealed):
+    """One robot behind guards: a `Robot` around a `Robot`.
+
+    A live robot (one with ``needs_clearance``) is handed a `ClearedCommand`, any other a plain array. The guards are
+    those of `default_guards`, always; no attribute changes them.
+
+    Args:
+        robot: One robot, simulated or live.
+        guards: More guards, asked before the others, which have the last word.
+        limits: How far the guards let it go; those of a live robot are inside `guard.BOUNDS`.
+        tool_position: Forward kinematics of an arm that is no UR5e, (n, k) [rad] to (n, 3) [m].
+        clock: Monotonic clock [s].
+
+    Raises:
+        InvalidValue: Several robots, a joint that is not measured, a limit that no live robot may have, or a live robot
+            that stands behind guards already.
+    """
+
+    __slots__ = (
+        "__weakref__",
+        "_bad",
+        "_before",
+        "_clock",
+        "_counts",
+        "_further",
+        "_guards",
+        "_halts",
+        "_is_base",
+        "_last",
+        "_limits",
+        "_live",
+        "_places",
+        "_robot",
+        "_sent",
+        "_sent_at",
+        "_shape",
+        "_spec",
+        "_speed",
+        "_speeds",
+        "_state",
+        "_status",
+        "_stopped",
+    )
+
+    def __init__(
+        self,
+        robot: Robot | LiveRobot,
+        guards: Sequence[Guard] = (),
+        *,
+        limits: Limits | None = None,
+        tool_position: ToolPosition | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        if robot.num_robots != 1:
+            raise InvalidValue(f"A SafeRobot guards one robot, not {robot.num_robots} stepped together.")
+        self._limits, self._spec = limits or Limits(), robot.spec
+        self._live: Any = robot if getattr(robot, "needs_clearance", False) else None
+        if self._live is not None:
+            require_bounded(self._limits, robot.spec)
+        self._shape = Shape(robot.spec)
+        self._further = tuple(guards)
+        self._guards = tuple(default_guards(robot.spec, self._limits, tool_position=tool_position))
+        self._robot: Any = robot
+        self._clock = clock
+        self._is_base, self._places = is_base(robot.spec), _measured_places(robot.spec)
+        self._speeds = _places_of(robot.spec, [f"{unit}/s" for unit in robot.spec.command.units])
+        every = (*self._further, *self._guards)
+        self._counts = {guard.name: {"altered": 0, "held": 0, "stopped": 0} for guard in every}
+        self._stopped: tuple[str, str] | None = None
+        self._bad, self._halts, self._status = 0, 0, 0
+        self._sent_at: float | None = None
+        self._forget()
+        if self._live is not None:
+            self._claim()
+
+    def __init_subclass__(cls) -> None:
+        raise InvalidValue("A SafeRobot has no other kind: it keeps a robot safe. Give it further guards with guards=.")
+
+    def __reduce_ex__(self, protocol: Any) -> NoReturn:
+        raise InvalidValue(
+            f"The SafeRobot of {self.spec.name} cannot be copied: a robot has one gate. Build another SafeRobot for "
+            "another robot."
+        )
+
+    def _claim(self) -> None:
+        """Two gates to one robot would each let a whole step through."""
+        other = _GUARDED.get(self._live)
+        if other is not None and other() is not None:
+            raise InvalidValue(f"{self.spec.name} stands behind a SafeRobot already; command it through that one.")
+        _GUARDED[self._live] = weakref.ref(self)
+
+    def _forget(self) -> None:
+        """Nothing is known of the robot."""
+        self._state: RobotState | None = None
+        self._before: Array | None = None  # what was measured a tick ago
+        self._sent: Array | None = None  # what the robot was really sent last
+        self._last: Array | None = None  # the same; None where the next command begins at what is measured
+        self._speed = np.zeros(len(self.spec.command.labels))  # of the last command [unit/s]
+
+    @property
+    def spec(self) -> RobotSpec:
+        """Of the robot."""
+        return self._spec
+
+    @property
+    def num_robots(self) -> int:
+        """1."""
+        return 1
+
+    @property
+    def limits(self) -> Limits:
+        """How far the guards let it go."""
+        return self._limits
+
+    @property
+    def status(self) -> int:
+        """Number of the last guard that changed the last command, or made the robot hold; 0 for none."""
+        return self._status
+
+    @property
+    def info(self) -> Any:
+        """What the robot says of itself, or None."""
+        return getattr(self._robot, "info", None)
+
+    def not_ready(self) -> str | None:
+        """Why a live robot cannot move now, by its own words; None if it does not say so. May ask it: at rest only."""
+        ask = getattr(self._live, "not_ready", None)
+        return None if ask is None else cast("str | None", ask())
+
+    def age(self) -> float:
+        """Age of the newest state of a live robot [s]; 0 for any other."""
+        return 0.0 if self._live is None else float(self._live.age())
+
+    def report(self) -> dict[str, dict[str, Any]]:
+        """For each guard: number, limit, unit, commands that it altered, ticks that it held, and stops of the robot.
+
+        What was altered on the way to a start pose is not counted.
+        """
+        return {
+            guard.name: {
+                "number": guard.number,
+                "limit": guard.limit_value,
+                "unit": guard.unit,
+                **self._counts[guard.name],
+            }
+            for guard in (*self._further, *self._guards)
+        }
+
+    def connect(self) -> None:
+        """Connect the robot. Moves nothing."""
+        self._robot.connect()
+
+    def step(self, command: Array) -> RobotState:
+        """Send `command` (1, m), as far as the guards let it; the state one period later says what was sent.
+
+        Raises:
+            InvalidValue: It has another shape; nothing was sent.
+            ResetNeeded: Nothing is known of the robot yet.
+            SafetyStop: A guard stopped the robot, now or earlier.
+            StaleState: The same, for want of a fresh state.
+        """
+        self._require_free()
+        return self._advance(self._shape.row(command))
+
+    def _advance(self, goal: Array, *, approach: bool = False) -> RobotState:
+        """One tick towards `goal` (m,)."""
+        halts = self._halts
+        try:
+            tick = self._tick(goal, approach)
+        except RobotFault:  # nobody knows where it is, and a base would go on
+            self.halt()
+            raise
+        fault = self._fault(tick)
+        if fault is None:
+            self._limit(tick)
+        else:
+            self._hold(tick, *fault)
+        return self._send(tick, halts)
+
+    def _tick(self, goal: Array, approach: bool) -> Tick:
+        pause = self._pause()
+        last = self._begin_at(pause)
+        measured, period = self._measured(), self.spec.period
+        before = np.full_like(measured, np.nan) if self._before is None else self._before
+        self._before = measured
+        velocity, time_passed = self._velocity(measured, before), min(period, pause or period)
+        waiting = getattr(self._live, "waiting", None)
+        return Tick(
+            goal,
+            goal.copy(),
+            last,
+            self._speed * time_passed,
+            measured,
+            before,
+            velocity,
+            self.age(),
+            time_passed,
+            pause,
+            0.0 if waiting is None else float(waiting()),
+            approach,
+        )
+
+    def _pause(self) -> float:
+        """Time since the last command of a motion that goes on [s]; 0 where time passes only with commands."""
+        if self._live is None or self._sent_at is None or self._in_lockstep():
+            return 0.0
+        return self._clock() - self._sent_at
+
+    def _in_lockstep(self) -> bool:
+        return bool(getattr(self.info, "lockstep", False))
+
+    def _begin_at(self, pause: float) -> Array:
+        """The last command, where the robot still follows it; else where it is, at rest. Shape: (m,)."""
+        goes_on = pause <= LATE * self.spec.period and (
+            self._sent_at is not None or self._live is None or self._in_lockstep()
+        )
+        last = self._last if goes_on else None
+        if last is None:
+            last = self._measured_anew()
+            self._last, self._speed, self._before = last, np.zeros_like(last), None
+            self._restart_guards()
+        return last
+
+    def _velocity(self, measured: Array, before: Array) -> Array:
+        """Of each number of the command [unit/s]: as it is measured, else from tick to tick. Shape: (m,)."""
+        velocity: Array = (measured - before) / self.spec.period
+        if self._state is not None:
+            for place, name, column in self._speeds:
+                velocity[place] = self._state.signals[name][0, column]
+        return velocity
+
+    def _measured_anew(self) -> Array:
+        """What is measured now, as a command; a gripper goes on holding, or is open if nobody knows. Shape: (m,)."""
+        if self._live is not None and self._state is not None:
+            self._state = self._fresh_state()
+        measured = self._measured()
+        if self._is_base:
+            return np.zeros_like(measured)
+        if self._sent is None:  # fingers may be measured a little beyond their range, which no robot takes as a command
+            known = np.where(np.isfinite(measured), measured, self.spec.command.high)
+            inside: Array = np.clip(known, self.spec.command.low, self.spec.command.high)
+            return inside
+        begin: Array = self._sent.copy()
+        joints = joint_columns(self.spec)
+        begin[joints] = measured[joints]
+        return begin
+
+    def _measured(self) -> Array:
+        """What is measured of each number of the command, NaN where nothing is. Shape: (m,)."""
+        if self._state is None:
+            raise ResetNeeded("Nothing is known of the robot yet. Call reset() first.")
+        measured = np.full(len(self.spec.command.labels), np.nan)
+        for place, name, column in self._places:
+            measured[place] = self._state.signals[name][0, column]
+        return measured
+
+    def _fresh_state(self) -> RobotState:
+        """The newest state. An old one is waited out for a little: after a pause of this process newer ones lie unread.
+
+        Raises:
+            StaleState: None came.
+        """
+        for _ in range(FRESH_LOOKS):
+            fresh = self._is_fresh()  # asked first: what is measured afterwards can only be newer
+            state: RobotState = self._live.measure()
+            if fresh:
+                return state
+            time.sleep(FRESH_PAUSE)
+        self._require_fresh()
+        return cast(RobotState, self._live.measure())
+
+    def _is_fresh(self) -> bool:
+        age = self.age()
+        return all(age <= guard.limit_value for guard in self._guards if isinstance(guard, Freshness))
+
+    def _require_fresh(self) -> None:
+        """An old state is no place to begin at: even to hold there would be a motion."""
+        age = self.age()
+        for guard in self._guards:
+            if isinstance(guard, Freshness) and not age <= guard.limit_value:
+                raise StaleState(
+                    f"The newest state is {age:.3f} s old, and a motion begins at a state of at most "
+                    f"{guard.limit_value:g} s. Nothing was sent; look at the link, at what publishes the state, and at "
+                    "whether this computer is busy.",
+                    age,
+                    guard.limit_value,
+                )
+
+    def _restart_guards(self) -> None:
+        for guard in (*self._further, *self._guards):
+            guard.restart()
+
+    def _forgive(self) -> None:
+        for guard in self._guards:
+            if isinstance(guard, Following):
+                guard.forgive()
+
+    def _fault(self, tick: Tick) -> tuple[Guard, str] | None:
+        for guard in self._guards:
+            reason = guard.fault(tick)
+            if reason is not None:
+                return guard, reason
+        for guard in self._further:
+            reason = guard.fault(_copy(tick))
+            if reason is not None:
+                return guard, reason
+        return None
+
+    def _limit(self, tick: Tick) -> None:
+        self._bad = self._status = 0
+        for guard in self._further:
+            asked = _copy(tick)
+            if guard.limit(asked):
+                tick.goal = self._shape.row(asked.command[None])
+                tick.command = tick.goal.copy()
+                self._note(guard, "altered")
+        for guard in self._guards:
+            if guard.limit(tick) and not tick.approach:
+                self._note(guard, "altered")
+
+    def _note(self, guard: Guard, what: str) -> None:
+        self._status = int(guard.number[1:])
+        self._counts[guard.name][what] += 1
+
+    def _hold(self, tick: Tick, guard: Guard, reason: str) -> None:
+        """Send what leaves the robot where it is; stop the robot if that happened too often."""
+        self._note(guard, "held")
+        self._bad += 1
+        if self._bad >= guard.patience:
+            self._stop(guard, reason if self._bad == 1 else f"{reason}, {self._bad} ticks on end")
+        tick.command = np.zeros_like(tick.last) if self._is_base else guard.hold(tick)
+        tick.last = tick.command  # at rest: what comes next begins there
+
+    def _send(self, tick: Tick, halts: int) -> RobotState:
+        """Hand the command over; whatever goes wrong with it, the robot is halted."""
+        cleared = _clear(self._robot, tick.command[None])
+        handed: Any = cleared.command if self._live is None else cleared
+        done, self._sent_at = False, self._clock()
+        try:
+            self._state = self._robot.step(handed)
+            done = True
+        finally:
+            _CLEARED.pop(cleared, None)
+            if not done or self._halts != halts:  # a halt of another thread may have come just before the command
+                self.halt()
+        self._sent = tick.command
+        if self._halts == halts:
+            self._last, self._speed = tick.command, (tick.command - tick.last) / tick.period
+        self._require_in_range(self._state)
+        return _copied(self._state)  # what a caller changes in it, the guards do not believe
+
+    def _require_in_range(self, state: RobotState) -> None:
+        for guard in self._guards:
+            reason = guard.trip(state)
+            if reason is not None:
+                self._stop(guard, reason)
+
+    def _stop(self, guard: Guard, reason: str) -> NoReturn:
+        """Halt, and stay so until a person resumes."""
+        self.halt()
+        self._counts[guard.name]["stopped"] += 1
+        why = self.not_ready()
+        said = "" if why is None else f"not ready: {why}: "
+        self._stopped = guard.name, f"{guard.number} {guard.name}: {said}{reason}"
+        message = f"The robot was stopped by {self._stopped[1]}. When it is safe, call resume()."
+        if isinstance(guard, Freshness):
+            raise StaleState(message, self.age(), guard.limit_value)
+        raise SafetyStop(guard.name, message)
+
+    def _require_free(self) -> None:
+        if self._stopped is not None:
+            name, reason = self._stopped
+            raise SafetyStop(name, f"The robot is still stopped by {reason}. When it is safe, call resume().")
+
+    def resume(self) -> None:
+        """Let a stopped robot move again: a person's decision, never a program's. It begins where it is."""
+        self._stopped, self._bad, self._last, self._sent_at, self._before = None, 0, None, None, None
+        self._forgive()
+
+    def reset(self, rows: Rows, initial: Initial) -> RobotState:
+        """Bring the robot to `initial`; a live arm opens its gripper and goes to its start pose slowly.
+
+        Raises:
+            InvalidValue: The start pose is outside the position limits; nothing moved.
+            StartNotReached: It was not there in time; it carries the joints.
+            SafetyStop: A guard stopped the robot, now or earlier.
+        """
+        self._require_free()
+        start = None if self._is_base else StartPose(self.spec, self.limits, initial)
+        if self._live is None:
+            self._forget()
+        else:
+            self.halt()
+        self._forgive()
+        state = self._take(self._robot.reset(rows, initial))
+        if start is not None and not start.is_near(self._measured()):
+            self._approach(start)
+            state = self._take(self._robot.reset(rows, initial))  # what the arm may have pushed is put back
+            self._forgive()
+        self._restart_guards()
+        begin = self._begin_at(self._pause())
+        self._sent_at = None  # the first command may take its time
+        return replace(_copied(state), command=begin[None].copy())
+
+    def _take(self, state: RobotState) -> RobotState:
+        """Begin anew with `state`."""
+        self._state, self._before, self._bad, self._status = state, None, 0, 0
+        self._require_in_range(state)
+        return state
+
+    def _approach(self, start: StartPose) -> None:
+        """Open the gripper where the arm is, then go to `start`."""
+        opened = start.opened(self._begin_at(0.0))
+        self._go(opened, GRIPPER_TIME, lambda: start.is_open(self._measured()))
+        self._go(start.command, self.limits.reset_timeout, lambda: self._is_reached(start))
+        if not self._is_reached(start):
+            self.halt()
+            raise start.failure(self._measured(), self.not_ready())
+
+    def _is_reached(self, start: StartPose) -> bool:
+        return start.is_reached(self._measured(), self._begin_at(0.0))
+
+    def _go(self, goal: Array, longest: float, done: Callable[[], bool]) -> None:
+        """Tick towards `goal` until `done`, at most for `longest` [s]."""
+        for _ in range(math.ceil(longest / self.spec.period)):
+            if done():
+                return
+            self._advance(goal, approach=True)
+
+    def halt(self) -> None:
+        """Stop moving and keep the link; what comes next begins where the robot is. From any thread; never raises."""
+        self._halts += 1
+        self._last = self._sent_at = None
+        self._robot.halt()
+
+    def close(self) -> None:
+        """Halt, then drop the link."""
+        self._robot.close()
+        self._forget()
+
+
+def _copied(state: RobotState) -> RobotState:
+    """The same, in arrays of its own."""
+    signals = {name: values.copy() for name, values in state.signals.items()}
+    return replace(state, signals=signals, command=state.command.copy())
+
+
+def _copy(tick: Tick) -> Tick:
+    """For a guard that is not ours: what it changes is looked at, and nothing else."""
+    return replace(tick, **{name: value.copy() for name, value in vars(tick).items() if isinstance(value, np.ndarray)})
+
+
+def _places_of(spec: RobotSpec, units: Sequence[str]) -> list[tuple[int, str, int]]:
+    """Place in the command, signal and column of the numbers that have its labels and are in `units`."""
+    measured = {
+        pair: (signal.name, column)
+        for signal in reversed(spec.signals)
+        for column, pair in enumerate(zip(signal.labels, signal.units, strict=True))
+    }
+    told = enumerate(zip(spec.command.labels, units, strict=True))
+    return [(place, *measured[pair]) for place, pair in told if pair in measured]
+
+
+def _measured_places(spec: RobotSpec) -> list[tuple[int, str, int]]:
+    """Place in the command, signal and column of what is measured of a command.
+
+    Raises:
+        InvalidValue: A joint is not measured: the guards could not know where the arm is.
+    """
+    places = _places_of(spec, spec.command.units)
+    known = {place for place, _, _ in places}
+    told = enumerate(zip(spec.command.labels, spec.command.units, strict=True))
+    missing = [label for place, (label, unit) in told if unit == "rad" and place not in known]
+    if missing:
+        raise InvalidValue(f"The guards need {', '.join(missing)} of {spec.name} measured in rad; no signal has it.")
+    return places

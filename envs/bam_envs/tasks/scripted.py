@@ -1,0 +1,198 @@
+"""Hand-written policies that solve MuJoCo's tasks from their observations alone: they can be done, and here is how.
+
+They keep no memory, so they act on rows of any length in any order, like a frozen policy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.registry import ENVIRONMENTS
+from bam_envs.core.task import Label
+from bam_envs.robots.ur5e import GEOMETRY, JOINTS
+from bam_envs.tasks.pick import PickTask
+from bam_envs.tasks.pick_place import CARRY, PickPlaceTask
+from bam_envs.tasks.reach import HOME, ReachTask
+from bam_envs.tasks.tool_control import JOINT_STEP, LEASH, TOOL_STEP, YAW_STEP
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Flags = NDArray[np.bool_]
+
+HOVER = 0.08
+"""How far above the object the tool comes in [m]."""
+DAMPING = 0.05
+"""Keeps the joints slow where the arm is nearly stretched [m/rad]."""
+PUT_DOWN = 0.004
+"""An object lower than this is let go of [m]."""
+
+
+class ScriptedPolicy(Protocol):
+    """The part of a frozen policy that evaluation uses."""
+
+    def act_batch(self, observations: Floats) -> Floats:
+        """Actions for n observations."""
+
+    def reset(self, rows: Sequence[int] | None = None) -> None:
+        """Forget what was seen of `rows`."""
+
+
+class Columns:
+    """Reads an observation (n, k) by the names of its labels."""
+
+    def __init__(self, labels: Sequence[Label]) -> None:
+        self._index = {label.name: column for column, label in enumerate(labels)}
+
+    def take(self, observation: Floats, *names: str) -> Array:
+        """The named numbers, side by side. Shape: (n, len(names))."""
+        columns: Array = observation[:, [self._index[name] for name in names]].astype(np.float64)
+        return columns
+
+
+class ScriptedReach:
+    """Turn the joints along the damped pseudo-inverse of the arm's Jacobian."""
+
+    def __init__(self) -> None:
+        self._columns = Columns(ReachTask.observation_labels)
+
+    def act_batch(self, observations: Floats) -> Floats:
+        """Actions for n observations. Shapes: (n, k) -> (n, 6)."""
+        joints = self._columns.take(observations, *JOINTS) + HOME
+        offset = 0.3 * self._columns.take(observations, "goal_dx", "goal_dy", "goal_dz")
+        jacobian = numeric_jacobian(joints)
+        square = jacobian @ jacobian.transpose(0, 2, 1) + DAMPING**2 * np.eye(3)
+        turn = (jacobian.transpose(0, 2, 1) @ np.linalg.solve(square, offset[:, :, None]))[:, :, 0]
+        actions: Floats = (turn / np.maximum(np.abs(turn).max(axis=1, keepdims=True), JOINT_STEP)).astype(np.float32)
+        return actions
+
+    def reset(self, rows: Sequence[int] | None = None) -> None:
+        """Nothing to forget."""
+
+
+def numeric_jacobian(joints: Array) -> Array:
+    """How the tool moves when each joint turns [m/rad]. Shape: (n, 6) -> (n, 3, 6)."""
+    step = 1e-6 * np.eye(joints.shape[1])
+    ahead = [GEOMETRY.tool_position(joints + one) - GEOMETRY.tool_position(joints - one) for one in step]
+    return np.stack(ahead, axis=2) / 2e-6
+
+
+class Sight:
+    """What an observation says of hand and object, in SI units; n rows."""
+
+    def __init__(self, columns: Columns, observations: Floats) -> None:
+        def take(*names: str) -> Array:
+            return columns.take(observations, *names)
+
+        self.offset = 0.1 * take("object_dx", "object_dy", "object_dz")
+        """Object from the tool [m]. Shape: (n, 3)."""
+        self.lead = LEASH * take("target_dx", "target_dy", "target_dz")
+        """Tool target from the tool [m]. Shape: (n, 3)."""
+        self.lift = 0.1 * take("object_lift")[:, 0]
+        """Object above where it lay [m]. Shape: (n,)."""
+        cosine, sine = take("object_yaw_cos", "object_yaw_sin").T
+        self.turn: Array = np.arctan2(sine, cosine) / 4
+        """Object's yaw from the gripper's, the nearest of four [rad]. Shape: (n,)."""
+        grip, width = take("grip", "gripper_width").T
+        self.closed: Flags = (grip > 0) & (np.linalg.norm(self.offset, axis=1) < 0.03)
+        """Whether the gripper was told to close on the object. Shape: (n,)."""
+        self.holding: Flags = self.closed & (width < 0.1)
+        """Whether it has stopped at the width of the object. Shape: (n,)."""
+
+
+def grasp(sight: Sight) -> tuple[Array, Array, Array]:
+    """Come down on the object through a funnel, the gripper turned to it, and close.
+
+    Returns:
+        Way of the tool target [m], shape (n, 3); turn [rad], shape (n,); 1 to close and -1 to open, shape (n,).
+    """
+    across = np.hypot(sight.offset[:, 0], sight.offset[:, 1])
+    astray = np.maximum((across - 0.007) / 0.015, (np.abs(sight.turn) - 0.08) / 0.15)
+    low = (astray < 0.3) & (np.abs(sight.offset[:, 2]) < 0.01)
+    travel = sight.offset - sight.lead
+    travel[:, 2] += HOVER * np.clip(astray, 0.0, 1.0)
+    travel[sight.closed] = 0.0
+    grip = np.where(low | sight.closed, 1.0, -1.0)
+    return travel, np.where(sight.closed, 0.0, sight.turn), grip
+
+
+def tool_actions(travel: Array, turn: Array, grip: Array) -> Floats:
+    """Actions (n, 5) that move the tool target by `travel` [m] and `turn` [rad], as far as a step goes."""
+    actions = np.concatenate([travel / TOOL_STEP, turn[:, None] / YAW_STEP, grip[:, None]], axis=1)
+    clipped: Floats = np.clip(actions, -1.0, 1.0).astype(np.float32)
+    return clipped
+
+
+class ScriptedPick:
+    """Grasp the cube and lift it."""
+
+    def __init__(self) -> None:
+        self._columns = Columns(PickTask.observation_labels)
+
+    def act_batch(self, observations: Floats) -> Floats:
+        """Actions for n observations. Shapes: (n, k) -> (n, 5)."""
+        sight = Sight(self._columns, observations)
+        travel, turn, grip = grasp(sight)
+        travel[sight.holding] = (0.0, 0.0, 1.0)
+        return tool_actions(travel, turn, grip)
+
+    def reset(self, rows: Sequence[int] | None = None) -> None:
+        """Nothing to forget."""
+
+
+class ScriptedPickPlace:
+    """Grasp the cube, carry it to the goal, put it down and let go."""
+
+    def __init__(self) -> None:
+        self._columns = Columns(PickPlaceTask.observation_labels)
+
+    def act_batch(self, observations: Floats) -> Floats:
+        """Actions for n observations. Shapes: (n, k) -> (n, 5)."""
+        sight = Sight(self._columns, observations)
+        goal = 0.2 * self._columns.take(observations, "goal_dx", "goal_dy")
+        travel, turn, grip = grasp(sight)
+        over = np.hypot(goal[:, 0], goal[:, 1]) < 0.006
+        travel[sight.holding] = carry(sight, goal, over)[sight.holding]
+        there = (np.hypot(goal[:, 0], goal[:, 1]) < 0.015) & (sight.lift < PUT_DOWN)
+        done = there & (~sight.closed | over)
+        travel[done], turn[done], grip[done] = 0.0, 0.0, -1.0
+        return tool_actions(travel, turn, grip)
+
+    def reset(self, rows: Sequence[int] | None = None) -> None:
+        """Nothing to forget."""
+
+
+def carry(sight: Sight, goal: Array, over: Flags) -> Array:
+    """Way of the tool target with the object in hand: up, across to `goal` (n, 2) [m], down. Shape: (n, 3) [m]."""
+    height = np.where(over, 0.0, CARRY)
+    travel = np.concatenate([goal - sight.lead[:, :2], (height - sight.lift)[:, None]], axis=1)
+    travel[:, :2] *= (over | (sight.lift > 0.6 * CARRY))[:, None]
+    travel[:, 2] = np.clip(travel[:, 2], -0.4 * TOOL_STEP, TOOL_STEP)
+    return travel
+
+
+SCRIPTED: dict[str, Any] = {
+    "bam/reach-v0": ScriptedReach,
+    "bam/pick-v0": ScriptedPick,
+    "bam/pick-place-v0": ScriptedPickPlace,
+}
+"""The scripted policy of each environment that has one."""
+
+
+def scripted_policy(env_id: str) -> ScriptedPolicy:
+    """The scripted policy for `env_id`.
+
+    Raises:
+        InvalidValue: The environment has none.
+        UnknownName: There is no such environment.
+    """
+    if env_id in ENVIRONMENTS and env_id not in SCRIPTED:
+        raise InvalidValue(f"{env_id} has no scripted policy. These have one: {', '.join(SCRIPTED)}.")
+    if env_id not in SCRIPTED:
+        raise UnknownName("scripted policy", env_id, SCRIPTED)
+    policy: ScriptedPolicy = SCRIPTED[env_id]()
+    return policy

@@ -1,0 +1,244 @@
+"""Live robots behind their guards: served robots, through a server, as any robot."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+
+from bam_envs.core.errors import InvalidValue, LinkLost, ProtocolError, UnknownName
+from bam_envs.core.robot import Initial, Robot, RobotState, Rows
+from bam_envs.live.building import live_robot, profile_limits
+from bam_envs.live.rosbridge import RosbridgeRobot
+from bam_envs.remote.serve.command import CommandLease
+from bam_envs.remote.serve.robot_service import RobotService
+from bam_envs.remote.serve.served_robot import ServedRobot
+from bam_envs.robots.fake import FakeRobot
+from bam_envs.robots.mir100 import base_spec
+from bam_envs.robots.physics.mir100 import SimulatedBase
+from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.robots.ur5e import JOINTS, arm_spec
+from bam_envs.rosbridge.server.server import BridgeServer
+from bam_envs.safety.guards import Limits
+from bam_envs.safety.safe import SafeRobot
+from bam_envs.testing import RobotContract
+
+ROW = np.zeros(1, np.int64)
+
+
+class Box:
+    """A robot in a box: a fake one, served on a port of its own."""
+
+    def __init__(self, robot, initial, realtime):
+        profile = load_profile("mir100" if isinstance(robot, SimulatedBase) else "ur5e")
+        self.server = BridgeServer(port=0).start()
+        self.robot = ServedRobot(robot, dead_man=profile.dead_man, zero_rests=profile.kind == "base", realtime=realtime)
+        self.robot.connect()
+        self.robot.reset(ROW, initial)
+        self.service = RobotService(self.robot, profile, self.server, CommandLease(0.5))
+        self.service.start()
+
+    def close(self):
+        self.service.close()
+        self.server.close()
+        self.robot.close()
+
+
+class LiveContract(RobotContract):
+    """Of live robots: n is 1, and each test has a box of its own."""
+
+    sizes = (1,)
+    holds_what_is_not_finite = True
+    realtime = False
+
+    @pytest.fixture(autouse=True)
+    def _boxes(self):
+        served = [self.served(), self.served()]  # as many as a test makes robots
+        self.boxes = [Box(robot, self.initial(robot, ROW), self.realtime) for robot in served]
+        self.urls = [box.server.url for box in self.boxes]
+        yield
+        for box in self.boxes:
+            box.close()
+
+    def served(self):
+        raise NotImplementedError
+
+    def make(self, num_robots: int) -> Robot:
+        return live_robot(self.urls.pop(), self.served().spec)
+
+
+class TestLiveArm(LiveContract):
+    def served(self):
+        return FakeRobot(1)
+
+    def move(self, robot: Robot, state: RobotState) -> np.ndarray:
+        return self.stay(state) - 0.005
+
+
+class TestLiveArmInRealTime(TestLiveArm):
+    realtime = True
+
+
+class TestLiveBase(LiveContract):
+    def served(self):
+        return SimulatedBase(1)
+
+    def initial(self, robot: Robot, rows: Rows) -> Initial:
+        return Initial({}, np.zeros(1, np.int64))
+
+    def measured(self, state: RobotState) -> np.ndarray:
+        return state.signals["base_velocity"]
+
+    def move(self, robot: Robot, state: RobotState) -> np.ndarray:
+        return np.array([[0.1, 0.1]])
+
+
+def test_an_address_of_something_else():
+    for url, text in (
+        ("http://robot:9090", "not 'http://robot:9090'. Did you mean 'ws://robot:9090'?"),
+        ("10.0.0.5:9090", "not '10.0.0.5:9090'. Did you mean 'ws://10.0.0.5:9090'?"),
+    ):
+        with pytest.raises(InvalidValue) as caught:
+            live_robot(url)
+        assert str(caught.value) == f"A live robot's address is ws://host:port or wss://host:port, {text}"
+    with pytest.raises(InvalidValue) as caught:
+        live_robot("tcp://10.0.0.5:5555")
+    assert str(caught.value) == (
+        "A live robot's address is ws://host:port or wss://host:port; 'tcp://10.0.0.5:5555' is that of a whole "
+        "environment. Give it as transport='tcp://10.0.0.5:5555' (--transport)."
+    )
+    with pytest.raises(InvalidValue) as caught:
+        live_robot("")
+    assert str(caught.value) == (
+        "A live robot's address is ws://host:port or wss://host:port, such as ws://10.0.0.5:9090, not ''."
+    )
+
+
+def test_certificates_without_tls():
+    with pytest.raises(InvalidValue) as caught:
+        live_robot("ws://robot", ca_file="ca.pem")
+    assert str(caught.value) == (
+        "ws://robot: ca_file says whom wss:// trusts, and this address is without TLS; leave it out."
+    )
+    live_robot("wss://robot", ca_file="ca.pem")
+
+
+def test_its_profile():
+    assert live_robot("ws://robot").spec == arm_spec("ur5e", with_object=True)
+    assert live_robot("ws://robot", base_spec("any")).spec == base_spec()
+    assert live_robot("ws://robot", profile="mir100").spec.name == "mir100"
+    assert live_robot("ws://robot", profile=load_profile("mir100")).spec.name == "mir100"
+    with pytest.raises(UnknownName, match="Did you mean 'ur5e'"):
+        live_robot("ws://robot", profile="ur5")
+    with pytest.raises(InvalidValue, match=r"^joint_position is needed, and mir100 measures only "):
+        live_robot("ws://robot", arm_spec("ur5e", with_object=False), profile="mir100")
+
+
+def test_its_limits(tmp_path):
+    path = tmp_path / "slow.toml"
+    path.write_text(
+        'extends = "ur5e"\nname = "slow"\nkind = "arm"\nmax_age = 0.2\n[limits]\njoint_speed = 0.25\ntool_speed = 0.1\n'
+    )
+    expected = Limits(joint_speed=0.25, tool_speed=0.1, max_age=0.2)
+    assert profile_limits(load_profile(path)) == expected
+    assert live_robot("ws://robot", profile=path).limits == expected
+    assert live_robot("ws://robot", profile=path, limits=Limits()).limits == Limits()
+    assert live_robot("ws://robot", profile="mir100").limits == Limits(max_age=0.5)
+
+
+def test_its_token(tmp_path):
+    path = tmp_path / "token"
+    with pytest.raises(InvalidValue, match=r"^The token file .* cannot be read: "):
+        live_robot("ws://robot", token_file=str(path))
+    path.write_text(" \n")
+    with pytest.raises(InvalidValue, match=r"^The token file .* is empty; put a secret into it\.$"):
+        live_robot("ws://robot", token_file=str(path))
+
+
+def test_a_token_opens_the_door(tmp_path, robot_on, start_pose):
+    path = tmp_path / "token"
+    path.write_text("secret\n")
+    with BridgeServer(port=0, token="secret") as server:
+        robot_on(server)
+        robot = live_robot(server.url, token_file=str(path))
+        robot.connect()
+        robot.reset(ROW, start_pose)
+        robot.close()
+        with pytest.raises(LinkLost, match="token was refused"):
+            live_robot(server.url).connect()
+
+
+def test_no_way_leads_around_the_gate(server, robot_on, start_pose):
+    scripted = robot_on(server)
+    robot = live_robot(server.url)
+    assert type(robot) is SafeRobot
+    robot.connect()
+    try:
+        state = robot.reset(ROW, start_pose)
+        inner = robot._robot
+        assert isinstance(inner, RosbridgeRobot)
+        kept = []
+        step, inner.step = inner.step, lambda command: kept.append(command) or step(command)
+        robot.step(state.command)
+        before = len(scripted.on("/forward_position_controller/commands"))
+        for forged in (state.command, kept[0], kept[0].__class__, None):
+            with pytest.raises(InvalidValue):
+                step(forged)
+        for copied in (copy.copy, copy.deepcopy, pickle.dumps):
+            with pytest.raises(InvalidValue):
+                copied(kept[0])
+        with pytest.raises(InvalidValue):
+            type(kept[0])(state.command)
+        assert len(scripted.on("/forward_position_controller/commands")) == before
+        public = [name for name in dir(inner) if not name.startswith("_")]
+        assert public == [
+            "age",
+            "close",
+            "connect",
+            "halt",
+            "info",
+            "measure",
+            "namespace",
+            "needs_clearance",
+            "not_ready",
+            "num_robots",
+            "profile",
+            "reset",
+            "spec",
+            "step",
+            "url",
+            "waiting",
+        ]
+    finally:
+        robot.close()
+
+
+def test_a_robot_that_talks_nonsense_is_halted(lax, robot_on, start_pose):
+    server = lax()
+    scripted = robot_on(server)
+    robot = live_robot(server.url)
+    robot.connect()
+    try:
+        state = robot.reset(ROW, start_pose)
+        halts = scripted.halts
+        scripted.mangle = lambda topic, message: message | {"name": []} if topic == "/joint_states" else message
+        with pytest.raises(ProtocolError) as caught:
+            [robot.step(state.command) for _ in range(10)]
+        assert str(caught.value) == f"/joint_states: {', '.join(JOINTS)} missing; found: no name."
+        scripted.wait_for(lambda: scripted.halts > halts)
+    finally:
+        robot.close()
+
+
+def test_its_start_pose_is_gone_to_slowly(server, robot_on, start_pose):
+    scripted = robot_on(server)
+    scripted.signals["joint_position"] = scripted.signals["joint_position"] + 0.05
+    robot = live_robot(server.url)
+    robot.connect()
+    try:
+        state = robot.reset(ROW, start_pose)
+        np.testing.assert_allclose(state.signals["joint_position"], start_pose.signals["joint_position"], atol=0.02)
+        told = np.array([message["data"] for message in scripted.on("/forward_position_controller/commands")])
+        assert np.abs(np.diff(told, axis=0)).max() <= 0.25 * 0.05 + 1e-9
+    finally:
+        robot.close()

@@ -1,0 +1,250 @@
+"""What a robot says of its being ready: it is named before anything moves, and instead of what follows from it."""
+
+import time
+
+import numpy as np
+import pytest
+
+from bam_envs.core.errors import NotReady, SafetyStop
+from bam_envs.live.building import live_robot
+from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.ros.codec import RobotInfo
+from bam_envs.safety.guard import Limits
+from bam_envs.safety.start_pose import StartPose
+
+ROW = np.zeros(1, np.int64)
+SAFETY, MODE, PROGRAM = (
+    f"/io_and_status_controller/{name}" for name in ("safety_mode", "robot_mode", "robot_program_running")
+)
+SPEED = "/speed_scaling_state_broadcaster/speed_scaling"
+LIST = "/controller_manager/list_controllers"
+TYPES = {one.topic: one.type for name in ("ur5e", "mir100") for one in load_profile(name).readiness}
+ACTIVE = {"forward_position_controller": "active", "scaled_joint_trajectory_controller": "inactive"}
+
+
+class Driver:
+    """Says on a server what a robot's driver says."""
+
+    def __init__(self, server):
+        self.server, self.controllers = server, dict(ACTIVE)
+
+    def say(self, topic, **message):
+        self.server.advertise(topic, TYPES[topic], latch=True)
+        self.server.publish(topic, message)
+
+    def offer_controllers(self):
+        self.server.serve(LIST, "controller_manager_msgs/ListControllers", self._list)
+
+    def _list(self, request, caller):
+        return {"controller": [{"name": name, "state": state} for name, state in self.controllers.items()]}
+
+    def say_ready(self):
+        self.say(SAFETY, mode=1)
+        self.say(MODE, mode=7)
+        self.say(PROGRAM, data=True)
+        self.say(SPEED, data=100.0)
+
+
+@pytest.fixture
+def driver(server):
+    return Driver(server)
+
+
+@pytest.fixture
+def connected(server, robot_on):
+    """Connect to a scripted robot, behind its guards."""
+    robots = []
+
+    def connect(profile="ur5e", frozen=False, **options):
+        scripted = robot_on(server, profile)
+        if frozen:
+            scripted._move = lambda: None
+        robots.append(live_robot(server.url, profile=profile, **options))
+        robots[-1].connect()
+        return robots[-1]
+
+    yield connect
+    for robot in robots:
+        robot.close()
+
+
+@pytest.fixture
+def wait():
+    def until(found):
+        deadline = time.monotonic() + 5.0
+        while not found():
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+
+    return until
+
+
+def test_a_robot_that_is_ready_moves(driver, connected, start_pose):
+    driver.say_ready()
+    driver.offer_controllers()
+    robot = connected()
+    assert robot.not_ready() is None
+    robot.step(robot.reset(ROW, start_pose).command)
+    assert robot.info.text == (
+        f"the robot at {driver.server.url}, which does not describe itself (profile ur5e: shoulder_pan_joint, "
+        "shoulder_lift_joint, elbow_joint, wrist_1_joint, wrist_2_joint, wrist_3_joint, gripper_width)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("topic", "message", "text"),
+    [
+        (SAFETY, {"mode": 3}, f"protective stop ({SAFETY})"),
+        (SAFETY, {"mode": 7}, f"robot emergency stop ({SAFETY})"),
+        (SAFETY, {"mode": 99}, f"safety mode 99 ({SAFETY})"),
+        (MODE, {"mode": 5}, f"idle, brakes engaged ({MODE})"),
+        (MODE, {"mode": -1}, f"no controller ({MODE})"),
+        (PROGRAM, {"data": False}, f"the external control program is not running ({PROGRAM})"),
+        (SPEED, {"data": 30.0}, f"the speed slider is at 30 % ({SPEED})"),
+    ],
+)
+def test_an_arm_that_is_not_ready_does_not_begin(driver, connected, start_pose, topic, message, text):
+    driver.say_ready()
+    driver.say(topic, **message)
+    robot = connected()
+    assert robot.not_ready() == text
+    with pytest.raises(NotReady) as caught:
+        robot.reset(ROW, start_pose)
+    assert str(caught.value) == (
+        f"{driver.server.url}: not ready: {text}. Nothing moves before it is ready and reset() is called."
+    )
+
+
+@pytest.mark.parametrize("field", ["robotState", "robot_state"])
+def test_a_base(driver, connected, field):
+    driver.say("/robot_state", **{field: 10})
+    assert connected("mir100").not_ready() == "emergency stop (/robot_state)"
+
+
+def test_it_becomes_ready_without_a_new_connection(driver, connected, start_pose, wait):
+    driver.say(SAFETY, mode=3)
+    robot = connected()
+    driver.say(SAFETY, mode=1)
+    wait(lambda: robot.not_ready() is None)
+    robot.reset(ROW, start_pose)
+
+
+def test_a_stop_in_mid_episode_is_named_at_once(driver, connected, start_pose, wait):
+    driver.say_ready()
+    robot = connected()
+    command = robot.reset(ROW, start_pose).command
+    robot.step(command)
+    driver.say(SPEED, data=30.0)  # may dip while it moves: the guards look at what follows from it
+    wait(lambda: robot.not_ready() is not None)
+    robot.step(command)
+    driver.say(SAFETY, mode=3)
+    wait(lambda: "protective" in robot.not_ready())
+    with pytest.raises(NotReady, match="not ready: protective stop"):
+        robot.step(command)
+
+
+def test_what_follows_from_it_is_told_with_it(driver, connected, start_pose, wait):
+    """The slider was pulled down while the arm moved: it does not follow any more, and why is said first."""
+    driver.say_ready()
+    robot = connected(frozen=True)
+    command = robot.reset(ROW, start_pose).command.copy()
+    driver.say(SPEED, data=30.0)
+    wait(lambda: robot.not_ready() is not None)
+    command[0, 0] += 0.3
+
+    def go_on():
+        for _ in range(100):
+            robot.step(command)
+
+    with pytest.raises(SafetyStop) as caught:
+        go_on()
+    assert str(caught.value).startswith(
+        f"The robot was stopped by G23 following: not ready: the speed slider is at 30 % ({SPEED}): shoulder_pan_joint "
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "way", "text"),
+    [
+        ({}, "position", None),
+        ({}, "trajectory", "the controller scaled_joint_trajectory_controller is inactive"),
+        ({"forward_position_controller": "unconfigured"}, "position", "forward_position_controller is unconfigured"),
+        ({"forward_position_controller": "running"}, "position", None),  # as ROS 1 calls it
+    ],
+)
+def test_controllers(driver, connected, start_pose, change, way, text):
+    driver.controllers |= change
+    driver.offer_controllers()
+    robot = connected(command=way)
+    if text is None:
+        assert robot.not_ready() is None
+    else:
+        assert text in robot.not_ready()
+        assert " --activate " in robot.not_ready()
+        with pytest.raises(NotReady, match=text):
+            robot.reset(ROW, start_pose)
+
+
+def test_a_controller_that_is_not_loaded(driver, connected):
+    driver.controllers = {}
+    driver.offer_controllers()
+    assert connected().not_ready() == (
+        "the controller forward_position_controller is not loaded: "
+        "ros2 control switch_controllers --activate forward_position_controller"
+    )
+
+
+def test_what_is_not_said_is_in_the_description(driver, connected, start_pose):
+    driver.say(SAFETY, mode=1)
+    driver.say(MODE, state="on")  # of another version: it has no mode
+    robot = connected()
+    assert robot.not_ready() is None
+    assert robot.info.text.endswith(
+        "wrist_3_joint, gripper_width; it does not say robot_mode, robot_program_running, speed_scaling, "
+        "list_controllers)"
+    )
+    robot.reset(ROW, start_pose)
+
+
+def test_another_type_is_not_listened_to(driver, connected):
+    driver.server.advertise(SAFETY, "std_msgs/String")
+    assert "it does not say safety_mode, " in connected().info.text
+
+
+def test_a_robot_that_describes_itself_is_not_asked(server, driver, robot_on, simulation):
+    driver.say(SAFETY, mode=3)
+    robot_on(server, info=simulation)
+    robot = live_robot(server.url, profile="ur5e")
+    robot.connect()
+    assert robot.not_ready() is None
+    assert robot.info == RobotInfo("ur5e", simulated=True, lockstep=True, period=0.05)
+    robot.close()
+
+
+def test_what_the_server_cannot_pass_on_is_no_refusal(lax, robot_on, start_pose):
+    """A server without the types of a driver says so, and the robot is driven without."""
+    server = lax()
+    robot_on(server)
+    robot = live_robot(server.url, profile="ur5e")
+    robot.connect()
+    inner = robot._robot
+    inner._on_status({"op": "status", "level": "error", "msg": "unknown type", "id": f"subscribe:{SAFETY}"})
+    robot.step(robot.reset(ROW, start_pose).command)
+    robot.close()
+
+
+def test_a_start_pose_that_is_not_reached(start_pose):
+    pose = StartPose(load_profile("ur5e").spec(), Limits(), start_pose)
+    measured = pose.command - 0.1
+    plain, told = pose.failure(measured), pose.failure(measured, "protective stop")
+    assert str(plain).startswith(
+        "The arm did not reach its start pose in 30 s: shoulder_pan_joint is +0.100 rad from it"
+    )
+    assert str(told) == f"Not ready: protective stop. {plain}"
+
+
+def test_what_is_no_value_says_nothing():
+    readiness = {one.topic: one for one in load_profile("ur5e").readiness}
+    assert readiness[SPEED].trouble({"data": "fast"}) is None
+    assert readiness[SPEED].trouble({}) is None
+    assert readiness[SAFETY].trouble([1]) is None

@@ -1,0 +1,664 @@
+"""A live robot through a rosbridge server: what is sent, what is believed, and what happens when something breaks."""
+
+import multiprocessing
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bam_envs.core.errors import (
+    InvalidValue,
+    LinkLost,
+    NoServer,
+    NotInCommand,
+    ProtocolError,
+    RemoteError,
+    ResetNeeded,
+    StaleState,
+    UnknownName,
+)
+from bam_envs.core.robot import Initial
+from bam_envs.live.rosbridge import RosbridgeRobot
+from bam_envs.robots.fake import FakeRobot
+from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.robots.ur5e import JOINTS
+from bam_envs.ros.codec import HALT_TOPIC, SCENE_TOPIC, RobotInfo
+from bam_envs.ros.freshness import read_tag
+from bam_envs.ros.messages import tag_text, write_stamp
+from bam_envs.rosbridge.server.server import BridgeServer
+from bam_envs.rosbridge.string_rpc import StringRpcService
+from bam_envs.safety.safe import _clear
+
+ROW = np.zeros(1, np.int64)
+JOINT_COMMANDS, GRIPPER_COMMANDS = "/forward_position_controller/commands", "/gripper/commands"
+DEADLINE = 10.0
+
+
+class OpenGate:
+    """Passes every command on to its robot, as no gate may: what the robot does with it is tested here."""
+
+    def __init__(self, robot):
+        self.robot = robot
+        self.state = robot.measure()
+
+    def step(self, command):
+        return self.robot.step(_clear(self.robot, np.array(command)))
+
+
+def robot_at(url, profile="ur5e", **options):
+    return RosbridgeRobot(url, load_profile(profile), **options)
+
+
+@pytest.fixture
+def connect():
+    """Connect to a robot; the robot, and an open gate before it."""
+    robots = []
+
+    def start(url, profile="ur5e", **options):
+        robots.append(robot_at(url, profile, **options))
+        robots[-1].connect()
+        return robots[-1], OpenGate(robots[-1])
+
+    yield start
+    for robot in robots:
+        robot.close()
+
+
+def raised(kind, act):
+    with pytest.raises(kind) as caught:
+        act()
+    assert type(caught.value) is kind
+    return str(caught.value)
+
+
+def test_joints_are_read_by_name(server, robot_on, connect):
+    def shuffled(topic, message):
+        if topic != "/joint_states":
+            return message
+        return message | {field: list(reversed(message[field])) for field in ("name", "position", "velocity")}
+
+    scripted = robot_on(server)
+    scripted.mangle = shuffled
+    scripted.signals["joint_velocity"] = np.arange(6.0)
+    scripted.signals["object_position"] = np.array([0.5, 0.1, 0.02])
+    _, gate = connect(server.url)
+    signals = gate.state.signals
+    np.testing.assert_array_equal(signals["joint_position"], scripted.signals["joint_position"][None])
+    np.testing.assert_array_equal(signals["joint_velocity"], [np.arange(6.0)])
+    np.testing.assert_array_equal(signals["gripper_width"], [[0.085]])
+    np.testing.assert_array_equal(signals["object_position"], [[0.5, 0.1, 0.02]])
+    np.testing.assert_array_equal(signals["object_quaternion"], [[1.0, 0.0, 0.0, 0.0]])
+    np.testing.assert_array_equal(gate.state.command[0, :6], signals["joint_position"][0])
+
+
+def test_commands_and_their_tags(server, robot_on, connect):
+    scripted = robot_on(server)
+    _, gate = connect(server.url)
+    command = gate.state.command + 0.01
+    states = [gate.step(command + n) for n in range(3)]
+    np.testing.assert_array_equal([state.command for state in states], [command, command + 1, command + 2])
+    scripted.wait_for(lambda: len(scripted.commands) == 6)
+    assert [topic for topic, _, _ in scripted.commands] == [GRIPPER_COMMANDS, JOINT_COMMANDS] * 3
+    assert [message["data"] for message in scripted.on(JOINT_COMMANDS)] == [
+        (command[0, :6] + n).tolist() for n in range(3)
+    ]
+    tags = [read_tag(tag_text(message)) for _, _, message in scripted.commands]
+    assert len({tag.session for tag in tags}) == 1
+    assert [tag.epoch for tag in tags] == [1] * 6
+    sequences = [tag.sequence for tag in tags]
+    assert sequences == [sequences[0] + n // 2 for n in range(6)]
+    assert all(tag.deadline - tag.sent == pytest.approx(0.1, abs=1e-5) for tag in tags)
+    assert (np.diff([state.stamp[0] for state in states]) > 0).all()
+
+
+def test_trajectories(server, robot_on, connect):
+    scripted = robot_on(server)
+    _, gate = connect(server.url, command="trajectory")
+    command = gate.state.command + 0.01
+    gate.step(command)
+    scripted.wait_for(lambda: len(scripted.commands) == 2)
+    (message,) = scripted.on("/scaled_joint_trajectory_controller/joint_trajectory")
+    assert message["joint_names"] == list(JOINTS)
+    assert message["points"][0]["positions"] == command[0, :6].tolist()
+    assert read_tag(message["header"]["frame_id"]) is not None
+
+
+def test_only_a_gate_sends_commands(server, robot_on, connect):
+    scripted = robot_on(server)
+    robot, gate = connect(server.url)
+    text = raised(InvalidValue, lambda: robot.step(gate.state.command))
+    assert text == "Commands reach a live robot only through SafeRobot. Build it with live_robot(...)."
+    assert scripted.commands == []
+
+
+def test_before_connect_and_after_close(server, robot_on, connect):
+    robot = robot_at("ws://127.0.0.1:9/cell_1")
+    assert raised(ResetNeeded, robot.measure) == (
+        "ur5e at ws://127.0.0.1:9/cell_1 is not connected. Call connect() first."
+    )
+    assert robot.age() == np.inf
+    robot_on(server)
+    robot, gate = connect(server.url)
+    robot.close()
+    robot.close()
+    robot.halt()
+    assert raised(ResetNeeded, lambda: gate.step(gate.state.command)).endswith("Call connect() first.")
+    robot.connect()
+    robot.connect()
+    assert robot.measure().signals["gripper_width"] == 0.085
+
+
+def test_only_what_is_needed_is_subscribed(server, robot_on, connect):
+    scripted = robot_on(server)
+    scripted.mangle = lambda topic, message: None if topic == "/object_pose" else message
+    _, gate = connect(server.url, spec=FakeRobot(with_object=False).spec)
+    assert list(gate.state.signals) == ["joint_position", "joint_velocity", "gripper_width"]
+
+
+def test_wrong_addresses_and_ways():
+    assert raised(InvalidValue, lambda: robot_at("http://robot")).startswith("Address 'http://robot' has the")
+    raised(UnknownName, lambda: robot_at("ws://robot", command="positions"))
+    robot = robot_at("ws://127.0.0.1:9")
+    assert raised(NoServer, robot.connect).startswith("ws://127.0.0.1:9: refused: nothing listens there.")
+
+
+def test_steps_last_a_period_each(server, robot_on, connect):
+    robot_on(server)
+    robot, gate = connect(server.url)
+    begin = robot._clock()
+    for _ in range(4):
+        gate.step(gate.state.command)
+    assert robot._clock() - begin >= 4 * robot.spec.period - 0.001
+
+
+def test_lockstep(server, robot_on, connect, simulation):
+    scripted = robot_on(server, info=simulation)
+    robot, gate = connect(server.url)
+    assert robot.info == simulation
+    for n in range(20):
+        command = gate.state.command + 0.001 * n
+        state = gate.step(command)
+        assert len(scripted.on(JOINT_COMMANDS)) == n + 1
+        assert robot.age() == 0.0
+        np.testing.assert_array_equal(state.signals["joint_position"], command[:, :6])
+
+
+def test_a_robot_that_answers_commands_owes_an_answer_to_what_does_not_arrive(server, robot_on, connect):
+    scripted = robot_on(server, info=RobotInfo("ur5e", simulated=True, lockstep=False, period=0.05))
+    robot, gate = connect(server.url)
+    assert robot.waiting() == 0.0
+    for _ in range(3):
+        gate.step(gate.state.command)
+    assert robot.waiting() < 0.05
+    answered, now = scripted._tag, robot._clock
+    scripted.mangle = lambda topic, message: (
+        message | {"header": message["header"] | {"frame_id": answered}} if topic == "/joint_states" else message
+    )
+    gate.step(gate.state.command)
+    robot._clock = lambda: now() + 0.5
+    assert 0.5 <= robot.waiting() < 1.5
+    robot.halt()  # what has not been executed is not any more
+    assert robot.waiting() == 0.0
+
+
+def test_in_lockstep_a_command_that_cannot_be_sent_is_told_at_once(server, robot_on, connect, simulation):
+    scripted = robot_on(server, info=simulation)
+    robot, gate = connect(server.url)
+    connection = robot._control._keeper.up
+    connection.held_up(True)
+    text = raised(LinkLost, lambda: gate.step(gate.state.command))
+    assert text == f"{server.url}: the server does not read what it is sent. Nothing more was sent."
+    assert scripted.on(JOINT_COMMANDS) == []
+    connection.held_up(False)
+    gate.step(gate.state.command)
+    assert len(scripted.on(JOINT_COMMANDS)) == 1
+
+
+def test_lockstep_without_an_answer(server, robot_on, connect, simulation, monkeypatch):
+    monkeypatch.setattr("bam_envs.live.rosbridge.ANSWER_TIMEOUT", 0.2)
+    scripted = robot_on(server, info=simulation)
+    _, gate = connect(server.url)
+    scripted.mangle = lambda topic, message: None
+    assert raised(StaleState, lambda: gate.step(gate.state.command)) == (
+        f"{server.url}: no state answered the command in 0.2 s. Does the simulation run?"
+    )
+
+
+def test_another_period(server, robot_on):
+    robot_on(server, info=RobotInfo("box", simulated=True, lockstep=True, period=0.1))
+    robot = robot_at(server.url)
+    assert raised(InvalidValue, robot.connect) == (
+        "box goes on 0.1 s with each command, and the task's period is 0.05 s. "
+        "Serve the environment that the task is of."
+    )
+
+
+def test_a_base_in_lockstep(server, robot_on, connect):
+    info = RobotInfo("mir100", simulated=True, lockstep=True, period=0.1)
+    scripted = robot_on(server, "mir100", info=info)
+    _, gate = connect(server.url, "mir100")
+    state = gate.step(np.array([[0.25, -0.5]]))
+    np.testing.assert_array_equal(state.signals["base_velocity"], [[0.25, -0.5]])
+    assert [topic for topic, _, _ in scripted.commands] == ["/cmd_vel_stamped"]
+    robot = robot_at(server.url, "mir100", command="velocity")
+    assert raised(InvalidValue, robot.connect) == (
+        "mir100 goes on with each command, and its answers cannot be told apart: velocity of the profile of mir100 has "
+        "no room for a tag. Give it a way that has, such as stamped messages."
+    )
+
+
+def test_a_cut_link_delivers_nothing_afterwards(server, robot_on, connect, start_pose):
+    robot_on(server)
+    robot, gate = connect(server.url)
+    command = gate.state.command + 0.01
+    server.close()
+    text = raised(LinkLost, lambda: [gate.step(command) for _ in range(100)])
+    assert text.startswith(server.url)
+    for _ in range(5):
+        raised(LinkLost, lambda: gate.step(command))
+    with BridgeServer(port=server.port) as again:
+        other = robot_on(again)
+        robot._control.wait_up(DEADLINE)
+        robot._halting.wait_up(DEADLINE)
+        assert raised(LinkLost, lambda: gate.step(command)) == (
+            f"{server.url}: the link dropped, and is back. Nothing is sent before reset()."
+        )
+        assert [topic for topic, _, _ in other.commands if topic == JOINT_COMMANDS] == []
+        robot.reset(ROW, start_pose)
+        gate.step(command)
+        other.wait_for(lambda: other.on(JOINT_COMMANDS))
+        (message,) = other.on(JOINT_COMMANDS)
+        assert message["data"] == command[0, :6].tolist()
+        assert read_tag(tag_text(message)).epoch == 2
+        robot.close()
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_a_halt_that_cannot_be_sent_is_told_once(server, robot_on, connect, caplog, told):
+    """By the error of the step that found the link down, or else by a line of its own."""
+    robot_on(server)
+    robot, gate = connect(server.url)
+    gate.step(gate.state.command)
+    server.close()
+    assert robot._cut.wait(DEADLINE)
+    robot._state.mailbox.wait_for(lambda slots: not (robot._halting.is_up or robot._control.is_up), DEADLINE)
+    text = "stop it by hand if it moves; a robot with a dead-man stops by itself."
+    if told:
+        assert raised(LinkLost, lambda: gate.step(gate.state.command)) == (
+            f"{server.url}: the link is down. Nothing was sent, and nothing is kept; {text}"
+        )
+    for _ in range(3):
+        robot.halt()
+    robot.close()
+    lines = [record.getMessage() for record in caplog.records if "halt" in record.getMessage()]
+    assert len(lines) == (0 if told else 1)
+    for line in lines:
+        assert line.startswith(f"{server.url}: the halt could not be sent, the link is down (")
+        assert line.endswith(f"): {text}")
+        assert line.count(server.url) == 1
+
+
+def test_a_command_that_a_halt_overtook_is_not_noted_as_sent(server, robot_on, connect, monkeypatch):
+    scripted = robot_on(server)
+    robot, gate = connect(server.url)
+    gate.step(gate.state.command)
+    scripted.wait_for(lambda: len(scripted.on(JOINT_COMMANDS)) == 1)
+    encoded = robot._messages
+
+    def halt_meanwhile(*args):
+        robot._halts += 1
+        return encoded(*args)
+
+    monkeypatch.setattr(robot, "_messages", halt_meanwhile)
+    np.testing.assert_array_equal(gate.step(gate.state.command + 0.01).command, gate.state.command)
+    assert len(scripted.on(JOINT_COMMANDS)) == 1
+
+
+def test_a_halt_overtakes_a_call_that_runs(lax, robot_on, connect):
+    server = lax()
+    scripted = robot_on(server)
+    robot, gate = connect(server.url)
+    gate.step(gate.state.command + 0.01)
+    waiting = threading.Thread(target=lambda: robot._control.call("/blocks", "std_srvs/Empty", {}, DEADLINE))
+    waiting.start()
+    server.wait_for(lambda frames: any(message.get("service") == "/blocks" for _, message in frames))
+    robot.halt()
+    scripted.wait_for(lambda: scripted.halts == 1)
+    server.release.set()
+    waiting.join(DEADLINE)
+    assert not waiting.is_alive()
+
+
+def test_what_a_halt_says(server, robot_on, connect):
+    scripted = robot_on(server)
+    robot, gate = connect(server.url)
+    robot.halt()
+    scripted.wait_for(lambda: len(scripted.commands) == 2)
+    assert [topic for topic, _, _ in scripted.commands] == [HALT_TOPIC, JOINT_COMMANDS]  # the gripper was told nothing
+    command = gate.state.command.copy()
+    command[0, 6] = 0.03
+    gate.step(command)
+    scripted.wait_for(lambda: len(scripted.commands) == 4)
+    for way, held in (
+        (0.1, 0.1),
+        (0.5, 0.0),
+    ):  # farther it cannot be: it is measured wrongly, and to go there would be a motion
+        gate.step(command)
+        there = (command[0, :6] + way).tolist()
+        scripted.signals["gripper_width"], scripted.signals["joint_position"] = np.array([0.04]), np.array(there)
+        robot._state.mailbox.wait_for(
+            lambda slots, there=there: slots["joint_position"].message["position"] == there, DEADLINE
+        )
+        before = len(scripted.commands)
+        robot.halt()
+        scripted.wait_for(lambda before=before: len(scripted.commands) == before + 3)
+        (halt, gripper, joints) = scripted.commands[before:]
+        assert halt[0] == HALT_TOPIC
+        assert gripper[2]["data"] == [0.03]  # it goes on holding what it holds
+        assert joints[2]["data"] == (command[0, :6] + held).tolist()  # the arm stays where it is
+        assert {caller for _, caller, _ in (halt, gripper, joints)} != {scripted.commands[before - 1][1]}
+
+
+def test_who_only_looks_commands_nothing(server, robot_on, connect):
+    scripted = robot_on(server)
+    robot, gate = connect(server.url)
+    robot.close()
+    assert scripted.commands == []
+    robot.connect()
+    gate.step(gate.state.command)
+    robot.close()
+    scripted.wait_for(lambda: len(scripted.on(HALT_TOPIC)) == 1)
+
+
+def test_a_halt_does_not_go_back_to_where_the_robot_was_some_time_ago(server, robot_on, connect):
+    scripted, ahead = robot_on(server), [0.0]
+    robot, gate = connect(server.url, clock=lambda: time.monotonic() + ahead[0])
+    command = gate.state.command.copy()
+    command[0, 5] += 0.02
+    gate.step(command)
+    scripted.mangle = lambda topic, message: None  # nothing more is heard of it
+    ahead[0] = 1.0
+    robot.halt()
+    scripted.wait_for(lambda: len(scripted.on(HALT_TOPIC)) == 1 and len(scripted.on(JOINT_COMMANDS)) == 2)
+    assert scripted.on(JOINT_COMMANDS)[-1]["data"] == command[0, :6].tolist()
+
+
+def test_a_base_is_halted_with_zeros(server, robot_on, connect):
+    scripted = robot_on(server, "mir100")
+    robot, gate = connect(server.url, "mir100")
+    assert {name: array.shape for name, array in gate.state.signals.items()} == {
+        "base_pose": (1, 3),
+        "base_velocity": (1, 2),
+        "f_scan": (1, 501),
+        "b_scan": (1, 511),
+    }
+    np.testing.assert_array_equal(gate.state.command, [[0.0, 0.0]])
+    gate.step(np.array([[0.25, -0.5]]))
+    robot.halt()
+    scripted.wait_for(lambda: len(scripted.commands) == 3)
+    assert [(topic, message.get("linear", {}).get("x")) for topic, _, message in scripted.commands] == [
+        ("/cmd_vel", 0.25),
+        (HALT_TOPIC, None),
+        ("/cmd_vel", 0.0),
+    ]
+
+
+def test_without_a_halt_link_nothing_is_sent(server, robot_on, connect):
+    scripted = robot_on(server)
+    robot, gate = connect(server.url)
+    robot._halting.close()
+    assert raised(LinkLost, lambda: gate.step(gate.state.command)) == (
+        f"{server.url}: the connection that halts the robot is down. Nothing is sent without it."
+    )
+    assert scripted.commands == []
+
+
+def test_a_topic_of_another_type(server, robot_on):
+    server.advertise("/object_pose", "std_msgs/String")
+    robot = robot_at(server.url)
+    assert raised(ProtocolError, robot.connect) == (
+        "/object_pose is a std_msgs/String there, and geometry_msgs/PoseStamped was expected. "
+        "Correct the topic or its type in the profile of ur5e."
+    )
+
+
+def test_a_command_that_must_be_stamped(server, robot_on):
+    """A bridge would drop what is not, and say nothing."""
+    for topic, kind in (
+        ("/odom", "nav_msgs/Odometry"),
+        ("/robot_pose", "geometry_msgs/PoseStamped"),
+        ("/f_scan", "sensor_msgs/LaserScan"),
+        ("/b_scan", "sensor_msgs/LaserScan"),
+    ):
+        server.advertise(topic, kind)
+    server.subscribe("/cmd_vel", "geometry_msgs/msg/TwistStamped", lambda message, caller: None)
+    robot = robot_at(server.url, "mir100")
+    assert raised(ProtocolError, robot.connect) == (
+        "/cmd_vel is a geometry_msgs/TwistStamped there, and geometry_msgs/Twist was expected. "
+        "Correct the topic or its type in the profile of mir100."
+    )
+
+
+def test_a_controller_that_is_not_there(server, monkeypatch):
+    monkeypatch.setattr("bam_envs.live.bringup.TIMEOUT", 0.3)
+    for topic in ("/joint_states", "/gripper/joint_states"):
+        server.advertise(topic, "sensor_msgs/JointState")
+    server.subscribe(GRIPPER_COMMANDS, "std_msgs/Float64MultiArray", lambda message, caller: None)
+    robot = robot_at(server.url)
+    assert raised(ProtocolError, robot.connect) == (
+        f"Nobody listens to {JOINT_COMMANDS} (std_msgs/Float64MultiArray), which takes {', '.join(JOINTS)}. Is the "
+        "controller active, and is the topic called so? Topics are in the profile of ur5e; this may be another "
+        "robot than it describes."
+    )
+
+
+def test_a_silent_topic(server, robot_on, monkeypatch):
+    monkeypatch.setattr("bam_envs.live.bringup.TIMEOUT", 0.5)
+    scripted = robot_on(server)
+    scripted.mangle = lambda topic, message: None if topic == "/object_pose" else message
+    robot = robot_at(server.url)
+    assert raised(StaleState, robot.connect) == (
+        "/object_pose (geometry_msgs/PoseStamped): no message in 0.5 s. Does it run, and is the topic called so? "
+        "Topics are in the profile of ur5e."
+    )
+
+
+BAD_STATES = [
+    ({"name": list(JOINTS[:5]), "position": [0.0] * 5}, "/joint_states: wrist_3_joint missing; found: "),
+    ({"name": [*JOINTS, "finger"], "position": [0.0] * 7}, "/joint_states: finger not expected; expected: "),
+    (
+        {"position": [None] + [0.0] * 5},
+        "/joint_states: position of shoulder_pan_joint must be a finite number, not null.",
+    ),
+    (
+        {"velocity": [0.0] * 5 + [float("nan")]},
+        "/joint_states: velocity of wrist_3_joint must be a finite number, not null.",
+    ),
+    ({"position": ["0"] * 6}, "/joint_states: position of shoulder_pan_joint must be a finite number, not '0'."),
+    ({"header": {"stamp": {"sec": "now", "nanosec": 0}}}, "/joint_states: header.stamp.sec must be a finite number"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), BAD_STATES)
+def test_what_a_robot_must_not_say(lax, robot_on, connect, changes, message):
+    server = lax()
+    scripted = robot_on(server)
+    _, gate = connect(server.url)
+    scripted.mangle = lambda topic, good: {**good, **changes} if topic == "/joint_states" else good
+    text = raised(ProtocolError, lambda: [gate.step(gate.state.command) for _ in range(10)])
+    assert text.replace("not nan.", "not null.").startswith(message)
+
+
+def test_a_robot_that_never_made_sense(lax, robot_on):
+    server = lax()
+    robot_on(server).mangle = lambda topic, message: {"data": 1}
+    robot = robot_at(server.url)
+    assert raised(ProtocolError, robot.connect) == "/joint_states: the field name is missing; found: data."
+
+
+def test_another_client_in_command(server, robot_on, connect):
+    def refuse(message, caller):
+        raise NotInCommand("a is in command, not b; it passes on when a leaves.")
+
+    robot_on(server)
+    _, gate = connect(server.url)
+    server.subscribe(JOINT_COMMANDS, "std_msgs/Float64MultiArray", refuse)
+    text = raised(NotInCommand, lambda: [gate.step(gate.state.command) for _ in range(10)])
+    assert "a is in command, not b; it passes on when a leaves." in text
+
+
+def test_a_refused_command_and_a_late_one(server, robot_on, connect):
+    reasons = ["expired: 0.2 s after its deadline", "the elbow is broken"]
+
+    def refuse(message, caller):
+        raise RemoteError(reasons[0])
+
+    robot_on(server)
+    _, gate = connect(server.url)
+    stop = server.subscribe(JOINT_COMMANDS, "std_msgs/Float64MultiArray", refuse)
+    for _ in range(3):
+        gate.step(gate.state.command)
+    reasons.pop(0)
+    text = raised(RemoteError, lambda: [gate.step(gate.state.command) for _ in range(10)])
+    assert "the elbow is broken" in text
+    stop()
+
+
+def test_a_scene_is_set_before_the_state_is_measured(server, robot_on, connect, simulation):
+    scripted = robot_on(server, info=simulation)
+    scenes = []
+
+    def place(request, caller):
+        scenes.append(dict(request))
+        scripted.signals["object_position"] = np.array([*request["object_pose"][0][:2], 0.02])
+        return {}
+
+    service = StringRpcService(server, SCENE_TOPIC, place).start()
+    try:
+        robot, _ = connect(server.url)
+        for n in range(3):
+            pose = np.array([[0.5, 0.1 * n, 0.3]])
+            state = robot.reset(ROW, Initial({"object_pose": pose}, np.array([n])))
+            np.testing.assert_array_equal(state.signals["object_position"], [[0.5, 0.1 * n, 0.02]])
+            assert scenes[-1]["object_pose"] == [[0.5, 0.1 * n, 0.3]]
+            assert scenes[-1]["seeds"] == [n]
+    finally:
+        service.close()
+
+
+def test_a_real_robot_gets_no_scene(server, robot_on, connect):
+    robot_on(server)
+    robot, _ = connect(server.url)
+    robot.reset(ROW, Initial({"object_pose": np.zeros((1, 3))}, ROW))
+    assert not robot.info.simulated
+
+
+def test_ros_1(lax, robot_on, connect):
+    server = lax("ros1")
+    scripted = robot_on(server)
+    seconds = iter(range(1_700_000_000, 1_800_000_000))
+    scripted.stamp = lambda: {"secs": next(seconds), "nsecs": 5}
+    _, gate = connect(server.url, command="trajectory")
+    assert gate.state.stamp[0] >= 1_700_000_000
+    gate.step(gate.state.command)
+    scripted.wait_for(lambda: len(scripted.commands) == 2)
+    message = scripted.commands[1][2]
+    assert message["header"]["stamp"] == {"secs": 0, "nsecs": 0}
+    assert message["points"][0]["time_from_start"] == {"secs": 0, "nsecs": 50_000_000}
+
+
+def test_two_robots_behind_one_server(server, robot_on, connect):
+    one, two = robot_on(server, namespace="/cell_1"), robot_on(server, namespace="/cell_2/arm")
+    two.signals["gripper_width"] = np.array([0.02])
+    _, first = connect(f"{server.url}/cell_1")
+    _, second = connect(f"{server.url}/cell_2/arm/")
+    assert (first.state.signals["gripper_width"], second.state.signals["gripper_width"]) == (0.085, 0.02)
+    second.step(second.state.command + 0.01)
+    two.wait_for(lambda: len(two.commands) == 2)
+    assert one.commands == []
+
+
+def test_age(server, robot_on, connect):
+    scripted = robot_on(server)
+    robot, _ = connect(server.url)
+    assert robot.age() < 1.0
+    scripted.mangle = lambda topic, message: None if topic == "/object_pose" else message
+    begin = robot.age()
+    threading.Event().wait(0.05)
+    assert robot.age() >= begin + 0.04
+    scripted.mangle = lambda topic, message: message
+    scripted.stamp = lambda: write_stamp(1_000_000_000.0)
+    before = robot._state.mailbox.newest()["joint_position"].number
+    robot._state.mailbox.wait_for(lambda slots: slots["joint_position"].number >= before + 10, DEADLINE)
+    assert robot.age() >= 0.05
+
+
+def drive(url, results):
+    """In a worker: connect, step twice."""
+    robot = robot_at(url)
+    try:
+        robot.connect()
+        gate = OpenGate(robot)
+        state = gate.step(gate.state.command)
+        results.put(gate.step(state.command).signals["gripper_width"].tolist())
+    finally:
+        robot.close()
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+@pytest.mark.parametrize("method", ["spawn", "fork"])
+def test_in_workers(server, robot_on, connect, method):
+    scripted = robot_on(server)
+    _, gate = connect(server.url)
+    context = multiprocessing.get_context(method)
+    results = context.Queue()
+    workers = [context.Process(target=drive, args=(server.url, results)) for _ in range(2)]
+    for worker in workers:
+        worker.start()
+    found = [results.get(timeout=60) for _ in workers]
+    for worker in workers:
+        worker.join(DEADLINE)
+        assert worker.exitcode == 0
+    assert found == [[[0.085]]] * 2
+    before = len(scripted.on(JOINT_COMMANDS))
+    gate.step(gate.state.command)  # this process goes on
+    scripted.wait_for(lambda: len(scripted.on(JOINT_COMMANDS)) > before)
+
+
+def subscriptions(server):
+    asked = {}
+    for _, frame in server.frames:
+        if frame["op"] == "subscribe" and "/io_" not in frame["topic"] and "/speed_" not in frame["topic"]:
+            asked[frame["topic"]] = (frame["throttle_rate"], frame["queue_length"])
+    return asked
+
+
+@pytest.mark.parametrize(("period", "rate"), [(0.05, 10), (0.1, 20), (0.01, 2), (0.004, 0)])
+def test_states_are_asked_for_throttled_and_the_newest_alone(lax, robot_on, connect, period, rate):
+    """Whole milliseconds: servers in Python drop a subscription for anything else, without a word."""
+    server = lax()
+    robot_on(server)
+    connect(server.url, spec=replace(load_profile("ur5e").spec(), period=period))
+    expected = (rate, 1 if rate else 0)
+    assert subscriptions(server) == dict.fromkeys(("/joint_states", "/gripper/joint_states", "/object_pose"), expected)
+    assert all(type(number) is int for pair in subscriptions(server).values() for number in pair)
+
+
+def test_states_that_answer_commands_come_all(lax, robot_on, connect, simulation):
+    server = lax()
+    robot_on(server, info=simulation)
+    connect(server.url)
+    assert set(subscriptions(server).values()) == {(0, 0)}
+
+
+def test_a_shared_topic_comes_whole(lax, robot_on, connect):
+    server, profile = lax(), load_profile("ur5e")
+    robot_on(server)
+    shared = tuple(replace(one, partial=one.signal == "gripper_width") for one in profile.state)
+    robot = RosbridgeRobot(server.url, replace(profile, state=shared))
+    robot.connect()
+    robot.close()
+    assert subscriptions(server)["/gripper/joint_states"] == (0, 0)
+    assert subscriptions(server)["/joint_states"] == (10, 1)

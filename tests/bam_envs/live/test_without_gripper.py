@@ -1,0 +1,166 @@
+"""Environments that command six joints: on an arm that has no gripper, and on one whose gripper is not theirs."""
+
+import json
+import logging
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from bam_envs.core.errors import InvalidValue, ProtocolError
+from bam_envs.core.robot import Initial
+from bam_envs.live.building import live_robot
+from bam_envs.live.rosbridge import RosbridgeRobot
+from bam_envs.remote.serve.command import CommandLease
+from bam_envs.remote.serve.robot_service import RobotService
+from bam_envs.remote.serve.served_robot import ServedRobot
+from bam_envs.robots.fake import FakeRobot
+from bam_envs.robots.physics.ur import empty_arm
+from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.robots.ur import START as EMPTY_START
+from bam_envs.robots.ur import ur_model, ur_spec
+from bam_envs.rosbridge.server.server import BridgeServer
+from bam_envs.tasks.ur_reach import START
+
+ARM, GRIPPER = "/forward_position_controller/commands", "/gripper/commands"
+SIX = ur_spec(ur_model("ur5e"), 0.1, with_object=False)
+ACTION = np.array([0.1, -0.4, 0.4, 0.1, -0.2], np.float32)
+HELD = 0.037
+ROW = np.zeros(1, np.int64)
+
+
+@pytest.fixture
+def make():
+    """`gymnasium.make` of a UR5e; closed at the end."""
+    made = []
+
+    def make_one(env_id, url):
+        made.append(gym.make(env_id, robot=url, ur_model="ur5e", disable_env_checker=True))
+        return made[-1]
+
+    yield make_one
+    for env in made:
+        env.close()
+
+
+@pytest.fixture
+def serve(request):
+    """Serve a robot as `bam-serve` does; its URL."""
+
+    def start(robot, realtime, joints=START):
+        server = BridgeServer(port=0).start()
+        served = ServedRobot(robot, dead_man=0.2, realtime=realtime)
+        served.connect()
+        served.reset(ROW, Initial({"joint_position": np.array([joints])}, ROW))
+        service = RobotService(served, load_profile("ur5e"), server, CommandLease(0.5))
+        service.start()
+        for close in (served.close, server.close, service.close):
+            request.addfinalizer(close)
+        return server.url, served
+
+    return start
+
+
+def run(env, steps=6, start=START):
+    """An episode, a halt, another one, and the end."""
+    for _ in range(2):
+        env.reset(seed=1)
+        for _ in range(steps):
+            env.step(ACTION)
+        env.unwrapped.robot.halt()
+    moved = env.unwrapped.state.signals["joint_position"][0] - start
+    env.close()
+    return np.abs(moved).max()
+
+
+def test_an_arm_without_gripper_runs_a_task_that_has_none(server, robot_on, make):
+    scripted = robot_on(server, spec=SIX)
+    scripted.signals["joint_position"][:] = START
+    env = make("bam/ur-reach-v0", server.url)
+    assert env.unwrapped.robot.spec.command.labels == SIX.command.labels
+    assert run(env) > 0.05
+    assert {topic for topic, _, _ in scripted.commands} == {ARM, "/bam/halt"}
+    assert {name: row["stopped"] for name, row in env.unwrapped.robot.report().items() if row["stopped"]} == {}
+
+
+def test_a_gripper_is_told_nothing(server, robot_on, make):
+    scripted = robot_on(server)
+    scripted.signals["joint_position"][:], scripted.signals["gripper_width"][:] = START, HELD
+    assert run(make("bam/ur-reach-v0", server.url)) > 0.05
+    assert len(scripted.on(ARM)) > 12
+    assert scripted.on(GRIPPER) == []
+    np.testing.assert_array_equal(scripted.signals["gripper_width"], [HELD])
+
+
+def test_nothing_that_is_sent_names_the_gripper(lax, robot_on, make):
+    """On a server that says nothing of its topics: neither subscribed, nor advertised, nor published."""
+    bus = lax()
+    scripted = robot_on(bus)
+    scripted.signals["joint_position"][:] = START
+    run(make("bam/ur-reach-v0", bus.url), steps=3)
+    said = [json.dumps(message) for _, message in bus.frames]
+    assert any(ARM in one for one in said)
+    assert [one for one in said if "gripper" in one] == []
+
+
+def test_the_way_of_sending_commands_is_chosen_as_ever(server, robot_on):
+    scripted = robot_on(server)
+    robot = live_robot(server.url, SIX, profile="ur5e", command="trajectory")
+    robot.connect()
+    state = robot.reset(ROW, Initial({"joint_position": scripted.signals["joint_position"][None].copy()}, ROW))
+    robot.step(state.command)
+    robot.close()
+    told = {topic for topic, _, _ in scripted.commands}
+    assert told == {"/scaled_joint_trajectory_controller/joint_trajectory", "/bam/halt"}
+
+
+@pytest.mark.parametrize("realtime", [False, True])
+def test_a_served_arm_with_a_gripper_keeps_its_width(serve, make, realtime):
+    url, served = serve(FakeRobot(1), realtime, EMPTY_START)
+    for _ in range(10):
+        served.step(np.array([[*EMPTY_START, HELD]]))
+    assert run(make("bam/ur-empty-v0", url), start=EMPTY_START) > 0.05
+    np.testing.assert_array_equal(served.state.signals["gripper_width"], [[HELD]])
+
+
+def test_a_served_arm_without_gripper_offers_none_and_says_so(serve, monkeypatch):
+    """To who commands one: one error, at once when connecting, and nothing has moved."""
+    monkeypatch.setattr("bam_envs.live.bringup.TIMEOUT", 0.5)
+    url, served = serve(empty_arm(1, ur_model="ur5e"), realtime=True)
+    robot = live_robot(url, FakeRobot(1).spec)
+    with pytest.raises(ProtocolError) as caught:
+        robot.connect()
+    assert str(caught.value) == (
+        f"Nobody listens to {GRIPPER} (std_msgs/Float64MultiArray), which takes gripper_width. Is the controller "
+        "active, and is the topic called so? Topics are in the profile of ur5e; this may be another robot "
+        "than it describes."
+    )
+    np.testing.assert_array_equal(served.state.signals["joint_position"], [START])
+
+
+def test_a_halt_holds_the_joints_alone(server, robot_on, caplog):
+    """A real arm does not hear our halts: it is sent where it is."""
+    scripted = robot_on(server)
+    robot = RosbridgeRobot(server.url, load_profile("ur5e"), spec=SIX)
+    robot.connect()
+    with caplog.at_level(logging.WARNING):
+        robot.halt()
+        scripted.wait_for(lambda: len(scripted.commands) == 2)
+    assert scripted.on(ARM)[-1]["data"] == scripted.signals["joint_position"].tolist()
+    assert scripted.on(GRIPPER) == []
+    assert caplog.records == []
+    robot.close()
+
+
+def test_a_message_is_never_cut(tmp_path):
+    (tmp_path / "one.toml").write_text(
+        'extends = "ur5e"\nname = "one"\n\n[[commands.all]]\ntopic = "/all"\ntype = "std_msgs/Float64MultiArray"\n'
+        f"labels = {json.dumps([*SIX.command.labels, 'gripper_width'])}\n"
+    )
+    with pytest.raises(InvalidValue) as caught:
+        live_robot("ws://127.0.0.1:9", SIX, profile=tmp_path / "one.toml")
+    joints = ", ".join(SIX.command.labels)
+    assert str(caught.value) == (
+        f"/all takes {joints}, gripper_width in one message, and gripper_width is not commanded. "
+        f"Give the profile of one a way of sending commands with a topic for {joints} alone."
+    )

@@ -1,0 +1,356 @@
+"""One environment, several clients: turns, command, errors, real time."""
+
+import threading
+import time
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from bam_envs.core.errors import InvalidValue, NotInCommand, RemoteError, ResetNeeded, SafetyStop
+from bam_envs.remote.serve.command import CommandLease
+from bam_envs.remote.serve.env_server import EnvServer
+from bam_envs.remote.transports.fake import FakeEnv
+from bam_envs.rosbridge.bus import Caller
+from bam_envs.testing.transports import MirrorEnv
+
+NO_EPISODE = "No episode is running: it ended, or never began. Call reset() first."
+
+
+def mirror(**options):
+    env = MirrorEnv(spaces.Box(-1, 1, (2,)), **options)
+    return env, EnvServer(env)
+
+
+def raised(kind, act):
+    with pytest.raises(kind) as caught:
+        act()
+    return str(caught.value)
+
+
+def test_it_is_the_environment(make, actions_of):
+    alone, server = make("bam/reach-v0"), EnvServer(make("bam/reach-v0"))
+    first, info = server.reset("ann", 3)
+    np.testing.assert_array_equal(first, alone.reset(seed=3)[0])
+    assert info == {"is_success": False}
+    for action in actions_of(0, 20, 6):
+        mine, theirs = server.step("ann", action), alone.step(action)
+        np.testing.assert_array_equal(mine[0], theirs[0])
+        assert mine[1:] == theirs[1:]
+
+
+def test_rows_are_lists(make_rows):
+    alone, server = make_rows("bam/reach-v0", 2), EnvServer(make_rows("bam/reach-v0", 2))
+    first, infos = server.reset("ann", [3, 9])
+    np.testing.assert_array_equal(first, alone.reset(seed=[3, 9])[0])
+    assert infos == [{"is_success": False}] * 2
+    action = np.zeros((2, 6), np.float32)
+    observations, rewards, terminated, truncated, infos = server.step("ann", list(action))
+    theirs = alone.step(action)
+    np.testing.assert_array_equal(observations, theirs[0])
+    assert (rewards, terminated, truncated) == (theirs[1].tolist(), [False, False], [False, False])
+    assert [info["distance"] for info in infos] == theirs[4]["distance"].tolist()
+
+
+def test_rows_that_end_say_so_in_their_own_info():
+    envs = SyncVectorEnv([lambda n=n: FakeEnv(episode_steps=n) for n in (1, 3)], autoreset_mode=AutoresetMode.SAME_STEP)
+    server = EnvServer(envs)
+    server.reset("ann", 0)
+    _, _, terminated, _, infos = server.step("ann", [np.zeros(2), np.zeros(2)])
+    assert terminated == [True, False]
+    assert infos[0].keys() == {"options", "final_obs", "final_info"}
+    assert infos[0]["final_info"]["elapsed"] == 1
+    assert infos[0]["final_obs"].dtype == np.float32
+    assert infos[1].keys() == {"elapsed", "steps"}
+    server.step("ann", [np.zeros(2), np.zeros(2)])
+    server.close()
+
+
+def test_some_rows_can_be_reset(make_rows):
+    server = EnvServer(make_rows("bam/reach-v0", 3))
+    first, _ = server.reset("ann", 1)
+    again, _ = server.reset("ann", None, {"reset_mask": [False, True, False]})
+    assert [np.array_equal(*pair) for pair in zip(first, again, strict=True)] == [True, False, True]
+
+
+def test_the_wrong_number_of_actions_is_refused(make_rows):
+    server = EnvServer(make_rows("bam/reach-v0", 3))
+    server.reset("ann", 1)
+    assert raised(InvalidValue, lambda: server.step("ann", [np.zeros(6)])) == (
+        "There must be one action for each of 3 rows, not 1."
+    )
+    assert raised(InvalidValue, lambda: server.step("ann", [np.zeros(6)] * 2 + [np.full(6, np.nan)])) == (
+        "action of row 2[0] is NaN; only numbers are sent."
+    )
+
+
+def test_an_episode_must_run():
+    _, server = mirror(episode_steps=1)
+    action = np.zeros(2)
+    assert raised(ResetNeeded, lambda: server.step("ann", action)) == NO_EPISODE
+    server.reset("ann")
+    assert server.step("ann", action)[2] is True
+    assert raised(ResetNeeded, lambda: server.step("ann", action)) == NO_EPISODE
+
+
+def test_the_others_are_told_who_is_in_command():
+    env, server = mirror()
+    server.reset("ann")
+    for act in (lambda: server.reset("bob"), lambda: server.step("bob", np.zeros(2))):
+        assert raised(NotInCommand, act) == (
+            "ann is in command, not bob; it passes on when ann leaves or is silent for 2 s."
+        )
+    assert (len(env.given), env.seen) == (1, [])
+    server.leave("ann")
+    server.reset("bob")
+
+
+def test_after_a_change_of_command_a_reset_is_needed():
+    _, server = mirror()
+    server.reset("ann")
+    assert raised(NotInCommand, lambda: server.reset("bob", take=True)) == (
+        "ann is in command, not bob; it passes on when ann leaves or is silent for 2 s. Taking it by force needs the "
+        "operator's token: start bam-serve with --operator-token-file, and show that one."
+    )
+    server.reset("bob", take=True, caller=Caller("x", operator=True))
+    server.leave("bob")
+    assert raised(ResetNeeded, lambda: server.step("ann", np.zeros(2))) == NO_EPISODE
+
+
+def test_a_lease_can_be_shared():
+    lease = CommandLease(5.0)
+    server = EnvServer(FakeEnv(), lease=lease)
+    server.reset("ann")
+    lease.take("a robot's client", force=True)
+    assert "a robot's client is in command, not ann" in raised(NotInCommand, lambda: server.step("ann", np.zeros(2)))
+    lease.release("a robot's client")
+    assert raised(ResetNeeded, lambda: server.step("ann", np.zeros(2))) == NO_EPISODE
+
+
+def test_silence_passes_command_on():
+    now = [0.0]
+    server = EnvServer(FakeEnv(), lease=2.0, clock=lambda: now[0])
+    server.reset("ann")
+    now[0] = 2.1
+    server.step("ann", np.zeros(2))
+    now[0] = 4.3
+    server.reset("bob")
+
+
+@pytest.mark.parametrize(
+    ("fault", "text"),
+    [
+        (ValueError("over\n  there"), "ValueError: over there"),
+        (SafetyStop("G2", "too far"), "SafetyStop: too far"),
+        (KeyError("x"), "KeyError: 'x'"),
+    ],
+)
+def test_errors_of_the_environment_are_told_and_a_reset_goes_on(fault, text):
+    env, server = mirror()
+    server.reset("ann")
+    env.fault = fault
+    assert raised(RemoteError, lambda: server.step("ann", np.zeros(2))) == text
+    assert raised(ResetNeeded, lambda: server.step("ann", np.zeros(2))) == NO_EPISODE
+    server.reset("ann")
+    server.step("ann", np.zeros(2))
+
+
+class Odd(FakeEnv):
+    """Says what it is told to say."""
+
+    said = (np.zeros(3, np.float32), 0.0, False, False, {})
+
+    def step(self, action):
+        return self.said
+
+
+@pytest.mark.parametrize(
+    ("said", "text"),
+    [
+        (
+            (np.float32([0, np.nan, 0]), 0, False, False, {}),
+            "InvalidValue: observation[1] is NaN; only numbers are sent.",
+        ),
+        ((np.zeros(2), 0, False, False, {}), "InvalidValue: observation must have shape (3,), not (2,)."),
+        ((np.zeros(3), np.nan, False, False, {}), "InvalidValue: reward is NaN; only numbers are sent."),
+        ((np.zeros(3), 0, False), "TypeError: "),
+        ((np.zeros(3), "much", False, False, {}), "ValueError: could not convert string to float: 'much'"),
+    ],
+)
+def test_what_an_environment_must_not_say_is_told(said, text):
+    env = Odd()
+    server = EnvServer(env)
+    server.reset("ann")
+    env.said = said
+    assert raised(RemoteError, lambda: server.step("ann", np.zeros(2))).startswith(text)
+    server.reset("ann")
+
+
+def test_values_have_the_dtypes_of_their_spaces():
+    env = Odd()
+    env.said = ([0, 0.1, 2], np.float32(0.1), np.bool_(True), 0, {"a": (1, np.int8(2)), 3: {4}})
+    server = EnvServer(env)
+    server.reset("ann")
+    observation, reward, terminated, truncated, info = server.step("ann", [0, 1])
+    assert observation.tobytes() == np.float32([0, 0.1, 2]).tobytes()
+    assert (reward, terminated, truncated) == (float(np.float32(0.1)), True, False)
+    assert [type(one) for one in (reward, terminated, truncated)] == [float, bool, bool]
+    assert info == {"a": [1, 2], "3": [4]}
+    assert info["a"][1].dtype == np.int8
+
+
+def test_a_bad_action_moves_nothing_and_the_episode_goes_on():
+    env, server = mirror()
+    server.reset("ann")
+    assert raised(InvalidValue, lambda: server.step("ann", [0, np.nan])) == "action[1] is NaN; only numbers are sent."
+    assert env.seen == []
+    server.step("ann", [0, 1])
+
+
+def test_a_turn_that_comes_too_late_does_nothing():
+    now = [10.0]
+    env = MirrorEnv(spaces.Discrete(2))
+    server = EnvServer(env, clock=lambda: now[0])
+    server.reset("ann", deadline=10.0)
+    now[0] = 10.25
+    assert raised(RemoteError, lambda: server.step("ann", 1, deadline=10.0)) == (
+        "expired: its turn came 0.250 s after its deadline"
+    )
+    assert env.seen == []
+    server.step("ann", 1, deadline=10.3)
+
+
+def test_a_step_that_ends_after_command_was_taken_leaves_no_episode_to_the_other(monkeypatch):
+    env, server = mirror()
+    server.reset("ann")
+    step = env.step
+    monkeypatch.setattr(env, "step", lambda action: (server.lease.take("bob", force=True), step(action))[1])
+    server.step("ann", np.zeros(2))
+    assert raised(ResetNeeded, lambda: server.step("bob", np.zeros(2))) == NO_EPISODE
+    assert len(env.seen) == 1
+
+
+def test_a_client_that_lost_command_while_it_waited_does_nothing():
+    env, server = mirror()
+    server.reset("ann")
+    told = []
+    with server.lock:
+        waiting = threading.Thread(
+            target=lambda: told.append(raised(NotInCommand, lambda: server.step("ann", np.zeros(2))))
+        )
+        waiting.start()
+        deadline = time.monotonic() + 10
+        while not server.lease._running and time.monotonic() < deadline:  # until it is in the queue
+            pass
+        server.lease.take("bob", force=True)
+    waiting.join(10)
+    assert told[0].startswith("bob is in command, not ann")
+    assert env.seen == []
+
+
+def test_callbacks_see_every_reset_and_step():
+    env, server = mirror()
+    seen = []
+    server.on_step(lambda: seen.append(env.elapsed))
+    server.reset("ann")
+    server.step("ann", np.zeros(2))
+    assert seen == [0, 1]
+
+
+def test_names_it_answers_to():
+    server = EnvServer(FakeEnv(), env_id="bam/pick-v0")
+    for name in ("", "Pick", "bam/pick"):
+        server.require_name(name)
+    assert raised(RemoteError, lambda: server.require_name("Place")) == (
+        "There is no environment 'Place' here; bam/pick-v0 is served."
+    )
+
+
+class Halting(FakeEnv):
+    """Has a robot, and a period."""
+
+    period = 0.05
+
+    def __init__(self):
+        super().__init__()
+        self.robot, self.halts, self.closes = self, 0, 0
+
+    def halt(self):
+        self.halts += 1
+
+    def close(self):
+        self.closes += 1
+
+
+def test_the_robot_halts_when_its_client_leaves():
+    env = Halting()
+    server = EnvServer(env)
+    server.reset("ann")
+    server.leave("bob")
+    assert env.halts == 0
+    server.leave("ann")
+    server.leave("ann")
+    assert env.halts == 1
+
+
+def test_closing_halts_and_closes_once():
+    env = Halting()
+    server = EnvServer(env)
+    server.reset("ann")
+    server.close()
+    server.close()
+    assert (env.halts, env.closes) == (1, 1)
+    assert raised(RemoteError, lambda: server.reset("ann")) == "The environment is closed."
+
+
+def test_at_its_end_it_refuses_and_halts_nothing_yet():
+    env = Halting()
+    server = EnvServer(env)
+    server.reset("ann")
+    server.end()
+    assert raised(RemoteError, lambda: server.step("ann", 0)) == "The environment is closed."
+    assert (env.halts, env.closes) == (0, 0)
+    server.close()
+    assert (env.halts, env.closes) == (1, 1)
+
+
+def test_in_real_time_steps_last_a_period():
+    now, slept = [0.0], []
+
+    def sleep(seconds):
+        slept.append(round(seconds, 6))
+        now[0] += seconds
+
+    server = EnvServer(Halting(), realtime=True, clock=lambda: now[0], sleep=sleep)
+    server.reset("ann")
+    for think in (0.0, 0.02, 0.06, 0.0):
+        now[0] += think
+        server.step("ann", np.zeros(2))
+    assert slept == [0.05, 0.03, 0.04]
+
+
+def test_real_time_needs_a_period():
+    assert raised(InvalidValue, lambda: EnvServer(FakeEnv(), realtime=True)) == (
+        "FakeEnv does not say its period, so it has no real time; serve it with --fast."
+    )
+
+
+def test_options_are_the_environments_own():
+    class Greedy(FakeEnv):
+        def reset(self, *, seed=None, options=None):
+            options.clear()
+            return super().reset(seed=seed)
+
+    options = {"easy": True}
+    EnvServer(Greedy()).reset("ann", 1, options)
+    assert options == {"easy": True}
+
+
+def test_wrapped_environments_are_served():
+    server = EnvServer(gym.wrappers.TimeLimit(FakeEnv(), 2))
+    server.reset("ann")
+    assert server.step("ann", np.zeros(2))[3] is False
+    assert server.step("ann", np.zeros(2))[3] is True
+    assert raised(ResetNeeded, lambda: server.step("ann", np.zeros(2))) == NO_EPISODE

@@ -1,0 +1,96 @@
+"""The MiR100's environments on a live robot: a simulated base behind our rosbridge server, as `bam-serve` offers it."""
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from bam_envs.core.errors import InvalidValue, SafetyStop
+from bam_envs.remote.serve.options import ServeOptions
+from bam_envs.remote.serve.program import ServedEnvironment
+from bam_envs.remote.serve.served_robot import ServedRobot
+
+NAVIGATION, AVOIDANCE = "bam/mir100-navigation-v0", "bam/mir100-avoidance-v0"
+FORWARD = np.array([1.0, 0.0], np.float32)
+
+
+@pytest.fixture
+def serve():
+    """Serve an environment whose base was put somewhere: ``serve(id, pose, **options)``."""
+    served = []
+
+    def start(env_id, pose, **options):
+        env = gym.make(env_id, disable_env_checker=True)
+        served.append(ServedEnvironment(env, ServeOptions(port=0, **options)).__enter__())
+        robot = env.unwrapped.robot
+        assert isinstance(robot, ServedRobot)
+        env.reset(seed=3, options={"start_pose": pose})
+        return served[-1]
+
+    yield start
+    for one in served:
+        one.close()
+
+
+def live(make, served, env_id, **options):
+    return make(env_id, robot=served.bus.url, **options)
+
+
+@pytest.mark.parametrize("options", [{"fast": True}, {}])
+def test_navigation_drives_to_the_target_from_where_the_base_is(serve, make, options):
+    served = serve(NAVIGATION, [0.4, -0.3, 0.7], **options)
+    assert served.endpoints[0].endswith("and a mir100's topics")
+    env = live(make, served, NAVIGATION)
+    env.reset(seed=1)
+    task = env.unwrapped.task
+    np.testing.assert_allclose(env.unwrapped.state.signals["base_pose"], [[0.4, -0.3, 0.7]], atol=1e-6)
+    assert math.dist(task.target[0, :2], (0.4, -0.3)) >= 1.0
+    for number in range(400):
+        bearing = env.unwrapped.task.observe(env.unwrapped.state)[0, 1] * math.pi
+        action = np.clip([1.0 if abs(bearing) < 0.3 else 0.0, 2 * bearing], -1, 1).astype(np.float32)
+        _, reward, terminated, truncated, info = env.step(action)
+        if terminated or truncated or (not options and number >= 10):
+            break
+    if options:
+        assert (reward, info["final_status"], info["is_success"]) == (2.0, "success", True)
+    else:  # a few steps of real time are enough
+        assert served.env.unwrapped.robot.state.signals["base_velocity"].any()
+
+
+def test_a_live_base_in_a_box_like_the_simulated_one(serve, make):
+    """The same commands, here and there; but for the noise of its rays the same is seen."""
+    pose = [0.0, -2.6, math.pi / 2]
+    served = serve(AVOIDANCE, pose, fast=True)
+    there, here = live(make, served, AVOIDANCE), make(AVOIDANCE)
+    here.reset(seed=3, options={"start_pose": pose, "target_pose": [0.0, 2.5, 0.0]})
+    there.reset(seed=8, options={"target_pose": [0.0, 2.5, 0.0]})
+    assert there.unwrapped.state.truth == {}
+    for _ in range(100):
+        one, two = here.step(FORWARD), there.step(FORWARD)
+        np.testing.assert_allclose(one[0], two[0], atol=0.05)
+        if one[2] or two[2]:
+            break
+    boxes = served.env.unwrapped.task.obstacles
+    np.testing.assert_array_equal(boxes, here.unwrapped.task.obstacles)
+    assert one[4]["final_status"] == "collision"
+
+
+def test_a_live_base_in_parity_has_no_collisions_and_is_stopped_at_the_wall(serve, make):
+    served = serve(AVOIDANCE, [0.0, -2.6, math.pi / 2], fast=True)
+    env = live(make, served, AVOIDANCE, parity=True)
+    env.reset(seed=1)
+
+    def drive():
+        for _ in range(80):
+            assert not env.step(FORWARD)[2]
+
+    with pytest.raises(SafetyStop, match=r"^The robot was stopped by G23 base following: "):
+        drive()
+    assert served.env.unwrapped.robot.state.truth["collision"].tolist() == [True]
+
+
+def test_somewhere_else_than_it_is(serve, make):
+    env = live(make, serve(NAVIGATION, [0.0, 0.0, 0.0], fast=True), NAVIGATION)
+    with pytest.raises(InvalidValue, match=r"start_pose: this robot stays where it is, at \[0.0, 0.0, 0.0\]"):
+        env.reset(options={"start_pose": [1.0, 1.0, 0.0]})

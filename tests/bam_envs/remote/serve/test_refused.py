@@ -1,0 +1,155 @@
+"""A rosbridge server that does not carry everything: what is missing is said, and what helps."""
+
+import asyncio
+import contextlib
+import json
+import threading
+import time
+
+import gymnasium as gym
+import pytest
+from websockets.asyncio.server import serve
+from websockets.exceptions import ConnectionClosed
+
+import bam_envs  # noqa: F401 - registers the environments
+from bam_envs.core.errors import RemoteError
+from bam_envs.remote.serve.options import ServeOptions
+from bam_envs.remote.serve.program import ServedEnvironment
+
+SERVICE, STATE = "/gym_env/gym_api_request", "/joint_states"
+
+
+class Bridge:
+    """A rosbridge server without some packages.
+
+    Args:
+        missing: The packages.
+        tells: Whether it says so in status messages; if not it is silent, as the servers in Python are.
+        rosapi: Whether rosapi runs beside it.
+    """
+
+    def __init__(self, missing, *, tells, rosapi):
+        self._missing, self._tells, self._rosapi = missing, tells, rosapi
+        self._topics, self._services = [], []
+        self._started, self._thread = threading.Event(), threading.Thread(target=lambda: asyncio.run(self._run()))
+        self._thread.start()
+        assert self._started.wait(10.0)
+
+    def close(self):
+        self._loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join(10.0)
+
+    async def _run(self):
+        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
+        async with serve(self._talk, "127.0.0.1", 0, compression=None) as server:
+            self.url = f"ws://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+            self._started.set()
+            await self._stop.wait()
+
+    async def _talk(self, connection):
+        with contextlib.suppress(ConnectionClosed):
+            async for frame in connection:
+                for answer in self._answers(json.loads(frame)):
+                    await connection.send(json.dumps(answer))
+
+    def _answers(self, message):
+        if message["op"] == "call_service":
+            response = {"op": "service_response", "id": message["id"], "service": message["service"], "result": True}
+            yield response | self._called(message["service"])
+        elif message.get("type", "").partition("/")[0] in self._missing:
+            if self._tells:
+                text = f"load message definition {message['type']}; install and source its ROS package"
+                yield {"op": "status", "level": "error", "msg": text, "id": message["id"]}
+        elif message["op"] in ("advertise", "subscribe"):
+            self._topics.append(message["topic"])
+        elif message["op"] == "advertise_service":
+            self._services.append(message["service"])
+
+    def _called(self, service):
+        seconds, nanoseconds = divmod(time.time_ns(), 10**9)
+        answers = {"/rosapi/get_time": {"time": {"sec": seconds, "nanosec": nanoseconds}}}
+        if self._rosapi:
+            answers |= {"/rosapi/topics": {"topics": self._topics}, "/rosapi/services": {"services": self._services}}
+        if service in answers:
+            return {"values": answers[service]}
+        return {"result": False, "values": f"Service {service} does not exist"}
+
+
+@pytest.fixture
+def offer(monkeypatch):
+    """Serve an environment through a bridge; what was told, or the error."""
+    monkeypatch.setattr("bam_envs.remote.serve.refused._WITHIN", 0.0)
+
+    def start(env_id, missing, *, tells=False, rosapi=True, tcp=None):
+        bridge, lines = Bridge(missing, tells=tells, rosapi=rosapi), []
+        env = gym.make(env_id, disable_env_checker=True)
+        try:
+            with ServedEnvironment(env, ServeOptions(via=bridge.url, fast=True, tcp=tcp), lines.append) as served:
+                lines += served.endpoints
+        except RemoteError as error:
+            lines.append(error)
+        finally:
+            bridge.close()
+        return [str(line).replace(bridge.url, "URL") for line in lines], lines[-1]
+
+    return start
+
+
+BUILD = (
+    "Build it beside the bridge from ros/bam_msgs of this project (colcon build --packages-select bam_msgs), source "
+    "it, and start the bridge again."
+)
+
+
+@pytest.mark.parametrize("tells", [True, False])
+def test_without_bam_msgs_topics_are_left(offer, tells):
+    lines, _ = offer("bam/pick-v0", ["bam_msgs"], tells=tells, rosapi=not tells)
+    told = "load message definition bam_msgs/GymAPI; install and source its ROS package"
+    reason = told if tells else "rosapi does not list it"
+    assert lines == [
+        f"URL does not carry {SERVICE} (bam_msgs/GymAPI): {reason}. {BUILD}",
+        'bam/pick-v0 on URL, fast: /gym_env/request and reply (channel="topics") and a ur5e\'s topics',
+    ]
+
+
+@pytest.mark.parametrize("tells", [True, False])
+def test_without_messages_of_states_there_is_no_robot(offer, tells):
+    lines, _ = offer("bam/pick-v0", ["sensor_msgs"], tells=tells, rosapi=not tells)
+    assert len(lines) == 2
+    assert "/joint_states (sensor_msgs/JointState)" in lines[0]
+    assert "/gripper/joint_states (sensor_msgs/JointState)" in lines[0]
+    assert lines[0].endswith(
+        ". Install sensor_msgs beside the bridge (apt install ros-$ROS_DISTRO-sensor-msgs), source it, and start the "
+        "bridge again."
+    )
+    assert lines[1] == f"bam/pick-v0 on URL, fast: {SERVICE}"
+
+
+def test_one_way_of_commanding_is_enough(offer):
+    lines, _ = offer("bam/pick-v0", ["trajectory_msgs"])
+    assert lines[-1] == f"bam/pick-v0 on URL, fast: {SERVICE} and a ur5e's topics"
+
+
+def test_nothing_of_use_is_an_error(offer):
+    lines, error = offer("CartPole-v1", ["bam_msgs", "std_msgs"], tells=True)
+    assert isinstance(error, RemoteError)
+    assert lines[-1] == "URL carries nothing of use of what is served here."
+    assert [line.startswith("URL does not carry /gym_env/") for line in lines[:-1]] == [True, True]
+
+
+def test_with_another_way_in_it_goes_on(offer):
+    lines, last = offer("CartPole-v1", ["bam_msgs", "std_msgs"], tells=True, tcp=0)
+    assert last.startswith("CartPole-v1 on tcp://127.0.0.1:")
+    assert len(lines) == 3
+
+
+def test_a_server_that_says_nothing(offer):
+    lines, _ = offer("CartPole-v1", [], rosapi=False)
+    assert lines == [
+        "URL does not say what it carries: rosapi, which lists it, does not run there.",
+        f"CartPole-v1 on URL, fast: {SERVICE}",
+    ]
+
+
+def test_a_server_that_carries_everything(offer):
+    assert offer("CartPole-v1", [])[0] == [f"CartPole-v1 on URL, fast: {SERVICE}"]

@@ -1,0 +1,454 @@
+"""The TCP server, whatever its clients do."""
+
+import contextlib
+import random
+import socket
+import threading
+import time
+
+import msgpack
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, NotInCommand, ProtocolError, RemoteError, UnknownName
+from bam_envs.remote.serve.env_server import EnvServer
+from bam_envs.remote.serve.tcp_server import TcpServer, _Connection
+from bam_envs.remote.transports.fake import FakeEnv
+from bam_envs.remote.transports.frames import FrameSocket, encode
+from bam_envs.remote.transports.tcp import TcpTransport
+from bam_envs.remote.transports.tcp_messages import Hello
+from bam_envs.testing.transports import MirrorEnv
+
+PATIENCE = 10.0
+ACTION = np.zeros(2, np.float32)
+
+
+class Stranger:
+    """A client that says what it wants."""
+
+    def __init__(self, server):
+        self.socket = socket.create_connection((server.host, server.port), timeout=PATIENCE)
+        self.frames = FrameSocket(self.socket)
+
+    def hello(self, **changes):
+        fields = {"session": "s1", "epoch": 1, "name": "stranger", "token": "", "env_id": "", **changes}
+        return self.ask(Hello(**fields).to_tree())
+
+    def ask(self, tree):
+        self.frames.send(encode(tree), time.monotonic() + PATIENCE)
+        return self.frames.receive(time.monotonic() + PATIENCE)
+
+    def request(self, kind, number, *values, epoch=1, session="s1", lifetime=PATIENCE, sent=None):
+        sent = time.monotonic() if sent is None else sent
+        return self.ask([kind, [session, epoch, number, sent, sent + lifetime], *values])
+
+
+@pytest.fixture
+def env():
+    return MirrorEnv(spaces.Box(-1, 1, (2,)))
+
+
+@pytest.fixture
+def server(env):
+    with TcpServer(EnvServer(env)) as server:
+        yield server
+
+
+@pytest.fixture
+def stranger(server):
+    strangers = []
+
+    def one():
+        strangers.append(Stranger(server))
+        return strangers[-1]
+
+    yield one
+    for each in strangers:
+        each.frames.close()
+
+
+@pytest.fixture
+def client(server):
+    clients = []
+
+    def one(**options):
+        clients.append(TcpTransport(server.url, **options))
+        return clients[-1]
+
+    yield one
+    for each in clients:
+        each.close()
+
+
+def test_a_request_that_comes_twice_is_executed_once(stranger, env):
+    one = stranger()
+    one.hello()
+    one.request("reset", 1, None, None, False)
+    first = one.request("step", 2, ACTION)
+    assert first[:2] == [2, "ok"]
+    again = one.request("step", 2, ACTION)
+    assert again[0:2] == first[0:2]
+    np.testing.assert_array_equal(again[2][0], first[2][0])
+    assert len(env.seen) == 1
+
+
+def test_old_requests_are_refused(stranger, env):
+    one = stranger()
+    one.hello()
+    one.request("reset", 5, None, None, False)
+    assert one.request("step", 4, ACTION) == [4, "RemoteError", "old message: number 4 after number 5"]
+    assert one.request("step", 6, ACTION, epoch=2)[1] == "ok"
+    assert one.request("step", 7, ACTION) == [7, "RemoteError", "old connection: epoch 1, and epoch 2 is there"]
+    assert len(env.seen) == 1
+
+
+def test_late_requests_are_refused(stranger, env):
+    one = stranger()
+    one.hello()
+    one.request("reset", 1, None, None, False)
+    number, kind, text = one.request("step", 2, ACTION, sent=time.monotonic() - 30, lifetime=1.0)
+    assert (number, kind) == (2, "RemoteError")
+    assert text.startswith("expired: ")
+    assert env.seen == []
+
+
+def test_a_new_connection_of_a_client_ends_its_old_one(stranger):
+    one, two = stranger(), stranger()
+    one.hello()
+    one.request("reset", 1, None, None, False)
+    two.hello(epoch=2)
+    with pytest.raises(LinkLost):
+        one.frames.receive(time.monotonic() + PATIENCE)
+    assert two.request("reset", 2, None, None, False, epoch=2)[1] == "ok"
+
+
+def test_clients_are_told_who_is_in_command(client):
+    one, two = client(name="ann"), client(name="bob")
+    one.connect(), two.connect()
+    one.reset()
+    with pytest.raises(NotInCommand) as caught:
+        two.reset()
+    assert str(caught.value).startswith("ann (127.0.0.1:")
+    assert " is in command, not bob (127.0.0.1:" in str(caught.value)
+    one.close()
+    two.reset()
+
+
+def test_command_can_be_taken_by_an_operator(env):
+    with TcpServer(EnvServer(env), token="secret", operator_token="mine") as server:
+        one, thief, two = (
+            TcpTransport(server.url, token=token, take=take)
+            for token, take in (("secret", False), ("secret", True), ("mine", True))
+        )
+        one.connect(), two.connect()
+        one.reset()
+        with pytest.raises(NotInCommand, match="Taking it by force needs the operator's token"):
+            thief.reset()
+        two.reset()
+        with pytest.raises(NotInCommand):
+            one.step(ACTION)
+        two.step(ACTION)
+        assert len(env.seen) == 1
+        for each in (one, thief, two):
+            each.close()
+
+
+def test_a_silent_client_keeps_command_while_its_connection_is_there(server, client, env):
+    one, two = client(), client()
+    one.connect(), two.connect()
+    one.reset()
+    server.server.lease._clock = lambda: 1e9
+    with pytest.raises(NotInCommand):
+        two.reset()
+
+
+def test_connections_that_say_nothing_keep_nobody_out(server, client):
+    silent = [socket.create_connection((server.host, server.port)) for _ in range(80)]
+    client().connect()
+    for one in silent:
+        one.close()
+
+
+def test_guessing_tokens_is_slow(env):
+    with TcpServer(EnvServer(env), token="secret") as server:
+        server._guesses._clock = lambda: 100.0
+        said = []
+        for _ in range(6):
+            with pytest.raises(NoServer) as caught:
+                TcpTransport(server.url, token="guess").connect()
+            said.append(str(caught.value).removeprefix(f"{server.url}: "))
+        wrong = "The token is wrong; give the one that the server was started with (--token-file)."
+        assert said == [wrong] * 4 + ["Too many wrong tokens came from this address; try again in a second."] * 2
+        server._guesses._clock = lambda: 101.0
+        with contextlib.closing(TcpTransport(server.url, token="secret")) as owner:
+            owner.connect()
+
+
+def test_an_array_of_a_million_dimensions_is_refused_at_once(stranger):
+    one = stranger()
+    one.hello()
+    content = msgpack.packb(["<f4", [2**63 - 1] * 90_000, 0])
+    header = msgpack.packb(["step", ["s1", 1, 1, 0.0, 1.0], msgpack.ExtType(1, content)])
+    one.socket.sendall(b"bam\x01" + len(header).to_bytes(4, "big") + bytes(4) + header)
+    assert one.frames.receive(time.monotonic() + PATIENCE)[2] == (
+        "A message is damaged: an array has at most 32 dimensions, not 90000."
+    )
+
+
+def test_a_client_that_vanishes_gives_command_back(server, stranger, client):
+    left = threading.Event()
+    server.server.lease.on_change(lambda before, after: after is None and left.set())
+    one = stranger()
+    one.hello()
+    one.request("reset", 1, None, None, False)
+    one.socket.close()
+    assert left.wait(PATIENCE)
+    two = client()
+    two.connect()
+    two.reset()
+
+
+def test_the_token(env):
+    with TcpServer(EnvServer(env), token="geheim") as server:
+        for token, what in ((None, "missing"), ("", "missing"), ("falsch", "wrong")):
+            with pytest.raises(NoServer) as caught:
+                TcpTransport(server.url, token=token).connect()
+            assert str(caught.value) == (
+                f"{server.url}: The token is {what}; give the one that the server was started with (--token-file)."
+            )
+        right = TcpTransport(server.url, token="geheim")
+        right.connect()
+        right.close()
+
+
+def test_a_token_that_is_no_text_is_refused(env):
+    with TcpServer(EnvServer(env), token="secret") as server:
+        one = Stranger(server)
+        assert one.hello(token="\ud800")[1:] == [
+            "RemoteError",
+            "The token is wrong; give the one that the server was started with (--token-file).",
+        ]
+        one.frames.close()
+
+
+def test_a_client_that_cannot_be_served_keeps_no_other_out(server, client, monkeypatch, caplog):
+    start = _Connection.start
+
+    def fail(connection):
+        monkeypatch.setattr(_Connection, "start", start)
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(_Connection, "start", fail)
+    with pytest.raises(NoServer):
+        TcpTransport(server.url).connect()
+    assert "A client could not be served: can't start new thread" in caplog.text
+    assert not server._connections
+    client().connect()
+
+
+def test_another_environment_is_refused(server):
+    with pytest.raises(NoServer) as caught:
+        TcpTransport(server.url, env_id="bam/pick-v0").connect()
+    assert str(caught.value) == f"{server.url}: There is no environment 'bam/pick-v0' here; MirrorEnv is served."
+
+
+def test_too_many_clients_are_refused_and_told(env):
+    with TcpServer(EnvServer(env), max_clients=1) as server:
+        one = TcpTransport(server.url)
+        one.connect()
+        with pytest.raises(NoServer) as caught:
+            TcpTransport(server.url).connect()
+        assert str(caught.value) == (f"{server.url}: All 1 places for clients are taken; try again when one has left.")
+        one.close()
+
+
+@pytest.mark.parametrize(
+    ("sent", "told"),
+    [
+        (b"GET / HTTP/1.1\r\n\r\n", "not a bam-serve TCP server: it says b'GET / HTTP/1'"),
+        (b"bam\x09" + bytes(8), "version 9 of the protocol there, 1 here; install one bam-train on both sides"),
+        (b"bam\x01\x00\x00\x00\x01\x00\x00\x00\x00\xc1", "A message is damaged: "),
+        (b"bam\x01\x00\x00\x00\x01\x00\x00\x00\x00\x07", "Expected a hello, found 7."),
+        (b"bam\x01\x00\x10\x00\x00\x00\x00\x00\x00", "A message of 1048576 bytes is too large; 65536 are allowed."),
+    ],
+)
+def test_strangers_are_told_what_is_wrong(stranger, sent, told):
+    one = stranger()
+    one.socket.sendall(sent)
+    number, kind, text = one.frames.receive(time.monotonic() + PATIENCE)
+    assert (number, kind) == (0, "RemoteError")
+    assert text.startswith(told)
+    with pytest.raises(LinkLost):
+        one.frames.receive(time.monotonic() + PATIENCE)
+
+
+@pytest.mark.parametrize(
+    "tree", [[], 7, ["step"], ["step", 3], ["walk", ["s", 1, 1, 0.0, 1.0]], ["step", ["s", 1, 1, 0.0, 1.0]], {"a": 1}]
+)
+def test_what_is_no_request_ends_its_connection_alone(stranger, client, tree):
+    one, two = stranger(), client()
+    two.connect()
+    two.reset()
+    one.hello()
+    assert one.ask(tree)[2].startswith("Expected a request, found ")
+    with pytest.raises(LinkLost):
+        one.frames.receive(time.monotonic() + PATIENCE)
+    two.step(ACTION)
+
+
+def test_a_request_of_100_mb_ends_its_connection_alone(server, stranger, client):
+    one = stranger()
+    one.hello()
+    one.socket.sendall(b"bam\x01" + (2**31).to_bytes(4, "big") + bytes(4))
+    assert one.frames.receive(time.monotonic() + PATIENCE)[2] == (
+        "A message of 2147483648 bytes is too large; 1048608 are allowed."
+    )
+    two = client()
+    two.connect()
+    two.reset()
+
+
+def test_actions_that_do_not_fit_are_refused(stranger, env):
+    one = stranger()
+    one.hello()
+    one.request("reset", 1, None, None, False)
+    bad = [None, "x", [0.0, 1.0], np.float32([0, np.nan]), np.zeros(3, np.float32), np.zeros(2), {"a": 1}]
+    for number, action in enumerate(bad, start=2):
+        assert one.request("step", number, action)[1] == "RemoteError"
+    assert env.seen == []
+    assert one.request("step", 100, ACTION)[1] == "ok"
+
+
+class Large(FakeEnv):
+    """Its observations are more than sockets keep for a client that does not read."""
+
+    def __init__(self):
+        super().__init__(spaces.Box(0, 255, (20_000_000,), np.uint8))
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(20_000_000, np.uint8), {}
+
+
+def test_a_client_that_never_reads_is_dropped_and_holds_up_nobody():
+    with TcpServer(EnvServer(Large(), lease=0.0), patience=1.0) as server:
+        left = threading.Event()
+        server.server.lease.on_change(lambda before, after: after is None and left.set())
+        deaf = Stranger(server)
+        deaf.hello()
+        sent = time.monotonic()
+        deaf.frames.send(encode(["reset", ["s1", 1, 1, sent, sent + 10], None, None, False]))
+        assert left.wait(PATIENCE)
+        other = TcpTransport(server.url)
+        other.connect()
+        assert other.reset()[0].shape == (20_000_000,)
+        other.close()
+        deaf.frames.close()
+
+
+@pytest.mark.parametrize("half", [b"bam", b"bam\x01" + bytes(3) + b"\x07" + bytes(4) + b"\x81"])
+def test_half_a_message_does_not_keep_a_connection(env, half):
+    with TcpServer(EnvServer(env), patience=0.1) as server:
+        one = Stranger(server)
+        one.hello()
+        one.socket.sendall(half)
+        with pytest.raises(LinkLost):
+            one.frames.receive(time.monotonic() + PATIENCE)
+        one.frames.close()
+
+
+def test_half_open_connections_hold_up_nobody(server, stranger, client):
+    for _ in range(20):
+        stranger()
+    one = client()
+    one.connect()
+    one.reset()
+    one.step(ACTION)
+
+
+def test_closing_drops_clients_and_ends_every_thread(env):
+    before = set(threading.enumerate())
+    server = TcpServer(EnvServer(env))
+    server.start()
+    one = TcpTransport(server.url)
+    one.connect()
+    one.reset()
+    server.close()
+    server.close()
+    assert set(threading.enumerate()) == before
+    with pytest.raises(LinkLost):
+        one.step(ACTION)
+    one.close()
+
+
+def test_a_port_in_use(server, env):
+    with pytest.raises(InvalidValue) as caught:
+        TcpServer(EnvServer(env), port=server.port).start()
+    assert str(caught.value).startswith(f"Cannot listen on 127.0.0.1 port {server.port}: Address already in use")
+    assert str(caught.value).endswith(". Give another port; 0 takes any that is free.")
+
+
+def test_the_constructor_does_no_io_and_refuses_what_cannot_be_sent(env):
+    assert TcpServer(EnvServer(env), port=5555).url == "tcp://127.0.0.1:5555"
+    with pytest.raises(UnknownName):
+        TcpServer(EnvServer(FakeEnv(spaces.OneOf([spaces.Discrete(2)]))))
+
+
+def junk(rng, depth=0):
+    """Anything that MessagePack can say."""
+    kind = rng.randrange(11 if depth < 3 else 7)
+    if kind < 7:
+        dtype, shape, start = rng.choice(["<f4", "|u1", "O", "f8,(", 3]), rng.choice([[2], [-1], [2**40], "x", 2]), -5
+        array = msgpack.ExtType(rng.choice([1, 2, 3]), msgpack.packb([dtype, shape, rng.choice([0, start, 2**50])]))
+        number = rng.choice([0, -1, 2**63, float("nan"), 1e300])
+        return rng.choice([None, True, number, rng.randbytes(9), "hello", array, np.zeros(2, np.float32)])
+    if kind < 9:
+        return [junk(rng, depth + 1) for _ in range(rng.randrange(6))]
+    return {key: junk(rng, depth + 1) for key in rng.sample(["a", "t", "s", "n", "x"], 4)}
+
+
+def fuzzed(rng, number):
+    if rng.random() < 0.2:
+        return junk(rng)
+    kind, count = rng.choice([("reset", 3), ("step", 1), ("leave", 0)])
+    sent = time.monotonic()
+    return [kind, ["s1", 1, number, sent, sent + 10], *[junk(rng) for _ in range(count)]]
+
+
+def test_ten_thousand_random_messages_change_nothing(client):
+    rng = random.Random(1)
+    space = spaces.Dict(
+        {
+            "a": spaces.Box(-1, 1, (2,)),
+            "n": spaces.Tuple([spaces.Text(3), spaces.Discrete(3)]),
+            "s": spaces.Sequence(spaces.MultiBinary(2), stack=True),
+            "t": spaces.MultiDiscrete([2, 3]),
+        }
+    )
+    with TcpServer(EnvServer(MirrorEnv(space))) as server:
+        number = 0
+        while number < 10_000:
+            one = Stranger(server)
+            try:
+                one.hello()
+                while number < 10_000:
+                    number += 1
+                    answer = one.ask(fuzzed(rng, number))
+                    assert isinstance(answer, list)
+            except (LinkLost, ProtocolError):
+                pass  # it was told, and the connection closed
+            one.frames.close()
+        good = TcpTransport(server.url, take=True)
+        good.connect()
+        action = space.sample()
+        good.reset()
+        assert good.step(action)[0].keys() == action.keys()
+        good.close()
+
+
+def test_refusals_keep_their_kind(stranger, client):
+    one = client()
+    one.connect()
+    with pytest.raises(RemoteError) as caught:
+        one.step(ACTION)
+    assert str(caught.value) == "No episode is running: it ended, or never began. Call reset() first."

@@ -1,0 +1,307 @@
+"""Rows behind transports: one rack with n rows, and several racks."""
+
+import os
+import signal
+import threading
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from bam_envs.core.errors import InvalidValue, LinkLost, ResetNeeded
+from bam_envs.core.registry import ENVIRONMENTS
+from bam_envs.remote.remote_env import RemoteVectorEnv
+from bam_envs.remote.serve.env_server import EnvServer
+from bam_envs.remote.serve.tcp_server import TcpServer
+from bam_envs.remote.transports.fake import FakeEnv, FakeTransport
+from bam_envs.remote.transports.local import LocalTransport
+from bam_envs.remote.transports.tcp import TcpTransport
+from bam_envs.testing.transports import MirrorEnv, assert_same_value
+
+PATIENCE = 10.0
+
+
+def assert_same_infos(ours, theirs):
+    """The same columns where a row has something."""
+    for key in set(theirs) - set(ours):
+        assert not theirs["_" + key.lstrip("_")].any(), key
+    for key, value in ours.items():
+        if isinstance(value, dict):
+            assert_same_infos(value, theirs[key])
+            continue
+        text = theirs[key].dtype.kind == "U"  # of another length in each answer: Gymnasium's own are objects
+        assert (value.dtype, value.shape) == (object if text else theirs[key].dtype, theirs[key].shape), key
+        rows = slice(None) if key.startswith("_") or key == "final_obs" else ours["_" + key]
+        np.testing.assert_array_equal(value[rows], theirs[key][rows], err_msg=key)
+
+
+@pytest.fixture
+def racks(make, make_rows):
+    """Four rows, in several ways."""
+
+    def make_racks(kind):
+        if kind == "one rack":
+            return LocalTransport(make_rows("bam/reach-v0", 4))
+        if kind == "singles":
+            return [LocalTransport(make("bam/reach-v0")) for _ in range(4)]
+        return [LocalTransport(make_rows("bam/reach-v0", 2)), *(LocalTransport(make("bam/reach-v0")) for _ in "ab")]
+
+    return make_racks
+
+
+def assert_same_episodes(envs, alone, actions_of, steps=230):
+    """Steps of which some end episodes by success or time."""
+    ours, theirs = envs.reset(seed=7), alone.reset(seed=7)
+    assert_same_value(ours[0], theirs[0], "the first observation")
+    assert_same_infos(ours[1], theirs[1])
+    ends = 0
+    actions = [actions_of(row, steps, alone.single_action_space.shape[0]) for row in range(4)]
+    for action in np.stack(actions, axis=1):
+        ours, theirs = envs.step(action), alone.step(action)
+        for name, one, two in zip(("observation", "reward", "terminated", "truncated"), ours, theirs, strict=False):
+            assert_same_value(one, two, name)
+        assert_same_infos(ours[4], theirs[4])
+        ends += (theirs[2] | theirs[3]).sum()
+    assert ends >= 8
+
+
+@pytest.mark.parametrize("kind", ["one rack", "singles", "both"])
+def test_rows_are_those_in_process_bit_for_bit(racks, make_rows, actions_of, kind):
+    envs = RemoteVectorEnv(racks(kind), 4)
+    assert_same_episodes(envs, make_rows("bam/reach-v0", 4), actions_of)
+    envs.close()
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_over_tcp_as_well(make_rows, actions_of, env_id):
+    alone, there = (make_rows(env_id, 4, max_episode_steps=15) for _ in range(2))
+    with TcpServer(EnvServer(there)) as server:
+        envs = RemoteVectorEnv(TcpTransport(server.url))
+        assert_same_episodes(envs, alone, actions_of, steps=35)
+        envs.close()
+
+
+def test_a_mask_goes_over_tcp(make_rows):
+    alone, mask = make_rows("bam/reach-v0", 3), {"reset_mask": np.array([False, True, False])}
+    with TcpServer(EnvServer(make_rows("bam/reach-v0", 3))) as server:
+        envs = RemoteVectorEnv(TcpTransport(server.url))
+        for options in (None, mask):
+            ours, theirs = envs.reset(seed=5, options=options), alone.reset(seed=5, options=options)
+            assert_same_value(ours[0], theirs[0], "observation")
+            assert_same_infos(ours[1], theirs[1])
+        envs.close()
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_what_the_other_end_says(make_rows, env_id):
+    there, entry = make_rows(env_id, 3), ENVIRONMENTS[env_id]
+    envs = RemoteVectorEnv(LocalTransport(there))
+    assert envs.num_envs == 3
+    for name in ("observation_space", "action_space", "single_observation_space", "single_action_space"):
+        assert getattr(envs, name) == getattr(there, name)
+    assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    assert (envs.env_id, envs.period, envs.max_episode_steps) == (env_id, entry.period, entry.max_episode_steps)
+    assert envs.describe() == there.unwrapped.describe()
+
+
+def test_it_connects_when_something_is_needed():
+    transports = [FakeTransport(), FakeTransport()]
+    envs = RemoteVectorEnv(transports)
+    assert [one.calls for one in transports] == [[], []]
+    assert envs.num_envs == 2
+    assert envs.observation_space.shape == (2, 3)
+    assert [one.calls for one in transports] == [[("connect",)], [("connect",)]]
+    envs.close()
+
+
+def test_seeds_go_on_over_the_racks():
+    transports = [FakeTransport(), FakeTransport(rows(2)), FakeTransport()]
+    envs = RemoteVectorEnv(transports, 4)
+    envs.reset(seed=10)
+    assert [one.calls[-1] for one in transports] == [
+        ("reset", 10, None),
+        ("reset", [11, 12], None),
+        ("reset", 13, None),
+    ]
+    envs.reset(seed=[1, None, 3, 4])
+    assert [one.calls[-1][1] for one in transports] == [1, [None, 3], 4]
+    envs.reset(options={"easy": True})
+    assert [one.calls[-1][1:] for one in transports] == [(None, {"easy": True})] * 3
+    with pytest.raises(InvalidValue) as caught:
+        envs.reset(seed=[1, 2])
+    assert str(caught.value) == "seed must be one number or 4 of them, not 2."
+    envs.close()
+
+
+def rows(number):
+    return SyncVectorEnv([FakeEnv] * number, autoreset_mode=AutoresetMode.SAME_STEP)
+
+
+def test_some_rows_can_be_reset():
+    transports = [FakeTransport(), FakeTransport(rows(2)), FakeTransport()]
+    envs = RemoteVectorEnv(transports)
+    first, _ = envs.reset(seed=1)
+    mask = np.array([False, True, False, True])
+    again, infos = envs.reset(options={"reset_mask": mask})
+    assert [np.array_equal(*pair) for pair in zip(first, again, strict=True)] == [True, False, True, False]
+    assert len(transports[0].calls) == 2
+    np.testing.assert_array_equal(transports[1].calls[-1][2]["reset_mask"], [True, False])
+    assert transports[2].calls[-1] == ("reset", None, None)
+    assert infos["_options"].tolist() == mask.tolist()
+    for bad in ([True], [[True] * 4]):
+        with pytest.raises(InvalidValue) as caught:
+            envs.reset(options={"reset_mask": np.array(bad)})
+        assert str(caught.value) == f"reset_mask must have shape (4,), not {np.shape(bad)}."
+    envs.close()
+
+
+def test_a_mask_needs_episodes_of_the_other_rows():
+    envs = RemoteVectorEnv([FakeTransport(), FakeTransport()])
+    with pytest.raises(ResetNeeded) as caught:
+        envs.reset(options={"reset_mask": [True, False]})
+    assert str(caught.value) == "No episode is running. Call reset() without a reset_mask first."
+    envs.close()
+
+
+class Meeting(FakeEnv):
+    """A step ends when the steps of all have begun."""
+
+    def __init__(self, barrier):
+        super().__init__()
+        self.barrier = barrier
+
+    def step(self, action):
+        self.barrier.wait(PATIENCE)
+        return super().step(action)
+
+
+def test_racks_are_stepped_at_the_same_time():
+    barrier = threading.Barrier(3)
+    envs = RemoteVectorEnv([LocalTransport(Meeting(barrier)) for _ in range(3)])
+    envs.reset(seed=0)
+    assert envs.step(np.zeros((3, 2)))[1].tolist() == [1.0, 1.0, 1.0]
+    envs.close()
+
+
+def test_a_fault_of_one_rack_goes_through_when_all_have_answered():
+    transports = [FakeTransport(), FakeTransport()]
+    envs = RemoteVectorEnv(transports)
+    envs.reset(seed=0)
+    transports[0].faults.append(LinkLost("the cable is out"))
+    with pytest.raises(LinkLost) as caught:
+        envs.step(np.zeros((2, 2)))
+    assert str(caught.value) == "the cable is out"
+    assert transports[1].calls[-1][0] == "step"
+    with pytest.raises(ResetNeeded) as needed:
+        envs.step(np.zeros((2, 2)))
+    assert str(needed.value) == "No episode is running. Call reset() first."
+    envs.reset()
+    envs.step(np.zeros((2, 2)))
+    envs.close()
+
+
+def test_the_number_of_rows_must_be_right():
+    with pytest.raises(InvalidValue) as caught:
+        RemoteVectorEnv([FakeTransport(rows(2)), FakeTransport()], 4).reset()
+    assert str(caught.value) == "num_envs must be 3, as many rows as there are, not 4."
+    with pytest.raises(InvalidValue) as caught:
+        RemoteVectorEnv([])
+    assert str(caught.value) == "There must be at least one transport."
+
+
+def test_racks_must_be_alike():
+    other = FakeTransport(FakeEnv(action_space=spaces.Discrete(2)))
+    envs = RemoteVectorEnv([FakeTransport(), other])
+    with pytest.raises(InvalidValue) as caught:
+        envs.reset()
+    assert str(caught.value) == (
+        "The action_space of transport 2 is Discrete(2), and that of the first Box(-1.0, 1.0, (2,), float32); rows "
+        "must be alike."
+    )
+    envs.close()
+
+
+@pytest.mark.parametrize("shape", [(2,), (3, 2), (2, 3)])
+def test_actions_of_another_shape_are_refused(shape):
+    envs = RemoteVectorEnv([FakeTransport(), FakeTransport()])
+    envs.reset()
+    with pytest.raises(InvalidValue) as caught:
+        envs.step(np.zeros(shape))
+    assert str(caught.value) == f"The actions must have shape (2, 2), not {shape}."
+    envs.close()
+
+
+SPACE = spaces.Dict({"x": spaces.Box(-1, 1, (2,)), "n": spaces.Discrete(3, start=1), "t": spaces.Text(3)})
+
+
+def test_rows_of_any_space():
+    makers = [lambda: MirrorEnv(SPACE, episode_steps=2)] * 2
+    alone = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
+    envs = RemoteVectorEnv([LocalTransport(makers[0]()), LocalTransport(SyncVectorEnv(makers[:1], **SAME_STEP))])
+    assert_same_value(envs.reset(seed=3)[0], alone.reset(seed=3)[0], "the first observation")
+    envs.action_space.seed(1)
+    for _ in range(4):
+        action = envs.action_space.sample()
+        ours, theirs = envs.step(action), alone.step(action)
+        assert_same_value(ours[0], theirs[0], "observation")
+    last = [ours[4]["final_obs"], theirs[4]["final_obs"]]
+    for one, two in zip(*last, strict=True):
+        assert_same_value(one, two, "final_obs")
+    envs.close()
+    alone.close()
+
+
+SAME_STEP = {"autoreset_mode": AutoresetMode.SAME_STEP}
+
+
+def test_discrete_actions():
+    transports = [FakeTransport(FakeEnv(action_space=spaces.Discrete(3))) for _ in range(2)]
+    envs = RemoteVectorEnv(transports)
+    envs.reset()
+    envs.step(np.array([2, 0]))
+    assert [one.calls[-1] for one in transports] == [("step", 2), ("step", 0)]
+    with pytest.raises(InvalidValue) as caught:
+        envs.step(np.array([2, 0, 1]))
+    assert str(caught.value) == "There must be one action for each of 2 rows, not 3."
+    envs.close()
+
+
+def test_gymnasiums_wrappers_work():
+    envs = gym.wrappers.vector.RecordEpisodeStatistics(RemoteVectorEnv([FakeTransport(), FakeTransport()]))
+    envs.reset(seed=0)
+    for _ in range(10):
+        infos = envs.step(envs.action_space.sample())[4]
+    assert infos["episode"]["l"].tolist() == [10, 10]
+    envs.close()
+
+
+def test_closing_closes_every_transport_and_ends_the_threads():
+    before = set(threading.enumerate())
+    transports = [FakeTransport(), FakeTransport()]
+    envs = RemoteVectorEnv(transports)
+    envs.reset()
+    envs.close()
+    assert [one.calls[-1] for one in transports] == [("close",), ("close",)]
+    assert set(threading.enumerate()) == before
+    with pytest.raises(LinkLost):
+        envs.reset()
+    envs.close_extras()
+
+
+def test_a_forked_child_has_threads_of_its_own():
+    envs = RemoteVectorEnv([FakeTransport(), FakeTransport()])
+    envs.reset(seed=0)
+    reads, writes = os.pipe()
+    child = os.fork()
+    if child == 0:
+        signal.alarm(20)
+        envs.reset(seed=0)
+        os.write(writes, b"done")
+        os._exit(0)
+    os.close(writes)
+    assert os.read(reads, 4) == b"done"
+    os.waitpid(child, 0)
+    os.close(reads)
+    envs.close()

@@ -1,0 +1,174 @@
+"""Pictures: which backend, what is said when there is none, and a real one."""
+
+import os
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from bam_envs.core.errors import InvalidValue
+from bam_envs.robots.physics import rendering
+from bam_envs.robots.physics.physics import Physics
+from bam_envs.robots.physics.rendering import RenderingUnavailable, SceneRenderer, find_backend
+
+
+@pytest.fixture(autouse=True)
+def forgotten():
+    """No backend is remembered from another test, or for another test."""
+    find_backend.cache_clear()
+    yield
+    find_backend.cache_clear()
+
+
+@pytest.fixture
+def working(monkeypatch):
+    """Say which backends work."""
+    tried = []
+
+    def only(*names):
+        monkeypatch.delenv("MUJOCO_GL", raising=False)
+        monkeypatch.setattr(rendering, "works", lambda name: tried.append(name) or name in names)
+        return tried
+
+    return only
+
+
+@pytest.mark.parametrize(("works", "found"), [(("egl", "osmesa"), "egl"), (("osmesa",), "osmesa")])
+def test_the_first_backend_that_works(working, works, found):
+    working(*works)
+    assert find_backend() == found
+
+
+def test_it_is_looked_for_once(working):
+    tried = working("egl")
+    find_backend()
+    find_backend()
+    assert tried == ["egl"]
+
+
+def test_without_any_it_says_what_to_install(working):
+    working()
+    with pytest.raises(RenderingUnavailable) as caught:
+        find_backend()
+    assert str(caught.value) == (
+        "Pictures need OpenGL without a display, and neither EGL nor OSMesa works here. "
+        "Run: apt-get install libegl1 libgl1-mesa-dri (or libosmesa6), or set MUJOCO_GL."
+    )
+
+
+@pytest.mark.parametrize("name", ["egl", "OSMesa", "glfw"])
+def test_the_users_choice_wins(working, monkeypatch, name):
+    monkeypatch.setattr(rendering, "require_display", lambda: None)
+    tried = working()
+    monkeypatch.setenv("MUJOCO_GL", name)
+    assert find_backend() == name.lower()
+    assert tried == []
+
+
+def test_a_backend_is_tried_in_a_process_of_its_own(monkeypatch):
+    seen = {}
+
+    def run(command, **options):
+        seen.update(command=command, **options)
+        return subprocess.CompletedProcess(command, 1)
+
+    monkeypatch.setattr(subprocess, "run", run)
+    assert not rendering.works("osmesa")
+    assert seen["command"][-1] == "osmesa"
+    assert seen["env"]["MUJOCO_GL"] == seen["env"]["PYOPENGL_PLATFORM"] == "osmesa"
+
+
+def test_a_backend_that_hangs_does_not_work(monkeypatch):
+    def run(command, **options):
+        raise subprocess.TimeoutExpired(command, 60)
+
+    monkeypatch.setattr(subprocess, "run", run)
+    assert not rendering.works("egl")
+
+
+def test_a_window_needs_a_display(monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(rendering.sys, "platform", "linux")
+    with pytest.raises(RenderingUnavailable) as caught:
+        SceneRenderer(Physics("ur5e_cube.xml", 1), "human")
+    assert str(caught.value) == (
+        'A window needs a display, and DISPLAY is not set. Use render_mode="rgb_array", or run under xvfb-run.'
+    )
+
+
+@pytest.mark.parametrize("env_id", ["bam/reach-v0", "bam/pick-place-v0"])
+def test_a_picture(make, env_id):
+    env = make(env_id, render_mode="rgb_array")
+    env.reset(seed=0)
+    try:
+        image = env.render()
+    except RenderingUnavailable as error:
+        pytest.skip(str(error))
+    assert image.shape == (480, 640, 3)
+    assert image.dtype == np.uint8
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 100
+    for _ in range(5):
+        env.step(np.ones(env.action_space.shape, np.float32))
+    assert (env.render() != image).any()
+
+
+def test_rows_are_drawn_after_close_and_reset(make_rows):
+    envs = make_rows("bam/pick-v0", 3, render_mode="rgb_array", randomize=True)
+    envs.reset(seed=0)
+    try:
+        assert envs.render()[0].shape == (480, 640, 3)
+    except RenderingUnavailable as error:
+        pytest.skip(str(error))
+
+
+def test_an_unknown_mode_is_refused(make):
+    from bam_envs.core.registry import make_env
+
+    with pytest.raises(InvalidValue) as caught:
+        make_env("bam/pick-v0", render_mode="ansi")
+    assert str(caught.value) == "render_mode must be one of ['rgb_array', 'human'] or None, not 'ansi'."
+
+
+def test_without_a_mode_render_warns(make):
+    env = make("bam/pick-v0")
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="render"):
+        assert env.unwrapped.render() is None
+
+
+@pytest.mark.skipif(shutil.which("xvfb-run") is None, reason="no virtual display: xvfb-run is not installed")
+def test_a_window_opens_shows_and_closes_with_the_process():
+    script = (
+        "import gymnasium as gym, bam_envs\n"
+        "env = gym.make('bam/pick-place-v0', render_mode='human')\n"
+        "env.reset(seed=0)\n"
+        "for _ in range(3): env.step(env.action_space.sample())\n"
+        "env.close()\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = ["xvfb-run", "-a", sys.executable, "-c", script]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_backend_that_needs_a_display_without_one(monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(rendering.sys, "platform", "linux")
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    find_backend.cache_clear()
+    with pytest.raises(RenderingUnavailable, match="A window needs a display, and DISPLAY is not set"):
+        find_backend()
+    find_backend.cache_clear()
+
+
+def test_a_display_that_cannot_be_opened(monkeypatch):
+    monkeypatch.setattr(rendering.sys, "platform", "linux")
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setenv("DISPLAY", ":77")
+    with pytest.raises(RenderingUnavailable) as caught:
+        rendering.require_display()
+    assert str(caught.value) == 'The display :77 cannot be opened. Check it, or use render_mode="rgb_array".'

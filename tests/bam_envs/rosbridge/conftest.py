@@ -1,0 +1,274 @@
+"""A small rosbridge server that does what a test tells it, also what no server should do."""
+
+import asyncio
+import datetime
+import ipaddress
+import json
+import socket
+import ssl
+import threading
+import time
+from http import HTTPStatus
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from websockets.asyncio.server import serve
+from websockets.exceptions import ConnectionClosed
+
+DEADLINE = 10.0
+
+
+class ScriptedServer:
+    """Keeps every frame it gets; answers requests from a table; misbehaves on request.
+
+    Args:
+        context: TLS settings.
+        status: HTTP status with which it refuses each connection, if any.
+        port: Where it listens; 0: anywhere.
+    """
+
+    def __init__(self, context=None, status=None, port=0):
+        self.frames = []
+        """Every message of every client, in order."""
+        self.headers = []
+        """HTTP path and authorization of each client."""
+        self.responses = {"/rosapi/get_time": lambda args: {"time": {"sec": 1000, "nanosec": 500_000_000}}}
+        """By service: a function of the arguments. A text it returns is the text of a failure; None: no answer."""
+        self.port = port
+        self.connected = 0
+        self._context, self._status = context, status
+        self._changed = threading.Condition()
+        self._connections = set()
+        self._loop = self._server = self._thread = None
+
+    @property
+    def url(self):
+        return f"{'wss' if self._context else 'ws'}://127.0.0.1:{self.port}"
+
+    def start(self):
+        started = threading.Event()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._run(started)), name="scripted-server")
+        self._thread.start()
+        assert started.wait(DEADLINE)
+        return self
+
+    def stop(self, code=1001):
+        if self._thread.is_alive():
+            self._loop.call_soon_threadsafe(self._stop.set)
+            self._thread.join(DEADLINE)
+        assert not self._thread.is_alive()
+
+    def send(self, *messages):
+        """Send dicts as JSON, text and bytes as they are, to every client."""
+        for message in messages:
+            data = json.dumps(message) if isinstance(message, dict) else message
+            asyncio.run_coroutine_threadsafe(self._send(data), self._loop).result(DEADLINE)
+
+    def drop(self):
+        """Cut every TCP connection, without a closing handshake."""
+        self._on_each(lambda connection: connection.transport.abort())
+
+    def freeze(self):
+        """Neither read nor answer, as a stopped process does."""
+        self._on_each(lambda connection: connection.transport.pause_reading())
+
+    def wait_for(self, op, count=1):
+        """The messages with this `op`, once there are `count` of them."""
+        with self._changed:
+            assert self._changed.wait_for(lambda: len(self.of(op)) >= count, DEADLINE), self.frames
+            return self.of(op)
+
+    def wait_connected(self, count):
+        """Wait until so many clients are connected now."""
+        with self._changed:
+            assert self._changed.wait_for(lambda: self.connected == count, DEADLINE), self.connected
+
+    def of(self, op):
+        return [frame for frame in self.frames if frame["op"] == op]
+
+    def _on_each(self, action):
+        done = threading.Event()
+
+        def act():
+            for connection in self._connections:
+                action(connection)
+            done.set()
+
+        self._loop.call_soon_threadsafe(act)
+        assert done.wait(DEADLINE)
+
+    async def _run(self, started):
+        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
+        settings = {"ssl": self._context, "process_request": self._greet, "compression": None, "ping_interval": None}
+        async with serve(self._serve, "127.0.0.1", self.port, max_size=None, close_timeout=0.5, **settings) as server:
+            self.port = server.sockets[0].getsockname()[1]
+            started.set()
+            await self._stop.wait()
+
+    def _greet(self, connection, request):
+        self.headers.append((request.path, request.headers.get("Authorization")))
+        return None if self._status is None else connection.respond(HTTPStatus(self._status), "no")
+
+    async def _serve(self, connection):
+        self._count(connection, 1)
+        try:
+            async for text in connection:
+                await self._take(connection, json.loads(text))
+        except ConnectionClosed:
+            pass
+        finally:
+            self._count(connection, -1)
+
+    async def _take(self, connection, frame):
+        with self._changed:
+            self.frames.append(frame)
+            self._changed.notify_all()
+        if frame["op"] == "call_service":
+            await self._answer(connection, frame)
+
+    async def _answer(self, connection, frame):
+        respond = self.responses.get(frame["service"], lambda args: f"Service {frame['service']} does not exist")
+        values = respond(frame["args"])
+        if values is not None:
+            head = {"op": "service_response", "id": frame["id"], "service": frame["service"]}
+            await connection.send(json.dumps({**head, "values": values, "result": not isinstance(values, str)}))
+
+    async def _send(self, data):
+        for connection in set(self._connections):
+            await connection.send(data)
+
+    def _count(self, connection, change):
+        with self._changed:
+            self.connected += change
+            (self._connections.add if change > 0 else self._connections.discard)(connection)
+            self._changed.notify_all()
+
+
+class Heard:
+    """A listener that keeps what it hears."""
+
+    def __init__(self):
+        self.messages = []
+        self._changed = threading.Condition()
+
+    def __call__(self, message, caller=None):
+        with self._changed:
+            self.messages.append(message)
+            self._changed.notify_all()
+
+    def wait(self, count=1):
+        with self._changed:
+            assert self._changed.wait_for(lambda: len(self.messages) >= count, DEADLINE), self.messages
+            return self.messages
+
+
+@pytest.fixture
+def heard():
+    return Heard()
+
+
+@pytest.fixture
+def new_heard():
+    return Heard
+
+
+@pytest.fixture
+def scripted():
+    """A running `ScriptedServer`."""
+    server = ScriptedServer().start()
+    yield server
+    server.stop()
+
+
+@pytest.fixture
+def new_scripted():
+    """Make `ScriptedServer`s; they are stopped at the end."""
+    made = []
+
+    def make(**options):
+        made.append(ScriptedServer(**options).start())
+        return made[-1]
+
+    yield make
+    for server in made:
+        server.stop()
+
+
+@pytest.fixture
+def new_link():
+    """Make a connected `RosbridgeLink`; closed at the end."""
+    from bam_envs.rosbridge.link.link import RosbridgeLink
+
+    made = []
+
+    def make(server, connect=True, **options):
+        url = server if isinstance(server, str) else server.url
+        made.append(RosbridgeLink(url, **options))
+        if connect:
+            made[-1].connect()
+        return made[-1]
+
+    yield make
+    for link in made:
+        link.close()
+
+
+@pytest.fixture
+def link(scripted, new_link):
+    """A link to `scripted`."""
+    return new_link(scripted)
+
+
+@pytest.fixture
+def free_port():
+    """A port at which nothing listens."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        return taken.getsockname()[1]
+
+
+@pytest.fixture(scope="session")
+def certificates(tmp_path_factory):
+    """Make a self-signed certificate for some hosts: its file, and the TLS settings of a server that has it."""
+
+    def make(*hosts):
+        directory = tmp_path_factory.mktemp("tls")
+        key = ec.generate_private_key(ec.SECP256R1())
+        (directory / "cert.pem").write_bytes(_certificate(key, hosts).public_bytes(serialization.Encoding.PEM))
+        (directory / "key.pem").write_bytes(
+            key.private_bytes(
+                serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+            )
+        )
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.load_cert_chain(directory / "cert.pem", directory / "key.pem")
+        return str(directory / "cert.pem"), context
+
+    return make
+
+
+def _certificate(key, hosts):
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, hosts[0])])
+    now = datetime.datetime.now(datetime.timezone.utc)
+    names = [x509.IPAddress(ipaddress.ip_address(one)) if one[0].isdigit() else x509.DNSName(one) for one in hosts]
+    builder = x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
+    builder = builder.not_valid_before(now - datetime.timedelta(days=1)).not_valid_after(
+        now + datetime.timedelta(days=1)
+    )
+    builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
+    builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=None), critical=True)
+    return builder.sign(key, hashes.SHA256())
+
+
+@pytest.fixture
+def until():
+    """Wait for something that tells nobody when it happens, such as the end of a thread."""
+
+    def wait(condition, timeout=DEADLINE):
+        end = time.monotonic() + timeout
+        while not condition():
+            assert time.monotonic() < end, condition
+            time.sleep(0.005)
+
+    return wait

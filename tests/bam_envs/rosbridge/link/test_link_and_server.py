@@ -1,0 +1,168 @@
+"""`RosbridgeLink` and `CborStream` on the embedded server: both ends are ours."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, NotInCommand, RemoteError
+from bam_envs.rosbridge.link.cbor_stream import CborStream
+from bam_envs.rosbridge.link.link import RosbridgeLink
+from bam_envs.rosbridge.server.server import BridgeServer
+
+STRING = "std_msgs/String"
+
+
+@pytest.fixture
+def server():
+    with BridgeServer(port=0) as running:
+        yield running
+
+
+def test_what_it_is_found_out_at_connect(server, new_link):
+    link = new_link(server)
+    assert (link.is_up, link.ros, abs(link.clock_offset) < 0.5) == (True, "ros2", True)
+
+
+def test_a_message_goes_there_and_back(server, new_link, heard):
+    server.advertise("/pong", STRING)
+    server.subscribe("/ping", STRING, lambda message, caller: server.publish("/pong", message))
+    link = new_link(server)
+    link.subscribe("/pong", STRING, heard)
+    link.advertise("/ping", STRING)
+    link.publish("/ping", {"data": "hello"})
+    assert heard.wait() == [{"data": "hello"}]
+
+
+def test_two_links_talk_through_it(server, new_link, heard):
+    link, other = new_link(server), new_link(server)
+    link.subscribe("/ping", STRING, heard)
+    link.call("/rosapi/get_time", "rosapi/GetTime", {}, 5.0)
+    other.advertise("/ping", STRING)
+    other.publish("/ping", {"data": "hello"})
+    assert heard.wait() == [{"data": "hello"}]
+
+
+def test_a_service_is_called(server, new_link):
+    server.serve("/act", "std_srvs/SetBool", lambda request, caller: {"success": request["data"], "message": "done"})
+    link = new_link(server)
+    assert link.call("/act", "std_srvs/SetBool", {"data": True}, 5.0) == {"success": True, "message": "done"}
+    with pytest.raises(RemoteError):
+        link.call("/act", "std_srvs/SetBool", {"data": "yes"}, 5.0)
+    with pytest.raises(RemoteError):
+        link.call("/nope", "std_srvs/SetBool", {"data": True}, 5.0)
+
+
+def test_a_service_of_one_link_is_called_by_another(server, new_link):
+    provider, caller = new_link(server), new_link(server)
+    provider.serve("/act", "std_srvs/Trigger", lambda request, caller: {"success": True, "message": "from the link"})
+    provider.call("/rosapi/get_time", "rosapi/GetTime", {}, 5.0)
+    assert caller.call("/act", "std_srvs/Trigger", {}, 5.0) == {"success": True, "message": "from the link"}
+    provider.close()
+    with pytest.raises(RemoteError):
+        caller.call("/act", "std_srvs/Trigger", {}, 5.0)
+
+
+def test_a_refused_message_is_a_status(server, new_link, heard):
+    def refuse(message, caller):
+        raise NotInCommand("another client is in command")
+
+    server.subscribe("/cmd", STRING, refuse)
+    link = new_link(server)
+    link.on_status(heard)
+    link.advertise("/cmd", STRING)
+    link.publish("/cmd", {"data": "go"})
+    assert "another client is in command" in heard.wait()[0]["msg"]
+
+
+def test_a_stopped_server_is_a_lost_link(server, new_link):
+    link, lost = new_link(server), threading.Event()
+    link.on_down(lambda reason: lost.set())
+    link.advertise("/cmd", STRING)
+    server.close()
+    assert lost.wait(10.0)
+    with pytest.raises(LinkLost, match=r"the server closed it with code 1001"):
+        link.publish("/cmd", {"data": "late"})
+
+
+def test_the_token_is_needed():
+    with BridgeServer(port=0, token="secret") as server:
+        link = RosbridgeLink(server.url, token="secret")
+        link.connect()
+        link.close()
+        for wrong in (None, "wrong"):
+            with pytest.raises(NoServer, match=r"the token was refused \(HTTP 40[13]\)"):
+                RosbridgeLink(server.url, token=wrong).connect()
+
+
+def test_tls(certificates, new_link, tmp_path):
+    cert, _ = certificates("127.0.0.1")
+    with BridgeServer(port=0, cert=cert, key=cert.replace("cert.pem", "key.pem")) as server:
+        assert new_link(server, ca_file=cert).is_up
+        with pytest.raises(NoServer, match=r"the certificate is not trusted: self-signed certificate\."):
+            new_link(server)
+
+
+@pytest.mark.parametrize(
+    ("kind", "message", "name"),
+    [
+        ("sensor_msgs/LaserScan", {"ranges": [1.0, 2.5]}, "ranges"),
+        ("sensor_msgs/Image", {"data": bytes(range(256)), "width": 16, "height": 16}, "data"),
+    ],
+)
+def test_arrays_come_in_cbor(server, heard, kind, message, name):
+    server.advertise("/large", kind, latch=True)
+    server.publish("/large", message)
+    stream = CborStream(server.url, "/large", kind, heard)
+    stream.start()
+    found = heard.wait()[0].message[name]
+    stream.close()
+    assert (found.tolist() if isinstance(found, np.ndarray) else found) == message[name]
+
+
+def test_many_messages_a_second_come_in_order(server, new_link, heard):
+    server.advertise("/count", "std_msgs/Int32")
+    link = new_link(server)
+    link.subscribe("/count", "std_msgs/Int32", heard)
+    link.call("/rosapi/get_time", "rosapi/GetTime", {}, 5.0)
+    for number in range(1000):
+        server.publish("/count", {"data": number})
+    assert [message["data"] for message in heard.wait(1000)] == list(range(1000))
+
+
+def test_several_messages_with_one_hand_over(server, new_link, heard):
+    for topic in ("/a", "/b"):
+        server.subscribe(topic, STRING, heard)
+    link = new_link(server)
+    for topic in ("/a", "/b"):
+        link.advertise(topic, STRING)
+    for bad, text in (({"data": float("nan")}, "NaN"), (("/c", {}), "advertise")):
+        second = bad if isinstance(bad, tuple) else ("/b", bad)
+        with pytest.raises(InvalidValue, match=text):
+            link.publish_all([("/a", {"data": "nothing of it"}), second])
+    link.publish_all([("/a", {"data": "1"}), ("/b", {"data": "2"}), ("/a", {"data": "3"})])
+    assert heard.wait(3) == [{"data": "1"}, {"data": "2"}, {"data": "3"}]
+
+
+def test_what_is_not_waited_for_comes_in_order_too(server, new_link, heard, new_heard):
+    server.subscribe("/a", STRING, heard)
+    link, refused = new_link(server), new_heard()
+    link.advertise("/a", STRING)
+    link.begin_publishing([("/a", {"data": "1"}), ("/a", {"data": "2"})], refused)
+    link.publish("/a", {"data": "3"})
+    assert heard.wait(3) == [{"data": "1"}, {"data": "2"}, {"data": "3"}]
+    assert refused.messages == []
+
+
+def test_a_listener_answers_before_what_comes_next(server, new_link, heard):
+    server.advertise("/pong", STRING)
+
+    def answer(message, caller):
+        server.publish_all([("/pong", message), ("/pong", {"data": "and"})])
+
+    server.subscribe("/ping", STRING, answer)
+    link = new_link(server)
+    link.subscribe("/pong", STRING, heard)
+    link.advertise("/ping", STRING)
+    link.publish_all([("/ping", {"data": "1"}), ("/ping", {"data": "2"})])
+    assert [message["data"] for message in heard.wait(4)] == ["1", "and", "2", "and"]

@@ -1,0 +1,538 @@
+"""`RosbridgeLink` when the server, the network or a message fails."""
+
+import contextlib
+import json
+import logging
+import threading
+
+import pytest
+
+from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, ProtocolError
+from bam_envs.rosbridge.link import keeper
+from bam_envs.rosbridge.link.link import RosbridgeLink
+
+STRING = "std_msgs/String"
+
+
+@pytest.fixture
+def lost(link):
+    """Set when `link` goes down; holds the reasons."""
+    event = threading.Event()
+    event.reasons = []
+    link.on_down(lambda reason: (event.reasons.append(str(reason)), event.set()))
+    return event
+
+
+def _restart(server, link):
+    epoch = link.epoch
+    server.stop()
+    server.start()
+    link.wait_up(10.0)
+    assert link.epoch == epoch + 1
+
+
+def test_nothing_from_before_a_cut_is_sent_after_it(scripted, link, lost):
+    link.advertise("/cmd", "std_msgs/Int32")
+    link.publish("/cmd", {"data": -1})
+    scripted.wait_for("publish")
+    scripted.stop()
+    assert lost.wait(10.0)
+    for number in range(50):
+        with pytest.raises(LinkLost):
+            link.publish("/cmd", {"data": number})
+    scripted.start()
+    link.wait_up(10.0)
+    link.publish("/cmd", {"data": 50})
+    scripted.wait_for("publish", 2)
+    assert [frame["msg"]["data"] for frame in scripted.of("publish")] == [-1, 50]
+
+
+def test_publishing_through_a_cut_loses_messages_and_delays_none(scripted, link):
+    link.advertise("/cmd", "std_msgs/Int32")
+    sent, stop, refused = [], threading.Event(), threading.Event()
+
+    def publish():
+        number = 0
+        while not stop.is_set():
+            number += 1
+            try:
+                link.publish("/cmd", {"data": number, "epoch": link.epoch})
+                sent.append(number)
+            except LinkLost:
+                refused.set()
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        for cut in range(1, 4):
+            scripted.wait_for("publish", 20)
+            refused.clear()
+            scripted.drop()
+            assert refused.wait(10.0)
+            link.wait_up(10.0)
+            scripted.wait_for("publish", len(scripted.of("publish")) + 5)
+            assert link.epoch == cut + 1
+    finally:
+        stop.set()
+        thread.join()
+    arrived = [frame["msg"] for frame in scripted.of("publish")]
+    assert [message["data"] for message in arrived] == sorted(message["data"] for message in arrived)
+    assert {message["data"] for message in arrived} <= set(sent)
+    assert [message["epoch"] for message in arrived] == sorted(message["epoch"] for message in arrived)
+
+
+def test_a_call_while_the_link_is_down_is_never_made(scripted, link, lost):
+    scripted.stop()
+    assert lost.wait(10.0)
+    with pytest.raises(LinkLost) as raised:
+        link.call("/step", "std_srvs/Trigger", {}, 5.0)
+    assert str(raised.value).startswith(f"{scripted.url}: the link is down (")
+    assert str(raised.value).endswith("). Nothing was sent, and nothing is kept.")
+    assert str(raised.value).count(scripted.url) == 1
+    scripted.start()
+    link.wait_up(10.0)
+    link.advertise("/last", STRING)
+    scripted.wait_for("advertise")
+    assert {frame["service"] for frame in scripted.of("call_service")} == {"/rosapi/get_time"}
+
+
+def test_a_call_that_timed_out_is_not_made_again_after_a_cut(scripted, link):
+    scripted.responses["/step"] = lambda args: None
+    with pytest.raises(LinkLost, match=r"did not answer in 0\.05 s"):
+        link.call("/step", "std_srvs/Trigger", {}, 0.05)
+    _restart(scripted, link)
+    link.advertise("/last", STRING)
+    scripted.wait_for("advertise")
+    assert [frame["service"] for frame in scripted.of("call_service")].count("/step") == 1
+
+
+def test_a_pending_call_fails_at_once_when_the_link_drops(scripted, link):
+    scripted.responses["/step"] = lambda args: scripted._loop.call_soon(scripted.cut) and None
+    scripted.cut = lambda: [connection.transport.abort() for connection in scripted._connections]
+    with pytest.raises(LinkLost) as raised:
+        link.call("/step", "std_srvs/Trigger", {}, 60.0)
+    assert str(raised.value).startswith(f"{scripted.url}: the link dropped: ")
+
+
+def test_a_pending_call_fails_at_once_when_the_server_says_goodbye(scripted, link):
+    def leave(args):
+        scripted._loop.call_soon(scripted._stop.set)
+
+    scripted.responses["/step"] = leave
+    with pytest.raises(LinkLost) as raised:
+        link.call("/step", "std_srvs/Trigger", {}, 60.0)
+    assert str(raised.value) == f"{scripted.url}: the link dropped: the server closed it with code 1001."
+
+
+def test_a_pending_call_fails_at_once_when_the_link_is_closed(scripted, link, lost):
+    scripted.responses["/step"] = lambda args: threading.Thread(target=link.close).start()
+    with pytest.raises(LinkLost) as raised:
+        link.call("/step", "std_srvs/Trigger", {}, 60.0)
+    assert str(raised.value) == f"{scripted.url}: the link was closed."
+    scripted.wait_connected(0)
+    assert lost.reasons == []
+
+
+def test_a_new_connection_is_told_everything_again(scripted, link, heard):
+    link.advertise("/cmd", STRING, latch=True)
+    link.serve("/act", "std_srvs/Trigger", lambda request, caller: {})
+    link.subscribe("/pong", STRING, heard, throttle_ms=5)
+    leave = link.subscribe("/gone", STRING, heard)
+    leave()
+    scripted.wait_for("unsubscribe")
+    before = [frame for frame in scripted.frames if frame.get("topic") != "/gone" and frame["op"] != "call_service"]
+    scripted.frames.clear()
+    _restart(scripted, link)
+    scripted.wait_for("subscribe")
+    again = [frame for frame in scripted.frames if frame["op"] != "call_service"]
+    assert sorted(again, key=json.dumps) == sorted(before, key=json.dumps)
+    scripted.send({"op": "publish", "topic": "/pong", "msg": {"data": "after"}})
+    assert heard.wait() == [{"data": "after"}]
+
+
+def test_what_is_declared_while_the_link_is_down_is_told_when_it_is_up(scripted, link, lost, heard):
+    scripted.stop()
+    assert lost.wait(10.0)
+    link.advertise("/cmd", STRING)
+    link.subscribe("/pong", STRING, heard)
+    scripted.start()
+    link.wait_up(10.0)
+    assert len(scripted.wait_for("subscribe")) == len(scripted.wait_for("advertise")) == 1
+
+
+def test_what_is_declared_before_connecting_is_told_once(scripted, new_link, heard):
+    link = new_link(scripted, connect=False)
+    link.advertise("/cmd", STRING)
+    link.subscribe("/pong", STRING, heard)
+    link.connect()
+    link.publish("/cmd", {"data": "1"})
+    scripted.wait_for("publish")
+    assert [frame["op"] for frame in scripted.frames[-3:]] == ["advertise", "subscribe", "publish"]
+
+
+def test_connect_waits_for_a_server_that_still_starts(new_link, new_scripted, free_port):
+    link = new_link(f"ws://127.0.0.1:{free_port}", connect=False, connect_timeout=10.0)
+    connecting = threading.Thread(target=link.connect)
+    connecting.start()
+    server = new_scripted(port=free_port)
+    connecting.join()
+    assert (link.is_up, server.connected) == (True, 1)
+
+
+def test_connect_can_be_tried_again(new_link, new_scripted, free_port):
+    link = new_link(f"ws://127.0.0.1:{free_port}", connect=False, connect_timeout=0.1)
+    with pytest.raises(NoServer):
+        link.connect()
+    new_scripted(port=free_port)
+    link.connect()
+    link.connect()
+    assert (link.is_up, link.epoch) == (True, 1)
+
+
+def test_connecting_again_waits_for_the_link(scripted, new_link):
+    link, lost = new_link(scripted, connect_timeout=0.2), threading.Event()
+    link.on_down(lambda reason: lost.set())
+    scripted.stop()
+    assert lost.wait(10.0)
+    with pytest.raises(LinkLost, match=r"^ws://127\.0\.0\.1:\d+: the link is down \("):
+        link.connect()
+    scripted.start()
+    link.wait_up(10.0)
+    link.connect()
+    assert link.epoch == 2
+
+
+def test_a_link_can_be_closed_while_it_connects(new_link, free_port, heard):
+    link = new_link(f"ws://127.0.0.1:{free_port}", connect=False, connect_timeout=60.0)
+
+    def connect():
+        with pytest.raises(LinkLost) as raised:
+            link.connect()
+        heard(str(raised.value))
+
+    connecting = threading.Thread(target=connect)
+    connecting.start()
+    link.close()
+    connecting.join()
+    assert heard.messages == [f"ws://127.0.0.1:{free_port}: this link was closed. Make a new one."]
+
+
+def test_before_connect_nothing_can_be_sent(scripted, new_link):
+    link = new_link(scripted, connect=False)
+    link.advertise("/cmd", STRING)
+    with pytest.raises(LinkLost) as raised:
+        link.publish("/cmd", {})
+    expected = (
+        f"{scripted.url}: the link is down (not connected yet: call connect()). Nothing was sent, and nothing is kept."
+    )
+    assert str(raised.value) == expected
+
+
+def test_waiting_for_a_link_that_stays_down_ends(scripted, new_link):
+    with pytest.raises(LinkLost) as raised:
+        new_link(scripted, connect=False).wait_up(0.01)
+    assert str(raised.value) == f"{scripted.url}: the link is down (not connected yet: call connect())."
+
+
+def test_a_server_that_does_not_read_gets_nothing_more(scripted, link):
+    link.advertise("/cmd", STRING)
+    scripted.freeze()
+
+    def fill():
+        for _ in range(100):
+            link.publish("/cmd", {"data": "x" * 1_000_000})
+
+    with pytest.raises(LinkLost) as raised:
+        fill()
+    assert str(raised.value) == f"{scripted.url}: the server does not read what it is sent. Nothing more was sent."
+
+
+def test_an_answer_that_cannot_be_sent_does_not_end_the_link(scripted, link, heard):
+    link.advertise("/cmd", STRING)
+    link.subscribe("/pong", STRING, heard)
+    scripted.wait_for("subscribe")
+    scripted.freeze()
+    with contextlib.suppress(LinkLost):  # until no more can be sent
+        for _ in range(100):
+            link.publish("/cmd", {"data": "x" * 1_000_000})
+    scripted.send({"op": "call_service", "id": "call:7", "service": "/nope", "args": {}})
+    scripted.send({"op": "publish", "topic": "/pong", "msg": {"data": "1"}})
+    assert heard.wait() == [{"data": "1"}]
+    assert link.is_up
+
+
+def test_connecting_that_was_given_up_makes_no_connection_later(scripted, link, new_link, heard, monkeypatch):
+    monkeypatch.setattr(keeper, "_LEAVE_WITHIN", 0.1)
+    entered, leave = threading.Event(), threading.Event()
+
+    def hold(message, caller):
+        entered.set()
+        leave.wait(10.0)
+
+    link.subscribe("/hold", STRING, hold)
+    scripted.wait_for("subscribe")
+    scripted.send({"op": "publish", "topic": "/hold", "msg": {}})
+    assert entered.wait(10.0)
+    other = new_link(scripted, connect=False, connect_timeout=0.1)
+    other.subscribe("/pong", STRING, heard)
+    with pytest.raises(LinkLost, match=r"the network thread took nothing for 0\.2 s"):
+        other.connect()
+    leave.set()
+    other.connect()
+    assert (other.epoch, scripted.connected) == (1, 2)
+
+
+def test_a_server_that_freezes_is_lost_within_a_second(scripted, link, lost):
+    scripted.responses["/step"] = lambda args: scripted._loop.call_soon(scripted.halt) and None
+    scripted.halt = lambda: [connection.transport.pause_reading() for connection in scripted._connections]
+    link.heartbeat(every=0.2, lost_after=1.0)
+    with pytest.raises(LinkLost) as raised:
+        link.call("/step", "std_srvs/Trigger", {}, 60.0)
+    assert str(raised.value) == f"{scripted.url}: nothing from the server for 1 s."
+    assert lost.reasons == [str(raised.value)]
+
+
+def test_a_server_that_is_alive_is_not_lost(scripted, link, lost):
+    link.heartbeat(every=0.05, lost_after=0.4)
+    assert not lost.wait(0.6)
+    assert (link.is_up, link.epoch, link.last_answer_age < 0.4) == (True, 1, True)
+
+
+def test_a_link_is_not_lost_because_this_process_stood_still(scripted, link, lost, heard):
+    link.heartbeat(every=0.02, lost_after=0.1)
+    link.subscribe("/pong", STRING, lambda message, caller: (threading.Event().wait(0.3), heard(message)))
+    scripted.wait_for("subscribe")
+    scripted.send({"op": "publish", "topic": "/pong", "msg": {}})
+    heard.wait()
+    assert link.call("/rosapi/get_time", "rosapi/GetTime", {}, 5.0)["time"]["sec"] == 1000
+    assert (link.epoch, lost.reasons) == (1, [])
+
+
+def test_a_frozen_server_is_connected_again_when_it_is_back(scripted, new_link, until):
+    link = new_link(scripted)
+    link.heartbeat(every=0.02, lost_after=0.1)
+    scripted.freeze()
+    until(lambda: link.epoch == 2)
+    link.wait_up(10.0)
+
+
+@pytest.mark.parametrize(("every", "lost_after"), [(0.0, 1.0), (1.0, 1.0), (-1.0, 1.0)])
+def test_a_heartbeat_that_cannot_be_is_refused(new_link, scripted, every, lost_after):
+    with pytest.raises(InvalidValue) as raised:
+        new_link(scripted, connect=False).heartbeat(every, lost_after)
+    expected = f"Heartbeat: every {every} s, lost_after {lost_after} s. Expected 0 < every < lost_after."
+    assert str(raised.value) == expected
+
+
+def test_a_message_above_the_limit_ends_the_connection_with_its_own_text(scripted, new_link):
+    link = new_link(scripted, max_message=10_000)
+    scripted.responses["/image"] = lambda args: {"data": "x" * 10_000}
+    with pytest.raises(ProtocolError) as raised:
+        link.call("/image", "std_srvs/Trigger", {}, 60.0)
+    assert str(raised.value) == (
+        f"{scripted.url}: the server sent a message above the limit of 10000 bytes. "
+        "Take compressed images, or raise max_message."
+    )
+
+
+def test_a_message_above_the_limit_is_not_sent(scripted, new_link):
+    link = new_link(scripted, max_message=10_000)
+    link.advertise("/image", STRING)
+    with pytest.raises(InvalidValue) as raised:
+        link.publish("/image", {"data": "x" * 10_000})
+    assert str(raised.value) == (
+        f"{scripted.url}: a message of 10051 bytes is above the limit of 10000; nothing was sent. "
+        "Send less at once, or raise max_message on both ends."
+    )
+    link.publish("/image", {"data": "x" * 9_000})
+    scripted.wait_for("publish")
+
+
+def test_fragments_are_joined_whatever_the_server_calls_their_number(scripted, link):
+    whole = json.dumps({"op": "service_response", "id": "call:1", "service": "/a", "values": {"n": 7}, "result": True})
+    parts = [whole[at : at + 20] for at in range(0, len(whole), 20)]
+
+    def answer_in_fragments(args):
+        for number in (1, 0, *range(2, len(parts))):
+            part = {"op": "fragment", "id": "f", "data": parts[number], "num": number, "total": len(parts) + 0.52}
+            scripted._loop.create_task(scripted._send(json.dumps(part)))
+
+    scripted.responses["/a"] = answer_in_fragments
+    assert link.call("/a", "std_srvs/Trigger", {}, 10.0) == {"n": 7}
+
+
+@pytest.mark.parametrize(
+    ("bad", "text"),
+    [
+        (b"\x00\x01\x02", "a binary message of 3 bytes, which nobody asked for"),
+        ("{", "expected a JSON object, found b'{': Expecting property name enclosed in double quotes"),
+        ("[1, 2]", "expected a JSON object, found b'[1, 2]'"),
+        ('{"op": "dance"}', "a message with op 'dance'"),
+        ('{"op": "publish", "topic": "/pong", "msg": 3}', "a published message has topic '/pong' and msg 3"),
+        ('{"op": "fragment", "id": "f", "num": 2, "total": 1, "data": ""}', "Fragment 2 of 1 of 'f' does not fit"),
+    ],
+)
+def test_nonsense_is_logged_and_the_link_stays_up(scripted, link, heard, caplog, bad, text):
+    link.subscribe("/pong", STRING, heard)
+    scripted.wait_for("subscribe")
+    with caplog.at_level(logging.INFO):
+        scripted.send(bad, {"op": "publish", "topic": "/pong", "msg": {"data": "1"}})
+        assert heard.wait() == [{"data": "1"}]
+    start = f"{scripted.url}: passed over: {text}"
+    said = [record for record in caplog.records if record.name.startswith("bam_envs.")]
+    assert [(record.levelname, record.getMessage()[: len(start)]) for record in said] == [("INFO", start)]
+
+
+@pytest.mark.parametrize("bad", [b"\x00", "nonsense", '{"op": "dance"}', "{}" * 100])
+def test_a_server_that_sends_nothing_but_nonsense_is_left_with_one_text(scripted, link, caplog, bad):
+    lost, down = threading.Event(), []
+    link.on_down(lambda error: (down.append(str(error)), lost.set()))
+    scripted.send(*[bad] * 20)
+    assert lost.wait(10.0)
+    assert down[0].startswith(f"{scripted.url}: the server sends what is no rosbridge message, 20 times by now: ")
+    assert down[0].endswith(". Is it the right port?")
+    assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
+
+
+def test_no_message_ends_the_link(scripted, link, heard, monkeypatch):
+    monkeypatch.setattr("bam_envs.rosbridge.link.connection._MOST_PASSED_OVER", 10**6)
+    link.subscribe("/pong", STRING, heard)
+    scripted.wait_for("subscribe")
+    values = [None, True, 7, 1e300, "x", [], {}, [{}], {"id": {}}]
+    names = ["publish", "service_response", "call_service", "status", "fragment", "png", 3, None, [], {}]
+    fields = ["id", "topic", "msg", "service", "args", "values", "result", "level", "num", "total", "data"]
+    for name in names:
+        for value in values:
+            scripted.send({"op": name, **dict.fromkeys(fields, value)})
+            scripted.send({"op": name, "topic": "/pong", "service": "/x", "num": 0, "total": value, "data": "{"})
+    scripted.send(b"\xff" * 100, "[" * 100_000, '{"op": "publish", "n": ' + "9" * 5000 + "}")
+    scripted.send({"op": "publish", "topic": "/pong", "msg": {"data": "last"}})
+    heard.wait()
+    assert (heard.messages[-1], link.epoch, link.is_up) == ({"data": "last"}, 1, True)
+
+
+def test_null_and_the_numbers_that_json_does_not_have_are_none(scripted, link, heard):
+    link.subscribe("/pong", "std_msgs/Float64MultiArray", heard)
+    scripted.wait_for("subscribe")
+    scripted.send('{"op": "publish", "topic": "/pong", "msg": {"data": [1.5, null, NaN, Infinity, -Infinity]}}')
+    assert heard.wait() == [{"data": [1.5, None, None, None, None]}]
+
+
+def test_statuses_are_kept_and_told(scripted, link, heard, caplog):
+    def fail(status):
+        raise KeyError("bad callback")
+
+    link.on_status(fail)
+    link.on_status(heard)
+    status = {"op": "status", "level": "error", "msg": "type mismatch on /cmd", "id": "advertise:/cmd"}
+    scripted.send(status)
+    assert heard.wait() == [status] == list(link.statuses)
+    assert [record.getMessage() for record in caplog.records] == ["a callback of a link failed"]
+    scripted.send(*({**status, "id": str(number)} for number in range(25)))
+    heard.wait(26)
+    assert [kept["id"] for kept in link.statuses] == [str(number) for number in range(5, 25)]
+
+
+def test_close_leaves_nothing_behind(scripted, new_link, until):
+    before = set(threading.enumerate())
+    link = new_link(scripted)
+    link.advertise("/cmd", STRING)
+    link.serve("/act", "std_srvs/Trigger", lambda request, caller: {})
+    scripted.wait_for("advertise_service")
+    link.close()
+    assert [frame["op"] for frame in scripted.wait_for("unadvertise")] == ["unadvertise"]
+    assert scripted.of("unadvertise_service") == [{"op": "unadvertise_service", "service": "/act"}]
+    scripted.wait_connected(0)
+    until(lambda: {thread.name for thread in set(threading.enumerate()) - before} <= {"roslibpy-asyncio"})
+    assert not link.is_up
+    link.close()
+
+
+def test_a_closed_link_stays_closed(scripted, link):
+    link.advertise("/cmd", STRING)
+    link.close()
+    with pytest.raises(LinkLost) as raised:
+        link.publish("/cmd", {})
+    expected = (
+        f"{scripted.url}: the link is down (it was closed; make a new one). Nothing was sent, and nothing is kept."
+    )
+    assert str(raised.value) == expected
+    with pytest.raises(LinkLost, match=r"this link was closed\. Make a new one\.$"):
+        link.connect()
+    with pytest.raises(LinkLost, match="it was closed; make a new one"):
+        link.wait_up(60.0)
+
+
+def test_a_link_can_be_closed_while_it_connects_again(scripted, link, lost):
+    scripted.stop()
+    assert lost.wait(10.0)
+    link.close()
+    scripted.start()
+    new = RosbridgeLink(scripted.url)
+    new.connect()
+    new.close()
+    assert len(scripted.headers) == 2
+
+
+def test_a_listener_may_close_the_link(scripted, link, heard):
+    link.subscribe("/pong", STRING, lambda message, caller: (link.close(), heard(message)))
+    scripted.wait_for("subscribe")
+    scripted.send({"op": "publish", "topic": "/pong", "msg": {"data": "1"}})
+    heard.wait()
+    scripted.wait_connected(0)
+
+
+def test_a_held_up_network_thread_sends_nothing_late(scripted, link):
+    link.advertise("/cmd", STRING)
+    entered, leave = threading.Event(), threading.Event()
+
+    def hold(message, caller):
+        entered.set()
+        leave.wait(10.0)
+
+    link.subscribe("/pong", STRING, hold)
+    scripted.wait_for("subscribe")
+    scripted.send({"op": "publish", "topic": "/pong", "msg": {}})
+    assert entered.wait(10.0)
+    with pytest.raises(LinkLost) as raised:
+        link.publish("/cmd", {"data": "late"})
+    leave.set()
+    assert str(raised.value) == (
+        "The network thread took nothing for 0.5 s; nothing was sent. "
+        "A listener must return at once: do work in another thread."
+    )
+    link.publish("/cmd", {"data": "now"})
+    assert [frame["msg"] for frame in scripted.wait_for("publish")] == [{"data": "now"}]
+
+
+def test_who_does_not_wait_hears_what_was_not_sent(scripted, new_link, heard):
+    link = new_link(scripted, max_message=4096)
+    link.advertise("/large", STRING)
+    link.begin_publishing([("/large", {"data": "small"}), ("/large", {"data": "x" * 5000})], heard)
+    (error,) = {str(one) for one in heard.wait(2)}
+    assert error.startswith(f"{scripted.url}: a message of 50")
+    assert "is above the limit of 4096; nothing was sent." in error
+    link.publish("/large", {"data": "last"})
+    assert [frame["msg"]["data"] for frame in scripted.wait_for("publish")] == ["last"]
+
+
+def test_what_is_taken_back_in_time_is_never_sent(scripted, link, heard):
+    link.advertise("/cmd", STRING)
+    busy, go_on = threading.Event(), threading.Event()
+    link._keeper.post(lambda: (busy.set(), go_on.wait(10.0)))
+    assert busy.wait(10.0)
+    take_back = link.begin_publishing([("/cmd", {"data": "1"}), ("/cmd", {"data": "2"})], heard)
+    take_back()
+    go_on.set()
+    link.publish("/cmd", {"data": "3"})
+    assert [frame["msg"]["data"] for frame in scripted.wait_for("publish")] == ["3"]
+    assert heard.messages == []
+
+
+def test_while_the_link_is_down_nothing_is_begun(scripted, link, lost, heard):
+    link.advertise("/cmd", STRING)
+    scripted.stop()
+    assert lost.wait(10.0)
+    with pytest.raises(LinkLost, match=r"the link is down \(.*\)\. Nothing was sent, and nothing is kept\.$"):
+        link.begin_publishing([("/cmd", {"data": "1"})], heard)
+    assert heard.messages == []

@@ -1,0 +1,790 @@
+import base64
+import io
+import json
+import math
+
+import cbor2
+import pytest
+from PIL import Image
+
+from bam_envs.core.errors import InvalidValue, NotInCommand, RemoteError
+from bam_envs.rosbridge.bus import Caller
+from bam_envs.rosbridge.encoding import split
+from bam_envs.rosbridge.server.core import Bridge
+from bam_envs.rosbridge.server.session import Invoke, Limits, Send
+
+JOINTS, FLOATS, TEXT, TRIGGER, SET_BOOL = (
+    "sensor_msgs/JointState",
+    "std_msgs/Float64MultiArray",
+    "std_msgs/String",
+    "std_srvs/Trigger",
+    "std_srvs/SetBool",
+)
+
+
+class Peers:
+    """A bridge, clients that keep what they get, and a clock that is set by hand."""
+
+    def __init__(self, limits=None):
+        self.now = 100.0
+        self.bridge = Bridge(limits, clock=lambda: 1_700_000_000.25)
+        self.got = {}
+        self.pending = []
+
+    def client(self, name="a"):
+        session = self.bridge.open(Caller(name, "here"))
+        self.got[session] = []
+        return session
+
+    def say(self, session, *messages, **message):
+        """Send messages; returns what this client got since, as objects."""
+        for one in [*messages, *([message] if message else [])]:
+            self.bridge.receive(session, one if isinstance(one, (str, bytes)) else json.dumps(one), self.now)
+        return self.take(session)
+
+    def take(self, session):
+        self.work()
+        got, self.got[session] = self.got[session], []
+        return [json.loads(frame) if packet.text else cbor2.loads(frame) for packet in got for frame in packet.frames]
+
+    def work(self):
+        """Do what the bridge wants done; handlers only when `run` is called."""
+        for event in self.bridge.events():
+            if isinstance(event, Send):
+                if event.session in self.got:
+                    self.got[event.session].append(event.packet)
+            else:
+                assert isinstance(event, Invoke)
+                self.pending.append(event)
+
+    def run(self):
+        """Let the handlers answer."""
+        self.work()
+        while self.pending:
+            invoke = self.pending.pop(0)
+            self.bridge.finish(invoke, self.bridge.packed_answer(invoke))
+            self.work()
+
+    def wait(self, seconds):
+        self.now += seconds
+        self.bridge.tick(self.now)
+
+
+@pytest.fixture
+def peers():
+    return Peers()
+
+
+def status(text, **more):
+    return [{"op": "status", "level": "error", "msg": text, **more}]
+
+
+def response(values, result, service="/s", **more):
+    return [{"op": "service_response", "service": service, "values": values, "result": result, **more}]
+
+
+def published(topic, message):
+    return {"op": "publish", "topic": topic, "msg": message}
+
+
+def text(value):
+    return {"data": value}
+
+
+# Everything is answered, and the connection is usable afterwards: the inputs of which real servers were measured.
+
+
+@pytest.mark.parametrize(
+    ("frame", "told"),
+    [
+        ("{", "Message: expected JSON: Expecting property name enclosed in double quotes: line 1 column 2 (char 1)."),
+        ("{}", "message: op: expected a text, found null."),
+        ('{"op": 3}', "message: op: expected a text, found 3."),
+        ('{"op": "dance", "id": 4}', None),
+        ("[]", "Message: expected an object, found a list of 0."),
+        (b"\xa1\x00\x01", "Message: expected text in UTF-8: invalid start byte at byte 0."),
+        (
+            '{"op": "set_level", "level": "loud"}',
+            "set_level: level: expected one of none, error, warning, info, found 'loud'.",
+        ),
+        ('{"op": "subscribe", "topic": "/new"}', "subscribe: Topic /new does not exist yet; its type is needed."),
+        (
+            '{"op": "subscribe", "topic": "/t", "type": "std_msgs/Bool"}',
+            "subscribe: Topic /t is of type std_msgs/String, found 'std_msgs/Bool'.",
+        ),
+        (
+            '{"op": "subscribe", "topic": "/t", "throttle_rate": "300"}',
+            "subscribe /t: throttle_rate: expected a number >= 0, found '300'.",
+        ),
+        (
+            '{"op": "subscribe", "topic": "/t", "queue_length": -1}',
+            "subscribe /t: queue_length: expected a number >= 0, found -1.",
+        ),
+        (
+            '{"op": "subscribe", "topic": "/t", "compression": "cbor-raw"}',
+            "subscribe /t: compression: expected one of none, png, cbor, found 'cbor-raw'.",
+        ),
+        (
+            '{"op": "subscribe", "topic": "/t", "fragment_size": 0}',
+            "subscribe /t: fragment_size: expected an integer >= 1, found 0.",
+        ),
+        (
+            '{"op": "subscribe", "topic": "/a b", "type": "std_msgs/Bool"}',
+            "subscribe /a b: Name: expected one such as '/joint_states', found '/a b'.",
+        ),
+        (
+            '{"op": "subscribe", "topic": "/t", "id": {}}',
+            "subscribe /t: id: expected a text or an integer, found an object.",
+        ),
+        (
+            '{"op": "subscribe", "topic": "/t", "id": 1e400}',
+            "subscribe /t: id: expected a text or an integer, found Infinity.",
+        ),
+        (
+            '{"op": "subscribe", "topic": "/t", "id": 9999999999999999999}',
+            "subscribe /t: id: expected an integer of 53 bits, found 9999999999999999999.",
+        ),
+        (
+            '{"op": "subscribe", "topic": "/t", "throttle_rate": 1e400}',
+            "subscribe /t: throttle_rate: expected a number >= 0, found Infinity.",
+        ),
+        ('{"op": "unsubscribe", "topic": "/t"}', "unsubscribe: Topic /t was not subscribed so by this client."),
+        (
+            '{"op": "advertise", "topic": "/t", "type": "std_msgs/Bool"}',
+            "advertise: Topic /t is of type std_msgs/String, found 'std_msgs/Bool'.",
+        ),
+        ('{"op": "advertise", "topic": "/u"}', "advertise /u: type: expected a text, found null."),
+        (
+            '{"op": "advertise", "topic": "/u", "type": "Bool"}',
+            "advertise /u: Type: expected a name such as 'std_msgs/String', found 'Bool'.",
+        ),
+        ('{"op": "unadvertise", "topic": "/u"}', "unadvertise: Topic /u was not advertised so by this client."),
+        (
+            '{"op": "publish", "topic": "/u", "msg": {}}',
+            "publish: Topic /u does not exist; advertise it with its type first.",
+        ),
+        (
+            '{"op": "publish", "topic": "/t", "msg": {"datum": ""}}',
+            "publish /t: std_msgs/String: expected only the fields data, found 'datum'.",
+        ),
+        (
+            '{"op": "publish", "topic": "/t", "msg": {"data": 1}}',
+            "publish /t: std_msgs/String.data: expected a text, found 1.",
+        ),
+        (
+            '{"op": "publish", "topic": "/f", "msg": {"data": [NaN]}}',
+            "publish /f: std_msgs/Float64MultiArray.data[0]: expected a finite number, found NaN.",
+        ),
+        (
+            '{"op": "publish", "topic": "/f", "msg": {"data": [Infinity]}}',
+            "publish /f: std_msgs/Float64MultiArray.data[0]: expected a finite number, found Infinity.",
+        ),
+        (
+            '{"op": "publish", "topic": "/f", "msg": {"data": [1e400]}}',
+            "publish /f: std_msgs/Float64MultiArray.data[0]: expected a finite number, found Infinity.",
+        ),
+        (
+            '{"op": "publish", "topic": "/f", "msg": {"data": [null]}}',
+            "publish /f: std_msgs/Float64MultiArray.data[0]: expected a number, found null.",
+        ),
+        (
+            '{"op": "publish", "topic": "/f", "msg": {"data": [true]}}',
+            "publish /f: std_msgs/Float64MultiArray.data[0]: expected a number, found true.",
+        ),
+        (
+            '{"op": "unadvertise_service", "service": "/s"}',
+            "unadvertise_service: Service /s is not offered by this client.",
+        ),
+        (
+            '{"op": "advertise_service", "service": "/s", "type": "std_srvs/Empty"}',
+            "advertise_service: Service /s is offered by this server already.",
+        ),
+        (
+            '{"op": "service_response", "id": "7", "service": "/s"}',
+            "service_response /s: Nobody waits for a response with the id '7'.",
+        ),
+        (
+            '{"op": "auth", "mac": ""}',
+            "auth: The op auth is for the first message of a web page; this client has been let in already.",
+        ),
+        (
+            '{"op": "advertise_action", "action": "/a"}',
+            "advertise_action: Actions are not supported by this server; use a service, or a pair of topics.",
+        ),
+    ],
+)
+def test_what_does_not_work_is_said_at_once(peers, frame, told):
+    peers.bridge.subscribe("/t", TEXT, lambda message, caller: None)
+    peers.bridge.subscribe("/f", FLOATS, lambda message, caller: pytest.fail("it must not get through"))
+    peers.bridge.serve("/s", TRIGGER, lambda request, caller: {})
+    client = peers.client()
+    (answer,) = peers.say(client, frame)
+    assert (answer["op"], answer["level"]) == ("status", "error")
+    if told is None:
+        assert answer["msg"].startswith("dance: Unknown op 'dance'; expected one of advertise, ")
+        assert answer["id"] == 4
+    else:
+        assert answer["msg"] == told
+    peers.say(client, op="call_service", service="/s", id=1)
+    peers.run()
+    assert peers.take(client) == response({"success": False, "message": ""}, True, id=1)
+
+
+def test_a_goal_of_an_action_is_answered_as_one(peers):
+    answer = {
+        "op": "action_result",
+        "action": "/a",
+        "id": "g",
+        "values": "Actions are not supported by this server; use a service, or a pair of topics.",
+        "status": 6,
+        "result": False,
+    }
+    assert peers.say(peers.client(), op="send_action_goal", action="/a", action_type="x/Y", id="g") == [answer]
+
+
+def test_two_messages_in_one_frame_are_refused(peers):
+    frame = json.dumps({"op": "call_service", "service": "/no"})
+    assert peers.say(peers.client(), frame + frame) == status("Message: expected one in a frame, found more behind it.")
+
+
+def test_json_in_a_binary_frame_is_done(peers):
+    frame = json.dumps({"op": "call_service", "service": "/no", "id": 5}).encode()
+    assert peers.say(peers.client(), frame) == response("Service /no does not exist", False, "/no", id=5)
+
+
+def test_a_wrong_type_harms_nobody_else(peers):
+    first, second, third = (peers.client(name) for name in "abc")
+    peers.say(first, op="subscribe", topic="/t", type=TEXT)
+    peers.say(second, op="subscribe", topic="/t", type="std_msgs/Int32")
+    assert peers.say(third, op="subscribe", topic="/t", type="std_msgs/msg/String") == []
+    peers.say(second, op="publish", topic="/t", msg=text("x"))
+    assert [peers.take(one) for one in (first, second, third)] == [
+        [published("/t", text("x"))],
+        [],
+        [published("/t", text("x"))],
+    ]
+
+
+def test_levels_of_status(peers):
+    client = peers.client()
+    assert peers.say(client, {"op": "set_level", "level": "none"}, {"op": "dance"}) == []
+    (answer,) = peers.say(client, {"op": "set_level", "level": "info"}, {"op": "dance"})
+    assert answer["op"] == "status"
+
+
+# Topics.
+
+
+def test_a_topic_ends_with_its_last_user(peers):
+    first, second = peers.client(), peers.client()
+    peers.say(first, op="advertise", topic="/t", type=TEXT, id=1)
+    peers.say(first, op="advertise", topic="/t", type=TEXT, id=2)
+    peers.say(second, op="subscribe", topic="t", type=TEXT)
+    assert peers.say(first, op="publish", topic="/t", msg=text("x")) == []
+    assert peers.take(second) == [published("t", text("x"))]
+    peers.say(first, op="unadvertise", topic="/t", id=1)
+    peers.say(second, op="unsubscribe", topic="/t")
+    assert peers.bridge.topics.find("/t") is not None
+    peers.say(first, op="unadvertise", topic="/t")
+    assert peers.bridge.topics.find("/t") is None
+
+
+def test_a_client_gets_each_message_once(peers):
+    client = peers.client()
+    peers.say(client, op="subscribe", topic="/t", type=TEXT, id="1")
+    peers.say(client, op="subscribe", topic="/t", type=TEXT, id="2", compression="png")
+    assert [one["op"] for one in peers.say(client, op="publish", topic="/t", msg=text("x"))] == ["png"]
+    peers.say(client, op="unsubscribe", topic="/t", id="2")
+    assert peers.say(client, op="publish", topic="/t", msg=text("x")) == [published("/t", text("x"))]
+    peers.say(client, op="unsubscribe", topic="/t", id="1")
+    assert peers.bridge.topics.find("/t") is None
+
+
+def test_a_throttled_client_gets_the_newest_when_it_is_time(peers):
+    client = peers.client()
+    peers.say(client, op="subscribe", topic="/t", type=TEXT, throttle_rate=33.3)
+    assert peers.say(client, *[{"op": "publish", "topic": "/t", "msg": text(one)} for one in "abc"]) == [
+        published("/t", text("a"))
+    ]
+    assert peers.bridge.next_deadline == pytest.approx(100.0333)
+    peers.wait(0.0332)
+    assert peers.take(client) == []
+    peers.wait(0.0002)
+    assert peers.take(client) == [published("/t", text("c"))]
+    assert peers.bridge.next_deadline is None
+
+
+def test_a_throttled_queue_keeps_the_last_ones_in_order(peers):
+    client = peers.client()
+    peers.say(client, op="subscribe", topic="/t", type=TEXT, throttle_rate=100, queue_length=2)
+    peers.say(client, *[{"op": "publish", "topic": "/t", "msg": text(one)} for one in "abcd"])
+    for one in "cd":
+        peers.wait(0.1)
+        assert peers.take(client) == [published("/t", text(one))]
+
+
+def test_a_topic_of_the_rate_that_is_asked_for_loses_nothing(peers):
+    client = peers.client()
+    peers.say(client, op="subscribe", topic="/t", type=TEXT, throttle_rate=10)
+    count = 0
+    for tick in range(100):
+        peers.now = 200.0 + tick * 0.01 + (0.002 if tick % 3 else 0.0)
+        count += len(peers.say(client, op="publish", topic="/t", msg=text("x")))
+        deadline = peers.bridge.next_deadline
+        if deadline is not None:
+            peers.bridge.tick(deadline)
+            count += len(peers.take(client))
+    assert count == 100
+
+
+def test_the_queue_length_goes_with_what_is_sent(peers):
+    client = peers.client()
+    peers.say(client, op="subscribe", topic="/t", type=TEXT, queue_length=3)
+    peers.bridge.advertise("/t", TEXT)
+    peers.bridge.publish(peers.bridge.publication("/t", text("x")), 0.0)
+    (event,) = peers.bridge.events()
+    assert event.keep == 3
+    assert event.packet.stream == "/t"
+
+
+def test_packing_is_done_once_for_all(peers):
+    clients = [peers.client(str(number)) for number in range(3)]
+    for client in clients:
+        peers.say(client, op="subscribe", topic="/t", type=TEXT)
+    peers.bridge.advertise("/t", TEXT)
+    peers.bridge.publish(peers.bridge.publication("/t", text("x")), 0.0)
+    assert len({id(event.packet) for event in peers.bridge.events()}) == 1
+
+
+def test_compressions(peers):
+    png, cbor, parts = (peers.client(name) for name in "abc")
+    header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
+    whole = published("/j", {"header": header, "name": ["a"], "position": [1.5], "velocity": [], "effort": []})
+    peers.say(png, op="subscribe", topic="/j", type=JOINTS, compression="png")
+    peers.say(cbor, op="subscribe", topic="/j", type=JOINTS, compression="cbor")
+    peers.say(parts, op="subscribe", topic="/j", type=JOINTS, fragment_size=50)
+    (image,) = peers.say(png, op="publish", topic="/j", msg={"name": ["a"], "position": [1.5]})
+    assert json.loads(Image.open(io.BytesIO(base64.b64decode(image["data"]))).tobytes()) == whole
+    assert peers.take(cbor)[0]["msg"]["position"].tag == 86
+    fragments = peers.take(parts)
+    assert json.loads("".join(one["data"] for one in fragments)) == whole
+    assert [(one["num"], one["total"]) for one in fragments] == [(0, 3), (1, 3), (2, 3)]
+
+
+def test_a_latched_message_waits_for_newcomers_as_long_as_its_publisher(peers):
+    first, second, third = (peers.client(name) for name in "abc")
+    peers.say(first, op="advertise", topic="/t", type=TEXT, latch=True)
+    peers.say(first, op="publish", topic="/t", msg=text("old"))
+    peers.say(first, op="publish", topic="/t", msg=text("new"))
+    assert peers.say(second, op="subscribe", topic="/t", type=TEXT) == [published("/t", text("new"))]
+    heard = []
+    peers.bridge.subscribe("/t", TEXT, lambda message, caller: heard.append((message, caller.name)))
+    assert heard == [(text("new"), "a")]
+    peers.bridge.lost(first)
+    assert peers.say(third, op="subscribe", topic="/t", type=TEXT) == []
+
+
+def test_bytes_travel_as_base64_and_as_bytes(peers):
+    plain, cbor = peers.client("a"), peers.client("b")
+    kind = "sensor_msgs/CompressedImage"
+    peers.say(plain, op="subscribe", topic="/i", type=kind)
+    peers.say(cbor, op="subscribe", topic="/i", type=kind, compression="cbor")
+    peers.bridge.advertise("/i", kind)
+    peers.bridge.publish(peers.bridge.publication("/i", {"data": b"\x00\xff"}), 0.0)
+    assert peers.take(plain)[0]["msg"]["data"] == "AP8="
+    assert peers.take(cbor)[0]["msg"]["data"] == b"\x00\xff"
+
+
+# This process.
+
+
+def test_listeners_of_this_process(peers):
+    heard, client = [], peers.client("c")
+    stop = peers.bridge.subscribe("cmd", FLOATS, lambda message, caller: heard.append((message["data"], caller)))
+    peers.say(client, op="publish", topic="/cmd", msg={"data": [1]})
+    stop()
+    stop()
+    peers.say(client, op="publish", topic="/cmd", msg={"data": [2]})
+    assert heard == [([1.0], Caller("c", "here"))]
+
+
+@pytest.mark.parametrize(
+    ("reason", "text"),
+    [
+        ("client b is in command", "/a/cmd: client b is in command"),
+        ("/a/cmd: data must have 6 numbers, not 1.", "/a/cmd: data must have 6 numbers, not 1."),
+        ("/cmd: data must have 6 numbers, not 1.", "/a/cmd: data must have 6 numbers, not 1."),
+        ("/other: it is busy", "/a/cmd: /other: it is busy"),
+    ],
+)
+def test_a_listener_may_refuse_and_the_topic_is_told_once(peers, reason, text):
+    def refuse(message, caller):
+        raise NotInCommand(reason)
+
+    heard = []
+    peers.bridge.subscribe("/a/cmd", FLOATS, refuse)
+    peers.bridge.subscribe("/a/cmd", FLOATS, lambda message, caller: heard.append(message))
+    answer = peers.say(peers.client(), op="publish", topic="/a/cmd", msg={"data": [1]})
+    assert answer == status(text)
+    assert len(heard) == 1
+
+
+def test_a_listener_that_breaks_silences_nobody(peers, caplog):
+    heard = []
+    peers.bridge.subscribe("/cmd", FLOATS, lambda message, caller: {}["missing"])
+    peers.bridge.subscribe("/cmd", FLOATS, lambda message, caller: heard.append(message))
+    answer = peers.say(peers.client(), op="publish", topic="/cmd", msg={"data": [1]})
+    assert answer == status("/cmd: The receiver failed; its log says more.")
+    assert len(heard) == 1
+    assert "A listener of /cmd failed." in caplog.text
+
+
+def test_mistakes_of_this_process_are_values(peers):
+    peers.bridge.advertise("/t", TEXT)
+    for mistake, told in [
+        (
+            lambda: peers.bridge.advertise("/t", FLOATS),
+            "Topic /t is of type std_msgs/String, found 'std_msgs/Float64MultiArray'.",
+        ),
+        (lambda: peers.bridge.publication("/u", {}), "Topic /u does not exist; advertise it with its type first."),
+        (lambda: peers.bridge.publication("/t", {"data": 1}), "std_msgs/String.data: expected a text, found 1."),
+        (lambda: peers.bridge.publication("a b", {}), "Name: expected one such as '/joint_states', found 'a b'."),
+        (
+            lambda: peers.bridge.serve("/rosapi/topics", TRIGGER, print),
+            "Service /rosapi/topics is offered by this server already.",
+        ),
+    ]:
+        with pytest.raises(InvalidValue) as caught:
+            mistake()
+        assert str(caught.value) == told
+
+
+def test_who_left_is_told(peers, caplog):
+    left, client = [], peers.client("c")
+    peers.bridge.on_leave(lambda caller: {}["missing"])
+    peers.bridge.on_leave(left.append)
+    peers.bridge.lost(client)
+    peers.bridge.lost(client)
+    assert left == [Caller("c", "here")]
+    assert "A callback about the end of a connection failed." in caplog.text
+
+
+# Services.
+
+
+def test_a_handler_answers(peers):
+    peers.bridge.serve("s", SET_BOOL, lambda request, caller: {"success": request["data"], "message": caller.name})
+    client = peers.client("c")
+    assert peers.say(client, op="call_service", service="/s", args={"data": True}, id="x") == []
+    peers.run()
+    assert peers.take(client) == response({"success": True, "message": "c"}, True, id="x")
+
+
+def test_arguments_may_have_no_names(peers):
+    peers.bridge.serve("/s", SET_BOOL, lambda request, caller: {"success": request["data"]})
+    client = peers.client()
+    peers.say(client, op="call_service", service="/s", args=[True])
+    peers.run()
+    assert peers.take(client) == response({"success": True, "message": ""}, True)
+    assert peers.say(client, op="call_service", service="/s", args=[True, 1]) == response(
+        "args: expected an object, found a list of 2.", False
+    )
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        ({"args": {"datum": 1}}, "std_srvs/SetBoolRequest: expected only the fields data, found 'datum'."),
+        ({"args": {"data": "yes"}}, "std_srvs/SetBoolRequest.data: expected true or false, found 'yes'."),
+        ({"args": {"data": math.nan}}, "std_srvs/SetBoolRequest.data: expected true or false, found NaN."),
+        ({"timeout": math.inf}, "timeout: expected a number >= 0, found Infinity."),
+        ({"compression": "zip"}, "compression: expected one of none, png, cbor, found 'zip'."),
+        ({"timeout": "soon"}, "timeout: expected a number >= 0, found 'soon'."),
+        ({"service": "/s s"}, "Name: expected one such as '/joint_states', found '/s s'."),
+    ],
+)
+def test_a_wrong_call_is_answered_by_a_response(peers, call, told):
+    peers.bridge.serve("/s", SET_BOOL, lambda request, caller: {})
+    message = {"op": "call_service", "service": "/s", "id": 1, **call}
+    assert peers.say(peers.client(), message) == response(told, False, message["service"], id=1)
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [(RemoteError("no"), "no"), (ValueError("boom"), "Service /s failed: ValueError: boom")],
+)
+def test_a_handler_that_fails_answers(peers, caplog, error, told):
+    def fail(request, caller):
+        raise error
+
+    peers.bridge.serve("/s", TRIGGER, fail)
+    client = peers.client()
+    peers.say(client, op="call_service", service="/s")
+    peers.run()
+    assert peers.take(client) == response(told, False)
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ({"success": 1}, "std_srvs/TriggerResponse.success: expected true or false, found 1."),
+        (3, "std_srvs/TriggerResponse: expected an object, found 3."),
+    ],
+)
+def test_a_handler_that_answers_wrongly(peers, values, told):
+    peers.bridge.serve("/s", TRIGGER, lambda request, caller: values)
+    client = peers.client()
+    peers.say(client, op="call_service", service="/s")
+    peers.run()
+    assert peers.take(client) == response(told, False)
+
+
+def test_a_response_that_is_too_large():
+    peers = Peers(Limits(max_message=1000))
+    peers.bridge.serve("/s", TRIGGER, lambda request, caller: {"message": "x" * 1000})
+    client = peers.client()
+    peers.say(client, op="call_service", service="/s")
+    peers.run()
+    assert peers.take(client) == response("The response of /s has 1094 bytes, and 1000 is the most.", False)
+
+
+def test_a_response_in_fragments(peers):
+    peers.bridge.serve("/s", TRIGGER, lambda request, caller: {"message": "x" * 100})
+    client = peers.client()
+    peers.say(client, op="call_service", service="/s", fragment_size=60)
+    peers.run()
+    answer = json.loads("".join(part["data"] for part in peers.take(client)))
+    assert [answer] == response({"success": False, "message": "x" * 100}, True)
+
+
+def test_a_client_offers_a_service(peers):
+    robot, client = peers.client("robot"), peers.client("c")
+    peers.say(robot, op="advertise_service", service="s", type="std_srvs/srv/SetBool")
+    peers.say(client, op="call_service", service="/s", args={"data": True}, id=9)
+    (call,) = peers.take(robot)
+    assert call == {"op": "call_service", "service": "s", "args": {"data": True}, "id": call["id"]}
+    assert (
+        peers.say(robot, op="service_response", id=call["id"], service="s", values={"success": True}, result=True) == []
+    )
+    assert peers.take(client) == response({"success": True, "message": ""}, True, id=9)
+
+
+def test_a_client_calls_its_own_service(peers):
+    robot = peers.client()
+    peers.say(robot, op="advertise_service", service="/s", type=TRIGGER)
+    (call,) = peers.say(robot, op="call_service", service="/s", id="me")
+    answer = peers.say(robot, op="service_response", id=call["id"], service="/s", values={"success": True}, result=True)
+    assert answer == response({"success": True, "message": ""}, True, id="me")
+
+
+@pytest.mark.parametrize(
+    ("answer", "told"),
+    [
+        ({"result": False, "values": "no"}, "no"),
+        ({"result": False, "values": {}}, "Service /s failed and gave no reason."),
+        ({"result": "yes", "values": {}}, "Service /s failed and gave no reason."),
+        ({"result": True, "values": {"success": "yes"}}, None),
+    ],
+)
+def test_a_client_s_service_fails(peers, answer, told):
+    robot, client = peers.client("robot"), peers.client("c")
+    peers.say(robot, op="advertise_service", service="/s", type=TRIGGER)
+    peers.say(client, op="call_service", service="/s")
+    (call,) = peers.take(robot)
+    reply = peers.say(robot, {"op": "service_response", "id": call["id"], "service": "/s", **answer})
+    if told is None:
+        wrong = "std_srvs/TriggerResponse.success: expected true or false, found 'yes'."
+        told = f"Service /s answered wrongly: {wrong}"
+        assert reply == status(f"service_response /s: Response of /s: {wrong}", id=call["id"])
+    assert peers.take(client) == response(told, False)
+
+
+def test_a_silent_service_is_answered_for(peers):
+    robot, client = peers.client("robot"), peers.client("c")
+    peers.say(robot, op="advertise_service", service="/s", type=TRIGGER)
+    peers.say(client, op="call_service", service="/s", timeout=0.5)
+    peers.say(client, op="call_service", service="/s")
+    late = peers.take(robot)[0]
+    assert peers.bridge.next_deadline == 100.5
+    peers.wait(0.5)
+    assert peers.take(client) == response("Timeout exceeded: service /s did not answer in 0.5 s.", False)
+    assert peers.bridge.next_deadline == 130.0
+    peers.wait(29.5)
+    assert peers.take(client) == response("Timeout exceeded: service /s did not answer in 30 s.", False)
+    (told,) = peers.say(robot, op="service_response", id=late["id"], service="/s", values={}, result=True)
+    assert told["msg"] == f"service_response /s: Nobody waits for a response with the id '{late['id']}'."
+
+
+def test_a_service_that_goes_is_answered_for(peers):
+    robot, client = peers.client("robot"), peers.client("c")
+    peers.say(robot, op="advertise_service", service="/s", type=TRIGGER)
+    peers.say(client, op="call_service", service="/s")
+    peers.bridge.lost(robot)
+    gone = "Service /s is gone: the client that offered it left or withdrew it."
+    assert peers.take(client) == response(gone, False)
+    assert peers.say(client, op="call_service", service="/s") == response("Service /s does not exist", False)
+
+
+def test_a_service_of_a_client_that_came_back_takes_the_place_of_the_old_one(peers):
+    old, new, client = (peers.client(name) for name in "abc")
+    for robot in (old, new):
+        peers.say(robot, op="advertise_service", service="/s", type=TRIGGER)
+    peers.say(client, op="call_service", service="/s")
+    assert peers.take(old) == status("Service /s is offered by another client now.")
+    assert len(peers.take(new)) == 1
+    peers.bridge.lost(old)
+    assert peers.bridge.services.find("/s").provider is new
+
+
+def test_only_the_one_who_was_asked_may_answer(peers):
+    robot, client = peers.client("robot"), peers.client("c")
+    peers.say(robot, op="advertise_service", service="/s", type=TRIGGER)
+    peers.say(client, op="call_service", service="/s")
+    (call,) = peers.take(robot)
+    (told,) = peers.say(client, op="service_response", id=call["id"], service="/s", values={}, result=True)
+    assert told["op"] == "status"
+
+
+def test_an_answer_for_someone_who_left_is_dropped(peers):
+    peers.bridge.serve("/s", TRIGGER, lambda request, caller: {})
+    client = peers.client()
+    peers.say(client, op="call_service", service="/s")
+    peers.bridge.lost(client)
+    peers.run()
+    assert peers.got[client] == []
+
+
+def test_calls_wait_their_turn_and_expired_ones_are_not_done():
+    peers, done = Peers(Limits(at_once=2, calls=5)), []
+    peers.bridge.serve("/s", TRIGGER, lambda request, caller: done.append(1) or {})
+    client = peers.client()
+    for _ in range(5):
+        assert peers.say(client, op="call_service", service="/s", timeout=1) == []
+    assert len(peers.pending) == 2
+    assert peers.say(client, op="call_service", service="/s") == response(
+        "At most 5 calls may be unanswered; wait for an answer first.", False
+    )
+    peers.wait(1.0)
+    assert len(peers.take(client)) == 5
+    peers.run()
+    assert done == []
+
+
+def test_rosapi(peers):
+    peers.bridge.advertise("/t", TEXT)
+    peers.bridge.serve("/s", TRIGGER, lambda request, caller: {})
+    client = peers.client()
+
+    def ask(name, **args):
+        (answer,) = peers.say(client, op="call_service", service=f"/rosapi/{name}", args=args)
+        assert answer["result"]
+        return answer["values"]
+
+    assert ask("get_time") == {
+        "time": {"sec": 1_700_000_000, "nanosec": 250_000_000, "secs": 1_700_000_000, "nsecs": 250_000_000}
+    }
+    assert ask("topics") == {"topics": ["/t"], "types": [TEXT]}
+    assert ask("topic_type", topic="/t") == {"type": TEXT}
+    assert ask("topic_type", topic="/u") == {"type": ""}
+    assert "/s" in ask("services")["services"]
+    assert ask("service_type", service="s") == {"type": TRIGGER}
+    assert ask("service_type", service="/u") == {"type": ""}
+    (answer,) = peers.say(client, op="call_service", service="/rosapi/topic_type", args={})
+    assert answer["values"] == "topic: expected a text, found ''."
+
+
+# Fragments and limits.
+
+
+def test_a_message_in_fragments_is_done_once_it_is_whole(peers):
+    client = peers.client()
+    parts = split(json.dumps({"op": "call_service", "service": "/no", "id": 3}), 10, "f")
+    assert peers.say(client, *reversed(parts)) == response("Service /no does not exist", False, "/no", id=3)
+    assert peers.bridge.next_deadline is None
+
+
+def test_fragments_that_do_not_come_are_told_of(peers):
+    client = peers.client()
+    assert peers.say(client, op="fragment", id="f", data="x", num=0, total=2) == []
+    assert peers.bridge.next_deadline == 110.0
+    peers.wait(10.0)
+    assert peers.take(client) == status("Fragments of 'f' did not all come in time.")
+    assert peers.bridge.next_deadline is None
+
+
+def test_fragments_hold_no_fragments(peers):
+    inner = json.dumps({"op": "fragment", "id": "g", "data": "{}", "num": 0, "total": 1})
+    answer = peers.say(peers.client(), op="fragment", id="f", data=inner, num=0, total=1)
+    assert answer == status("A fragment must not hold fragments.")
+
+
+def test_who_holds_most_in_fragments_gives_way(peers):
+    peers = Peers(Limits(unfinished=10_000))
+    small, great, new = (peers.client(name) for name in "abc")
+    for client, size in ((small, 1000), (great, 8000), (new, 2000)):
+        peers.say(client, op="fragment", id="f", num=0, total=2, data="x" * size)
+    assert [peers.take(one) for one in (small, new)] == [[], []]
+    assert peers.take(great) == status("All unfinished fragments hold more than 10000 bytes.")
+    assert peers.say(new, op="fragment", id="f", num=1, total=2, data="")[0]["msg"].startswith("Message: expected JSON")
+
+
+def test_what_this_process_publishes_nobody_else_does(peers):
+    """Else a client could say where the robot is."""
+    peers.bridge.advertise("/joint_states", JOINTS)
+    listener, liar = peers.client("a"), peers.client("b")
+    peers.say(listener, op="subscribe", topic="/joint_states")
+    text = "Topic /joint_states is published by this server alone; its clients may subscribe."
+    assert peers.say(liar, op="advertise", topic="/joint_states", type=JOINTS) == status(f"advertise: {text}")
+    for check in (False, True):
+        frame = json.dumps({"op": "publish", "topic": "/joint_states", "msg": {"position": [1.0]}})
+        peers.bridge.take(liar, peers.bridge.read(frame, check=check), peers.now)
+        assert peers.take(liar) == status(f"publish: {text}")
+    assert peers.take(listener) == []
+
+
+def test_what_is_checked_elsewhere_is_done_as_what_is_not(peers):
+    first, second = peers.client("a"), peers.client("b")
+    peers.bridge.serve("/mine", SET_BOOL, lambda request, caller: {"success": request["data"], "message": "done"})
+    peers.say(first, op="subscribe", topic="/t", type=FLOATS)
+    peers.say(second, op="advertise_service", service="/theirs", type=SET_BOOL)
+    messages = [
+        {"op": "publish", "topic": "/t", "msg": {"data": [1.0, 2.0]}},
+        {"op": "publish", "topic": "/t", "msg": {"data": ["x"]}},
+        {"op": "publish", "topic": "no name", "msg": {}},
+        {"op": "call_service", "service": "/mine", "args": {"data": True}},
+        {"op": "call_service", "service": "/mine", "args": {"data": 3}},
+        {"op": "call_service", "service": "/theirs", "args": [True]},
+        {"op": "service_response", "service": "/theirs", "id": "1", "values": {}},
+        {"op": "unheard of", "msg": {}},
+    ]
+    for message in messages:
+        got = []
+        for check in (True, False):
+            peers.bridge.take(second, peers.bridge.read(json.dumps(message), check=check), peers.now)
+            peers.run()
+            got.append([[{**one, "id": ""} for one in peers.take(client)] for client in (first, second)])
+        assert got[0] == got[1], message
+
+
+@pytest.mark.parametrize(
+    ("op", "what"),
+    [
+        ({"op": "advertise", "topic": "/t{}", "type": TEXT}, "advertisements"),
+        ({"op": "subscribe", "topic": "/t{}", "type": TEXT}, "subscriptions"),
+        ({"op": "advertise_service", "service": "/t{}", "type": TRIGGER}, "services"),
+    ],
+)
+def test_a_client_has_limits(op, what):
+    peers = Peers(Limits(topics=3, services=3))
+    client = peers.client()
+    for number in range(3):
+        assert peers.say(client, {name: value.format(number) for name, value in op.items()}) == []
+    (told,) = peers.say(client, {name: value.format(3) for name, value in op.items()})
+    assert told["msg"].endswith(f"A client may have at most 3 {what}.")
+
+
+def test_what_is_refused_leaves_nothing_behind(peers):
+    client = peers.client()
+    peers.say(client, op="advertise", topic="/t", type=TEXT, id=[])
+    peers.say(client, op="subscribe", topic="/t", type=TEXT, compression="zip")
+    assert list(peers.bridge.topics) == []

@@ -1,0 +1,61 @@
+import asyncio
+import threading
+
+import pytest
+
+from bam_envs.rosbridge.server.loop_thread import LoopThread
+
+DEADLINE = 10.0
+
+
+@pytest.fixture
+def running():
+    """A loop that runs until the test is over."""
+    thread = LoopThread("test-loop")
+    stop = []
+
+    async def main(ready):
+        stop.append(asyncio.Event())
+        ready.set_result(None)
+        await stop[0].wait()
+
+    thread.start(main)
+    yield thread
+    thread.post(lambda: stop[0].set())
+    thread.join()
+    assert not thread.post(list)
+
+
+def test_work_is_done_in_the_thread(running):
+    assert running.do(lambda: threading.current_thread().name) == "test-loop"
+    assert running.do(lambda: running.is_current)
+    assert running.do(lambda: running.do(lambda: running.is_current))
+    assert not running.is_current
+    done = threading.Event()
+    assert running.post(done.set)
+    assert done.wait(DEADLINE)
+
+
+def test_what_work_raises_is_for_who_waits(running):
+    with pytest.raises(ZeroDivisionError):
+        running.do(lambda: 1 // 0)
+    assert running.do(lambda: 1) == 1
+
+
+def test_without_a_loop_work_is_done_at_once():
+    thread = LoopThread("never")
+    assert not thread.was_started
+    assert thread.do(threading.current_thread) is threading.current_thread()
+    assert not thread.post(list)
+    thread.join()
+
+
+def test_what_goes_wrong_at_the_start_is_raised_there():
+    async def main(ready):
+        raise OSError(98, "no")
+
+    thread = LoopThread("wrong")
+    with pytest.raises(OSError, match="no"):
+        thread.start(main)
+    thread.join()
+    assert thread.was_started

@@ -1,0 +1,241 @@
+import math
+
+import numpy as np
+import pytest
+
+from bam_envs.core.errors import InvalidValue
+from bam_envs.ros.definitions import DEFINITIONS
+from bam_envs.ros.interfaces import (
+    complete,
+    complete_known,
+    default,
+    describe,
+    is_known,
+    normal_name,
+    request_type,
+    require_plain,
+    response_type,
+    variants,
+)
+
+STAMP = {"sec": 0, "nanosec": 0}
+HEADER = {"stamp": STAMP, "frame_id": ""}
+SERVICES = [line.split(":")[0] for line in DEFINITIONS.splitlines() if "->" in line]
+MESSAGES = [line.split(":")[0] for line in DEFINITIONS.splitlines() if line and "->" not in line]
+
+
+def refusal(kind, message):
+    with pytest.raises(InvalidValue) as caught:
+        complete(kind, message)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("kind", MESSAGES + [part(one) for one in SERVICES for part in (request_type, response_type)])
+def test_each_type_has_defaults_that_fit_it(kind):
+    assert complete(kind, default(kind)) == default(kind)
+    assert is_known(kind)
+
+
+def test_services_are_known_by_their_own_name():
+    assert is_known("std_srvs/srv/Trigger")
+    assert not is_known("my_msgs/Thing")
+
+
+def test_names_of_both_ros_mean_the_same():
+    assert normal_name("std_msgs/msg/String") == "std_msgs/String"
+    assert normal_name("std_srvs/srv/Trigger") == "std_srvs/Trigger"
+    assert normal_name("std_msgs/String") == "std_msgs/String"
+    assert request_type("std_srvs/srv/SetBool") == "std_srvs/SetBoolRequest"
+
+
+@pytest.mark.parametrize(
+    "name", ["String", "a/b/c", "", "a/", "/b", "a b/c", "a/msg", None, 3, "é/b", "a" * 300 + "/b"]
+)
+def test_other_names_are_refused(name):
+    if name == "a/msg":
+        assert normal_name(name) == "a/msg"
+        return
+    with pytest.raises(InvalidValue, match=r"^Type: expected a name such as 'std_msgs/String', found "):
+        normal_name(name)
+
+
+def test_what_is_left_out_is_filled_in():
+    assert complete("geometry_msgs/msg/PoseStamped", {"pose": {"position": {"x": 1}}}) == {
+        "header": HEADER,
+        "pose": {
+            "position": {"x": 1.0, "y": 0.0, "z": 0.0},
+            "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+        },
+    }
+    assert default("sensor_msgs/CameraInfo")["k"] == [0.0] * 9
+    assert default("sensor_msgs/CompressedImage") == {"header": HEADER, "format": "", "data": b""}
+
+
+def test_both_spellings_of_time_are_kept():
+    assert complete("std_msgs/Header", {"stamp": {"secs": 3}})["stamp"] == {"secs": 3, "nsecs": 0}
+    assert complete("std_msgs/Header", {"stamp": {"sec": 3}})["stamp"] == {"sec": 3, "nanosec": 0}
+    assert complete("std_msgs/Header", {"seq": 7}) == {"seq": 7, "stamp": STAMP, "frame_id": ""}
+    assert complete("sensor_msgs/CameraInfo", {"K": [1.0] * 9})["K"] == [1.0] * 9
+    found = refusal("std_msgs/Header", {"stamp": {"secs": 3, "nanosec": 1}})
+    assert found == "std_msgs/Header.stamp: expected only the fields sec, nanosec, found 'secs'."
+
+
+@pytest.mark.parametrize("data", [b"\x00\xff", "AP8=", [0, 255], bytearray(b"\x00\xff"), memoryview(b"\x00\xff")])
+def test_bytes_come_in_several_forms(data):
+    assert complete("std_msgs/UInt8MultiArray", {"data": data})["data"] == b"\x00\xff"
+
+
+def test_one_or_a_list_where_both_are_allowed():
+    image = {"format": "jpeg", "data": b"x"}
+    one = complete("bam_msgs/GymFeedback", {"color_img": image})["color_img"]
+    assert complete("bam_msgs/GymFeedback", {"color_img": [image]})["color_img"] == [one]
+
+
+def test_the_message_that_came_is_not_changed():
+    message = {"data": [1, 2]}
+    checked = complete("std_msgs/Float64MultiArray", message)
+    checked["data"].append(3.0)
+    assert message == {"data": [1, 2]}
+    assert all(type(value) is float for value in checked["data"])
+
+
+@pytest.mark.parametrize("data", [[1, 2], [1, 2.5], [2.5, 1], [2**64, 0.5], [-0.0]])
+def test_integers_where_floats_are_expected_become_floats(data):
+    checked = complete("std_msgs/Float64MultiArray", {"data": data})["data"]
+    assert checked == data
+    assert {type(value) for value in checked} == {float}
+
+
+def test_fields_that_a_type_does_not_have_can_be_ignored():
+    kind = "bam_msgs/GymAPIRequest"
+    message = {"seed": 3, "newer": None, "header": {"newer": 1}, "action": [{"continuous_action": [1], "newer": []}]}
+    plain = {"seed": 3, "header": {}, "action": [{"continuous_action": [1]}]}
+    assert complete_known(kind, message) == complete(kind, plain)
+    with pytest.raises(InvalidValue) as caught:
+        complete_known(kind, {"seed": "3", "newer": 1})
+    assert str(caught.value) == "bam_msgs/GymAPIRequest.seed: expected an integer (int64), found '3'."
+
+
+def test_bytes_as_a_list_of_integers():
+    assert complete("std_msgs/UInt8MultiArray", {"data": [0, 255]})["data"] == b"\x00\xff"
+
+
+ARRAY, TWIST = "std_msgs/Float64MultiArray", "geometry_msgs/Twist"
+BASE64 = ".data: expected bytes as base64 or a list of integers in [0, 255], found a list of 1."
+EXPECTED = [
+    (ARRAY, {"data": [1, math.nan]}, ".data[1]: expected a finite number, found NaN."),
+    (ARRAY, {"data": [1.0, math.nan]}, ".data[1]: expected a finite number, found NaN."),
+    (ARRAY, {"data": [1.0, math.inf]}, ".data[1]: expected a finite number, found Infinity."),
+    (ARRAY, {"data": [math.inf, -math.inf]}, ".data[0]: expected a finite number, found Infinity."),
+    (ARRAY, {"data": [None]}, ".data[0]: expected a number, found null."),
+    (ARRAY, {"data": [True]}, ".data[0]: expected a number, found true."),
+    (ARRAY, {"data": ["1"]}, ".data[0]: expected a number, found '1'."),
+    (ARRAY, {"data": "1"}, ".data: expected a list, found '1'."),
+    (ARRAY, {"data": None}, ".data: expected a list, found null."),
+    (ARRAY, {"data": np.zeros(2)}, ".data: expected a list, found a ndarray."),
+    (ARRAY, {"data": [np.int64(1)]}, ".data[0]: expected a number, found a int64."),
+    (ARRAY, {"data": [10**400]}, ".data[0]: expected a finite number, found a huge integer."),
+    (ARRAY, {"data": [0.5, 10**400]}, ".data[1]: expected a finite number, found a huge integer."),
+    (ARRAY, {"data": [1, -(10**400), 10**400]}, ".data[1]: expected a finite number, found a huge integer."),
+    (ARRAY, {"data": [1, 2.5, True]}, ".data[2]: expected a number, found true."),
+    (ARRAY, {"data": [math.inf, 1, -math.inf]}, ".data[0]: expected a finite number, found Infinity."),
+    (
+        "std_msgs/Float32MultiArray",
+        {"data": [0, 2**128]},
+        ".data[1]: expected a finite number of 32 bits, found a huge integer.",
+    ),
+    ("std_msgs/UInt8MultiArray", {"data": [True]}, BASE64),
+    ("std_msgs/UInt8MultiArray", {"data": [256]}, BASE64),
+    (ARRAY, {"datas": []}, ": expected only the fields layout, data, found 'datas'."),
+    (ARRAY, [], ": expected an object, found a list of 0."),
+    (ARRAY, None, ": expected an object, found null."),
+    (
+        ARRAY,
+        {"layout": {"dim": [{"size": -1}]}},
+        ".layout.dim[0].size: expected an integer in [0, 4294967295], found -1.",
+    ),
+    (TWIST, {"linear": {"x": "1"}}, ".linear.x: expected a number, found '1'."),
+    (TWIST, {"linear": None}, ".linear: expected an object, found null."),
+    ("std_msgs/Float32", {"data": 1e39}, ".data: expected a finite number of 32 bits, found 1e+39."),
+    (
+        "std_msgs/Float32MultiArray",
+        {"data": [0.0, -1e39]},
+        ".data[1]: expected a finite number of 32 bits, found -1e+39.",
+    ),
+    ("std_msgs/UInt8", {"data": 256}, ".data: expected an integer in [0, 255], found 256."),
+    ("std_msgs/Int32", {"data": 1.0}, ".data: expected an integer (int32), found 1.0."),
+    ("std_msgs/Int32", {"data": True}, ".data: expected an integer (int32), found true."),
+    ("std_msgs/Int8MultiArray", {"data": [127, 128]}, ".data[1]: expected an integer in [-128, 127], found 128."),
+    ("std_msgs/Bool", {"data": 1}, ".data: expected true or false, found 1."),
+    ("std_msgs/String", {"data": 1}, ".data: expected a text, found 1."),
+    ("std_msgs/String", {"data": "\ud800"}, ".data: expected a text of whole characters, found '\\ud800'."),
+    ("std_msgs/Empty", {"data": 1}, ": expected no fields, found 'data'."),
+    (
+        "std_msgs/UInt8MultiArray",
+        {"data": "#"},
+        ".data: expected bytes as base64 or a list of integers in [0, 255], found '#'.",
+    ),
+    (
+        "geometry_msgs/PoseWithCovariance",
+        {"covariance": [0.0]},
+        ".covariance: expected a list of 36, found a list of 1.",
+    ),
+    ("my_msgs/Thing", {"a": [{"b": None}]}, ".a[0].b: expected a plain value, found null."),
+    ("my_msgs/Thing", {"a": math.nan}, ".a: expected a finite number, found NaN."),
+    ("my_msgs/Thing", {"a": 2**64}, ".a: expected a number of 64 bits, found 18446744073709551616."),
+    ("my_msgs/Thing", {"a": [1, 2**64]}, ".a[1]: expected a number of 64 bits, found 18446744073709551616."),
+    ("my_msgs/Thing", {"a": [-(2**63) - 1]}, ".a[0]: expected a number of 64 bits, found -9223372036854775809."),
+    ("my_msgs/Thing", {"a": object()}, ".a: expected a plain value, found a object."),
+    ("my_msgs/Thing", {1: 2}, ": expected texts as names, found 1."),
+]
+
+
+@pytest.mark.parametrize(("kind", "message", "text"), EXPECTED)
+def test_what_does_not_fit_is_named(kind, message, text):
+    assert refusal(kind, message) == kind + text
+
+
+def test_unknown_types_take_plain_values_as_they_are():
+    message = {"a": [1, 2.5, "x", True, b"\x00", {"b": []}]}
+    assert complete("my_msgs/msg/Thing", message) == message
+
+
+def test_nesting_has_an_end():
+    message = leaf = {}
+    for _ in range(40):
+        leaf["a"] = {}
+        leaf = leaf["a"]
+    assert refusal("my_msgs/Thing", message).endswith(
+        "expected at most 32 lists and objects in one another, found an object."
+    )
+    message["self"] = message
+    assert "at most 32" in refusal("my_msgs/Thing", message)
+
+
+def test_null_is_plain_outside_of_messages():
+    require_plain({"id": None}, "Message")
+    with pytest.raises(InvalidValue, match=r"^Message\.id: expected a finite number, found NaN\.$"):
+        require_plain({"id": math.nan}, "Message")
+
+
+def test_values_in_a_few_words():
+    assert describe("x" * 50) == "'" + "x" * 37 + "'..."
+    assert describe(np.float64(1.5)) == "1.5"
+    assert describe(-math.inf) == "-Infinity"
+
+
+def test_fields_can_be_looked_up():
+    (fields,) = variants("sensor_msgs/JointState")
+    assert [one.name for one in fields] == ["header", "name", "position", "velocity", "effort"]
+    assert fields[2].type == "float64"
+    assert fields[2].array == ""
+    assert variants("my_msgs/Thing") == ()
+
+
+def test_texts_in_a_list():
+    assert complete("sensor_msgs/JointState", {"name": ["a", "\u00e9"]})["name"] == ["a", "\u00e9"]
+    assert complete("sensor_msgs/JointState", {"name": ("a", "b")})["name"] == ["a", "b"]
+    for names, found in ((["a", 1], "[1]: expected a text, found 1."), (["\ud800"], "[0]: expected a text of whole")):
+        with pytest.raises(InvalidValue) as raised:
+            complete("sensor_msgs/JointState", {"name": names})
+        assert str(raised.value).startswith(f"sensor_msgs/JointState.name{found}")

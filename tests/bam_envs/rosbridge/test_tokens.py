@@ -1,0 +1,103 @@
+import os
+
+import pytest
+
+from bam_envs.core.errors import InvalidValue
+from bam_envs.rosbridge.tokens import Guesses, Tokens, read_token
+
+
+def test_a_secret_is_read_without_the_white_space_around_it(tmp_path):
+    path = tmp_path / "token"
+    path.write_text(" se cret \n")
+    assert read_token(path) == "se cret"
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        (None, "cannot be read: No such file or directory."),
+        (b" \n", "is empty; put a secret into it."),
+        (b"\xff\xfe", "cannot be read: it is not text."),
+    ],
+)
+def test_a_token_file_that_is_none(tmp_path, content, text):
+    path = tmp_path / "token"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InvalidValue) as error:
+        read_token(str(path))
+    assert str(error.value) == f"The token file {path} {text}"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="elsewhere a mode says nothing")
+@pytest.mark.parametrize("mode", [0o640, 0o604, 0o620, 0o666])
+def test_a_servers_token_file_is_its_users_alone(tmp_path, mode):
+    path = tmp_path / "token"
+    path.write_text("secret")
+    path.chmod(mode)
+    assert read_token(path) == "secret"
+    with pytest.raises(InvalidValue) as error:
+        read_token(path, private=True)
+    assert str(error.value) == f"The token file {path} is open to other users of this computer. Run: chmod 600 {path}"
+    path.chmod(0o600)
+    assert read_token(path, private=True) == "secret"
+
+
+def test_roles():
+    tokens = Tokens("secret", "mine")
+    shown = [[], [""], ["secre"], ["secret"], ["x", "mine"], ["mine", "secret"], ["\ud800"]]
+    assert [tokens.role(one) for one in shown] == [None, None, None, "client", "operator", "operator", None]
+    assert (tokens.needed, Tokens(operator="mine").needed, Tokens().exist) == (True, False, False)
+    assert Tokens(operator="mine").role(["secret"]) is None
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        (("", None), "Token: expected a text, found an empty one."),
+        (("a", ""), "Token: expected a text, found an empty one."),
+        (("a", "a"), "The operator's token must be another one than that of the clients."),
+    ],
+)
+def test_tokens_that_cannot_be(given, text):
+    with pytest.raises(InvalidValue) as error:
+        Tokens(*given)
+    assert str(error.value) == text
+
+
+def tries(guesses, addresses):
+    """How many of wrong tokens from `addresses` were looked at."""
+    looked = 0
+    for address in addresses:
+        if guesses.may_try(address):
+            guesses.wrong(address)
+            looked += 1
+    return looked
+
+
+def test_few_guesses_a_second_from_one_address():
+    now = [0.0]
+    guesses = Guesses(lambda: now[0])
+    for _ in range(10):
+        assert tries(guesses, ["10.0.0.1"] * 1000) == 4
+        now[0] += 1.0
+    assert tries(guesses, [f"2001:db8::{k:x}" for k in range(1000)]) == 4  # one network
+
+
+def test_few_guesses_a_second_from_all_and_no_address_is_kept_out_by_others():
+    now = [0.0]
+    guesses = Guesses(lambda: now[0])
+    attackers = [f"10.0.{k}.1" for k in range(200)]
+    assert tries(guesses, attackers) == 200  # each once: nobody knows yet who they are
+    for _ in range(10):
+        now[0] += 1.0
+        assert tries(guesses, attackers * 10) <= 35
+        assert guesses.may_try("10.1.0.1")
+    now[0] += 100.0
+    assert guesses.may_try("10.0.0.1")
+
+
+def test_addresses_are_forgotten_in_the_end():
+    guesses = Guesses()
+    tries(guesses, [f"10.{k // 250}.{k % 250}.1" for k in range(6000)])
+    assert len(guesses._wrong) == 4096

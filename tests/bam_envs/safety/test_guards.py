@@ -1,0 +1,478 @@
+"""The guards one by one: what they let through, what they make of the rest, and what they say."""
+
+import math
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.robot import RobotSpec, RobotState, SignalSpec
+from bam_envs.robots.mir100 import base_spec
+from bam_envs.robots.ur5e import GEOMETRY, JOINTS, arm_spec
+from bam_envs.safety import arm_guards, guards
+from bam_envs.safety.arm_guards import longest_step
+from bam_envs.safety.guard import BOUNDS, Guard, Limits, Tick
+from bam_envs.safety.guards import default_guards
+from bam_envs.testing import ARM_HOME
+
+ARM, BASE = arm_spec("ur5e", with_object=False), base_spec(with_scans=False)
+HOME = np.array([*ARM_HOME, 0.085])
+PERIOD = {7: ARM.period, 2: BASE.period}
+
+
+def tick_from(last, step=None, **numbers):
+    """A tick of a robot that was sent `last`, which is `step` after what it was sent before."""
+    last = np.array(last, dtype=np.float64)
+    still = {"before": last.copy(), "velocity": np.zeros_like(last), "age": 0.0, "period": PERIOD[len(last)]}
+    given = {"goal": last.copy(), "measured": last.copy(), **still, **numbers}
+    given.setdefault("command", given["goal"].copy())
+    return Tick(last=last, last_step=np.zeros_like(last) if step is None else np.array(step), **given)
+
+
+def arm_tick(goal, step=None, **numbers):
+    """A tick of an arm at home that is told to go `goal` (7,) from there."""
+    return tick_from(HOME, None if step is None else np.array([*step, 0.0]), goal=HOME + goal, **numbers)
+
+
+def joints(*way):
+    return np.array([*way, *[0.0] * (7 - len(way))])
+
+
+def test_the_list_of_an_arm():
+    table = [(one.number, one.name, round(one.limit_value, 9), one.unit) for one in default_guards(ARM)]
+    assert table == [
+        ("G2", "shape", 7, "numbers"),
+        ("G2", "finite", 3, "bad ticks in a row"),
+        ("G3", "state age", 0.1, "s"),
+        ("G15", "command pace", 1.0, "s"),
+        ("G4", "answer to a command", 0.3, "s"),
+        ("G7", "measured jump", 0.05, "rad"),
+        ("G8", "measured joint speed", 1.3, "rad/s"),
+        ("G10", "measured tool speed", 0.325, "m/s"),
+        ("G7", "position margin", 0.1, "rad"),
+        ("G8", "gripper speed", 0.15, "m/s"),
+        ("G8", "joint speed", 1.0, "rad/s"),
+        ("G14", "ramp-in speed", 0.25, "rad/s"),
+        ("G10", "tool speed", 0.25, "m/s"),
+        ("G9", "joint acceleration", 10.0, "rad/s^2"),
+        ("G10", "tool speed", 0.25, "m/s"),
+        ("G23", "following", 0.05, "rad"),
+        ("G7", "measured limits", 0.0, "beyond the data sheet"),
+    ]
+
+
+def test_an_arm_that_is_told_its_joints_alone_has_no_guard_of_a_gripper():
+    spec = replace(ARM, command=ARM.command.part(JOINTS))
+    whole, joints_only = ([(one.name, one.limit_value) for one in default_guards(one)] for one in (ARM, spec))
+    assert joints_only == [("shape", 6), *(one for one in whole[1:] if one[0] != "gripper speed")]
+
+
+def test_the_list_of_a_base():
+    table = [(one.number, one.name, round(one.limit_value, 9), one.unit) for one in default_guards(BASE)]
+    assert table == [
+        ("G2", "shape", 2, "numbers"),
+        ("G2", "finite", 3, "bad ticks in a row"),
+        ("G3", "state age", 0.5, "s"),
+        ("G15", "command pace", 1.0, "s"),
+        ("G4", "answer to a command", 0.3, "s"),
+        ("G11", "measured base speed", 0.65, "m/s"),
+        ("G11", "measured turn speed", 0.91, "rad/s"),
+        ("G11", "base speed", 0.5, "m/s"),
+        ("G11", "turn speed", 0.7, "rad/s"),
+        ("G11", "base acceleration", 2.0, "m/s^2"),  # the data sheet's, which is below the limit
+        ("G11", "turn acceleration", 2.5, "rad/s^2"),
+        ("G23", "base following", 0.2, "m/s"),
+        ("G23", "turn following", 0.25, "rad/s"),
+        ("G7", "measured limits", 0.0, "beyond the data sheet"),
+    ]
+
+
+def test_limits_that_are_infinite_are_off():
+    limits = Limits(joint_acceleration=math.inf, tool_speed=math.inf)
+    names = [guard.name for guard in default_guards(ARM, limits)]
+    assert "joint acceleration" not in names
+    assert "tool speed" not in names
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, "1", None, True])
+def test_a_limit_is_a_number_above_zero(value):
+    with pytest.raises(InvalidValue) as caught:
+        Limits(tool_speed=value)
+    assert str(caught.value) == f"The limit tool_speed must be above 0, not {value!r}."
+
+
+@pytest.mark.parametrize("name", ["position_margin", "reset_speed", "ramp_time", "reset_tolerance", "reset_timeout"])
+def test_a_limit_that_cannot_be_switched_off(name):
+    with pytest.raises(InvalidValue) as caught:
+        Limits(**{name: math.inf})
+    assert str(caught.value) == f"The limit {name} must be finite."
+
+
+def test_a_margin_leaves_room():
+    with pytest.raises(InvalidValue) as caught:
+        default_guards(ARM, Limits(position_margin=4.0))
+    assert str(caught.value) == "The limit position_margin of 4 rad leaves elbow_joint no room."
+
+
+def test_limits_by_name():
+    assert Limits.of({"joint_speed": 0.5}) == Limits(joint_speed=0.5)
+    with pytest.raises(UnknownName) as caught:
+        Limits.of({"joint_sped": 0.5})
+    assert str(caught.value) == "Unknown limit 'joint_sped'. Did you mean 'joint_speed'?"
+
+
+@pytest.mark.parametrize("name", sorted(BOUNDS))
+def test_a_profile_cannot_open_a_guard(name):
+    least, most, unit = BOUNDS[name]
+    assert Limits.of({name: least}) != Limits.of({name: most})
+    for value in (1000.5, least / 2):
+        with pytest.raises(InvalidValue) as caught:
+            Limits.of({name: value})
+        text = f"The limit {name} of a live robot must be {least:g} to {most:g} {unit}, not {value:g}."
+        assert str(caught.value) == text
+
+
+def test_every_limit_has_its_bounds():
+    assert sorted(BOUNDS) == sorted(one.name for one in fields(Limits))
+
+
+def other_arm():
+    command = SignalSpec("command", ("a", "b"), ("rad", "rad"), (-3.0, -3.0), (3.0, 3.0), (2.0, 0.5))
+    measured = SignalSpec("joint_position", ("a", "b"), ("rad", "rad"), (-3.0, -3.0), (3.0, 3.0))
+    return RobotSpec("other", (measured,), command, 0.1)
+
+
+def test_an_arm_without_kinematics_has_no_tool_speed_that_could_be_limited():
+    with pytest.raises(InvalidValue) as caught:
+        default_guards(other_arm())
+    assert str(caught.value) == (
+        "The tool speed of other cannot be limited: its kinematics are not known. "
+        "Give tool_position=; a simulated robot may do with the limit tool_speed = inf."
+    )
+    blind = [one.name for one in default_guards(other_arm(), Limits(tool_speed=math.inf))]
+    assert not [name for name in blind if "tool" in name]
+    seeing = default_guards(other_arm(), tool_position=lambda q: np.pad(q, ((0, 0), (0, 1))))
+    assert len(seeing) == len(blind) + 3
+    with pytest.raises(InvalidValue) as caught:
+        default_guards(other_arm(), tool_position=lambda q: np.zeros((len(q), 3)))
+    assert str(caught.value) == (
+        "tool_position of other must give the position of the tool [m] for joints [rad], and the tool stays within "
+        "0.01 m when each joint is turned by 0.5 rad."
+    )
+
+
+@pytest.mark.parametrize(
+    "units", [("m/s", "rad"), ("m/s", "rad/s", "m"), ("m/s",), ("rad", "rad/s"), ("rad/s",), ("m",), ("1",)]
+)
+def test_a_command_with_numbers_that_no_guard_limits_is_refused(units):
+    labels, ones = tuple(f"n{i}" for i in range(len(units))), (1.0,) * len(units)
+    command = SignalSpec("command", labels, units, tuple(-one for one in ones), ones, ones)
+    with pytest.raises(InvalidValue) as caught:
+        default_guards(RobotSpec("other", (), command, 0.1), Limits(tool_speed=math.inf))
+    assert str(caught.value) == (
+        "The command of other cannot be guarded: a base is told m/s and rad/s and nothing else, an arm rad and no "
+        f"speeds; found {', '.join(units)}."
+    )
+
+
+def test_a_guard_that_says_nothing_changes_nothing():
+    guard, tick = Guard(), arm_tick(joints(1.0))
+    guard.restart()
+    assert guard.fault(tick) is None
+    assert guard.limit(tick) is False
+    assert guard.trip(RobotState({}, np.zeros(1), HOME[None])) is None
+
+
+@pytest.mark.parametrize("shape", [(7,), (1, 6), (2, 7), (1, 7, 1)])
+def test_shape(shape):
+    with pytest.raises(InvalidValue) as caught:
+        guards.Shape(ARM).row(np.zeros(shape))
+    assert str(caught.value) == f"The command must have shape (1, 7), not {shape}."
+
+
+def test_what_is_no_number():
+    with pytest.raises(InvalidValue, match=r"^The command must be numbers: could not convert string"):
+        guards.Shape(ARM).row(["a"] * 7)
+
+
+def test_finite():
+    guard = guards.Finite(ARM, Limits())
+    assert guard.fault(arm_tick(joints(0.1))) is None
+    tick = arm_tick(joints(math.nan, 0, math.inf))
+    assert guard.fault(tick) == "the command for shoulder_pan_joint, elbow_joint is not a finite number"
+
+
+def test_state_age():
+    guard = guards.Freshness(ARM, Limits())
+    assert guard.fault(arm_tick(joints(), age=0.1)) is None
+    for age in (0.1004, math.inf, math.nan):
+        text = f"the newest state is {age:.3f} s old, and at most 0.1 s are allowed"
+        assert guard.fault(arm_tick(joints(), age=age)) == text
+
+
+@pytest.mark.parametrize(
+    ("name", "velocity", "text"),
+    [
+        ("measured joint speed", joints(0, 0, 0, 0, 0, -1.6), "1.350 rad/s were measured, and at most 1.300 rad/s"),
+        ("measured tool speed", joints(0.8), "0.339 m/s were measured, and at most 0.325 m/s"),
+    ],
+)
+def test_a_measured_speed_is_the_mean_of_two_ticks(name, velocity, text):
+    guard = next(one for one in default_guards(ARM) if one.name == name)
+    for _ in range(2):
+        assert guard.fault(arm_tick(joints(), velocity=velocity)) is None
+        assert guard.fault(arm_tick(joints(), velocity=joints())) is None
+        assert guard.fault(arm_tick(joints(), velocity=velocity * 0.6875)) is None
+        assert guard.fault(arm_tick(joints(), velocity=velocity)) == f"{text} are allowed"
+        guard.restart()
+    assert guard.fault(arm_tick(joints(), velocity=joints(math.nan))) is None
+
+
+def test_joints_keep_a_margin_and_the_gripper_its_range():
+    guard = arm_guards.PositionLimits(ARM, Limits())
+    tick = tick_from(HOME, goal=np.array([7.0, -7.0, 3.1, 0.0, 0.0, 0.0, 0.2]))
+    assert guard.limit(tick)
+    clipped = [2 * math.pi - 0.1, 0.1 - 2 * math.pi, math.pi - 0.1, 0.0, 0.0, 0.0, 0.085]
+    np.testing.assert_array_equal(tick.command, clipped)
+    np.testing.assert_array_equal(tick.goal, clipped)
+    assert not guard.limit(tick)
+
+
+def test_a_joint_inside_the_margin_may_stay_and_go_back_and_not_come_nearer():
+    guard = arm_guards.PositionLimits(ARM, Limits())
+    near = HOME.copy()
+    near[2] = math.pi - 0.05
+    for goal, command in ((3.14, math.pi - 0.05), (math.pi - 0.05, math.pi - 0.05), (3.0, 3.0)):
+        tick = tick_from(near, goal=np.where(np.arange(7) == 2, goal, near))
+        assert guard.limit(tick) == (goal == 3.14)
+        assert tick.command[2] == command
+
+
+def test_joint_speed_keeps_the_direction():
+    tick = arm_tick(joints(0.1, -0.05, 0.01))
+    assert arm_guards.JointSpeed(ARM, Limits()).limit(tick)
+    np.testing.assert_allclose(tick.command - HOME, joints(0.05, -0.025, 0.005), atol=1e-15)
+
+
+def test_joint_speed_leaves_the_gripper_and_slow_joints_alone():
+    tick = arm_tick(joints(0.05, -0.05, 0, 0, 0, 0, -0.08))
+    assert not arm_guards.JointSpeed(ARM, Limits()).limit(tick)
+    np.testing.assert_array_equal(tick.command, tick.goal)
+
+
+def test_joint_speed_is_never_above_the_data_sheet():
+    tick = tick_from([0.0, 0.0], goal=np.array([0.1, 0.1]))
+    assert arm_guards.JointSpeed(other_arm(), Limits()).limit(tick)
+    np.testing.assert_allclose(tick.command, [0.05, 0.05])
+
+
+def test_tool_speed_shortens_the_step_of_all_joints():
+    guard = arm_guards.ToolSpeed(ARM, Limits(), GEOMETRY.tool_position)
+    tick = arm_tick(joints(0.05, 0.02, 0, 0, 0, 0.05))
+    assert guard.limit(tick)
+    step = tick.command - HOME
+    np.testing.assert_allclose(step / step[0], joints(1, 0.4, 0, 0, 0, 1), atol=1e-9)
+    there, here = GEOMETRY.tool_position(np.stack([tick.command[:6], ARM_HOME]))
+    assert 0.99 * 0.0125 < math.dist(there, here) <= 0.0125
+
+
+def test_tool_speed_leaves_a_slow_tool_alone():
+    tick = arm_tick(joints(0.02, 0, 0, 0, 0, 0.05))
+    assert not arm_guards.ToolSpeed(ARM, Limits(), GEOMETRY.tool_position).limit(tick)
+    np.testing.assert_array_equal(tick.command, tick.goal)
+
+
+def test_tool_speed_holds_where_no_part_of_the_step_is_slow():
+    places = iter(range(100))
+    guard = arm_guards.ToolSpeed(ARM, Limits(), lambda q: np.full((len(q), 3), float(next(places))))
+    tick = arm_tick(joints(0.05))
+    assert guard.limit(tick)
+    np.testing.assert_array_equal(tick.command, HOME)
+
+
+def acceleration(limit=10.0):
+    return arm_guards.JointAcceleration(ARM, Limits(joint_acceleration=limit))
+
+
+def test_acceleration_from_rest_keeps_the_direction():
+    tick = arm_tick(joints(0.05, -0.025))
+    assert acceleration().limit(tick)
+    np.testing.assert_allclose(tick.command - HOME, joints(0.025, -0.0125), atol=1e-15)
+
+
+def test_acceleration_leaves_a_steady_motion_alone():
+    tick = arm_tick(joints(0.02, -0.01), step=[0.02, -0.01, 0, 0, 0, 0])
+    assert not acceleration().limit(tick)
+    np.testing.assert_array_equal(tick.command, tick.goal)
+
+
+def test_where_joints_cannot_go_together_each_goes_as_far_as_it_may():
+    tick = arm_tick(joints(0.03, 0.03), step=[0.03, -0.03, 0, 0, 0, 0])
+    assert acceleration(4.0).limit(tick)
+    np.testing.assert_allclose(tick.command - HOME, joints(0.02, -0.02), atol=1e-15)
+
+
+def test_a_step_of_next_to_nothing():
+    tick = tick_from(np.zeros(7), [0.03, 0, 0, 0, 0, 0, 0], goal=joints(5e-324, -5e-324))
+    assert acceleration(4.0).limit(tick)
+    np.testing.assert_allclose(tick.command, joints(0.02), atol=1e-9)
+
+
+def ticks_of(guard, goal, count, speed=math.inf):
+    """Steps of the first joint on its way to `goal` (m,) away."""
+    steps, position, step = [], HOME.copy(), np.zeros(7)
+    for _ in range(count):
+        tick = tick_from(position, step, goal=HOME + goal)
+        tick.command[:6] = position[:6] + np.clip(tick.goal[:6] - position[:6], -speed, speed)
+        guard.limit(tick)
+        position, step = tick.command, tick.command - position
+        steps.append(step[0])
+    return np.array(steps)
+
+
+def test_a_joint_brakes_in_time_and_stops_at_its_goal():
+    steps = ticks_of(acceleration(2.0), joints(0.05), 9)
+    np.testing.assert_allclose(steps, np.array([3, 6, 9, 7, 4, 1, 0, 0, 0]) / 600, atol=1e-10)
+    assert steps.sum() == pytest.approx(0.05, abs=1e-12)
+
+
+def test_at_its_speed_limit_a_joint_goes_on_until_it_must_brake():
+    steps = ticks_of(acceleration(2.0), joints(1.0), 40, speed=0.0125)
+    assert (steps[3:70] <= 0.0125 + 1e-12).all()
+    np.testing.assert_allclose(steps[5:38], 0.0125)
+
+
+@given(st.floats(0, 100), st.floats(1e-4, 10))
+def test_the_longest_step_is_followed_by_others_that_stop_at_the_end(distance, change):
+    step, left, count = float(longest_step(np.array([distance]), change)[0]), distance, 0
+    assert 0 <= step <= distance + 1e-12
+    before = step
+    while left > 1e-9 * max(1.0, distance) and count < 100_000 and step < 2000 * change:
+        assert before - step <= change * (1 + 1e-6)
+        left, before, count = left - step, step, count + 1
+        step = float(longest_step(np.array([max(left, 0.0)]), change)[0])
+    assert left >= -1e-9 * max(1.0, distance)
+
+
+def test_the_gripper_is_sent_no_farther_than_it_goes():
+    tick = arm_tick(joints(0, 0, 0, 0, 0, 0, -0.085))
+    assert arm_guards.GripperSpeed(ARM).limit(tick)
+    assert tick.command[6] == pytest.approx(0.0775)
+
+
+def test_opening_begins_at_the_fingers():
+    last = np.array([*ARM_HOME, 0.0])
+    tick = tick_from(last, goal=HOME, measured=np.array([*ARM_HOME, 0.04]))
+    assert arm_guards.GripperSpeed(ARM).limit(tick)
+    assert tick.command[6] == pytest.approx(0.0475)
+
+
+def test_a_gripper_that_is_not_measured_goes_from_the_last_width():
+    tick = arm_tick(joints(0, 0, 0, 0, 0, 0, -0.085), measured=np.full(7, math.nan))
+    assert arm_guards.GripperSpeed(ARM).limit(tick)
+    assert tick.command[6] == pytest.approx(0.0775)
+
+
+def ramp():
+    return arm_guards.RampIn(ARM, Limits())
+
+
+def test_a_near_first_command_is_free_at_once_and_so_is_what_follows():
+    guard = ramp()
+    assert not guard.limit(arm_tick(joints(0.05)))
+    assert not guard.limit(arm_tick(joints(1.0)))
+
+
+def test_a_far_first_command_is_gone_to_slowly_until_it_is_caught_up_with():
+    guard = ramp()
+    for _ in range(3):
+        tick = arm_tick(joints(0.2, 0.1))
+        assert guard.limit(tick)
+        np.testing.assert_allclose(tick.command - HOME, joints(0.0125, 0.00625), atol=1e-15)
+    assert not guard.limit(arm_tick(joints(0.05)))
+    assert not guard.limit(arm_tick(joints(1.0)))
+    guard.restart()
+    assert guard.limit(arm_tick(joints(1.0)))
+
+
+@pytest.mark.parametrize("data_sheet", [(2.0, 2.0), None])
+def test_a_far_first_command_is_gone_to_slowly_without_a_speed_limit_too(data_sheet):
+    command = SignalSpec("command", ("a", "b"), ("rad", "rad"), (-3.0, -3.0), (3.0, 3.0), data_sheet)
+    guard = arm_guards.RampIn(RobotSpec("other", (), command, 0.1), Limits(joint_speed=math.inf))
+    tick = tick_from([0.0, 0.0], goal=np.array([1.0, 0.5]))
+    assert guard.limit(tick)
+    np.testing.assert_allclose(tick.command, [0.025, 0.0125])
+
+
+def test_after_three_seconds_it_is_free():
+    guard = ramp()
+    altered = [guard.limit(arm_tick(joints(1.0))) for _ in range(65)]
+    assert altered == [True] * 60 + [False] * 5
+
+
+def test_the_way_to_a_start_pose_is_slow_however_long_and_near():
+    guard = ramp()
+    assert all(guard.limit(arm_tick(joints(0.03), approach=True)) for _ in range(100))
+
+
+def base_tick(command, last=(0.0, 0.0)):
+    return tick_from(last, goal=np.array(command, dtype=np.float64))
+
+
+def run(names, tick):
+    altered = [guard.name for guard in default_guards(BASE) if guard.name in names and guard.limit(tick)]
+    return altered, tick.command.tolist()
+
+
+@pytest.mark.parametrize(
+    ("command", "altered", "sent"),
+    [
+        ((0.5, 0.7), [], [0.5, 0.7]),
+        ((0.6, 0.1), ["base speed"], [0.5, 0.1]),
+        ((-9.0, 0.1), ["base speed"], [-0.5, 0.1]),
+        ((0.2, -0.8), ["turn speed"], [0.2, -0.7]),
+        ((0.9, 0.8), ["base speed", "turn speed"], [0.5, 0.7]),
+    ],
+)
+def test_base_speeds_are_limited_one_by_one(command, altered, sent):
+    assert run(("base speed", "turn speed"), base_tick(command)) == (altered, sent)
+
+
+@pytest.mark.parametrize(
+    ("last", "command", "sent"),
+    [
+        (0.0, 0.5, 0.2),  # the data sheet's 2.0 m/s^2 is below the limit of 2.5
+        (0.0, -0.5, -0.2),
+        (0.3, 0.5, 0.5),
+        (0.1, 0.5, 0.3),
+        (0.5, 0.0, 0.0),  # slowing down is never held back
+        (0.5, 0.1, 0.1),
+        (0.5, -0.5, 0.0),  # turning round begins at 0
+        (0.1, -0.5, -0.1),
+        (-0.5, 0.5, 0.0),
+        (-0.1, 0.5, 0.1),
+    ],
+)
+def test_base_acceleration(last, command, sent):
+    tick = base_tick((command, 0.0), (last, 0.0))
+    altered, speeds = run(("base acceleration",), tick)
+    assert speeds == pytest.approx([sent, 0.0])
+    assert altered == ([] if command == sent else ["base acceleration"])
+
+
+def measured(position=0.0, velocity=0.0):
+    signals = {"joint_position": np.full((1, 6), position), "joint_velocity": np.full((1, 6), velocity)}
+    return RobotState({**signals, "gripper_width": np.full((1, 1), -0.001)}, np.zeros(1), HOME[None])
+
+
+def test_measured_limits():
+    guard = guards.MeasuredLimits(ARM)
+    assert guard.trip(measured(3.14, 3.14)) is None
+    text = "joint_position of elbow_joint was measured at 3.200 rad, outside -3.142 to 3.142"
+    assert guard.trip(measured(3.2)) == text
+    text = "joint_velocity of shoulder_pan_joint was measured at -4.000 rad/s, outside -3.142 to 3.142"
+    assert guard.trip(measured(0.0, -4.0)) == text
+    assert guard.trip(measured(math.nan)).startswith("joint_position of shoulder_pan_joint was measured at nan rad")

@@ -1,0 +1,986 @@
+"""The gate: nothing reaches the robot but what the guards let through, at no time and by no way."""
+
+import copy
+import itertools
+import math
+import pickle
+import threading
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bam_envs.core.errors import (
+    InvalidValue,
+    LinkLost,
+    ProtocolError,
+    ResetNeeded,
+    SafetyStop,
+    StaleState,
+    StartNotReached,
+)
+from bam_envs.core.robot import Initial, Robot, RobotState
+from bam_envs.robots.fake import FakeRobot
+from bam_envs.robots.physics.mir100 import SimulatedBase
+from bam_envs.robots.ur5e import GEOMETRY
+from bam_envs.safety.arm_guards import JointSpeed
+from bam_envs.safety.guards import Guard, Limits
+from bam_envs.safety.safe import ClearedCommand, SafeRobot
+from bam_envs.testing import ARM_HOME, RobotContract
+
+FIRST = np.zeros(1, np.int64)
+NAN = np.array([[math.nan] * 7])
+
+
+def start_at(joints=ARM_HOME):
+    return Initial({"joint_position": np.array(joints, dtype=np.float64)[None]}, FIRST)
+
+
+class LiveArm(FakeRobot):
+    """What a live arm is to a SafeRobot: reset moves nothing, commands must be cleared, states have an age."""
+
+    needs_clearance = True
+    info = None
+
+    def __init__(self):
+        super().__init__(1)
+        self.now, self.old = 0.0, 0.0
+        self.stuck, self.fails, self.during = None, None, None
+        self.cleared = []
+
+    def clock(self):
+        return self.now
+
+    def age(self):
+        return self.old
+
+    def measure(self):
+        self._require_link()
+        return self._measure()
+
+    def reset(self, rows, initial):
+        return self.measure()
+
+    def place(self, joints, width=0.085):
+        """Somebody moves the arm by hand."""
+        self._position = np.array([[*joints, width]])
+        self._velocity = np.zeros((1, 6))
+
+    def step(self, command):
+        if not isinstance(command, ClearedCommand):
+            raise InvalidValue("not cleared")
+        if self.during is not None:
+            self.during()
+        if self.fails is not None:
+            raise self.fails
+        self.cleared.append(command)
+        self.now += self.spec.period
+        before = self._position
+        state = super().step(command.command)
+        if self.stuck is not None:
+            self._position = self._position.copy()
+            self._position[:, self.stuck] = before[:, self.stuck]
+            state = self._measure()
+        return state
+
+
+def live(joints=ARM_HOME, **options):
+    """A live arm at `joints` and the gate before it, reset there."""
+    arm = LiveArm()
+    robot = SafeRobot(arm, clock=arm.clock, **options)
+    robot.connect()
+    arm.place(joints)
+    return arm, robot, robot.reset(np.arange(1), start_at(joints))
+
+
+def fake(joints=ARM_HOME, **options):
+    inner = FakeRobot()
+    robot = SafeRobot(inner, **options)
+    robot.connect()
+    return inner, robot, robot.reset(np.arange(1), start_at(joints))
+
+
+def away(state, *way):
+    """A command that is `way` from where `state` was sent to."""
+    command = np.array(state.command)
+    command[0, : len(way)] += way
+    return command
+
+
+def turned(state, way):
+    """The same, but only the last joint, which does not move the tool."""
+    return away(state, 0, 0, 0, 0, 0, way)
+
+
+class Guarded(RobotContract):
+    sizes = (1,)
+    holds_what_is_not_finite = True
+
+    def move(self, robot, state):
+        return self.stay(state) - 0.005
+
+
+class TestSafeFakeRobot(Guarded):
+    def make(self, num_robots: int) -> Robot:
+        return SafeRobot(FakeRobot(num_robots))
+
+
+class TestSafeLiveArm(Guarded):
+    def make(self, num_robots: int) -> Robot:
+        arm = LiveArm()
+        return SafeRobot(arm, clock=arm.clock)
+
+
+class TestSafeBase(Guarded):
+    def make(self, num_robots: int) -> Robot:
+        return SafeRobot(SimulatedBase(num_robots, with_scans=False))
+
+    def measured(self, state: RobotState):
+        return state.signals["base_velocity"]
+
+    def stay(self, state: RobotState):
+        return np.zeros_like(state.command)
+
+
+NUMBERS = st.one_of(
+    st.floats(-8, 8),
+    st.floats(allow_nan=True, allow_infinity=True),
+    st.sampled_from([0.0, 0.085, 2 * math.pi, -2 * math.pi, 1e308, -1e308, math.nan, math.inf, -math.inf]),
+)
+PLACES = st.lists(NUMBERS, min_size=7, max_size=7)
+WAYS = st.lists(st.floats(-0.12, 0.12), min_size=7, max_size=7)
+KEPT = st.integers(1, 12)
+"""How many ticks the same is told."""
+ORDERS = st.lists(
+    st.one_of(
+        st.tuples(st.just("place"), PLACES, KEPT),
+        st.tuples(st.just("way"), WAYS, KEPT),
+        st.tuples(st.sampled_from(["halt", "reset", "resume"]), st.none(), st.just(1)),
+    ),
+    max_size=12,
+)
+
+
+def tool_travel(one, other):
+    return math.dist(*GEOMETRY.tool_position(np.stack([one[:6], other[:6]])))
+
+
+class Watcher:
+    """Follows what an arm is sent, and checks every tick of it."""
+
+    def __init__(self, inner, state, limits):
+        self.inner, self.limits = inner, limits
+        low, high = np.array(inner.spec.command.low), np.array(inner.spec.command.high)
+        margin = np.array([limits.position_margin] * 6 + [0.0])
+        self.low, self.high = low + margin, high - margin
+        self.begin(state)
+
+    def begin(self, state):
+        """It was set somewhere, or halted: what follows begins there."""
+        self.last, self.step = state.command[0].copy(), np.zeros(7)
+        self.least, self.most = self.last.copy(), self.last.copy()
+        self.count = len(self.inner.sent)
+
+    def told(self, command):
+        if np.isfinite(command).all():
+            inside = np.clip(command[0], np.minimum(self.low, self.last), np.maximum(self.high, self.last))
+            self.least, self.most = np.minimum(self.least, inside), np.maximum(self.most, inside)
+
+    def look(self):
+        for sent in self.inner.sent[self.count :]:
+            self.check(sent[0], sent[0] - self.last)
+        self.count = len(self.inner.sent)
+
+    def check(self, sent, step):
+        period, limits = 0.05, self.limits
+        assert np.isfinite(sent).all()
+        assert (sent >= np.minimum(self.low, self.last) - 1e-9).all()
+        assert (sent <= np.maximum(self.high, self.last) + 1e-9).all()
+        assert (np.abs(step[:6]) <= limits.joint_speed * period + 1e-8).all()
+        assert abs(step[6]) <= 0.15 * period + 1e-9
+        assert tool_travel(self.last, sent) <= limits.tool_speed * period + 1e-8
+        change = np.abs(step - self.step)[:6]
+        slower = (np.abs(step) <= np.abs(self.step) + 1e-12) & (step * self.step >= -1e-12)
+        assert ((change <= limits.joint_acceleration * period**2 + 1e-8) | slower[:6]).all()
+        assert (sent >= self.least - 1e-9).all(), "it passed the farthest place that it was told"
+        assert (sent <= self.most + 1e-9).all(), "it passed the farthest place that it was told"
+        self.last, self.step = sent, step
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    ORDERS,
+    st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6),
+    st.sampled_from([0.5, 2.0, 10.0, 40.0]),
+    st.sampled_from([0.02, 0.25, 1.0]),
+)
+def test_whatever_it_is_told_what_is_sent_keeps_every_limit_at_every_tick(orders, joints, acceleration, tool_speed):
+    limits = Limits(joint_acceleration=acceleration, tool_speed=tool_speed)
+    inner, robot, state = fake(joints, limits=limits)
+    watcher = Watcher(inner, state, limits)
+    for kind, numbers, times in orders:
+        for _ in range(times):
+            if kind in ("place", "way"):
+                state = tell(robot, watcher, state, np.array([numbers]) + (state.command if kind == "way" else 0.0))
+            elif kind == "halt":
+                robot.halt()
+                watcher.begin(state)
+            elif kind == "reset":
+                robot.resume()
+                state = robot.reset(np.arange(1), start_at(joints))
+                watcher.begin(state)
+            else:
+                robot.resume()
+                watcher.step[:] = 0.0
+
+
+def tell(robot, watcher, state, command):
+    """One step; what a stopped robot refuses is not sent."""
+    watcher.told(command)
+    try:
+        state = robot.step(command)
+    except SafetyStop:
+        assert len(watcher.inner.sent) == watcher.count
+        robot.resume()
+        watcher.begin(state)
+        return state
+    watcher.look()
+    return state
+
+
+SPEEDS = st.one_of(st.floats(-3, 3), st.sampled_from([math.nan, math.inf, 1e300]))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(SPEEDS, SPEEDS), max_size=40))
+def test_whatever_a_base_is_told_it_keeps_its_limits(commands):
+    robot = SafeRobot(SimulatedBase(with_scans=False))
+    robot.connect()
+    last = robot.reset(np.arange(1), Initial({}, FIRST)).command[0]
+    np.testing.assert_array_equal(last, [0.0, 0.0])
+    for command in commands:
+        try:
+            sent = robot.step(np.array([command])).command[0]
+        except SafetyStop:
+            robot.resume()
+            last = np.zeros(2)
+            continue
+        assert (np.abs(sent) <= [0.5, 0.7]).all()
+        gain = np.where(sent * last >= 0, np.abs(sent) - np.abs(last), np.abs(sent))
+        assert (gain <= np.array([0.2, 0.25]) + 1e-9).all()
+        if not np.isfinite(command).all():
+            np.testing.assert_array_equal(sent, [0.0, 0.0])
+        last = sent
+
+
+def test_a_slow_command_passes_unchanged():
+    inner, robot, state = fake()
+    command = away(state, 0.01, -0.02)
+    np.testing.assert_array_equal(robot.step(command).command, command)
+    np.testing.assert_array_equal(inner.sent[-1], command)
+    assert robot.status == 0
+    assert not any(row["altered"] for row in robot.report().values())
+
+
+def test_what_was_altered_is_counted_by_guard_and_told_by_status():
+    _, robot, state = fake()
+    robot.step(turned(state, 0.04))
+    assert robot.status == 9
+    assert robot.report()["joint acceleration"] == {
+        "number": "G9",
+        "limit": 10.0,
+        "unit": "rad/s^2",
+        "altered": 1,
+        "held": 0,
+        "stopped": 0,
+    }
+    altered = {name: row["altered"] for name, row in robot.report().items() if row["altered"]}
+    assert altered == {"joint acceleration": 1}
+
+
+def test_another_shape_is_refused_and_nothing_is_sent():
+    inner, robot, _ = fake()
+    with pytest.raises(InvalidValue) as caught:
+        robot.step(np.zeros((1, 6)))
+    assert str(caught.value) == "The command must have shape (1, 7), not (1, 6)."
+    assert inner.sent == []
+    assert inner.halts == 0
+
+
+def test_one_robot_only():
+    with pytest.raises(InvalidValue) as caught:
+        SafeRobot(FakeRobot(2))
+    assert str(caught.value) == "A SafeRobot guards one robot, not 2 stepped together."
+
+
+class Opener(Guard):
+    """Allows everything, and more than it was asked."""
+
+    number, name, unit, limit_value = "G99", "joint speed", "", math.inf
+
+    def fault(self, tick):
+        tick.last[:] += 1.0
+        tick.age = math.inf
+
+    def limit(self, tick):
+        tick.last[:], tick.period, tick.approach = tick.goal, 100.0, True
+        tick.command = tick.goal + 1.0
+        return True
+
+
+@pytest.mark.parametrize("kind", [FakeRobot, lambda: LiveArm()])
+def test_guards_of_ones_own_are_asked_first_and_never_have_the_last_word(kind):
+    inner = kind()
+    robot = SafeRobot(inner, [Opener()])
+    robot.connect()
+    if isinstance(inner, LiveArm):
+        inner.place(ARM_HOME)
+    state = robot.reset(np.arange(1), start_at())
+    sent = robot.step(turned(state, 0.5)).command
+    assert np.abs(sent - state.command)[0, :6].max() <= 0.0125 + 1e-9
+    assert len(robot.report()) == len(SafeRobot(FakeRobot()).report())
+
+
+def test_no_attribute_opens_the_gate():
+    arm, robot, _ = live()
+    for name in ("guards", "limits", "spec", "status", "num_robots", "step", "report"):
+        with pytest.raises(AttributeError):
+            setattr(robot, name, ())
+    for kind, name in ((SafeRobot, "step"), (ClearedCommand, "command"), (JointSpeed, "limit"), (Guard, "fault")):
+        with pytest.raises(
+            AttributeError, match=rf"^{kind.__name__}\.{name} cannot be replaced: it keeps a robot safe"
+        ):
+            setattr(kind, name, lambda *_: None)
+        with pytest.raises(AttributeError, match="cannot be removed"):
+            delattr(kind, name)
+    with pytest.raises(AttributeError):
+        robot.limits.tool_speed = math.inf
+    with pytest.raises(InvalidValue) as caught:
+        SafeRobot(arm)
+    assert str(caught.value) == "fake stands behind a SafeRobot already; command it through that one."
+
+
+@pytest.mark.parametrize(
+    ("limits", "text"),
+    [
+        (Limits(tool_speed=math.inf), "tool_speed of a live robot must be 0.005 to 1 m/s, not inf."),
+        (Limits(joint_acceleration=math.inf), "joint_acceleration of a live robot must be 0.1 to 20 rad/s^2, not inf."),
+        (Limits(position_margin=1e-12), "position_margin of a live robot must be 0.01 to 1 rad, not 1e-12."),
+        (Limits(lag=3.0), "lag of a live robot must be 0.001 to 0.5 s, not 3."),
+    ],
+)
+def test_no_limit_of_a_live_robot_opens_a_guard(limits, text):
+    with pytest.raises(InvalidValue) as caught:
+        SafeRobot(LiveArm(), limits=limits)
+    assert str(caught.value) == f"The limit {text}"
+
+
+def test_a_joint_that_is_not_measured_is_refused():
+    class Blind(FakeRobot):
+        def __init__(self):
+            super().__init__()
+            spec = self.spec
+            self.spec = type(spec)(spec.name, spec.signals[2:], spec.command, spec.period)
+
+    with pytest.raises(InvalidValue) as caught:
+        SafeRobot(Blind())
+    assert str(caught.value) == (
+        "The guards need shoulder_pan_joint, shoulder_lift_joint, elbow_joint, wrist_1_joint, wrist_2_joint, "
+        "wrist_3_joint of fake measured in rad; no signal has it."
+    )
+
+
+def test_two_bad_ticks_hold_and_the_third_stops_for_good():
+    inner, robot, state = fake()
+    sent = robot.step(away(state, 0.02)).command
+    for _ in range(2):
+        np.testing.assert_array_equal(robot.step(NAN).command, sent)
+        assert robot.status == 2
+    halts = inner.halts
+    with pytest.raises(SafetyStop) as caught:
+        robot.step(NAN)
+    assert caught.value.guard == "finite"
+    assert str(caught.value) == (
+        "The robot was stopped by G2 finite: the command for shoulder_pan_joint, shoulder_lift_joint, elbow_joint, "
+        "wrist_1_joint, wrist_2_joint, wrist_3_joint, gripper_width is not a finite number, 3 ticks on end. "
+        "When it is safe, call resume()."
+    )
+    assert inner.halts == halts + 1
+    assert len(inner.sent) == 3
+    assert robot.report()["finite"] == {
+        "number": "G2",
+        "limit": 3,
+        "unit": "bad ticks in a row",
+        "altered": 0,
+        "held": 3,
+        "stopped": 1,
+    }
+
+
+def test_a_good_tick_between_bad_ones_counts_anew():
+    _, robot, state = fake()
+    for _ in range(3):
+        robot.step(NAN)
+        robot.step(NAN)
+        robot.step(state.command)
+
+
+def stopped():
+    inner, robot, state = fake()
+    for _ in range(2):
+        robot.step(NAN)
+    with pytest.raises(SafetyStop):
+        robot.step(NAN)
+    return inner, robot, state
+
+
+def test_a_stop_is_latched_over_steps_resets_and_connections_until_a_person_resumes():
+    inner, robot, state = stopped()
+    sent = len(inner.sent)
+    robot.close()
+    robot.connect()
+    for act in (lambda: robot.step(state.command), lambda: robot.reset(np.arange(1), start_at())):
+        with pytest.raises(SafetyStop) as caught:
+            act()
+        assert caught.value.guard == "finite"
+        assert str(caught.value).startswith("The robot is still stopped by G2 finite: ")
+        assert str(caught.value).endswith("When it is safe, call resume().")
+    assert len(inner.sent) == sent
+    robot.resume()
+    state = robot.reset(np.arange(1), start_at())
+    robot.step(state.command)
+
+
+def test_after_a_stop_it_begins_where_it_is():
+    arm, robot, state = live()
+    for _ in range(10):
+        state = robot.step(turned(state, 0.03))
+    for _ in range(2):
+        robot.step(NAN)
+    with pytest.raises(SafetyStop):
+        robot.step(NAN)
+    elsewhere = ARM_HOME - np.array([0, 0, 0, 0, 0, 0.3])
+    arm.place(elsewhere)
+    robot.resume()
+    sent = robot.step(away(state)).command[0]
+    assert np.abs(sent[:6] - elsewhere).max() == pytest.approx(0.0125)
+    assert robot.status == 14
+
+
+def test_after_a_hold_it_starts_from_rest():
+    _, robot, state = fake()
+    for _ in range(5):
+        state = robot.step(turned(state, 0.03))
+    held = robot.step(NAN).command
+    np.testing.assert_array_equal(held, state.command)
+    assert np.abs(robot.step(turned(state, 0.1)).command - held)[0, :6].max() <= 0.025 + 1e-9
+
+
+def test_a_base_holds_at_zero():
+    robot = SafeRobot(SimulatedBase(with_scans=False))
+    robot.connect()
+    robot.reset(np.arange(1), Initial({}, FIRST))
+    robot.step(np.array([[0.2, 0.1]]))
+    np.testing.assert_array_equal(robot.step(np.array([[math.nan, 0.1]])).command, [[0.0, 0.0]])
+
+
+def test_stale_states_hold_for_half_a_second_and_then_stop():
+    arm, robot, state = live()
+    state = robot.step(away(state, 0.02))
+    arm.old = 0.11
+    for _ in range(9):
+        np.testing.assert_array_equal(robot.step(away(state, 0.02)).command, state.command)
+        assert robot.status == 3
+    with pytest.raises(StaleState) as caught:
+        robot.step(away(state, 0.02))
+    assert str(caught.value) == (
+        "The robot was stopped by G3 state age: the newest state is 0.110 s old, and at most 0.1 s are allowed, "
+        "10 ticks on end. When it is safe, call resume()."
+    )
+    assert (caught.value.age, caught.value.limit) == (0.11, 0.1)
+    assert robot.report()["state age"]["held"] == 10
+    with pytest.raises(SafetyStop):
+        robot.step(state.command)
+    assert robot.age() == 0.11
+
+
+def test_after_stale_states_it_goes_on_from_rest():
+    arm, robot, state = live()
+    state = robot.step(state.command)
+    for _ in range(20):
+        arm.old = 0.3
+        for _ in range(5):
+            state = robot.step(turned(state, 0.05))
+        arm.old = 0.0
+        after = robot.step(turned(state, 0.05))
+        np.testing.assert_allclose((after.command - state.command)[0, 5], 0.025)
+        state = after
+    assert robot.report()["state age"] | {"limit": 0, "number": ""} == {
+        "number": "",
+        "limit": 0,
+        "unit": "s",
+        "altered": 0,
+        "held": 100,
+        "stopped": 0,
+    }
+
+
+def test_no_motion_begins_at_a_stale_state():
+    arm, robot, state = live()
+    robot.halt()
+    arm.old, sent = 0.3, len(arm.sent)
+    with pytest.raises(StaleState) as caught:
+        robot.step(away(state, 0.02))
+    assert str(caught.value) == (
+        "The newest state is 0.300 s old, and a motion begins at a state of at most 0.1 s. Nothing was sent; "
+        "look at the link, at what publishes the state, and at whether this computer is busy."
+    )
+    assert len(arm.sent) == sent
+
+
+def test_after_a_pause_of_this_process_a_motion_begins_at_the_state_that_lay_unread():
+    arm, robot, state = live()
+    robot.halt()
+    ages = [0.3] * 20
+    arm.age = lambda: ages.pop() if ages else 0.01
+    robot.step(away(state, 0.02))
+    assert ages == []
+    assert robot.status == 0
+    assert robot.report()["state age"]["stopped"] == 0
+
+
+@pytest.mark.parametrize("fault", [ProtocolError("no stamp"), LinkLost("gone")])
+def test_a_state_that_cannot_be_read_before_a_command_halts(fault):
+    arm, robot, state = live()
+    state = robot.step(away(state, 0.02))
+
+    def fail():
+        raise fault
+
+    arm.age, halts, sent = fail, arm.halts, len(arm.sent)
+    with pytest.raises(type(fault)):
+        robot.step(away(state, 0.02))
+    assert (arm.halts, len(arm.sent)) == (halts + 1, sent)
+
+
+def test_a_stale_state_after_a_pause_halts():
+    arm, robot, state = live()
+    state = robot.step(away(state, 0.02))
+    arm.now, arm.old, halts = arm.now + 1.0, 1.0, arm.halts
+    with pytest.raises(StaleState, match=r"^The newest state is 1.000 s old"):
+        robot.step(away(state, 0.02))
+    assert arm.halts == halts + 1
+
+
+@pytest.mark.parametrize("what", ["position", "speed"])
+def test_a_measurement_beyond_the_data_sheet_stops_at_once(what):
+    arm, robot, state = live()
+
+    def push():
+        if what == "position":
+            arm._low[2], arm._high[2] = 3.5, 4.0
+            arm._position = arm._position.copy()
+            arm._position[0, 2] = 3.5
+        else:
+            arm.spec = type(arm.spec)(arm.spec.name, arm.spec.signals, arm.spec.command, 0.001)
+
+    arm.during = push
+    with pytest.raises(SafetyStop, match=r"^The robot was stopped by G7 measured limits: joint_") as caught:
+        robot.step(away(state, 0.02))
+    assert caught.value.guard == "measured limits"
+    with pytest.raises(SafetyStop):
+        robot.step(state.command)
+
+
+def test_nothing_is_known_before_reset():
+    robot = SafeRobot(FakeRobot())
+    robot.connect()
+    with pytest.raises(ResetNeeded) as caught:
+        robot.step(np.zeros((1, 7)))
+    assert str(caught.value) == "Nothing is known of the robot yet. Call reset() first."
+
+
+def test_a_live_arm_opens_its_gripper_and_goes_to_its_start_slowly():
+    arm, robot, _ = live()
+    begin, goal = ARM_HOME - np.array([0.1, 0, 0, 0, 0, 0.6]), ARM_HOME
+    arm.place(begin, width=0.03)
+    count = len(arm.sent)
+    state = robot.reset(np.arange(1), start_at(goal))
+    np.testing.assert_allclose(state.signals["joint_position"][0], goal, atol=1e-9)
+    np.testing.assert_allclose(state.command[0, :6], goal, atol=1e-12)
+    path = np.array([[*begin, 0.03], *[sent[0] for sent in arm.sent[count:]]])
+    opening = np.abs(np.diff(path[:, 6])) > 0
+    np.testing.assert_array_equal(path[1:][opening][:, :6], np.tile(begin, (opening.sum(), 1)))
+    steps = np.diff(path, axis=0)
+    assert np.abs(steps[:, :6]).max() <= 0.25 * 0.05 + 1e-9
+    assert np.abs(np.diff(steps[:, :6], axis=0)).max() <= 10.0 * 0.05**2 + 1e-9
+    assert len(steps) == 8 + 48  # 55 mm at 0.15 m/s, then 0.6 rad at 0.25 rad/s
+
+
+def test_a_live_arm_that_is_there_is_sent_nothing():
+    arm, robot, _ = live()
+    count = len(arm.sent)
+    robot.reset(np.arange(1), start_at(ARM_HOME + 0.01))
+    assert len(arm.sent) == count
+
+
+def test_a_joint_that_is_blocked_on_the_way_to_the_start_stops_the_arm():
+    arm, robot, _ = live()
+    arm.stuck = 1
+    halts, count = arm.halts, len(arm.sent)
+    with pytest.raises(SafetyStop) as caught:
+        robot.reset(np.arange(1), start_at(ARM_HOME + 0.2))
+    assert caught.value.guard == "following"
+    assert str(caught.value) == (
+        "The robot was stopped by G23 following: shoulder_lift_joint does not follow its commands: it is -0.012 rad "
+        "from the last one, and beyond a lag of 0 s it may be 0.009 rad, and the tool 0.009 m: look for a protective "
+        "stop, a paused program, an inactive controller, a low speed slider, or something in its way. When it is safe, "
+        "call resume()."
+    )
+    assert arm.halts > halts + 1
+    assert np.abs(np.array(arm.sent[count:])[:, 0, 1] - ARM_HOME[1]).max() <= 0.0125 + 1e-9
+
+
+def test_a_way_that_is_too_long_for_the_time():
+    _, robot, _ = live(limits=Limits(reset_timeout=0.1))
+    with pytest.raises(StartNotReached, match=r"in 0\.1 s: shoulder_pan_joint is \+0\.1"):
+        robot.reset(np.arange(1), start_at(ARM_HOME + 0.2))
+
+
+def test_a_start_outside_the_limits_is_refused_before_anything_moves():
+    arm, robot, _ = live()
+    goal = ARM_HOME.copy()
+    goal[2] = 3.1
+    count = len(arm.sent)
+    with pytest.raises(InvalidValue) as caught:
+        robot.reset(np.arange(1), start_at(goal))
+    assert str(caught.value) == (
+        "The start pose has elbow_joint at 3.100 rad, outside the -3.042 to 3.042 rad that the guards allow. "
+        "Choose another start, or a smaller position_margin."
+    )
+    assert len(arm.sent) == count
+
+
+def test_a_first_command_far_away_is_gone_to_slowly():
+    arm, robot, state = live()
+    far = away(state, 0.3)
+    for _ in range(5):
+        before = state.command
+        state = robot.step(far)
+        assert robot.status == 14
+        assert np.abs(state.command - before).max() <= 0.0125 + 1e-9
+    assert len(arm.sent) == 5
+
+
+def test_after_a_halt_the_next_command_begins_at_what_is_measured():
+    arm, robot, state = live()
+    robot.step(away(state, 0.02))
+    robot.halt()
+    pushed = ARM_HOME + 0.4
+    arm.place(pushed)
+    sent = robot.step(state.command).command[0]
+    assert np.abs(sent[:6] - pushed).max() <= 0.0125 + 1e-9
+
+
+def test_after_a_halt_the_gripper_goes_on_holding():
+    arm, robot, state = live()
+    closed = state.command.copy()
+    closed[0, 6] = 0.0
+    for _ in range(15):
+        robot.step(closed)
+    robot.halt()
+    arm.place(ARM_HOME, width=0.04)
+    assert robot.step(closed).command[0, 6] == 0.0
+
+
+def test_a_halt_that_comes_just_before_the_command_is_repeated_after_it():
+    arm, robot, state = live()
+    seen = []
+
+    def halt_meanwhile():
+        arm.during = None
+        thread = threading.Thread(target=robot.halt)
+        thread.start()
+        thread.join()
+        seen.append(arm.halts)
+
+    arm.during = halt_meanwhile
+    robot.step(away(state, 0.02))
+    assert arm.halts == seen[0] + 1
+    pushed = ARM_HOME + 0.4
+    arm.place(pushed)
+    assert np.abs(robot.step(state.command).command[0, :6] - pushed).max() <= 0.0125 + 1e-9
+
+
+def test_a_lost_link_halts_and_what_comes_after_begins_at_what_is_measured():
+    arm, robot, state = live()
+    arm.fails, halts = LinkLost("cut"), arm.halts
+    with pytest.raises(LinkLost, match="cut"):
+        robot.step(away(state, 0.02))
+    assert arm.halts == halts + 1
+    arm.fails = None
+    pushed = ARM_HOME + 0.4
+    arm.place(pushed)
+    assert np.abs(robot.step(state.command).command[0, :6] - pushed).max() <= 0.0125 + 1e-9
+
+
+def halt(arm, robot, state, pushed):
+    robot.halt()
+    arm.place(pushed)
+
+
+def lose_link(arm, robot, state, pushed):
+    arm.fails = LinkLost("cut")
+    with pytest.raises(LinkLost):
+        robot.step(state.command)
+    arm.fails = None
+    arm.place(pushed)
+
+
+def stop(arm, robot, state, pushed):
+    robot.step(NAN)
+    robot.step(NAN)
+    with pytest.raises(SafetyStop):
+        robot.step(NAN)
+    arm.place(pushed)
+    robot.resume()
+
+
+def pause(arm, robot, state, pushed):
+    arm.now += 10.0
+    arm.place(pushed)
+    with pytest.raises(SafetyStop):
+        robot.step(state.command)
+    robot.resume()
+
+
+def connect_again(arm, robot, state, pushed):
+    robot.close()
+    arm.place(pushed)
+    robot.connect()
+    robot.reset(np.arange(1), start_at(pushed))
+
+
+INTERRUPTIONS = {"halt": halt, "lost link": lose_link, "stop": stop, "pause": pause, "connect": connect_again}
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.floats(-0.04, 0.04), min_size=6, max_size=6),
+    st.sampled_from(sorted(INTERRUPTIONS)),
+    st.lists(st.floats(-0.5, 0.5), min_size=6, max_size=6),
+    st.lists(st.floats(-8, 8), min_size=7, max_size=7),
+)
+def test_no_jump_from_where_somebody_moved_it_whatever_came_between(way, kind, push, command):
+    arm, robot, state = live()
+    for _ in range(5):
+        state = robot.step(away(state, *way))
+    pushed = arm._position[0, :6] + push
+    INTERRUPTIONS[kind](arm, robot, state, pushed)
+    sent = robot.step(np.array([command])).command[0]
+    assert np.abs(sent[:6] - pushed).max() <= 0.025 + 1e-9
+    assert tool_travel(pushed, sent) <= 0.0125 + 1e-9
+
+
+def test_a_late_command_is_not_executed():
+    arm, robot, state = live()
+    for _ in range(10):
+        state = robot.step(turned(state, 0.03))
+    arm.now += 0.06  # beyond two periods since the last command
+    np.testing.assert_array_equal(robot.step(turned(state, 0.03)).command, state.command)
+    assert robot.status == 15
+    assert np.abs(robot.step(turned(state, 0.03)).command - state.command).max() <= 0.025 + 1e-9
+
+
+def test_a_policy_that_is_too_slow_moves_nothing_and_is_stopped():
+    arm, robot, state = live()
+    state = robot.step(turned(state, 0.02))
+    for _ in range(9):
+        arm.now += 0.3
+        np.testing.assert_array_equal(robot.step(turned(state, 0.03)).command, state.command)
+    arm.now += 0.3
+    with pytest.raises(SafetyStop) as caught:
+        robot.step(turned(state, 0.03))
+    assert str(caught.value) == (
+        "The robot was stopped by G15 command pace: the command came 0.350 s after the one before, and one is "
+        "expected every 0.05 s: the policy takes too long, or this process was paused or the computer is busy, "
+        "10 ticks on end. When it is safe, call resume()."
+    )
+
+
+@pytest.mark.parametrize("when", ["in the episode", "on the way to the start"])
+def test_after_a_pause_of_this_process_nothing_moves_before_a_person_resumes(when):
+    arm, robot, state = live()
+    for _ in range(3):
+        state = robot.step(turned(state, 0.03))
+    sent = len(arm.sent)
+
+    def pause_once():
+        arm.now, arm.during = arm.now + 10.0, None
+
+    arm.during = pause_once
+    stopped = r"^The robot was stopped by G15 command pace: the command came 10\.050 s after"
+    if when == "in the episode":
+        robot.step(turned(state, 0.03))
+        with pytest.raises(SafetyStop, match=stopped):
+            robot.step(turned(state, 0.03))
+    else:
+        with pytest.raises(SafetyStop, match=stopped):
+            robot.reset(np.arange(1), start_at(ARM_HOME + 0.3))
+    assert len(arm.sent) == sent + 1
+    with pytest.raises(SafetyStop, match=r"^The robot is still stopped by G15"):
+        robot.step(state.command)
+    robot.resume()
+    robot.step(state.command)
+
+
+def test_limits_hold_over_the_real_time_since_the_last_command():
+    """Commands that are late every second tick come 29 ms after the one before."""
+    arm, robot, state = live()
+    arm.info = type("Info", (), {"lockstep": False})
+    sent = [(arm.now, state.command[0])]
+    for tick in range(20):
+        arm.now += 0.021 if tick % 2 else -0.021
+        begun = arm.now
+        state = robot.step(away(state, 0.05, 0, 0, 0, 0, 0.2))
+        sent.append((begun, state.command[0]))
+    for (before, one), (now, other) in itertools.pairwise(sent[1:]):
+        took = min(now - before, 0.05)
+        assert tool_travel(one, other) <= 0.25 * took + 1e-9
+        assert np.abs(other - one)[:6].max() <= 1.0 * took + 1e-9
+    assert {round(now - before, 3) for (before, _), (now, _) in itertools.pairwise(sent[1:])} == {0.029, 0.071}
+
+
+def test_a_robot_that_does_not_answer_is_held_and_then_stopped():
+    arm, robot, state = live()
+    arm.waiting = lambda: arm.now
+    for _ in range(6):
+        state = robot.step(turned(state, 0.01))
+    assert robot.status == 0
+    for _ in range(10):
+        arm.now += 0.001
+        try:
+            np.testing.assert_array_equal(robot.step(turned(state, 0.01)).command, state.command)
+        except SafetyStop as stop:
+            told = str(stop)
+    assert told == (
+        "The robot was stopped by G4 answer to a command: a command that was sent 0.760 s ago is not answered, and at "
+        "most 0.3 s are allowed: commands do not arrive, or late; look at the network and at who else commands the "
+        "robot, 10 ticks on end. When it is safe, call resume()."
+    )
+
+
+def test_an_arm_that_is_measured_too_fast_is_held_and_stopped_when_it_goes_on():
+    arm, robot, state = live()
+    state = robot.step(state.command)
+    measure = arm._measure
+
+    def run_away():
+        measured = measure()
+        return RobotState(
+            {**measured.signals, "joint_velocity": np.array([[0, 0, 0, 0, 0, 1.5]])}, measured.stamp, measured.command
+        )
+
+    arm._measure = run_away
+    robot.step(turned(state, 0.01))
+    held = robot.step(turned(state, 0.02)).command
+    assert robot.status == 0
+    for _ in range(2):
+        np.testing.assert_array_equal(robot.step(turned(state, 0.03)).command, held)
+        assert robot.status == 8
+    with pytest.raises(SafetyStop) as caught:
+        robot.step(turned(state, 0.03))
+    assert caught.value.guard == "measured joint speed"
+
+
+def test_a_joint_that_is_measured_elsewhere_at_once_is_not_gone_to():
+    arm, robot, state = live()
+    for _ in range(5):
+        state = robot.step(turned(state, 0.03))
+    sent = len(arm.sent)
+    arm.place(state.command[0, :6] + np.array([0, 0, 0, 0.5, 0, 0]))
+    robot.step(state.command)  # measured before
+    with pytest.raises(SafetyStop) as caught:
+        robot.step(state.command)
+    assert caught.value.guard == "measured jump"
+    assert len(arm.sent) == sent + 1
+
+
+def test_a_robot_that_waits_for_commands_does_not_mind_a_pause():
+    arm, robot, state = live()
+    arm.info = type("Info", (), {"lockstep": True})
+    for _ in range(10):
+        state = robot.step(turned(state, 0.02))
+    arm.now += 60.0
+    command = turned(state, 0.02)
+    np.testing.assert_array_equal(robot.step(command).command, command)
+    assert robot.info.lockstep
+
+
+@pytest.mark.parametrize(("width", "begin"), [(-0.0004, 0.0), (0.0853, 0.085)])
+def test_a_gripper_that_is_measured_beyond_its_range_begins_inside(width, begin):
+    arm = LiveArm()
+    robot = SafeRobot(arm, clock=arm.clock)
+    robot.connect()
+    arm.place(ARM_HOME - 0.1, width)
+    state = robot.reset(np.arange(1), start_at())
+    assert abs(arm.sent[0][0, 6] - begin) <= 0.0075 + 1e-9
+    assert all(0.0 <= sent[0, 6] <= 0.085 for sent in arm.sent)
+    assert state.command[0, 6] == 0.085
+
+
+def test_a_gripper_that_is_not_measured():
+    arm = LiveArm()
+    arm.spec = type(arm.spec)(arm.spec.name, arm.spec.signals[:2], arm.spec.command, arm.spec.period)
+    robot = SafeRobot(arm, clock=arm.clock)
+    robot.connect()
+    arm.place(ARM_HOME)
+    state = robot.reset(np.arange(1), start_at())
+    assert arm.sent == []  # it is there, and nobody waits for what nobody sees
+    assert state.command[0, 6] == 0.085
+    assert robot.step(away(state, 0.01)).command[0, 6] == 0.085
+
+
+def test_nobody_else_makes_a_cleared_command():
+    with pytest.raises(InvalidValue) as caught:
+        ClearedCommand(np.zeros((1, 7)))
+    assert str(caught.value) == "Only a SafeRobot clears commands. Build the robot with live_robot(...)."
+    with pytest.raises(InvalidValue):
+        ClearedCommand(np.zeros((1, 7)), seal=object())
+    with pytest.raises(InvalidValue):
+        type("Mine", (ClearedCommand,), {})
+
+
+def test_a_cleared_command_is_read_only_and_good_for_its_tick_alone():
+    arm, robot, state = live()
+    tried = []
+
+    def try_to_change():
+        arm.during = None
+        tried.append(True)
+
+    arm.during = try_to_change
+    robot.step(away(state, 0.01))
+    assert tried
+    old = arm.cleared[-1]
+    with pytest.raises(InvalidValue) as caught:
+        arm.step(old)
+    assert str(caught.value) == (
+        "The tick that this command was cleared for is over. Give the next one to the SafeRobot."
+    )
+    for copied in (copy.copy, copy.deepcopy, pickle.dumps):
+        with pytest.raises(InvalidValue):
+            copied(old)
+    with pytest.raises(AttributeError):
+        old._command = state.command
+    with pytest.raises(InvalidValue):
+        arm.step(object.__new__(ClearedCommand))
+
+
+def test_any_other_robot_is_handed_a_plain_array():
+    inner, robot, state = fake()
+    robot.step(state.command)
+    assert isinstance(inner.sent[-1], np.ndarray)
+    assert robot.age() == 0.0
+    assert robot.info is None
