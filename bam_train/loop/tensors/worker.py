@@ -13,8 +13,8 @@ import multiprocessing
 import os
 import pickle
 import signal
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from multiprocessing.reduction import ForkingPickler
 from typing import Any
@@ -66,7 +66,8 @@ class Worker:
         context: Any = multiprocessing.get_context(start_method)
         self._connection, there = context.Pipe()
         self._process = context.Process(target=serve, args=(there, payload, seed, noise), daemon=True)
-        self._process.start()
+        with _signals_blocked(start_method == "fork"):
+            self._process.start()
         there.close()
         self._pending = 1  # it says when it is ready
 
@@ -181,6 +182,21 @@ class Worker:
                 f"{self.name}: cannot be sent to another process: {error}; use functions and classes of a module "
                 f'instead of local ones and lambdas, or start_method="fork".'
             ) from error
+
+
+@contextmanager
+def _signals_blocked(blocked: bool) -> Iterator[None]:
+    """Keep signals from a forked process until it has handlers of its own.
+
+    It begins inside ``os.fork()`` with this process's handlers. One that raises, such as Ray's for SIGTERM or the one
+    for Ctrl-C, would leave ``os.fork()`` there and go on with this process's own code a second time. The forked process
+    inherits the mask; `serve` takes the handlers away and then unblocks.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals() if blocked else ())
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def wait_for_any(workers: Sequence[Worker]) -> None:

@@ -470,6 +470,39 @@ def test_processes_end_with_their_parent(killed, code):
     assert (run.returncode, run.stdout, run.stderr) == (code, "True\n", "")
 
 
+HANDLER = """
+import functools, os, signal
+from remote_agents import Walker
+from bam_train.loop import AsynchronousAgent
+
+def handler(number, frame):  # such as the one that ray.init installs
+    raise SystemExit(3)
+
+signal.signal(signal.SIGTERM, handler)
+# In the child os.fork() takes a tenth of a second, in which no Python code runs: the signal comes within it.
+os.register_at_fork(after_in_child=functools.partial(sum, range(4_000_000)))
+try:
+    for _ in range(4):
+        agent = AsynchronousAgent(Walker(), start_method="fork")
+        agent(t=0)
+        agent.close()
+finally:
+    print("the end of the program", flush=True)
+"""
+
+
+def test_a_process_that_is_closed_while_it_forks_does_not_run_the_program_again():
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    run = subprocess.run(
+        [sys.executable, "-W", "ignore::DeprecationWarning", "-c", HANDLER],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert (run.returncode, run.stdout, run.stderr) == (0, "the end of the program\n", "")
+
+
 def test_a_script_without_main_guard(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
