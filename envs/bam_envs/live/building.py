@@ -10,8 +10,7 @@ from bam_envs.core.robot import RobotSpec
 from bam_envs.live.rosbridge import RosbridgeRobot
 from bam_envs.robots.profiles.profile import load_profile, profile_for
 from bam_envs.ros.profile_tables import RobotProfile
-from bam_envs.rosbridge.addresses import require_tls
-from bam_envs.rosbridge.tokens import read_token
+from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.safety.arm_guards import ToolPosition
 from bam_envs.safety.guards import Limits
 from bam_envs.safety.safe import SafeRobot
@@ -49,11 +48,9 @@ def live_robot(
         UnknownName: There is no such profile, or no such way of sending commands.
     """
     require_robot_address(url)
-    require_tls(url, ca_file)
+    endpoint = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file)
     chosen = _profile(profile, spec)
-    robot = RosbridgeRobot(
-        url, chosen, spec=spec, ca_file=ca_file, token=read_token(token_file) if token_file else None, command=command
-    )
+    robot = RosbridgeRobot(url, chosen, spec=spec, ca_file=endpoint.ca_file, token=endpoint.token, command=command)
     return SafeRobot(robot, limits=limits or profile_limits(chosen), tool_position=tool_position)
 
 

@@ -20,7 +20,7 @@ from bam_envs.live.state import SourceAge
 from bam_envs.ros.images import message_bytes, read_color_message, read_depth_message
 from bam_envs.ros.messages import read_stamp, require_message
 from bam_envs.ros.profile_tables import CameraSource
-from bam_envs.rosbridge.addresses import parse_address
+from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.link.cbor_stream import CborStream
 
 Pixels = NDArray[Any]
@@ -93,7 +93,7 @@ class LiveCamera:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.source, self.url = source, url
-        self._topic = parse_address(url).namespace + source.topic
+        self._topic = Endpoint(url).address.namespace + source.topic
         self._ca_file, self._token, self._clock = ca_file, token, clock
         self._feed: _Feed | None = None
         self._decoded: CameraImage | None = None
@@ -119,8 +119,8 @@ class LiveCamera:
         self._feed = feed
 
     def _new_feed(self) -> _Feed:
-        options: dict[str, Any] = {"ca_file": self._ca_file, "token": self._token, "clock": self._clock}
-        return _Feed(CborStream(self.url, self._topic, self.source.type, **options))
+        endpoint = Endpoint(self.url, self._ca_file, self._token)
+        return _Feed(CborStream(endpoint, self._topic, self.source.type, clock=self._clock))
 
     def _await_first(self, feed: _Feed) -> None:
         deadline = time.monotonic() + FIRST_IMAGE

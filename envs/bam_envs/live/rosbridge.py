@@ -49,7 +49,7 @@ from bam_envs.ros.codec import HALT_TOPIC, SCENE_TOPIC, RobotInfo, encode_sink
 from bam_envs.ros.command_messages import has_room
 from bam_envs.ros.freshness import Tag
 from bam_envs.ros.profile_tables import RobotProfile
-from bam_envs.rosbridge.addresses import parse_address
+from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.link.connection import bare_reason
 from bam_envs.rosbridge.link.link import RosbridgeLink
 from bam_envs.rosbridge.sessions import is_over
@@ -109,7 +109,7 @@ class RosbridgeRobot:
         self._spec = profile.spec(spec, command)
         self.profile = profile.narrowed(self.spec.command.labels, command)
         self.url = url
-        self.namespace = parse_address(url).namespace
+        self.namespace = Endpoint(url).address.namespace
         self._info = RobotInfo(self.profile.name)
         self._hears_halts = False
         self._way, self._sinks = command, self.profile.sinks(command)
@@ -169,7 +169,7 @@ class RosbridgeRobot:
         close_at_exit(self)
 
     def _new_link(self, name: str) -> RosbridgeLink:
-        return RosbridgeLink(self.url, name=name, ca_file=self._ca_file, token=self._token)
+        return RosbridgeLink(Endpoint(self.url, self._ca_file, self._token), name=name)
 
     def _open(self, control: RosbridgeLink, halting: RosbridgeLink) -> None:
         control.on_down(self._on_down)

@@ -198,14 +198,17 @@ def new_scripted():
 
 @pytest.fixture
 def new_link():
-    """Make a connected `RosbridgeLink`; closed at the end."""
+    """Make a connected `RosbridgeLink`; closed at the end. Options are of the link, or of its endpoint."""
+    from bam_envs.rosbridge.endpoint import Endpoint
     from bam_envs.rosbridge.link.link import RosbridgeLink
 
     made = []
 
     def make(server, connect=True, **options):
         url = server if isinstance(server, str) else server.url
-        made.append(RosbridgeLink(url, **options))
+        names = ("ca_file", "token", "connect_timeout")
+        endpoint = Endpoint(url, **{name: options.pop(name) for name in names if name in options})
+        made.append(RosbridgeLink(endpoint, **options))
         if connect:
             made[-1].connect()
         return made[-1]

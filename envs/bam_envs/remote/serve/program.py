@@ -23,6 +23,7 @@ from bam_envs.robots.profiles.profile import profile_for
 from bam_envs.ros.codec import INFO_SERVICE
 from bam_envs.ros.profile_tables import RobotProfile
 from bam_envs.rosbridge.bus import Bus
+from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.link.link import RosbridgeLink
 from bam_envs.rosbridge.server.server import BridgeServer
 from bam_envs.rosbridge.tokens import read_token
@@ -143,7 +144,7 @@ class ServedEnvironment:
             node.start()
             return node
         if options.via is not None:
-            link = RosbridgeLink(options.via, name="serve", ca_file=options.ca_file, token=self._token)
+            link = RosbridgeLink(Endpoint(options.via, options.ca_file, self._token), name="serve")
             started.callback(link.close)
             link.on_down(self._say_down)
             self._refusals = Refusals(link)

@@ -9,8 +9,7 @@ from typing import Any
 
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.remote.transports.transport import Transport
-from bam_envs.rosbridge.addresses import require_tls
-from bam_envs.rosbridge.tokens import read_token
+from bam_envs.rosbridge.endpoint import Endpoint
 
 _CLASSES = {
     "tcp": "bam_envs.remote.transports.tcp:TcpTransport",
@@ -57,12 +56,12 @@ def open_transport(
         raise InvalidValue(f"A transport is a URL such as tcp://10.0.0.5:5555 or ws://10.0.0.5:9090, not {url!r}.")
     if scheme not in _CLASSES:
         raise InvalidValue(f"{url}: {UnknownName('transport', scheme, _CLASSES)} It must be one of {_schemes()}.")
-    require_tls(url, ca_file)
+    endpoint = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file)
     for name, value in (("ca_file", ca_file), ("timeout", timeout)):
         if value is not None:
             options = {**options, name: value}
     if token_file is not None:
-        options = {**options, "token": read_token(token_file)}
+        options = {**options, "token": endpoint.token}
     module, _, name = _CLASSES[scheme].partition(":")
     make: Any = getattr(importlib.import_module(module), name)
     _require_options(url, make, options)

@@ -30,6 +30,7 @@ from bam_envs.remote.transports.foreign_rack import ForeignRack, LastKnown
 from bam_envs.remote.transports.transport import EnvSpecMessage, Info
 from bam_envs.remote.transports.trees import spec_from_json, spec_to_json
 from bam_envs.ros.freshness import Tagger
+from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.link.link import RosbridgeLink
 from bam_envs.rosbridge.sessions import is_over, read_session
 from bam_envs.rosbridge.string_rpc import StringRpc
@@ -173,9 +174,7 @@ class RosbridgeTransport:
                 self._ask(RequestType.CLOSE, timeout=min(self.timeout, _CLOSE_TIMEOUT))
 
     def _make_link(self) -> RosbridgeLink:
-        return RosbridgeLink(
-            self.url, name="gymapi", ca_file=self._ca_file, token=self._token, connect_timeout=self.connect_timeout
-        )
+        return RosbridgeLink(Endpoint(self.url, self._ca_file, self._token, self.connect_timeout), name="gymapi")
 
     def _make_rpc(self) -> StringRpc:
         return StringRpc(self._link, base_name(self._link.namespace), self._tagger)

@@ -21,7 +21,7 @@ from websockets.sync.client import ClientConnection
 from bam_envs.core.errors import BamEnvsError, LinkLost, ProtocolError
 from bam_envs.ros.interfaces import normal_name
 from bam_envs.ros.typed_arrays import decode_cbor
-from bam_envs.rosbridge.addresses import parse_address
+from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.json_frames import decode_frame
 from bam_envs.rosbridge.link.dialing import Dial
 from bam_envs.rosbridge.link.websocket_client import CLOSE_WITHIN, open_websocket
@@ -44,14 +44,11 @@ class CborStream:
     """The newest message of one topic.
 
     Args:
-        url: As of `RosbridgeLink`; a namespace in it is not used.
+        endpoint: As of `RosbridgeLink`; a namespace in it is not used.
         topic: Its name.
         kind: Its type.
         listener: Called with each message that is not passed over, in a thread of the stream; it may take its time.
-        ca_file: As of `RosbridgeLink`.
-        token: As of `RosbridgeLink`.
         throttle_ms: Least time between two messages [ms]; the server drops the others.
-        connect_timeout: For one connection [s].
         max_message: Largest message [bytes].
         clock: Monotonic clock [s], for `Arrival.at`.
 
@@ -61,20 +58,18 @@ class CborStream:
 
     def __init__(
         self,
-        url: str,
+        endpoint: Endpoint | str,
         topic: str,
         kind: str,
         listener: Callable[[Arrival], None] | None = None,
         *,
-        ca_file: str | None = None,
-        token: str | None = None,
         throttle_ms: int = 0,
-        connect_timeout: float = 3.0,
         max_message: int = 64 * 1024 * 1024,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._clock = clock
-        self._dial = Dial(parse_address(url), ca_file, token, max_message)
+        endpoint = Endpoint(endpoint) if isinstance(endpoint, str) else endpoint
+        self._dial = Dial(endpoint, max_message)
         self.url, self.topic = self._dial.address.url, topic
         self._request: dict[str, Any] = {
             "op": "subscribe",
@@ -85,7 +80,7 @@ class CborStream:
             "throttle_rate": throttle_ms,
             "queue_length": 0,
         }
-        self._listener, self._timeout = listener, connect_timeout
+        self._listener, self._timeout = listener, endpoint.connect_timeout
         self._changed = threading.Condition()
         self._frame: tuple[str | bytes, float] | None = None
         self._decoded: tuple[tuple[str | bytes, float], Arrival | None] | None = None

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import re
-import ssl
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, RemoteError
-from bam_envs.rosbridge.addresses import Address
+from bam_envs.core.errors import LinkLost, NoServer, RemoteError
+from bam_envs.rosbridge.endpoint import Address, Endpoint
 from bam_envs.rosbridge.link.connection import Connection
 from bam_envs.rosbridge.link.refusals import no_connection, no_websocket, refused_status, silent_bridge, silent_port
 
@@ -24,41 +23,15 @@ _DEAD_NODE = "context is invalid"
 class Dial:
     """What it takes to connect."""
 
-    address: Address
-    """Where to."""
-    ca_file: str | None
-    """PEM file of the authorities to trust instead of the system's."""
-    token: str | None
-    """Shared secret, sent as a bearer token."""
+    endpoint: Endpoint
+    """Where to, and with what."""
     max_message: int
     """Largest message to receive [bytes]."""
 
-    def __post_init__(self) -> None:
-        if self.token is not None and not re.fullmatch(r"[!-~]+", self.token):
-            raise InvalidValue(
-                "The token is empty, or has blanks, line ends or letters beyond ASCII in it: none can be sent. "
-                "Read a file of it without the line end."
-            )
-
     @property
-    def headers(self) -> dict[str, str]:
-        """HTTP headers of the handshake."""
-        return {"Authorization": f"Bearer {self.token}"} if self.token else {}
-
-    def tls_context(self) -> ssl.SSLContext | None:
-        """The TLS settings, with which certificate and host are always checked; None without TLS.
-
-        Raises:
-            InvalidValue: The CA file cannot be read.
-        """
-        if not self.address.secure:
-            return None
-        try:
-            return ssl.create_default_context(cafile=self.ca_file)
-        except OSError as error:
-            raise InvalidValue(
-                f"CA file {self.ca_file!r} cannot be used: {error}. Expected certificates in PEM."
-            ) from error
+    def address(self) -> Address:
+        """Where to."""
+        return self.endpoint.address
 
 
 @dataclass(frozen=True)
@@ -103,8 +76,8 @@ async def dial_server(dial: Dial, connection: Connection, timeout: float, clock:
 async def _open_socket(dial: Dial, connection: Connection, timeout: float) -> asyncio.Transport:
     from bam_envs.rosbridge.link.protocol import LinkFactory, open_socket
 
-    context = dial.tls_context()
-    factory = LinkFactory(dial.address, dial.headers, dial.max_message, connection)
+    context = dial.endpoint.tls_context()
+    factory = LinkFactory(dial.address, dial.endpoint.headers, dial.max_message, connection)
     try:
         return await asyncio.wait_for(open_socket(factory, dial.address, context), timeout)
     except (OSError, asyncio.TimeoutError) as error:

@@ -22,8 +22,8 @@ from typing import Any
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, ProtocolError, RemoteError
 from bam_envs.ros.interfaces import describe, normal_name
-from bam_envs.rosbridge.addresses import parse_address
 from bam_envs.rosbridge.bus import Caller, Handler, Listener, Message
+from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.json_frames import encode_frame
 from bam_envs.rosbridge.link.answering import Answerer
 from bam_envs.rosbridge.link.callbacks import tell_all
@@ -46,11 +46,8 @@ class RosbridgeLink:
     """A client of a rosbridge server; a `Bus` that can also call services.
 
     Args:
-        url: ``ws://host:port`` or ``wss://host:port``, with a namespace behind it (``/bam_001``) if there is one.
+        endpoint: The server; the text of a URL stands for `Endpoint(url)`.
         name: What it is for; in the names of threads.
-        ca_file: PEM file of the authorities to trust instead of the system's.
-        token: Shared secret of the server.
-        connect_timeout: How long `connect` tries [s].
         max_message: Largest message, either way [bytes].
         clock: Our wall clock [s].
 
@@ -60,22 +57,20 @@ class RosbridgeLink:
 
     def __init__(
         self,
-        url: str,
+        endpoint: Endpoint | str,
         *,
         name: str = "control",
-        ca_file: str | None = None,
-        token: str | None = None,
-        connect_timeout: float = 3.0,
         max_message: int = 64 * 1024 * 1024,
         clock: Callable[[], float] = time.time,
     ) -> None:
-        address = parse_address(url)
+        endpoint = Endpoint(endpoint) if isinstance(endpoint, str) else endpoint
+        address = endpoint.address
         self.url, self.namespace, self.name = address.url, address.namespace, name
         self.statuses: deque[dict[str, Any]] = deque(maxlen=_STATUSES_KEPT)
         """The last `status` messages of the server."""
         self._declarations, self._answerer = Declarations(), Answerer(f"bam-link-{name}-service")
         self._keeper = Keeper(
-            Dial(address, ca_file, token, max_message), connect_timeout, clock, self._declarations, self._take
+            Dial(endpoint, max_message), endpoint.connect_timeout, clock, self._declarations, self._take
         )
         self._numbers = itertools.count(1)
         # A declaration and its announcement must reach the network thread in the same order.

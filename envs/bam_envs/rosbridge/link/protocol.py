@@ -15,7 +15,7 @@ from typing import Any, Protocol
 from roslibpy.comm import comm_asyncio
 
 from bam_envs.core.errors import LinkLost
-from bam_envs.rosbridge.addresses import Address
+from bam_envs.rosbridge.endpoint import Address
 from bam_envs.rosbridge.text_frames import split_texts, text_frame
 
 _AUTOBAHN = logging.getLogger("autobahn")

@@ -7,7 +7,7 @@ import socket
 import ssl
 
 from bam_envs.core.errors import NoServer
-from bam_envs.rosbridge.addresses import Address
+from bam_envs.rosbridge.endpoint import Address
 
 _HOST_MISMATCH = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
 

@@ -26,7 +26,7 @@ def open_websocket(dial: Dial, timeout: float) -> ClientConnection:
         NoServer: There is no server that can be used; the text says why.
         InvalidValue: The CA file cannot be read.
     """
-    address, context = dial.address, dial.tls_context()
+    address, context = dial.address, dial.endpoint.tls_context()
     try:
         # A socket of our own keeps `websockets` from going through a proxy, behind which no robot is.
         plain = socket.create_connection((address.host, address.port), timeout)
@@ -38,7 +38,7 @@ def open_websocket(dial: Dial, timeout: float) -> ClientConnection:
             sock=plain,
             ssl=context,
             server_hostname=address.host if context is not None else None,
-            additional_headers=dial.headers,
+            additional_headers=dial.endpoint.headers,
             compression=None,
             open_timeout=timeout,
             close_timeout=CLOSE_WITHIN,

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, ProtocolError
 from bam_envs.ros.typed_arrays import decode_cbor
+from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.link.cbor_stream import CborStream
 
 SCAN = "sensor_msgs/LaserScan"
@@ -22,7 +23,9 @@ def new_stream():
     made = []
 
     def make(url, listener=None, start=True, **options):
-        made.append(CborStream(url, "/f_scan", "sensor_msgs/msg/LaserScan", listener, **options))
+        names = ("ca_file", "token", "connect_timeout")
+        endpoint = Endpoint(url, **{name: options.pop(name) for name in names if name in options})
+        made.append(CborStream(endpoint, "/f_scan", "sensor_msgs/msg/LaserScan", listener, **options))
         if start:
             made[-1].start()
         return made[-1]

@@ -8,7 +8,7 @@ import threading
 import pytest
 
 from bam_envs.core.errors import InvalidValue, NoServer
-from bam_envs.rosbridge.addresses import Address, parse_address
+from bam_envs.rosbridge.endpoint import Address, Endpoint
 from bam_envs.rosbridge.link.link import RosbridgeLink
 
 START = (
@@ -46,7 +46,7 @@ def answering():
 
 
 def _failure(url, **options):
-    link = RosbridgeLink(url, **{"connect_timeout": 0.3, **options})
+    link = RosbridgeLink(Endpoint(url, **{"connect_timeout": 0.3, **options}))
     with pytest.raises(NoServer) as raised:
         link.connect()
     assert raised.value.url == url
@@ -208,7 +208,7 @@ def test_a_ca_file_that_is_none(scripted, tmp_path, content, reason):
     path = tmp_path / "ca.pem"
     if content is not None:
         path.write_text(content)
-    link = RosbridgeLink(scripted.url.replace("ws://", "wss://"), ca_file=str(path))
+    link = RosbridgeLink(Endpoint(scripted.url.replace("ws://", "wss://"), ca_file=str(path)))
     with pytest.raises(InvalidValue) as raised:
         link.connect()
     assert str(raised.value).startswith(f"CA file {str(path)!r} cannot be used: {reason}")
@@ -227,11 +227,11 @@ def test_a_ca_file_that_is_none(scripted, tmp_path, content, reason):
     ],
 )
 def test_an_address(url, address):
-    assert parse_address(url) == address
+    assert Endpoint(url).address == address
 
 
 def test_an_address_without_its_namespace():
-    assert parse_address("ws://[::1]/a").url == "ws://[::1]:9090"
+    assert Endpoint("ws://[::1]/a").address.url == "ws://[::1]:9090"
 
 
 EXAMPLE = "Expected ws://host:port or wss://host:port, with a namespace behind it if there is one."
@@ -245,10 +245,13 @@ EXAMPLE = "Expected ws://host:port or wss://host:port, with a namespace behind i
         ("ws://", f"Address 'ws://' names no host. {EXAMPLE}"),
         ("ws://me:secret@robot", f"Address 'ws://me:secret@robot' has more than host, port and namespace. {EXAMPLE}"),
         ("ws://robot/a?b=c", f"Address 'ws://robot/a?b=c' has more than host, port and namespace. {EXAMPLE}"),
-        ("ws://robot:0", f"Address 'ws://robot:0' has port 0, which no server has. {EXAMPLE}"),
+        (
+            "ws://robot:0",
+            f"Address 'ws://robot:0' has an invalid port: no server has port 0. {EXAMPLE}",
+        ),
         (
             "ws://robot:70000",
-            f"Address 'ws://robot:70000' has a port that is none: Port out of range 0-65535. {EXAMPLE}",
+            f"Address 'ws://robot:70000' has an invalid port: Port out of range 0-65535. {EXAMPLE}",
         ),
         (
             "ws://robot/a-b",
@@ -259,19 +262,37 @@ EXAMPLE = "Expected ws://host:port or wss://host:port, with a namespace behind i
 )
 def test_an_address_that_is_none(url, text):
     with pytest.raises(InvalidValue) as raised:
-        RosbridgeLink(url)
+        assert Endpoint(url).address is None
     assert str(raised.value) == text
 
 
 def test_a_host_with_a_character_that_ends_texts():
     with pytest.raises(InvalidValue) as raised:
-        RosbridgeLink("ws://a\0b:9090")
-    assert str(raised.value) == (f"Address 'ws://a\\x00b:9090' has a host that is none: a NUL character. {EXAMPLE}")
+        Endpoint("ws://a\0b:9090")
+    assert str(raised.value) == (f"Address 'ws://a\\x00b:9090' has an invalid host: a NUL character. {EXAMPLE}")
 
 
 @pytest.mark.parametrize("host", ["[::1", "[robot]", "a..b", ".", "x" * 64])
 def test_a_host_that_is_none(host):
     with pytest.raises(InvalidValue) as raised:
-        RosbridgeLink(f"ws://{host}:9090")
-    assert str(raised.value).startswith(f"Address 'ws://{host}:9090' has a host that is none: ")
+        Endpoint(f"ws://{host}:9090")
+    assert str(raised.value).startswith(f"Address 'ws://{host}:9090' has an invalid host: ")
     assert str(raised.value).endswith(EXAMPLE)
+
+
+def test_what_does_not_fit_the_address_is_refused(tmp_path):
+    for options, text in (
+        (
+            {"ca_file": "ca.pem"},
+            "ca_file says whom wss:// trusts, and this address is without TLS; leave it out.",
+        ),
+        ({"connect_timeout": 0}, "connect_timeout: expected a time above 0 s, found 0."),
+        ({"timeout": float("nan")}, "timeout: expected a time above 0 s, found nan."),
+    ):
+        with pytest.raises(InvalidValue) as raised:
+            Endpoint("ws://a:1", **options)
+        assert str(raised.value).removeprefix("ws://a:1: ") == text
+    secret = tmp_path / "token"
+    secret.write_text("hush\n")
+    endpoint = Endpoint.with_token_file("tcp://a:1", token_file=secret)
+    assert (endpoint.token, endpoint.is_websocket, "hush" in repr(endpoint)) == ("hush", False, False)

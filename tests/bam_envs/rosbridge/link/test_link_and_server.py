@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, NotInCommand, RemoteError
+from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.link.cbor_stream import CborStream
 from bam_envs.rosbridge.link.link import RosbridgeLink
 from bam_envs.rosbridge.server.server import BridgeServer
@@ -87,12 +88,12 @@ def test_a_stopped_server_is_a_lost_link(server, new_link):
 
 def test_the_token_is_needed():
     with BridgeServer(port=0, token="secret") as server:
-        link = RosbridgeLink(server.url, token="secret")
+        link = RosbridgeLink(Endpoint(server.url, token="secret"))
         link.connect()
         link.close()
         for wrong in (None, "wrong"):
             with pytest.raises(NoServer, match=r"the token was refused \(HTTP 40[13]\)"):
-                RosbridgeLink(server.url, token=wrong).connect()
+                RosbridgeLink(Endpoint(server.url, token=wrong)).connect()
 
 
 def test_tls(certificates, new_link, tmp_path):

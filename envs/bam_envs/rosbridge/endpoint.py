@@ -1,0 +1,164 @@
+"""Where a server is, and what a client needs to be let in: one frozen value that is passed whole."""
+
+from __future__ import annotations
+
+import re
+import ssl
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from urllib.parse import SplitResult, urlsplit
+
+from bam_envs.core.errors import InvalidValue
+from bam_envs.rosbridge.tokens import read_token
+
+DEFAULT_PORT = 9090
+"""The port of a rosbridge server whose address names none."""
+_NAMESPACE = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)*")
+_EXAMPLE = "Expected ws://host:port or wss://host:port, with a namespace behind it if there is one."
+
+
+@dataclass(frozen=True)
+class Address:
+    """The parts of the URL of a rosbridge server."""
+
+    host: str
+    """Name or IP address."""
+    port: int
+    """TCP port."""
+    secure: bool
+    """Whether the connection uses TLS."""
+    namespace: str
+    """Prefix of each topic and service, e.g. ``/bam_001``; empty without one. It is not sent to the server."""
+
+    @property
+    def url(self) -> str:
+        """The URL without the namespace."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{'wss' if self.secure else 'ws'}://{host}:{self.port}"
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """A server as a client sees it: a rosbridge server (``ws://``, ``wss://``) or a whole environment (``tcp://``, …).
+
+    Raises:
+        InvalidValue: The address, the token or a time-out is not valid, or `ca_file` is given without TLS.
+    """
+
+    url: str
+    """``ws://host:port/namespace`` or ``wss://…`` (TLS); transports also take ``tcp://host:port`` and ``ros2://…``."""
+    ca_file: str | None = None
+    """PEM file of the certificate authorities that ``wss://`` trusts instead of the system's."""
+    token: str | None = field(default=None, repr=False)
+    """Shared secret of the server; sent as a bearer token."""
+    connect_timeout: float = 3.0
+    """Longest time to connect [s]."""
+    timeout: float | None = None
+    """Longest time to wait for an answer [s]; None: the default of whoever asks."""
+
+    def __post_init__(self) -> None:
+        if self.is_websocket:
+            self.address  # noqa: B018 - parsed here, so that a wrong one is reported where it was written
+            if self.token is not None and not re.fullmatch(r"[!-~]+", self.token):
+                raise InvalidValue(
+                    "The token is empty, or contains blanks, line ends or characters beyond ASCII, which HTTP headers "
+                    "cannot carry. Read a token file without its line end."
+                )
+        if self.ca_file is not None and not self.url.startswith("wss://"):
+            raise InvalidValue(
+                f"{self.url}: ca_file says whom wss:// trusts, and this address is without TLS; leave it out."
+            )
+        for name, value in (("connect_timeout", self.connect_timeout), ("timeout", self.timeout)):
+            if value is not None and not value > 0:
+                raise InvalidValue(f"{name}: expected a time above 0 s, found {value!r}.")
+
+    @classmethod
+    def with_token_file(
+        cls,
+        url: str,
+        *,
+        ca_file: str | Path | None = None,
+        token_file: str | Path | None = None,
+        connect_timeout: float = 3.0,
+        timeout: float | None = None,
+    ) -> Endpoint:
+        """The endpoint whose token is in `token_file`, as commands and ``gym.make`` take it.
+
+        Raises:
+            InvalidValue: As the class; or the file cannot be read.
+        """
+        token = None if token_file is None else read_token(token_file)
+        return cls(url, None if ca_file is None else str(ca_file), token, connect_timeout, timeout)
+
+    @property
+    def is_websocket(self) -> bool:
+        """Whether it is a rosbridge server."""
+        return self.url.startswith(("ws://", "wss://"))
+
+    @cached_property
+    def address(self) -> Address:
+        """The parts of `url`.
+
+        Raises:
+            InvalidValue: It is not the address of a rosbridge server.
+        """
+        return parse_address(self.url)
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """HTTP headers of the WebSocket handshake."""
+        return {"Authorization": f"Bearer {self.token}"} if self.token else {}
+
+    def tls_context(self) -> ssl.SSLContext | None:
+        """TLS settings that check certificate and host name; None without TLS.
+
+        Raises:
+            InvalidValue: The CA file cannot be read.
+        """
+        if not self.address.secure:
+            return None
+        try:
+            return ssl.create_default_context(cafile=self.ca_file)
+        except OSError as error:
+            raise InvalidValue(
+                f"CA file {self.ca_file!r} cannot be used: {error}. Expected certificates in PEM."
+            ) from error
+
+
+def parse_address(url: str) -> Address:
+    """The parts of a rosbridge URL; the port is rosbridge's 9090 where it is left out.
+
+    Raises:
+        InvalidValue: It is not such a URL.
+    """
+    try:
+        parts = urlsplit(url)
+        (parts.hostname or "").encode("idna")
+        if "\0" in url:
+            raise ValueError("a NUL character")
+    except ValueError as error:  # brackets, or a name that cannot be looked up
+        raise InvalidValue(f"Address {url!r} has an invalid host: {error}. {_EXAMPLE}") from error
+    if parts.scheme not in ("ws", "wss"):
+        raise InvalidValue(f"Address {url!r} has the scheme {parts.scheme!r}. {_EXAMPLE}")
+    if not parts.hostname:
+        raise InvalidValue(f"Address {url!r} names no host. {_EXAMPLE}")
+    if parts.query or parts.fragment or parts.username is not None:
+        raise InvalidValue(f"Address {url!r} has more than host, port and namespace. {_EXAMPLE}")
+    namespace = parts.path.rstrip("/")
+    if not _NAMESPACE.fullmatch(namespace):
+        raise InvalidValue(
+            f"Address {url!r} has the namespace {namespace!r}. "
+            "Expected names of letters, digits and underscores, each after a slash, e.g. /bam_001."
+        )
+    return Address(parts.hostname, _port(url, parts), parts.scheme == "wss", namespace)
+
+
+def _port(url: str, parts: SplitResult) -> int:
+    try:
+        port = DEFAULT_PORT if parts.port is None else parts.port
+        if port == 0:
+            raise ValueError("no server has port 0")
+        return port
+    except ValueError as error:
+        raise InvalidValue(f"Address {url!r} has an invalid port: {error}. {_EXAMPLE}") from error
