@@ -15,7 +15,7 @@ import inspect
 import itertools
 import re
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,8 @@ SECTIONS = ("Start", "Reward", "Success", "End", "Info")
 """Parts of a task's docstring that its page shows; every task has them."""
 OPTIONAL = ("Action",)
 """Parts that a task may have."""
+DIRECTIONS = ("x", "y", "z", "forward", "to the left", "up", "above the table", "near", "close up")
+"""What may follow the last comma of a signal's meaning."""
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -71,9 +73,14 @@ def environments() -> str:
         task = resolve(entry.task)(1)
         shapes = [f"{len(task.observation_labels)} numbers", f"{len(task.action_labels)} numbers"]
         seconds = f"{entry.max_episode_steps * entry.period:g} s"
-        rows.append([f"[`{entry.id}`](#{anchor(entry.id)})", entry.summary, *shapes, entry.max_episode_steps, seconds])
+        rows.append([f"[`{entry.id}`]({page_of(entry.id)})", entry.summary, *shapes, entry.max_episode_steps, seconds])
     header = ["id", "what to do", "observation", "action", "steps an episode", "which is"]
     return table(header, rows)
+
+
+def page_of(env_id: str) -> str:
+    """The file of an environment's page: ``pick-place.md`` for ``bam/pick-place-v0``."""
+    return env_id.partition("/")[2].rpartition("-v")[0] + ".md"
 
 
 def anchor(heading: str) -> str:
@@ -98,13 +105,43 @@ def environment(env_id: str) -> str:
         parts.append(f"**Options**: arguments of `gym.make`\n\n{table(['name', 'default', 'meaning'], named)}")
     for kind in ("observation", "action"):
         rows = signals[kind]
-        numbers = [
-            [i, f"`{row['name']}`", row["meaning"], row["unit"], row["scale"], row["low"], row["high"]]
-            for i, row in enumerate(rows)
-        ]
+        lines = [[where, *line] for where, line in _joined(rows)]
         parts.append(f"**{kind.capitalize()}**: float32, shape ({len(rows)},)")
-        parts.append(table(["index", "name", "meaning", "unit", "scale", "min", "max"], numbers))
+        parts.append(table(["numbers", "names", "meaning", "unit", "scale", "min", "max"], lines))
     return "\n\n".join(parts)
+
+
+def _joined(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[object]]]:
+    """Neighbours that differ in their joint or direction only, as one line: ``[0:6]`` and what they are.
+
+    A meaning ends with its direction ("tool, x"), or names its joint ("turn elbow_joint"), or is the same for all.
+    """
+    lines: list[tuple[str, list[object]]] = []
+    groups = itertools.groupby(enumerate(rows), lambda pair: _alike(pair[1]))
+    for (head, *columns), members in groups:
+        numbered = list(members)
+        first, last = numbered[0][0], numbered[-1][0]
+        where = f"[{first}]" if first == last else f"[{first}:{last + 1}]"
+        tails = [row["meaning"].rpartition(", ")[2] for _, row in numbered]
+        meaning = numbered[0][1]["meaning"] if first == last else head
+        if len(set(tails)) > 1 and head != tails[0] and "the joint" not in head:
+            meaning = f"{head}: {', '.join(tails)}"
+        lines.append((f"`{where}`", [_listed([row["name"] for _, row in numbered]), meaning, *columns]))
+    return lines
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Names as code; of more than three the first and the last, with the dots between them."""
+    quoted = [f"`{name}`" for name in names]
+    return ", ".join(quoted) if len(quoted) <= 3 else f"{quoted[0]} … {quoted[-1]}"
+
+
+def _alike(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    """What rows have in common that stand in one line."""
+    joint = row["name"].removeprefix("d_")
+    head, comma, direction = row["meaning"].rpartition(", ")
+    meaning = head if comma and direction in DIRECTIONS else row["meaning"].replace(joint, "the joint")
+    return (meaning, *(row[name] for name in ("unit", "scale", "low", "high")))
 
 
 def _paragraphs(kind: type, beginning: str) -> list[str]:
@@ -180,20 +217,23 @@ def _once(rows: list[list[str]]) -> list[list[str]]:
 def robot_signals() -> str:
     """What the arm measures and what it is sent."""
     spec = resolve(ENVIRONMENTS["bam/pick-v0"].robot)(1).spec
-    rows = [row for signal in spec.signals for row in _signal_rows(signal)]
-    header = ["signal", "index", "name", "unit", "min", "max"]
-    measured = table(header, [row[:-1] for row in rows])
+    header = ["signal", "names", "unit", "min", "max"]
+    measured = table(header, [row[:-1] for signal in spec.signals for row in _signal_rows(signal)])
     sent = table([*header, "fastest change"], _signal_rows(spec.command))
     return f"**State**: what it measures\n\n{measured}\n\n**Command**: what it is sent\n\n{sent}"
 
 
 def _signal_rows(signal: SignalSpec) -> list[list[object]]:
+    """Neighbours with the same unit and bounds are one row: ``joint_position[0:2]``."""
     rates = signal.max_rate or (0.0,) * len(signal.labels)
-    columns = zip(signal.labels, signal.units, signal.low, signal.high, rates, strict=True)
-    return [
-        [f"`{signal.name}`", i, f"`{label}`", unit, float(low), float(high), f"{rate:.5g} {unit}/s"]
-        for i, (label, unit, low, high, rate) in enumerate(columns)
-    ]
+    columns = zip(signal.units, map(float, signal.low), map(float, signal.high), rates, strict=True)
+    rows: list[list[object]] = []
+    groups = itertools.groupby(zip(itertools.count(), signal.labels, columns), lambda one: one[2])  # noqa: B905
+    for (unit, low, high, rate), members in groups:
+        indices, names, _ = zip(*members, strict=True)
+        where = f"[{indices[0]}]" if len(indices) == 1 else f"[{indices[0]}:{indices[-1] + 1}]"
+        rows.append([f"`{signal.name}{where}`", _listed(names), unit, low, high, f"{rate:.5g} {unit}/s"])
+    return rows
 
 
 def fields_of(reference: str) -> str:
@@ -288,7 +328,7 @@ def robo_gym() -> str:
         task = resolve(ours.task)(1, parity=True, **entry.defaults)
         numbers = [len(task.observation_labels), len(task.action_labels)]
         told = ", ".join(f"`{name}={value!r}`" for name, value in entry.defaults.items() if value is not False)
-        link = f"[`{ours.id}`](environments.md#{anchor(ours.id)})"
+        link = f"[`{ours.id}`](environments/{page_of(ours.id)})"
         rate = f"{1 / ours.period:g} Hz"
         rows.append([f"`{entry.stem}`", link, told, *numbers, ours.max_episode_steps, rate])
     names = ["id, before `Sim-v0` or `Rob-v0`", "is", "with"]
@@ -356,12 +396,12 @@ def main() -> int:
     parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if a page is not current")
     check = parser.parse_args().check
     stale = []
-    for page in sorted(DOCS.glob("*.md")):
+    for page in sorted(DOCS.rglob("*.md")):
         text = page.read_text(encoding="utf-8")
         current = generate(text)
         if current == text:
             continue
-        stale.append(page.name)
+        stale.append(str(page.relative_to(DOCS)))
         if not check:
             page.write_text(current, encoding="utf-8")
     if stale:

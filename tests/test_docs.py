@@ -30,7 +30,7 @@ from bam_train.cli import train
 from bam_train.settings import tomllib
 
 ROOT = Path(__file__).parents[1]
-DOCS = sorted((ROOT / "docs").glob("*.md"))
+DOCS = sorted((ROOT / "docs").rglob("*.md"))
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "checkpoints" / "README.md", *DOCS]
 PROGRAMS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 FLAGS_OF = {"bam-train": "training.md", "bam-serve": "remote.md"}
@@ -100,18 +100,25 @@ def test_a_stale_page_is_found(make_docs, tmp_path, monkeypatch, capsys):
     assert page.read_text().endswith("|\n\n<!-- /generated -->\nafter\n")
 
 
-def test_every_environment_has_a_section_and_a_version():
-    text = (ROOT / "docs" / "environments.md").read_text()
+def test_every_environment_has_a_page_and_a_version(make_docs):
+    folder = ROOT / "docs" / "environments"
+    versions = (folder / "index.md").read_text().partition("## Version history")[2]
     for env_id in ENVIRONMENTS:
-        assert f"## {env_id}\n\n<!-- generated: environment {env_id} -->" in text
-        assert f"| `{env_id}` | " in text.partition("## Version history")[2]
+        page = (folder / make_docs.page_of(env_id)).read_text()
+        assert page.startswith(f"# {env_id}\n\n<!-- generated: environment {env_id} -->")
+        assert f"| `{env_id}` | " in versions
+    assert len(list(folder.iterdir())) == len(ENVIRONMENTS) + 1
 
 
 def test_every_number_of_an_environment_is_in_its_table(make_docs):
     text = make_docs.environment("bam/pick-v0")
-    assert "| 2 | `tool_z` | tool, above the table | m | (z - 0.183) / 0.167 | -2 | 2 |" in text
-    assert "| 4 | `grip` | close the gripper when positive, open it otherwise | 1 | 1 | -1 | 1 |" in text
-    assert text.count("\n| ") == 18 + 5 + 2 * 2
+    assert "| `[2]` | `tool_z` | tool, above the table | m | (z - 0.183) / 0.167 | -2 | 2 |" in text
+    line = "tool target from the tool: forward, to the left, up | m | / 0.03 | -2 | 2 |"
+    assert f"| `[3:6]` | `target_dx`, `target_dy`, `target_dz` | {line}" in text
+    assert "| `[4]` | `grip` | close the gripper when positive, open it otherwise | 1 | 1 | -1 | 1 |" in text
+    assert "| `[0:6]` | `d_shoulder_pan_joint` … `d_wrist_3_joint` | turn the joint | rad |" in make_docs.environment(
+        "bam/reach-v0"
+    )
     for name in make_docs.SECTIONS:
         assert f"**{name}.** " in text
 
