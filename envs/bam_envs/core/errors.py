@@ -24,8 +24,9 @@ Third-party errors are mapped to these at the border, with the cause kept by ``f
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
+
+from bam_envs.core.wording import closest, did_you_mean
 
 
 class BamEnvsError(Exception):
@@ -60,11 +61,8 @@ class UnknownName(BamEnvsError, ValueError):  # noqa: N818 - reads as what happe
         meant: str | None = None,
     ) -> None:
         self.kind, self.name, self.choices = kind, name, sorted(choices)
-        matches = difflib.get_close_matches(str(meant or name), self.choices, n=1, cutoff=similar)
-        self.closest = matches[0] if matches else None
-        some = ", ".join(self.choices if examples is None else examples)
-        rest = f"Choose from: {some}." if some else "There are none."
-        hint = f"Did you mean {self.closest!r}?" if self.closest else rest
+        self.closest = closest(meant or name, self.choices, similar)
+        hint = did_you_mean(meant or name, self.choices, similar, examples)
         super().__init__(f"Unknown {kind} {name!r}. {hint}")
 
 

@@ -1,0 +1,219 @@
+"""The one check of values that people give: an annotated type says what fits, and msgspec compares.
+
+::
+
+    @dataclass(frozen=True)
+    class Options:
+        rate: Positive = 20.0
+        port: Port = 9090
+
+        def __post_init__(self) -> None:
+            check_fields(self)      # rate: expected a number above 0, found -1
+
+A range is ``Annotated[float, msgspec.Meta(gt=0, le=2)]``; the names below are the frequent ones, and every one of them
+refuses NaN and infinity. ``Meta(description=...)`` replaces the words that an error makes of the type and its range.
+"""
+
+from __future__ import annotations
+
+import sys
+import types
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, fields, is_dataclass
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import msgspec
+from msgspec import Meta
+
+from bam_envs.core.errors import InvalidValue
+from bam_envs.core.wording import brief, did_you_mean
+
+T = TypeVar("T")
+_MOST = sys.float_info.max
+
+Finite = Annotated[float, Meta(ge=-_MOST, le=_MOST)]
+Positive = Annotated[float, Meta(gt=0, le=_MOST)]
+NonNegative = Annotated[float, Meta(ge=0, le=_MOST)]
+Fraction = Annotated[float, Meta(ge=0, le=1)]
+PositiveInt = Annotated[int, Meta(ge=1)]
+NonNegativeInt = Annotated[int, Meta(ge=0)]
+Port = Annotated[int, Meta(ge=0, le=65535)]
+NonEmpty = Annotated[str, Meta(min_length=1)]
+
+
+def check(value: object, kind: Any, name: str, error: type[Exception] = InvalidValue) -> Any:
+    """`value` as a `kind`: an int where a float is wanted becomes one, a whole float (1e6) an int, a list a tuple.
+
+    Args:
+        value: A number, text, list, table, a dataclass or an instance of any other class.
+        kind: A type or annotation, such as ``Positive`` or ``list[int] | None``.
+        name: What the value is for, as the error begins.
+        error: Exception to raise.
+
+    Raises:
+        error: ``name: expected ..., found ...``; in a list or table with the place, ``name[2]``, ``name.key``.
+    """
+    value = _plain(value)
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError:
+        if isinstance(value, float) and value.is_integer() and _fits(int(value), kind):
+            return int(value)
+    place, part, wanted = _misfit(value, kind, name)
+    raise error(f"{place}: expected {expected(wanted)}, found {brief(part)}")
+
+
+def check_fields(instance: Any, name: Callable[[str], str] = str, error: type[Exception] = InvalidValue) -> None:
+    """Check every field of a dataclass instance against its annotation; nothing is converted.
+
+    Args:
+        instance: The dataclass instance.
+        name: Makes of a field's name the one that errors show, such as `bam_envs.core.wording.as_flag`.
+        error: Exception to raise.
+
+    Raises:
+        error: As of `check`, for the first field that does not fit.
+    """
+    for field, hint in type_hints(type(instance)).items():
+        check(getattr(instance, field), hint, name(field), error)
+
+
+def read_table(kind: type[T], data: object, where: str, error: type[Exception] = InvalidValue) -> T:
+    """The dataclass `kind` with the values of the table `data`, as it comes out of TOML, YAML or JSON.
+
+    Args:
+        kind: A dataclass; its fields are the keys.
+        data: What was read.
+        where: File and table, as the error begins.
+        error: Exception to raise.
+
+    Raises:
+        error: It is no table, a key is unknown (with the closest match) or missing, or a value does not fit.
+    """
+    table, hints = check(data, dict[str, Any], where, error), type_hints(kind)
+    check_keys(table, hints, where, error)
+    for field in fields(kind):  # type: ignore[arg-type]
+        if field.name not in table and field.default is MISSING and field.default_factory is MISSING:
+            raise error(f"{where}: the key {field.name!r} is missing")
+    return kind(**{key: check(value, hints[key], f"{where}: {key}", error) for key, value in table.items()})
+
+
+def check_keys(
+    table: Mapping[str, Any],
+    known: Sequence[str] | Mapping[str, Any],
+    where: str,
+    error: type[Exception] = InvalidValue,
+) -> None:
+    """Refuse a key of `table` that is not `known`, with the closest match."""
+    for key in table:
+        if key not in known:
+            raise error(f"{where}: unknown key {key!r}. {did_you_mean(key, known, cutoff=0.5)}")
+
+
+def type_hints(kind: type[Any]) -> dict[str, Any]:
+    """The annotation of each field of a dataclass, with its ranges."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {field.name: hints[field.name] for field in fields(kind)}
+
+
+def expected(kind: Any) -> str:
+    """What fits the annotation `kind`, in words: ``a whole number from 0 to 65535``."""
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        metas = [one for one in arguments[1:] if isinstance(one, Meta)]
+        said = next((meta.description for meta in metas if meta.description), None)
+        return said or expected(arguments[0]) + "".join(map(_range, metas))
+    if origin in (Union, types.UnionType):
+        return " or ".join(map(expected, arguments))
+    if origin is Literal:
+        return " or ".join(map(repr, arguments))
+    base = origin or kind
+    if base in (list, tuple, Sequence) and arguments:
+        if base is not tuple or arguments[-1] is ...:
+            return f"a list of {_plural(expected(arguments[0]))}"
+        return f"a list [{', '.join(map(expected, arguments))}]"
+    if base in (dict, Mapping):
+        rest = _plural(expected(arguments[1])) if arguments and arguments[1] is not Any else "named values"
+        return f"a table of {rest}"
+    return _WORDS.get(base) or f"a {base.__name__}"
+
+
+_WORDS: dict[Any, str] = {
+    type(None): "none",
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    str: "text",
+    list: "a list",
+    tuple: "a list",
+    Sequence: "a list",
+}
+
+
+def _range(meta: Meta) -> str:
+    """The range of `meta`, as it follows a noun."""
+    low, high = meta.ge, meta.le
+    if high == _MOST:  # every finite number, on this side
+        high = None
+        if low == -_MOST:
+            return " that is finite"
+    if meta.min_length is not None:
+        return " that is not empty" if meta.min_length == 1 else f" of length {meta.min_length} or more"
+    if low is not None and high is not None:
+        return f" from {_number(low)} to {_number(high)}"
+    limits = (("above", meta.gt), ("of at least", low), ("below", meta.lt), ("of at most", high))
+    said = [f"{word} {_number(limit)}" for word, limit in limits if limit is not None]
+    return f" {' and '.join(said)}" if said else ""
+
+
+def _number(limit: float) -> str:
+    return str(limit) if isinstance(limit, int) else f"{limit:g}"
+
+
+def _plural(text: str) -> str:
+    """``numbers above 0`` of ``a number above 0``."""
+    for noun in ("number", "text", "table", "list"):
+        head, found, tail = text.partition(noun)
+        if found:
+            return f"{head.removeprefix('a ')}{noun}s{tail}"
+    return f"({text})"
+
+
+def _plain(value: Any) -> Any:
+    """A number of NumPy as Python's own."""
+    is_number = type(value).__module__ == "numpy" and getattr(value, "ndim", None) == 0
+    return value.item() if is_number else value
+
+
+def _fits(value: object, kind: Any) -> bool:
+    try:
+        msgspec.convert(value, kind)
+    except msgspec.ValidationError:
+        return False
+    return True
+
+
+def _misfit(value: Any, kind: Any, name: str) -> tuple[str, Any, Any]:
+    """The innermost part of `value` that does not fit `kind`: its place, itself, what it should be."""
+    for place, part, wanted in _parts(value, kind, name):
+        if not _fits(part, wanted):
+            return _misfit(part, wanted, place)
+    return name, value, kind
+
+
+def _parts(value: Any, kind: Any, name: str) -> list[tuple[str, Any, Any]]:
+    """Items of a list, entries of a table and fields of a dataclass, each with its place and annotation."""
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return _parts(value, arguments[0], name)
+    if origin in (Union, types.UnionType):  # an optional list is looked into, a choice of several types is not
+        rest = [one for one in arguments if one is not type(None)]
+        return _parts(value, rest[0], name) if len(rest) == 1 else []
+    if isinstance(value, Mapping) and origin in (dict, Mapping):
+        return [(f"{name}.{key}", one, arguments[1]) for key, one in value.items()]
+    if isinstance(value, (list, tuple)) and origin in (list, tuple, Sequence):
+        each = arguments if origin is tuple and arguments[-1] is not ... else (arguments[0],) * len(value)
+        return [(f"{name}[{i}]", one, wanted) for i, (one, wanted) in enumerate(zip(value, each, strict=False))]
+    if isinstance(value, Mapping) and is_dataclass(kind):
+        return [(f"{name}.{key}", value[key], hint) for key, hint in type_hints(kind).items() if key in value]
+    return []
