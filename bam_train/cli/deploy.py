@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 
     import gymnasium as gym
 
+    from bam_envs.core.timing import Pacer
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.deploy_config import DeployConfig
     from bam_train.deploy.agents import Watcher
     from bam_train.deploy.journal import Journal
     from bam_train.deploy.loop import Deployment
-    from bam_train.deploy.pacer import Pacer
     from bam_train.place import Place
 
 
@@ -40,9 +40,9 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     startup = Startup()
     startup.mark("python and arguments")
     _require_sane(config)
+    from bam_envs.core.timing import Pacer
     from bam_train.checkpoint import Checkpoint
     from bam_train.deploy.loop import Deployment
-    from bam_train.deploy.pacer import Pacer
     from bam_train.environments import environment_of, make_env, require_fit
     from bam_train.policy import FrozenPolicy
 

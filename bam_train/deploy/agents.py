@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+from bam_envs.core.timing import Pacer
 from bam_train.deploy.journal import EpisodeRecord, Journal, Startup
-from bam_train.deploy.pacer import Pacer
 from bam_train.loop import Agent
 from bam_train.loop.robot_agent import SAYS_SUCCESS, SUCCESS
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
+from bam_envs.core.timing import Pacer
 from bam_train.deploy.journal import EpisodeRecord, Journal
-from bam_train.deploy.pacer import Pacer
 from bam_train.deploy.report import lateness_text, rate_text
 from bam_train.shown import rich_text
 

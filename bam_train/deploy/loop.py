@@ -14,9 +14,9 @@ from typing import Any
 import gymnasium as gym
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, SafetyStop
+from bam_envs.core.timing import Pacer
 from bam_train.deploy.agents import JournalAgent, PacerAgent, StartupAgent, Watcher
 from bam_train.deploy.journal import Journal
-from bam_train.deploy.pacer import Pacer
 from bam_train.deploy.signals import Stopped, StopSwitch, stop_signals
 from bam_train.errors import BamTrainError
 from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, Workspace

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from bam_envs.core.timing import Lateness, Pacer
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.journal import Journal
 from bam_train.deploy.loop import Ending
-from bam_train.deploy.pacer import Lateness, Pacer
 
 MISSED_SHARE = 0.05
 """More missed ticks than this share are worth a warning."""

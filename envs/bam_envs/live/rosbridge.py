@@ -30,6 +30,7 @@ from bam_envs.core.errors import (
     StaleState,
 )
 from bam_envs.core.robot import Initial, RobotSpec, RobotState, Rows
+from bam_envs.core.timing import Pacer
 from bam_envs.live.bringup import (
     TopicTypes,
     ask_info,
@@ -39,7 +40,6 @@ from bam_envs.live.bringup import (
     tagged_sinks,
     throttle,
 )
-from bam_envs.live.grid import Grid
 from bam_envs.live.mailbox import Letter
 from bam_envs.live.readiness import LiveReadiness
 from bam_envs.live.rest import hold_command, places_of, rest_command
@@ -116,7 +116,7 @@ class RosbridgeRobot:
         self._ca_file, self._token = ca_file, token
         self._clock, self._state = clock, LiveState(self.profile, self.spec, clock)
         self._readiness: LiveReadiness | None = None  # of a robot that is real
-        self._grid, self._session = Grid(self.spec.period), DrivingSession()
+        self._pacer, self._session = Pacer(self.spec.period, now=clock), DrivingSession()
         self._command_life = profile.command_life(self.spec.period)
         self._control: RosbridgeLink | None = None
         self._halting: RosbridgeLink | None = None
@@ -278,7 +278,7 @@ class RosbridgeRobot:
         if self.info.simulated:
             self._set_scene(control, initial)
         self._await(lambda slots: self._state.age() <= self.profile.max_age)
-        self._grid.restart()
+        self._pacer = Pacer(self.spec.period, now=self._clock)  # the first period begins with the first command
         return self.measure()
 
     def _set_scene(self, control: RosbridgeLink, initial: Initial) -> None:
@@ -323,14 +323,14 @@ class RosbridgeRobot:
         told = command.for_robot(self)[0]
         self._require_link()
         self._require_accepted()
-        end = self._grid.next(self._clock())
         # Where no time passes between commands, a late one does no harm before it is given up.
         tag = self._session.tagger.next(self._epoch, ANSWER_TIMEOUT if self.info.lockstep else self._command_life)
         if self.info.lockstep:
             self._ask(control, told, tag)
         else:
+            self._pacer.tick()
             self._send(control, told, tag)
-            self._cut.wait(max(0.0, end - self._clock()))
+            self._cut.wait(max(0.0, self._pacer.slack))
         self._require_link()
         self._require_accepted()
         return self.measure()

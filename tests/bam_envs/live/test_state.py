@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import ProtocolError, StaleState
-from bam_envs.live.grid import Grid
 from bam_envs.live.mailbox import Alarm, Mailbox
 from bam_envs.live.state import LiveState, SourceAge
 from bam_envs.robots.profiles.profile import load_profile
@@ -240,17 +239,6 @@ def test_the_mailbox_keeps_the_newest():
     mailbox.clear()
     waiting.join(10.0)
     assert not waiting.is_alive()
-
-
-def test_an_even_grid():
-    grid = Grid(0.1)
-    assert grid.next(5.0) == pytest.approx(5.1)
-    assert grid.next(5.13) == pytest.approx(5.2)  # a little late: the grid stays
-    assert grid.next(5.2) == pytest.approx(5.3)
-    assert grid.next(5.36) == pytest.approx(5.46)  # late by more than half a period: it begins anew
-    assert grid.next(5.46) == pytest.approx(5.56)
-    grid.restart()
-    assert grid.next(5.5) == pytest.approx(5.6)
 
 
 def test_an_alarm_wakes_once_and_can_be_stopped():

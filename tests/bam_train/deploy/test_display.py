@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from bam_envs.core.timing import Pacer
 from bam_train.deploy.display import (
     LiveDisplay,
     PlainDisplay,
@@ -16,7 +17,6 @@ from bam_train.deploy.display import (
     state_rows,
 )
 from bam_train.deploy.journal import EpisodeRecord, Journal
-from bam_train.deploy.pacer import Pacer
 
 
 class Panel:

@@ -8,6 +8,7 @@ import pytest
 
 from bam_envs.core.errors import LinkLost, RobotFault, SafetyStop, StaleState
 from bam_envs.core.robot_env import RobotEnv
+from bam_envs.core.timing import Pacer
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.physics.arm import SimulatedArm
 from bam_envs.safety.safe import SafeRobot
@@ -16,7 +17,6 @@ from bam_envs.tasks.reach import ReachTask
 from bam_envs.testing.drivers import DrivenRobot
 from bam_train.deploy.journal import Journal, Startup
 from bam_train.deploy.loop import Deployment, Ending, fault_text
-from bam_train.deploy.pacer import Pacer
 
 
 class Right:

@@ -1,10 +1,10 @@
 import json
 import math
 
+from bam_envs.core.timing import Pacer
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.journal import Journal, Startup
 from bam_train.deploy.loop import Ending
-from bam_train.deploy.pacer import Pacer
 from bam_train.deploy.report import DeployReport, episodes_text, lateness_text, rate_text
 
 
@@ -20,7 +20,7 @@ class Clock:
 
 
 def driven_pacer(period):
-    """Ticks at 0, 0.051, 0.221 (instead of 0.1; the deadlines 0.15 and 0.2 are missed) and 0.251 s."""
+    """Ticks at 0, 0.051, 0.221 (instead of 0.1; the deadlines 0.15 and 0.2 are missed) and 0.272 s, on a new grid."""
     clock = Clock()
     pacer = Pacer(period, now=clock.now, sleep=clock.sleep)
     pacer.start()
@@ -79,7 +79,7 @@ def test_lines(corridor_checkpoint):
     first, second, third = DeployReport(
         checkpoint, 0, Ending("episodes done", 0), journal(), driven_pacer(0.05)
     ).lines()
-    assert first == "episodes done: 2 of 3 episodes, 1 success, 4 ticks, 11.95 Hz of 20"
+    assert first == "episodes done: 2 of 3 episodes, 1 success, 4 ticks, 11.03 Hz of 20"
     assert second.startswith("lateness p50 1.00 ms, p99 ")
     assert second.endswith(" ms, max 121.00 ms, 2 missed")
     assert third == "first action after 0.75 s of CPU time: python 0.50, first action 0.25"

@@ -17,10 +17,10 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 
 from bam_envs.core.errors import InvalidValue, NotInCommand, RemoteError, ResetNeeded
+from bam_envs.core.timing import Pacer
 from bam_envs.remote.serve.checked_values import Begun, CheckedValues, Stepped
 from bam_envs.remote.serve.command import LEASE_SECONDS, CommandLease
 from bam_envs.remote.serve.describe import Env, describe_env, same_name
-from bam_envs.remote.serve.pace import Pace
 from bam_envs.remote.transports.transport import EnvSpecMessage, Info
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
 
@@ -59,7 +59,7 @@ class EnvServer:
         """Held while the environment runs; whoever moves its robot in another way holds it, too."""
         self._spec = describe_env(env, env_id)
         self._values = CheckedValues(self._spec, env.observation_space if isinstance(env, VectorEnv) else None)
-        self._pace = Pace(_period(self._spec), clock, sleep) if realtime else None
+        self._pacer = Pacer(_period(self._spec), now=clock, sleep=sleep) if realtime else None
         self._clock, self._ended, self._closed = clock, False, False
         self._episode: str | None = None  # whose is running
         self._over: str | None = None  # whose came to its end
@@ -116,8 +116,9 @@ class EnvServer:
             begun: Begun = self._run(lambda: self._values.begun(*given))
             self._episode = client
             self._tell()
-        if self._pace is not None:
-            self._pace.restart()
+        if self._pacer is not None:
+            self._pacer.start()
+            self._pacer.tick()
         return begun
 
     def step(self, client: str, action: Any, *, deadline: float | None = None) -> Stepped:
@@ -147,8 +148,8 @@ class EnvServer:
                 goes_on = self._spec.vector or not (stepped[2] or stepped[3])
                 self._episode, self._over = (client, None) if goes_on else (None, client)
                 self._tell()
-            if self._pace is not None:
-                self._pace.wait()
+            if self._pacer is not None:
+                self._pacer.wait()
         return stepped
 
     def has_ended(self, client: str) -> bool:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from bam_envs.core.errors import LinkLost, ProtocolError, RemoteError, RobotFault
-from bam_envs.remote.serve.clock import Clock
+from bam_envs.core.timing import Ticker
 from bam_envs.remote.serve.command import CommandLease
 from bam_envs.remote.serve.command_slot import CommandSlot, Order
 from bam_envs.remote.serve.served_robot import ServedRobot
@@ -92,7 +92,7 @@ class RobotService:
         self._scene = (
             StringRpcService(bus, namespace + SCENE_TOPIC, self._set_scene, self._sessions) if simulated else None
         )
-        self.clock = Clock(
+        self.clock = Ticker(
             self._tick_lockstep if lockstep else self._tick, IDLE_PERIOD if lockstep else robot.tick_period
         )
         """Moves the robot and publishes."""

@@ -5,7 +5,7 @@ import pytest
 
 from bam_envs.core.errors import InvalidValue, PhysicsDiverged, RemoteError, ResetNeeded
 from bam_envs.core.robot import Initial
-from bam_envs.remote.serve.clock import Clock
+from bam_envs.core.timing import Ticker
 from bam_envs.remote.serve.served_robot import PARTS, ServedRobot
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.physics.arm import SimulatedArm
@@ -198,7 +198,7 @@ def test_a_step_in_real_time_waits_for_the_clock():
     served = ServedRobot(SimulatedArm(1), dead_man=0.1, realtime=True)
     served.connect()
     served.reset(ROWS, initial())
-    clock = Clock(served.tick, 0.001)
+    clock = Ticker(served.tick, 0.001)
     clock.start()
     stamps = [served.step(command(0.01 * i)).stamp[0] for i in range(1, 4)]
     clock.stop()
@@ -257,7 +257,7 @@ def test_a_fault_reaches_the_step_that_waits():
     served = ServedRobot(Failing(1), dead_man=0.1, realtime=True)
     served.connect()
     served.reset(ROWS, initial())
-    clock = Clock(served.tick, 0.001)
+    clock = Ticker(served.tick, 0.001)
     clock.start()
     with pytest.raises(PhysicsDiverged, match="not finite"):
         served.step(command())

@@ -1,8 +1,11 @@
+"""Deadlines, the pacer and the ticking thread; clocks are the test's."""
+
 import math
+import threading
 
 import pytest
 
-from bam_train.deploy.pacer import Lateness, Pacer
+from bam_envs.core.timing import Deadline, Lateness, Pacer, Ticker
 
 
 class Clock:
@@ -60,9 +63,9 @@ def test_late_sleeps_do_not_add_up():
     [
         (0.15625, [0.0, 0.15625, 0.25, 0.375], 0),  # a quarter late: starts at once, then on the grid again
         (0.1875, [0.0, 0.1875, 0.25, 0.375], 0),  # half a period late: the next is still run
-        (0.21875, [0.0, 0.21875, 0.375, 0.5], 1),  # three quarters late: too close to the next, which is missed
+        (0.21875, [0.0, 0.21875, 0.34375, 0.46875], 1),  # three quarters late: a new grid begins
         (0.5, [0.0, 0.5, 0.625, 0.75], 3),  # a long stall: no burst afterwards
-        (1.0625, [0.0, 1.0625, 1.125, 1.25], 7),
+        (1.0625, [0.0, 1.0625, 1.1875, 1.3125], 7),
     ],
 )
 def test_no_burst_after_a_late_tick(work, expected, missed):
@@ -116,3 +119,65 @@ def test_slack_is_the_time_to_the_next_deadline():
 def test_nothing_is_known_before_the_first_tick():
     pacer = paced(Clock())
     assert (pacer.rate, pacer.lateness, pacer.ticks) == (None, None, 0)
+
+
+def test_ticks_without_waiting():
+    """Whoever waits elsewhere asks for the slack, and says when a tick starts."""
+    clock = Clock()
+    pacer = Pacer(0.125, now=clock.now)
+    clock.work(3.0)
+    assert (pacer.slack, pacer.tick()) == (0.0, 0.0)  # not started: the first tick is due when it comes
+    assert pacer.slack == 0.125
+    clock.work(0.03125)
+    pacer.tick()  # more than half a period early
+    assert pacer.slack == 0.125
+    clock.work(0.09375)
+    pacer.tick()  # a quarter early: the grid stays
+    assert (pacer.slack, pacer.missed) == (0.15625, 0)
+
+
+def test_a_deadline():
+    clock = Clock()
+    deadline = Deadline(0.5, clock.now)
+    clock.work(0.25)
+    assert (deadline.left, deadline.passed) == (0.25, False)
+    clock.work(0.5)
+    assert (deadline.left, deadline.passed) == (0.0, True)
+
+
+def test_a_ticker_ticks_until_it_is_stopped():
+    ticks = threading.Semaphore(0)
+    ticker = Ticker(ticks.release, 0.001)
+    assert not ticker.running
+    ticker.start()
+    assert all(ticks.acquire(timeout=10) for _ in range(5))
+    assert ticker.running
+    ticker.stop()
+    ticker.stop()
+    assert not ticker.running
+
+
+def test_a_ticker_can_be_woken():
+    ticks = threading.Semaphore(0)
+    ticker = Ticker(ticks.release, 3600.0)
+    ticker.start()
+    assert ticks.acquire(timeout=10)
+    ticker.wake()
+    assert ticks.acquire(timeout=10)
+    ticker.stop()
+
+
+def test_a_ticker_can_be_stopped_from_within_and_before_it_starts():
+    done = threading.Event()
+
+    def tick():
+        ticker.stop()
+        done.set()
+
+    ticker = Ticker(tick, 0.001)
+    ticker.stop()
+    ticker = Ticker(tick, 0.001)
+    ticker.start()
+    assert done.wait(10)
+    ticker.stop()
+    assert not ticker.running
