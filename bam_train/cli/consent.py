@@ -18,9 +18,9 @@ def guards_of(env: Any) -> dict[str, dict[str, Any]]:
 
 
 def limit_lines(guards: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """One line for each guard that has a limit, such as ``  G8 joint speed: 1 rad/s``."""
+    """One line for each guard that has a limit, such as ``  joint speed (G8): 1 rad/s``."""
     limited = [(name, row) for name, row in guards.items() if row["limit"] not in (None, "")]
-    return [f"  {row['number']} {name}: {row['limit']:.3g} {row['unit']}".rstrip() for name, row in limited]
+    return [f"  {name} ({row['number']}): {row['limit']:.3g} {row['unit']}".rstrip() for name, row in limited]
 
 
 def plan_lines(env: Any, env_id: str, address: str, episodes: int) -> list[str]:

@@ -22,7 +22,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from bam_envs.safety.safe import SafeRobot
+from bam_envs.safety.gate import SafeRobot
 from bam_train.errors import SettingsError, ValueMismatch
 from bam_train.loop.gym.actions import ActionReader
 from bam_train.loop.gym.env_rows import EnvRows, Rows, has_autoreset

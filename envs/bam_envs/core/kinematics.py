@@ -12,7 +12,7 @@ Source of the constants: Universal Robots, "DH parameters for calculations of ki
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -167,6 +167,17 @@ UR5E = ArmGeometry(d1=0.1625, a2=-0.425, a3=-0.3922, d4=0.1333, d5=0.0997, d6=0.
 UR10 = ArmGeometry(d1=0.1273, a2=-0.612, a3=-0.5723, d4=0.163941, d5=0.1157, d6=0.0922)
 UR10E = ArmGeometry(d1=0.1807, a2=-0.6127, a3=-0.57155, d4=0.17415, d5=0.11985, d6=0.11655)
 UR16E = ArmGeometry(d1=0.1807, a2=-0.4784, a3=-0.36, d4=0.17415, d5=0.11985, d6=0.11655)
+UR5E_GRIPPER = replace(UR5E, tool=0.15)
+"""A UR5e with a parallel gripper; the tool is the middle of the gripper's pads."""
+UR_JOINTS = (
+    "shoulder_pan_joint",
+    "shoulder_lift_joint",
+    "elbow_joint",
+    "wrist_1_joint",
+    "wrist_2_joint",
+    "wrist_3_joint",
+)
+"""Names of the joints of a Universal Robots arm, from its base on."""
 
 
 def _turned(vectors: Array, c1: Array, s1: Array) -> Array:

@@ -11,9 +11,9 @@ from bam_envs.live.rosbridge import RosbridgeRobot
 from bam_envs.robots.profiles.profile import load_profile, profile_for
 from bam_envs.ros.profile_tables import RobotProfile
 from bam_envs.rosbridge.endpoint import Endpoint
-from bam_envs.safety.arm_guards import ToolPosition
+from bam_envs.safety.gate import SafeRobot
+from bam_envs.safety.guard import ToolPosition
 from bam_envs.safety.guards import Limits
-from bam_envs.safety.safe import SafeRobot
 
 DEFAULT_PROFILE = "ur5e"
 

@@ -54,7 +54,7 @@ from bam_envs.rosbridge.link.connection import bare_reason
 from bam_envs.rosbridge.link.link import RosbridgeLink
 from bam_envs.rosbridge.sessions import is_over
 from bam_envs.rosbridge.string_rpc import StringRpc
-from bam_envs.safety.safe import ClearedCommand
+from bam_envs.safety.gate import ClearedCommand
 
 Array = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from bam_envs.robots.fake import FakeRobot
     from bam_envs.robots.physics.mir100 import SimulatedBase
     from bam_envs.robots.profiles.profile import load_profile
-    from bam_envs.safety.safe import SafeRobot
+    from bam_envs.safety.gate import SafeRobot
 
 _MODULES = {
     "FakeRobot": "bam_envs.robots.fake",
@@ -22,7 +22,7 @@ _MODULES = {
     "RobotSpec": "bam_envs.core.robot",
     "RobotState": "bam_envs.core.robot",
     "RosbridgeRobot": "bam_envs.live.rosbridge",
-    "SafeRobot": "bam_envs.safety.safe",
+    "SafeRobot": "bam_envs.safety.gate",
     "SignalSpec": "bam_envs.core.robot",
     "SimulatedBase": "bam_envs.robots.physics.mir100",
     "live_robot": "bam_envs.live.building",

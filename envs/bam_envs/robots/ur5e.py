@@ -7,27 +7,19 @@ cannot fold by more than 180 degrees); Robotiq 2F-85 instruction manual (85 mm s
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
-from bam_envs.core.kinematics import UR5E
+from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS
 from bam_envs.core.robot import RobotSpec, SignalSpec
 
-JOINTS = (
-    "shoulder_pan_joint",
-    "shoulder_lift_joint",
-    "elbow_joint",
-    "wrist_1_joint",
-    "wrist_2_joint",
-    "wrist_3_joint",
-)
+JOINTS = UR_JOINTS
 GRIPPER_OPEN = 0.085
 """Width of the open gripper [m] (Robotiq 2F-85)."""
 GRIPPER_SPEED = 0.15
 """Speed of the gripper's width [m/s]; the 2F-85 does 0.02 to 0.15."""
-TOOL_LENGTH = 0.15
-"""Flange to the middle of the gripper's pads [m]."""
-GEOMETRY = replace(UR5E, tool=TOOL_LENGTH)
+GEOMETRY = UR5E_GRIPPER
 """Kinematics of the arm with this gripper."""
+TOOL_LENGTH = GEOMETRY.tool
+"""Flange to the middle of the gripper's pads [m]."""
 
 _TURN, _SPEED = 2 * math.pi, math.pi
 _LOW = (-_TURN, -_TURN, -math.pi, -_TURN, -_TURN, -_TURN)

@@ -1,33 +1,48 @@
 """The guards of an arm.
 
-They keep three promises, whatever the arm is told: it stays inside its position limits; no joint goes beyond the
-farthest place that it was told to go to; and what slows one joint slows all of them, so that the arm keeps its
-direction.
+They guarantee three things, whatever the arm is commanded: it stays inside its position limits; no joint goes beyond
+the farthest position that it was commanded to; and whatever slows one joint down slows all of them down, so that the
+arm keeps its direction.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.robot import RobotSpec
-from bam_envs.safety.guard import Guard, Limits, Tick, joint_columns, max_rate, position_range
+from bam_envs.safety.guard import (
+    Guard,
+    Limits,
+    Tick,
+    ToolPosition,
+    clip,
+    columns_in,
+    joint_columns,
+    max_rate,
+    position_range,
+)
 
 Array = NDArray[np.float64]
-ToolPosition = Callable[[Array], Array]
-"""Forward kinematics: joints (n, k) [rad] to tool positions (n, 3) [m]."""
 ROUNDING = 1 + 1e-9
-"""A step as long as its limit is not beyond it for the last bits of its ends."""
+"""A step that is exactly as long as its limit must not exceed it by floating point rounding."""
+JUMP = 0.05
+"""A joint may be measured this much farther away than it can have turned [rad]."""
+
+
+def fastest_joints(spec: RobotSpec, limits: Limits) -> Array:
+    """Maximum speed of each joint [rad/s]: of the limits and of the data sheet."""
+    fastest: Array = np.minimum(limits.joint_speed, max_rate(spec.command)[joint_columns(spec)])
+    return fastest
 
 
 class PositionLimits(Guard):
     """Joints keep a margin from the ends of their travel, the gripper stays in its range.
 
-    A joint that is already nearer to an end may go back or stay, and not come nearer.
+    A joint that is inside the margin may stay or go back, and must not come nearer to the end.
     """
 
     number, name, unit = "G7", "position margin", "rad"
@@ -45,14 +60,13 @@ class PositionLimits(Guard):
 
 
 class JointSpeed(Guard):
-    """No joint is faster than the limit nor than its data sheet; the others slow down with it."""
+    """No joint is faster than the limit or its data sheet; the other joints slow down with it."""
 
     number, name, unit = "G8", "joint speed", "rad/s"
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
-        self._joints = joint_columns(spec)
-        fastest = np.minimum(limits.joint_speed, max_rate(spec.command)[self._joints])
-        self.limit_value, self._fastest = float(fastest.max()), fastest
+        self._joints, self._fastest = joint_columns(spec), fastest_joints(spec, limits)
+        self.limit_value = float(self._fastest.max())
 
     def limit(self, tick: Tick) -> bool:
         """Shorten the step of all joints."""
@@ -60,15 +74,14 @@ class JointSpeed(Guard):
 
 
 class RampIn(Guard):
-    """A first command that is farther than one step from the arm is gone to slowly, at most for a while."""
+    """A first command that is farther than one step from the arm is approached slowly, for a limited time."""
 
     number, name, unit = "G14", "ramp-in speed", "rad/s"
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
-        self.limit_value = limits.reset_speed
-        self._joints = joint_columns(spec)
-        fastest = np.minimum(limits.joint_speed, max_rate(spec.command)[self._joints])
-        # Where nothing limits a joint's speed, a first step of any length would be near.
+        self.limit_value, self._joints = limits.reset_speed, joint_columns(spec)
+        fastest = fastest_joints(spec, limits)
+        # If nothing limited a joint's speed, a first step of any length would count as near.
         free = np.where(np.isfinite(fastest), fastest, limits.reset_speed)
         self._one_step = free * spec.period * ROUNDING
         self._longest = math.ceil(limits.ramp_time / spec.period)
@@ -79,7 +92,7 @@ class RampIn(Guard):
         self._left = None
 
     def limit(self, tick: Tick) -> bool:
-        """Shorten the step until the command is caught up with."""
+        """Shorten the steps until the command is reached."""
         reach = self.limit_value * tick.period
         if tick.approach:
             return _shorten(tick, self._joints, reach)
@@ -120,7 +133,7 @@ class ToolSpeed(Guard):
         return True
 
     def _position(self, joints: Array) -> Array:
-        """Of the tool [m]. Kinematics cost the most of a tick, and each command is the next one's last."""
+        """Position of the tool [m]. Cached: kinematics cost the most of a tick, and each command is the next `last`."""
         key = joints.tobytes()
         if key not in self._known:
             if len(self._known) >= 2 * self._ROUNDS:
@@ -132,9 +145,9 @@ class ToolSpeed(Guard):
 class JointAcceleration(Guard):
     """Joints gain and lose speed gradually, and begin to brake early enough to stop at their goal.
 
-    So a joint never passes the goal of a command unless a later command calls it back sooner than it can brake, and
-    then it passes the later one only. Where the change of direction is too sharp for all joints to go together, each
-    goes as far towards it as it may.
+    A joint therefore never passes the goal of a command, unless a later command calls it back sooner than it can brake;
+    then it passes the later goal only. If a change of direction is too sharp for all joints to turn together, each
+    joint goes as far towards it as it may.
     """
 
     number, name, unit = "G9", "joint acceleration", "rad/s^2"
@@ -172,31 +185,51 @@ class JointAcceleration(Guard):
 
 
 class GripperSpeed(Guard):
-    """The gripper's width is sent no farther ahead than it can go in a period: ahead of the fingers or of the last."""
+    """The gripper's width changes by no more than it can in a period, from the last command or the measured width."""
 
     number, name, unit = "G8", "gripper speed", "m/s"
 
     def __init__(self, spec: RobotSpec) -> None:
-        self._columns = np.flatnonzero([unit == "m" for unit in spec.command.units])
-        rate = max_rate(spec.command)[self._columns]
-        self.limit_value, self._rate = float(rate.min()), rate
+        self._columns = columns_in(spec.command, "m")
+        self._rate = max_rate(spec.command)[self._columns]
+        self.limit_value = float(self._rate.min())
 
     def limit(self, tick: Tick) -> bool:
         """Clip the width."""
-        reach = self._rate * tick.period
-        wanted = tick.command[self._columns]
-        last, measured = tick.last[self._columns], tick.measured[self._columns]
+        reach, last, measured = self._rate * tick.period, tick.last[self._columns], tick.measured[self._columns]
         # Around a held object the last width is far below the fingers: opening begins at the fingers.
-        low, high = np.fmin(last, measured) - reach, np.fmax(last, measured) + reach
-        tick.command[self._columns] = width = np.clip(wanted, low, high)
-        return bool((width != wanted).any())
+        return clip(tick, self._columns, np.fmin(last, measured) - reach, np.fmax(last, measured) + reach)
+
+
+class MeasuredJump(Guard):
+    """A joint measured farther from its last position than it can have turned since then is a wrong measurement."""
+
+    number, name, unit = "G7", "measured jump", "rad"
+
+    def __init__(self, spec: RobotSpec) -> None:
+        self.limit_value, self._joints = JUMP, joint_columns(spec)
+        self._fastest = max_rate(spec.command)[self._joints]
+        self._labels = np.array(spec.command.labels)[self._joints]
+
+    def fault(self, tick: Tick) -> str | None:
+        """Names the joint that jumped most."""
+        way = np.abs(tick.measured - tick.before)[self._joints]
+        can = self._fastest * (max(tick.period, tick.pause) + tick.age) + self.limit_value
+        over = way > can  # NaN: there was no tick before
+        if not over.any():
+            return None
+        at = int(np.argmax(way - can))
+        return (
+            f"{self._labels[at]} was measured {way[at]:.3f} rad from where it was a tick before, and it turns "
+            f"{can[at]:.3f} rad at most in that time: look at what publishes its position"
+        )
 
 
 def longest_step(distance: Array, change: float) -> Array:
     """The longest next step after which a joint can still stop within `distance`.
 
-    Each step may be shorter than the one before by `change`: n of them, the last of which is at most `change`, cover
-    ``n s - change n (n - 1) / 2`` when the first is s.
+    Each step may be shorter than the one before by `change`. If the first of n steps has length s and the last one is
+    at most `change`, together they cover ``n s - change n (n - 1) / 2``.
 
     Args:
         distance: Not negative. Shape: (k,).

@@ -1,8 +1,8 @@
-"""G23: the robot follows its commands. Where it does not, they wait where it is; where it goes on so, it is stopped.
+"""Following (G23): a robot that does not follow its commands is held where it is, and stopped if that goes on.
 
-A joint that is behind its commands by no more than the known lag at its measured speed follows. What is beyond that is
-the way that it would jump when it is let go: at rest at most what it may go in a period, so that it never goes faster
-than it may.
+A joint follows if it is behind its commands by no more than its known lag at its measured speed. The rest of the gap is
+how far it would jump when it is let go. At rest that is at most what the joint may go in a period, so that it never
+moves faster than its limit.
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.robot import RobotSpec
-from bam_envs.safety.arm_guards import ToolPosition
-from bam_envs.safety.guard import Guard, Limits, Tick, columns_in, joint_columns, max_rate, ticks_of
+from bam_envs.safety.arm_guards import fastest_joints
+from bam_envs.safety.guard import Guard, Limits, Tick, ToolPosition, clip, columns_in, joint_columns, max_rate, ticks_of
 
 Array = NDArray[np.float64]
 _ROUNDS = 8
 SHARE = 0.75
-"""The part of the way that a robot may go in a period by which it may be off."""
+"""The gap that is allowed, as a share of how far the robot may go in a period."""
 STRIKES = 3
-"""A robot that was held so often because it did not follow is stopped."""
+"""How often a robot is held for not following before it is stopped."""
 FORGIVEN = 2.0
-"""A robot that has followed for so long [s] begins anew."""
+"""Following for this long [s] sets that count back to 0."""
 LIKELY = (
     "look for a protective stop, a paused program, an inactive controller, a low speed slider, or something in its way"
 )
 
 
 class Following(Guard):
-    """What arms and bases share: the last commands, and how often the robot did not follow them."""
+    """What the guards of arms and bases share: recent commands, and how often the robot did not follow them."""
 
     number = "G23"
 
@@ -46,19 +46,19 @@ class Following(Guard):
         self._sent.clear()
 
     def forgive(self) -> None:
-        """An episode begins, or a person resumed it."""
+        """An episode begins, or a person resumed the robot."""
         self.restart()
         self._strikes = self._good = 0
 
     def off(self, sent: Array, measured: Array) -> Array:
-        """How far every command of the last time is from what is measured, 0 where one is there. Shape: (k,)."""
+        """Distance of the measured values from the range of the recent commands, 0 inside it. Shape: (k,)."""
         self._sent.append(sent)
         commands = np.stack(self._sent)
         off: Array = np.clip(measured, commands.min(axis=0), commands.max(axis=0)) - measured
         return off
 
     def is_struck(self, over: bool) -> bool:
-        """Take note of whether the robot was too far `over`; a third time within a while is one too many."""
+        """Count a tick whose gap was `over` the limit; after `STRIKES` of them the robot is stopped."""
         if not over:
             self._good += 1
             self._strikes = 0 if self._good >= self._forgiven else self._strikes
@@ -79,7 +79,7 @@ class JointFollowing(Following):
         self._joints, self._period = joint_columns(spec), spec.period
         self._tool, self._tool_reach = tool_position, limits.tool_speed * spec.period
         self._labels = np.array(spec.command.labels)[self._joints]
-        fastest = np.minimum(limits.joint_speed, max_rate(spec.command)[self._joints])
+        fastest = fastest_joints(spec, limits)
         self._fastest = np.where(np.isfinite(fastest), fastest, limits.reset_speed)
         self._slowest = np.minimum(self._fastest, limits.reset_speed)
         self._tolerance = limits.follow_tolerance
@@ -108,13 +108,13 @@ class JointFollowing(Following):
         )
 
     def hold(self, tick: Tick) -> Array:
-        """Where the joints are, gone to no faster than they may go."""
+        """Where the joints are, approached no faster than they may go."""
         held: Array = tick.last.copy()
         held[self._joints] = self._near(tick, tick.measured[self._joints])
         return held
 
     def limit(self, tick: Tick) -> bool:
-        """Bring the command so near that a joint that is let go does not jump: as if the command went from there."""
+        """Bring the command so near that a joint that is let go cannot jump: no farther than one step from there."""
         wanted, measured = tick.command[self._joints], tick.measured[self._joints]
         ahead = np.clip(np.nan_to_num(tick.velocity[self._joints]), -self._fastest, self._fastest) * self._lag
         explained = measured + np.clip(wanted - measured, np.minimum(ahead, 0.0), np.maximum(ahead, 0.0))
@@ -129,7 +129,7 @@ class JointFollowing(Following):
         return True
 
     def _slow_tool(self, here: Array, there: Array) -> Array:
-        """The part of the way that the tool may go in a period. Shapes: (k,)."""
+        """The part of the way `here` to `there` that the tool may go in a period. Shapes: (k,)."""
         for _ in range(_ROUNDS):
             travel = self._travel(here, there)
             if travel <= self._tool_reach:
@@ -138,18 +138,18 @@ class JointFollowing(Following):
         return there
 
     def _travel(self, here: Array, there: Array) -> float:
-        """Of the tool [m]; 0 where its kinematics are not known."""
+        """Distance that the tool goes [m]; 0 if its kinematics are not known."""
         return 0.0 if self._tool is None else math.dist(*self._tool(np.stack([here, there])))
 
     def _near(self, tick: Tick, wanted: Array) -> Array:
-        """`wanted`, as far as the joints may go to it from the last command: what is measured may be wrong."""
+        """`wanted`, at most one step from the last command: what is measured may be wrong."""
         last, step = tick.last[self._joints], (self._slowest if tick.approach else self._fastest) * self._period
         near: Array = np.clip(wanted, last - step, last + step)
         return near
 
 
 class BaseFollowing(Following):
-    """A base that does not go as it is told is told no more speed than it can gain, then to stand."""
+    """A base that does not follow its commands is sent no more speed than it can gain, and then 0."""
 
     def __init__(self, name: str, unit: str, acceleration: float, spec: RobotSpec, limits: Limits) -> None:
         super().__init__(spec, limits)
@@ -160,15 +160,15 @@ class BaseFollowing(Following):
         self.limit_value = float(self._ahead.max())
         self._change = self._fastest * spec.period
         self._allowed = SHARE * self._change
-        self._reached: Array | None = None  # what a base that gains and loses speed as it may has reached
+        self._reached: Array | None = None  # speed of a base that follows as well as its acceleration allows
 
     def restart(self) -> None:
-        """As of any; it need not stand yet."""
+        """The base may still be moving."""
         super().restart()
         self._reached = None
 
     def fault(self, tick: Tick) -> str | None:
-        """Says how fast it is, and how fast it was told to be."""
+        """Names the measured speed and the commanded one."""
         sent, measured = tick.last[self._columns], tick.measured[self._columns]
         before = measured if self._reached is None else self._reached
         self._reached = np.clip(sent, before - self._change, before + self._change)
@@ -183,8 +183,7 @@ class BaseFollowing(Following):
         )
 
     def limit(self, tick: Tick) -> bool:
-        """Clip it around the measured speed; slower is always allowed."""
-        wanted, measured = tick.command[self._columns], tick.measured[self._columns]
+        """Clip the speed around the measured one; slower is always allowed."""
+        measured = tick.measured[self._columns]
         low, high = np.minimum(0.0, measured - self._ahead), np.maximum(0.0, measured + self._ahead)
-        tick.command[self._columns] = speed = np.clip(wanted, low, high)
-        return bool((speed != wanted).any())
+        return clip(tick, self._columns, low, high)

@@ -1,10 +1,10 @@
 """The guards between whoever commands a live robot and the robot, in one list: `default_guards`.
 
-Each has a number, a name, a limit and a unit, and says one of three things:
+Each guard has a number, a name, a limit and a unit, and acts in one of three ways:
 
-* `Guard.fault`: nothing of this tick may be executed, the robot holds;
-* `Guard.limit`: the command goes so far and no farther;
-* `Guard.trip`: what was measured is beyond what the robot may ever do, it is stopped.
+* `Guard.fault`: the command is not executed at all, the robot holds;
+* `Guard.limit`: the command goes as far as the limit and no farther;
+* `Guard.trip`: a measurement is beyond what the robot may ever do, the robot is stopped.
 
 All of them look at one robot and at the last command that was *sent*; speeds and accelerations hold over the real time
 since then.
@@ -13,20 +13,22 @@ since then.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue
+from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS
 from bam_envs.core.robot import RobotSpec, RobotState
-from bam_envs.robots.ur5e import GEOMETRY, JOINTS
 from bam_envs.safety.arm_guards import (
     GripperSpeed,
     JointAcceleration,
     JointSpeed,
+    MeasuredJump,
     PositionLimits,
     RampIn,
-    ToolPosition,
     ToolSpeed,
 )
 from bam_envs.safety.following import BaseFollowing, JointFollowing
@@ -34,28 +36,30 @@ from bam_envs.safety.guard import (
     Guard,
     Limits,
     Tick,
+    ToolPosition,
+    clip,
     columns_in,
-    default_age,
     is_base,
     joint_columns,
     max_rate,
     ticks_of,
 )
-from bam_envs.safety.measured import measured_guards
-
-__all__ = ["Guard", "Limits", "Tick", "ToolPosition", "default_guards"]
 
 Array = NDArray[np.float64]
-_SPEEDS = {"m/s", "rad/s"}
 LATE = 2.0
-"""A live robot that was sent nothing for so many periods need not be where it was going to: its dead-man may have
-stopped it."""
+"""After this many periods without a command a live robot need not be where it was going: its watchdog may have stopped
+it."""
 LATE_TICKS = 10
-"""So many late commands, one after another, stop the robot."""
+"""This many late commands in a row stop the robot."""
+MEASURED_MARGIN = 1.3
+"""A measured speed may be this many times its limit: commands keep the limit, and controllers overshoot a little."""
+MEASURED_PATIENCE = 3
+"""Ticks: a network that bunches commands up has them executed within one, and a robot that is held slows down."""
+_MOMENT = 1e-3
 
 
 class Shape(Guard):
-    """A command has one number for each label. Another shape is a mistake in the program, and an error at once."""
+    """A command has one number for each label. Another shape is a bug in the program, and raises at once."""
 
     number, name, unit = "G2", "shape", "numbers"
 
@@ -80,7 +84,7 @@ class Shape(Guard):
 
 
 class Finite(Guard):
-    """NaN and infinity are no places to go to."""
+    """A command with NaN or infinity is not executed."""
 
     number, name, unit = "G2", "finite", "bad ticks in a row"
 
@@ -98,12 +102,12 @@ class Finite(Guard):
 
 
 class Freshness(Guard):
-    """While the newest state is old, nobody knows where the robot is: nothing new is commanded."""
+    """While the newest state is too old, nobody knows where the robot is, and no new command is sent."""
 
     number, name, unit = "G3", "state age", "s"
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
-        self.limit_value = limits.max_age or default_age(spec)
+        self.limit_value = limits.max_age or (0.5 if is_base(spec) else 0.1)
         self.patience = ticks_of(limits.hold_time, spec)
 
     def fault(self, tick: Tick) -> str | None:
@@ -114,7 +118,7 @@ class Freshness(Guard):
 
 
 class Pace(Guard):
-    """Commands come one period after the other: a late one is not executed, and a pause or many late ones stop."""
+    """Commands come one period apart: a late one is not executed, and a pause or many late ones stop the robot."""
 
     number, name, unit = "G15", "command pace", "s"
 
@@ -133,7 +137,7 @@ class Pace(Guard):
 
 
 class Answers(Guard):
-    """A robot that says which command it has executed does so soon; else commands do not arrive, or late."""
+    """A robot that reports which command it has executed does so in time; else commands do not arrive, or too late."""
 
     number, name, unit = "G4", "answer to a command", "s"
 
@@ -141,7 +145,7 @@ class Answers(Guard):
         self.limit_value, self.patience = limits.answer_time, ticks_of(limits.hold_time, spec)
 
     def fault(self, tick: Tick) -> str | None:
-        """Says for how long it has been waited."""
+        """Says how long the answer has been missing."""
         if tick.waiting <= self.limit_value:
             return None
         return (
@@ -151,7 +155,7 @@ class Answers(Guard):
 
 
 class BaseSpeed(Guard):
-    """The drive, or its turning, is never faster than the limit nor than its data sheet."""
+    """A base drives, or turns, no faster than the limit or its data sheet."""
 
     number = "G11"
 
@@ -163,14 +167,12 @@ class BaseSpeed(Guard):
         self.limit_value = float(self._high.max())
 
     def limit(self, tick: Tick) -> bool:
-        """Clip it, the other one is left alone."""
-        wanted = tick.command[self._columns]
-        tick.command[self._columns] = speed = np.clip(wanted, self._low, self._high)
-        return bool((speed != wanted).any())
+        """Clip this speed; the other one stays."""
+        return clip(tick, self._columns, self._low, self._high)
 
 
 class BaseAcceleration(Guard):
-    """The drive, or its turning, gains speed gradually; slowing down is never held back, turning round begins at 0."""
+    """A base gains speed gradually, driving or turning. It may always slow down, and reverses only from 0."""
 
     number = "G11"
 
@@ -181,17 +183,41 @@ class BaseAcceleration(Guard):
         self.limit_value, self._fastest = float(fastest.max()), fastest
 
     def limit(self, tick: Tick) -> bool:
-        """Clip it around the last."""
-        wanted, last = tick.command[self._columns], tick.last[self._columns]
-        change = self._fastest * tick.period
+        """Clip the speed around the last one."""
+        last, change = tick.last[self._columns], self._fastest * tick.period
         low = np.where(last > 0, np.minimum(0.0, last - change), last - change)
         high = np.where(last < 0, np.maximum(0.0, last + change), last + change)
-        tick.command[self._columns] = speed = np.clip(wanted, low, high)
-        return bool((speed != wanted).any())
+        return clip(tick, self._columns, low, high)
+
+
+class MeasuredSpeed(Guard):
+    """The measured speed, averaged over two ticks, is at most 1.3 times its limit; a robot that is held slows down."""
+
+    patience = MEASURED_PATIENCE
+
+    def __init__(self, number: str, name: str, unit: str, limit: float, speeds: Callable[[Tick], Array]) -> None:
+        self.number, self.name, self.unit = number, f"measured {name}", unit
+        self.limit_value, self._speeds = MEASURED_MARGIN * limit, speeds
+        self._before: Array | None = None
+
+    def restart(self) -> None:
+        """The mean needs two ticks."""
+        self._before = None
+
+    def fault(self, tick: Tick) -> str | None:
+        """Says how fast the robot is."""
+        now = np.abs(self._speeds(tick))
+        before, self._before = self._before, now
+        if before is None:
+            return None
+        fastest = float(((before + now) / 2).max())
+        if not fastest > self.limit_value:  # NaN: it is not measured
+            return None
+        return f"{fastest:.3f} {self.unit} were measured, and at most {self.limit_value:.3f} {self.unit} are allowed"
 
 
 class MeasuredLimits(Guard):
-    """A robot that is measured beyond its data sheet, in position or speed, is not under control."""
+    """A robot whose measured position or speed is beyond its data sheet is out of control, and is stopped."""
 
     number, name, unit, limit_value = "G7", "measured limits", "beyond the data sheet", 0.0
     SIGNALS = ("joint_position", "joint_velocity", "base_velocity")
@@ -221,32 +247,24 @@ def default_guards(
     """Every guard that a robot of `spec` has, in the order in which they are asked.
 
     Args:
-        spec: Of the robot; joints are what it is told in rad, a base is told m/s and rad/s.
+        spec: Of the robot; an arm is commanded in rad, a base in m/s and rad/s.
         limits: How far they let it go.
-        tool_position: Forward kinematics; a UR5e's is known.
+        tool_position: Forward kinematics; those of a UR5e are known.
 
     Raises:
-        InvalidValue: A command with numbers that no guard knows, or an arm whose tool would have no speed limit.
+        InvalidValue: The command has numbers that no guard limits, or the tool of an arm would have no speed limit.
     """
     limits = limits or Limits()
     _require_guarded(spec)
-    first: list[Guard] = [
-        Shape(spec),
-        Finite(spec, limits),
-        Freshness(spec, limits),
-        Pace(spec, limits),
-        Answers(spec, limits),
-    ]
     moving = _base_guards(spec, limits) if is_base(spec) else _arm_guards(spec, limits, tool_position)
-    return [*first, *moving, MeasuredLimits(spec)]
+    first = [Finite(spec, limits), Freshness(spec, limits), Pace(spec, limits), Answers(spec, limits)]
+    return [Shape(spec), *first, *moving, MeasuredLimits(spec)]
 
 
 def _require_guarded(spec: RobotSpec) -> None:
-    """Every number of a command is one that the guards of a base, or those of an arm, limit."""
-    units = set(spec.command.units)
-    moving = _SPEEDS if is_base(spec) else {"rad"}
-    other = sorted(units - _SPEEDS if is_base(spec) else units & _SPEEDS)
-    if units >= moving and not other:
+    """Every number of a command is limited by the guards of a base, or by those of an arm."""
+    units, speeds = set(spec.command.units), {"m/s", "rad/s"}
+    if units == speeds if is_base(spec) else "rad" in units and not units & speeds:
         return
     found = ", ".join(dict.fromkeys(spec.command.units))
     raise InvalidValue(
@@ -256,22 +274,33 @@ def _require_guarded(spec: RobotSpec) -> None:
 
 
 def _arm_guards(spec: RobotSpec, limits: Limits, tool_position: ToolPosition | None) -> list[Guard]:
-    # The tool's speed is looked at twice: joints that change their speed one by one can speed up the tool.
     position = None if math.isinf(limits.tool_speed) else _kinematics(spec, tool_position)
-    tool: list[Guard] = [] if position is None else [ToolSpeed(spec, limits, position)]
-    gripper: list[Guard] = [GripperSpeed(spec)] if "m" in spec.command.units else []
-    acceleration = JointAcceleration(spec, limits)
-    return [
-        *measured_guards(spec, limits, position),
-        PositionLimits(spec, limits),
-        *gripper,
-        JointSpeed(spec, limits),
-        RampIn(spec, limits),
-        *tool,
-        *([acceleration] if math.isfinite(limits.joint_acceleration) else []),
-        *tool,
-        JointFollowing(spec, limits, position),
-    ]
+    joints = joint_columns(spec)
+    guards: list[Guard] = [MeasuredJump(spec)]
+    if math.isfinite(limits.joint_speed):
+        speeds = lambda tick: tick.velocity[joints]  # noqa: E731
+        guards.append(MeasuredSpeed("G8", "joint speed", "rad/s", limits.joint_speed, speeds))
+    tool: list[Guard] = []
+    if position is not None:
+        tool.append(ToolSpeed(spec, limits, position))
+        guards.append(_measured_tool_speed(limits, joints, position))
+    guards.append(PositionLimits(spec, limits))
+    if "m" in spec.command.units:
+        guards.append(GripperSpeed(spec))
+    guards += [JointSpeed(spec, limits), RampIn(spec, limits), *tool]
+    if math.isfinite(limits.joint_acceleration):
+        guards.append(JointAcceleration(spec, limits))
+    # The tool's speed is limited twice: joints that change their speed one by one can speed the tool up.
+    return [*guards, *tool, JointFollowing(spec, limits, position)]
+
+
+def _measured_tool_speed(limits: Limits, joints: Any, position: ToolPosition) -> MeasuredSpeed:
+    def speed(tick: Tick) -> Array:
+        here, way = tick.measured[joints], tick.velocity[joints] * _MOMENT
+        begin, end = position(np.stack([here, here + way]))
+        return np.array([math.dist(begin, end) / _MOMENT])
+
+    return MeasuredSpeed("G10", "tool speed", "m/s", limits.tool_speed, speed)
 
 
 def _kinematics(spec: RobotSpec, tool_position: ToolPosition | None) -> ToolPosition:
@@ -282,8 +311,8 @@ def _kinematics(spec: RobotSpec, tool_position: ToolPosition | None) -> ToolPosi
     """
     joints = joint_columns(spec)
     if tool_position is None:
-        if tuple(np.array(spec.command.labels)[joints]) == JOINTS:
-            return GEOMETRY.tool_position
+        if tuple(np.array(spec.command.labels)[joints]) == UR_JOINTS:
+            return UR5E_GRIPPER.tool_position
         raise InvalidValue(
             f"The tool speed of {spec.name} cannot be limited: its kinematics are not known. "
             "Give tool_position=; a simulated robot may do with the limit tool_speed = inf."
@@ -299,8 +328,10 @@ def _kinematics(spec: RobotSpec, tool_position: ToolPosition | None) -> ToolPosi
 
 
 def _base_guards(spec: RobotSpec, limits: Limits) -> list[Guard]:
+    drive, turn = columns_in(spec.command, "m/s"), columns_in(spec.command, "rad/s")
     return [
-        *measured_guards(spec, limits, None),
+        MeasuredSpeed("G11", "base speed", "m/s", limits.base_speed, lambda tick: tick.measured[drive]),
+        MeasuredSpeed("G11", "turn speed", "rad/s", limits.turn_speed, lambda tick: tick.measured[turn]),
         BaseSpeed("base speed", "m/s", limits.base_speed, spec),
         BaseSpeed("turn speed", "rad/s", limits.turn_speed, spec),
         BaseAcceleration("base acceleration", "m/s", limits.base_acceleration, spec),

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import Initial, Robot, RobotSpec, RobotState, Rows
+from bam_envs.safety.gate import ClearedCommand
 from bam_envs.safety.guard import is_base
-from bam_envs.safety.safe import ClearedCommand
 
 Array = NDArray[np.float64]
 FAULTS = ("ignore", "slow", "delay")

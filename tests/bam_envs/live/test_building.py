@@ -19,8 +19,8 @@ from bam_envs.robots.physics.mir100 import SimulatedBase
 from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.robots.ur5e import JOINTS, arm_spec
 from bam_envs.rosbridge.server.server import BridgeServer
+from bam_envs.safety.gate import SafeRobot
 from bam_envs.safety.guards import Limits
-from bam_envs.safety.safe import SafeRobot
 from bam_envs.testing import RobotContract
 
 ROW = np.zeros(1, np.int64)

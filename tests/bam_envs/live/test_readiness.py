@@ -9,8 +9,6 @@ from bam_envs.core.errors import NotReady, SafetyStop
 from bam_envs.live.building import live_robot
 from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.ros.codec import RobotInfo
-from bam_envs.safety.guard import Limits
-from bam_envs.safety.start_pose import StartPose
 
 ROW = np.zeros(1, np.int64)
 SAFETY, MODE, PROGRAM = (
@@ -159,7 +157,8 @@ def test_what_follows_from_it_is_told_with_it(driver, connected, start_pose, wai
     with pytest.raises(SafetyStop) as caught:
         go_on()
     assert str(caught.value).startswith(
-        f"The robot was stopped by G23 following: not ready: the speed slider is at 30 % ({SPEED}): shoulder_pan_joint "
+        f"The robot was stopped by following (G23): not ready: the speed slider is at 30 % ({SPEED}): "
+        "shoulder_pan_joint "
     )
 
 
@@ -231,16 +230,6 @@ def test_what_the_server_cannot_pass_on_is_no_refusal(lax, robot_on, start_pose)
     inner._on_status({"op": "status", "level": "error", "msg": "unknown type", "id": f"subscribe:{SAFETY}"})
     robot.step(robot.reset(ROW, start_pose).command)
     robot.close()
-
-
-def test_a_start_pose_that_is_not_reached(start_pose):
-    pose = StartPose(load_profile("ur5e").spec(), Limits(), start_pose)
-    measured = pose.command - 0.1
-    plain, told = pose.failure(measured), pose.failure(measured, "protective stop")
-    assert str(plain).startswith(
-        "The arm did not reach its start pose in 30 s: shoulder_pan_joint is +0.100 rad from it"
-    )
-    assert str(told) == f"Not ready: protective stop. {plain}"
 
 
 def test_what_is_no_value_says_nothing():

@@ -29,7 +29,7 @@ from bam_envs.ros.freshness import read_tag
 from bam_envs.ros.messages import tag_text, write_stamp
 from bam_envs.rosbridge.server.server import BridgeServer
 from bam_envs.rosbridge.string_rpc import StringRpcService
-from bam_envs.safety.safe import _clear
+from bam_envs.safety.gate import _clear
 
 ROW = np.zeros(1, np.int64)
 JOINT_COMMANDS, GRIPPER_COMMANDS = "/forward_position_controller/commands", "/gripper/commands"

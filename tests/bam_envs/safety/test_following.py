@@ -12,8 +12,8 @@ from bam_envs.core.errors import InvalidValue, SafetyStop
 from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.core.robot import Initial, RobotState
 from bam_envs.core.robot_env import RobotEnv
+from bam_envs.safety.gate import SafeRobot
 from bam_envs.safety.guards import Limits
-from bam_envs.safety.safe import SafeRobot
 from bam_envs.testing.drivers import DrivenRobot
 
 CHECKPOINTS = Path(__file__).parents[3] / "checkpoints"
@@ -128,7 +128,7 @@ def test_a_frozen_robot_is_held_where_it_is_and_then_stopped():
     assert min(gaps[3:]) < 1e-6  # held where it is
     assert 8 <= len(gaps) <= 20  # at most a second
     assert trial.safe.report()["following"]["held"] == 3
-    with pytest.raises(SafetyStop, match=r"^The robot is still stopped by G23 following: "):
+    with pytest.raises(SafetyStop, match=r"^The robot is still stopped by following \(G23\): "):
         trial.steps(np.ones(6), 1)
 
 
@@ -172,7 +172,7 @@ def test_a_freeze_on_the_way_to_the_start_pose(seconds):
     trial = Trial("bam/reach-v0", way=1.2)
     trial.driven.misbehave("ignore", seconds, after=1.0)
     if seconds > 1.0:
-        with pytest.raises(SafetyStop, match=r"^The robot was stopped by G23 following: "):
+        with pytest.raises(SafetyStop, match=r"^The robot was stopped by following \(G23\): "):
             trial.reset()
         trial.driven.now = 1.0 + seconds
         trial.safe.resume()
@@ -188,8 +188,8 @@ def test_a_base_that_does_not_follow_is_told_to_stand_and_stopped():
         trial.steps([1.0, 0.0], 60)
     assert caught.value.guard == "base following"
     assert str(caught.value) == (
-        "The robot was stopped by G23 base following: the base does not follow its commands: it goes at 0.000 m/s, and "
-        "was told 0.200 m/s; beyond a lag of 0 s it may be off by 0.150 m/s: look for a protective stop, a paused "
+        "The robot was stopped by base following (G23): the base does not follow its commands: it goes at 0.000 m/s, "
+        "and was told 0.200 m/s; beyond a lag of 0 s it may be off by 0.150 m/s: look for a protective stop, a paused "
         "program, an inactive controller, a low speed slider, or something in its way. When it is safe, call resume()."
     )
 
@@ -203,7 +203,7 @@ def test_a_joint_that_is_pressed_against_the_table_is_held_and_then_stopped():
         for _ in range(200):
             trial.safe.step(down)
 
-    with pytest.raises(SafetyStop, match=r"^The robot was stopped by G23 following: "):
+    with pytest.raises(SafetyStop, match=r"^The robot was stopped by following \(G23\): "):
         press()
     assert trial.driven.fastest <= 1.0
 

@@ -20,8 +20,8 @@ from bam_envs.live.building import live_robot
 from bam_envs.live.rosbridge import RosbridgeRobot
 from bam_envs.robots.physics.arm import SimulatedArm
 from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.safety.gate import ClearedCommand, SafeRobot
 from bam_envs.safety.guard import BOUNDS, Limits
-from bam_envs.safety.safe import ClearedCommand, SafeRobot
 from bam_envs.testing import ARM_HOME, DrivenRobot
 
 NOBODY = "ws://127.0.0.1:9"
@@ -42,7 +42,7 @@ def test_a_live_robot_is_built_behind_the_gate_and_nowhere_else():
     assert isinstance(live_robot(NOBODY), SafeRobot)
     assert isinstance(live_robot(NOBODY, profile="mir100"), SafeRobot)
     assert callers("RosbridgeRobot") == ["building.py"]
-    assert callers("_clear") == ["safe.py"]
+    assert callers("_clear") == ["gate.py"]
 
 
 @pytest.mark.parametrize("env_id", sorted(ENVIRONMENTS))

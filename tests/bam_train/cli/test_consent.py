@@ -44,7 +44,7 @@ def test_before_a_real_robot_moves_its_limits_are_shown_and_somebody_asked(monke
     consent(monkeypatch, RealArm(), "yes\n")
     assert capsys.readouterr().err == (
         "bam-deploy: pick.zip will move ur5e at ws://10.0.0.5:9090, within\n"
-        "  G8 joint speed: 3.14 rad/s\n"
+        "  joint speed (G8): 3.14 rad/s\n"
         "Is the robot clear of people, and a hand on its emergency stop? Type yes to go on: "
     )
 
@@ -74,7 +74,7 @@ def test_what_it_will_do_is_shown(monkeypatch, capsys, spec, episodes, expected)
     consent(monkeypatch, robot, yes=True, plan=plan)
     assert capsys.readouterr().err == (
         "bam-deploy: pick.zip will move ur5e at ws://10.0.0.5:9090:\n"
-        f"  address: ws://10.0.0.5:9090\n{expected}within\n  G8 joint speed: 3.14 rad/s\n"
+        f"  address: ws://10.0.0.5:9090\n{expected}within\n  joint speed (G8): 3.14 rad/s\n"
     )
 
 

@@ -280,7 +280,7 @@ GUARDS = {
 
 
 def test_what_the_guards_did_is_reported():
-    assert guards_text(GUARDS) == "guards changed the command: joint speed in 3 ticks"
+    assert guards_text(GUARDS) == "guards changed the command: joint speed (G8) in 3 ticks"
     assert guards_text({"finite": GUARDS["finite"]}) == "no guard changed a command"
 
 

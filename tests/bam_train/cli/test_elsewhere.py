@@ -177,7 +177,7 @@ def test_a_real_robot_is_shown_and_does_not_move_unasked(serve, run, monkeypatch
         "  each begins by opening the gripper and going to the start pose",
         "within",
     ]
-    assert "  G10 tool speed: 0.25 m/s" in lines
+    assert "  tool speed (G10): 0.25 m/s" in lines
     assert lines[-1] == (
         "bam-deploy: a real robot would move, and there is nobody to ask; give --yes to go on without asking"
     )

@@ -11,7 +11,7 @@ from bam_envs.core.robot_env import RobotEnv
 from bam_envs.core.timing import Pacer
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.physics.arm import SimulatedArm
-from bam_envs.safety.safe import SafeRobot
+from bam_envs.safety.gate import SafeRobot
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.reach import ReachTask
 from bam_envs.testing.drivers import DrivenRobot
@@ -104,7 +104,7 @@ def test_a_slow_policy_or_a_process_that_stood_still_stops_a_live_robot(takes, a
     ending, _, _ = run(env, policy, episodes=1)
     assert ending.status == 3
     assert ending.reason.startswith(
-        f"safety stop: The robot was stopped by G15 command pace: the command came {takes + 0.05:.3f} s"
+        f"safety stop: The robot was stopped by command pace (G15): the command came {takes + 0.05:.3f} s"
     )
     assert ending.reason.endswith("When it is safe, run it again.")
     assert len(policy.seen) == ticks

@@ -27,7 +27,7 @@ from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.link.link import RosbridgeLink
 from bam_envs.rosbridge.server.server import BridgeServer
 from bam_envs.rosbridge.tokens import read_token
-from bam_envs.safety.safe import SafeRobot
+from bam_envs.safety.gate import SafeRobot
 
 _LOOK = 3.0
 """How long a robot that may be there already may take to answer [s]."""

@@ -85,7 +85,7 @@ def test_a_live_base_in_parity_has_no_collisions_and_is_stopped_at_the_wall(serv
         for _ in range(80):
             assert not env.step(FORWARD)[2]
 
-    with pytest.raises(SafetyStop, match=r"^The robot was stopped by G23 base following: "):
+    with pytest.raises(SafetyStop, match=r"^The robot was stopped by base following \(G23\): "):
         drive()
     assert served.env.unwrapped.robot.state.truth["collision"].tolist() == [True]
 

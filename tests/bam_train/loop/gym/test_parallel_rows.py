@@ -8,7 +8,7 @@ from gymnasium.wrappers import Autoreset
 
 from bam_envs.core.robot_env import RobotEnv
 from bam_envs.robots.fake import FakeRobot
-from bam_envs.safety.safe import SafeRobot
+from bam_envs.safety.gate import SafeRobot
 from bam_envs.tasks.pick import PickTask
 from bam_train.errors import LoopError, SettingsError
 from bam_train.loop import ParallelGymAgent, VecGymAgent, Workspace

@@ -25,8 +25,8 @@ from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.physics.mir100 import SimulatedBase
 from bam_envs.robots.ur5e import GEOMETRY
 from bam_envs.safety.arm_guards import JointSpeed
+from bam_envs.safety.gate import ClearedCommand, SafeRobot
 from bam_envs.safety.guards import Guard, Limits
-from bam_envs.safety.safe import ClearedCommand, SafeRobot
 from bam_envs.testing import ARM_HOME, RobotContract
 
 FIRST = np.zeros(1, np.int64)
@@ -279,14 +279,14 @@ def test_a_slow_command_passes_unchanged():
     command = away(state, 0.01, -0.02)
     np.testing.assert_array_equal(robot.step(command).command, command)
     np.testing.assert_array_equal(inner.sent[-1], command)
-    assert robot.status == 0
+    assert robot.status == ""
     assert not any(row["altered"] for row in robot.report().values())
 
 
 def test_what_was_altered_is_counted_by_guard_and_told_by_status():
     _, robot, state = fake()
     robot.step(turned(state, 0.04))
-    assert robot.status == 9
+    assert robot.status == "joint acceleration (G9)"
     assert robot.report()["joint acceleration"] == {
         "number": "G9",
         "limit": 10.0,
@@ -396,13 +396,13 @@ def test_two_bad_ticks_hold_and_the_third_stops_for_good():
     sent = robot.step(away(state, 0.02)).command
     for _ in range(2):
         np.testing.assert_array_equal(robot.step(NAN).command, sent)
-        assert robot.status == 2
+        assert robot.status == "finite (G2)"
     halts = inner.halts
     with pytest.raises(SafetyStop) as caught:
         robot.step(NAN)
     assert caught.value.guard == "finite"
     assert str(caught.value) == (
-        "The robot was stopped by G2 finite: the command for shoulder_pan_joint, shoulder_lift_joint, elbow_joint, "
+        "The robot was stopped by finite (G2): the command for shoulder_pan_joint, shoulder_lift_joint, elbow_joint, "
         "wrist_1_joint, wrist_2_joint, wrist_3_joint, gripper_width is not a finite number, 3 ticks on end. "
         "When it is safe, call resume()."
     )
@@ -444,7 +444,7 @@ def test_a_stop_is_latched_over_steps_resets_and_connections_until_a_person_resu
         with pytest.raises(SafetyStop) as caught:
             act()
         assert caught.value.guard == "finite"
-        assert str(caught.value).startswith("The robot is still stopped by G2 finite: ")
+        assert str(caught.value).startswith("The robot is still stopped by finite (G2): ")
         assert str(caught.value).endswith("When it is safe, call resume().")
     assert len(inner.sent) == sent
     robot.resume()
@@ -465,7 +465,7 @@ def test_after_a_stop_it_begins_where_it_is():
     robot.resume()
     sent = robot.step(away(state)).command[0]
     assert np.abs(sent[:6] - elsewhere).max() == pytest.approx(0.0125)
-    assert robot.status == 14
+    assert robot.status == "ramp-in speed (G14)"
 
 
 def test_after_a_hold_it_starts_from_rest():
@@ -491,11 +491,11 @@ def test_stale_states_hold_for_half_a_second_and_then_stop():
     arm.old = 0.11
     for _ in range(9):
         np.testing.assert_array_equal(robot.step(away(state, 0.02)).command, state.command)
-        assert robot.status == 3
+        assert robot.status == "state age (G3)"
     with pytest.raises(StaleState) as caught:
         robot.step(away(state, 0.02))
     assert str(caught.value) == (
-        "The robot was stopped by G3 state age: the newest state is 0.110 s old, and at most 0.1 s are allowed, "
+        "The robot was stopped by state age (G3): the newest state is 0.110 s old, and at most 0.1 s are allowed, "
         "10 ticks on end. When it is safe, call resume()."
     )
     assert (caught.value.age, caught.value.limit) == (0.11, 0.1)
@@ -546,7 +546,7 @@ def test_after_a_pause_of_this_process_a_motion_begins_at_the_state_that_lay_unr
     arm.age = lambda: ages.pop() if ages else 0.01
     robot.step(away(state, 0.02))
     assert ages == []
-    assert robot.status == 0
+    assert robot.status == ""
     assert robot.report()["state age"]["stopped"] == 0
 
 
@@ -586,7 +586,7 @@ def test_a_measurement_beyond_the_data_sheet_stops_at_once(what):
             arm.spec = type(arm.spec)(arm.spec.name, arm.spec.signals, arm.spec.command, 0.001)
 
     arm.during = push
-    with pytest.raises(SafetyStop, match=r"^The robot was stopped by G7 measured limits: joint_") as caught:
+    with pytest.raises(SafetyStop, match=r"^The robot was stopped by measured limits \(G7\): joint_") as caught:
         robot.step(away(state, 0.02))
     assert caught.value.guard == "measured limits"
     with pytest.raises(SafetyStop):
@@ -633,7 +633,7 @@ def test_a_joint_that_is_blocked_on_the_way_to_the_start_stops_the_arm():
         robot.reset(np.arange(1), start_at(ARM_HOME + 0.2))
     assert caught.value.guard == "following"
     assert str(caught.value) == (
-        "The robot was stopped by G23 following: shoulder_lift_joint does not follow its commands: it is -0.012 rad "
+        "The robot was stopped by following (G23): shoulder_lift_joint does not follow its commands: it is -0.012 rad "
         "from the last one, and beyond a lag of 0 s it may be 0.009 rad, and the tool 0.009 m: look for a protective "
         "stop, a paused program, an inactive controller, a low speed slider, or something in its way. When it is safe, "
         "call resume()."
@@ -643,8 +643,12 @@ def test_a_joint_that_is_blocked_on_the_way_to_the_start_stops_the_arm():
 
 
 def test_a_way_that_is_too_long_for_the_time():
-    _, robot, _ = live(limits=Limits(reset_timeout=0.1))
-    with pytest.raises(StartNotReached, match=r"in 0\.1 s: shoulder_pan_joint is \+0\.1"):
+    arm, robot, _ = live(limits=Limits(reset_timeout=0.1))
+    text = r"The arm did not reach its start pose in 0\.1 s: shoulder_pan_joint is \+0\.1"
+    with pytest.raises(StartNotReached, match=f"^{text}"):
+        robot.reset(np.arange(1), start_at(ARM_HOME + 0.2))
+    arm.not_ready = lambda: "protective stop"
+    with pytest.raises(StartNotReached, match=rf"^Not ready: protective stop\. {text}"):
         robot.reset(np.arange(1), start_at(ARM_HOME + 0.2))
 
 
@@ -668,7 +672,7 @@ def test_a_first_command_far_away_is_gone_to_slowly():
     for _ in range(5):
         before = state.command
         state = robot.step(far)
-        assert robot.status == 14
+        assert robot.status == "ramp-in speed (G14)"
         assert np.abs(state.command - before).max() <= 0.0125 + 1e-9
     assert len(arm.sent) == 5
 
@@ -789,7 +793,7 @@ def test_a_late_command_is_not_executed():
         state = robot.step(turned(state, 0.03))
     arm.now += 0.06  # beyond two periods since the last command
     np.testing.assert_array_equal(robot.step(turned(state, 0.03)).command, state.command)
-    assert robot.status == 15
+    assert robot.status == "command pace (G15)"
     assert np.abs(robot.step(turned(state, 0.03)).command - state.command).max() <= 0.025 + 1e-9
 
 
@@ -803,7 +807,7 @@ def test_a_policy_that_is_too_slow_moves_nothing_and_is_stopped():
     with pytest.raises(SafetyStop) as caught:
         robot.step(turned(state, 0.03))
     assert str(caught.value) == (
-        "The robot was stopped by G15 command pace: the command came 0.350 s after the one before, and one is "
+        "The robot was stopped by command pace (G15): the command came 0.350 s after the one before, and one is "
         "expected every 0.05 s: the policy takes too long, or this process was paused or the computer is busy, "
         "10 ticks on end. When it is safe, call resume()."
     )
@@ -820,7 +824,7 @@ def test_after_a_pause_of_this_process_nothing_moves_before_a_person_resumes(whe
         arm.now, arm.during = arm.now + 10.0, None
 
     arm.during = pause_once
-    stopped = r"^The robot was stopped by G15 command pace: the command came 10\.050 s after"
+    stopped = r"^The robot was stopped by command pace \(G15\): the command came 10\.050 s after"
     if when == "in the episode":
         robot.step(turned(state, 0.03))
         with pytest.raises(SafetyStop, match=stopped):
@@ -829,7 +833,7 @@ def test_after_a_pause_of_this_process_nothing_moves_before_a_person_resumes(whe
         with pytest.raises(SafetyStop, match=stopped):
             robot.reset(np.arange(1), start_at(ARM_HOME + 0.3))
     assert len(arm.sent) == sent + 1
-    with pytest.raises(SafetyStop, match=r"^The robot is still stopped by G15"):
+    with pytest.raises(SafetyStop, match=r"^The robot is still stopped by command pace"):
         robot.step(state.command)
     robot.resume()
     robot.step(state.command)
@@ -857,7 +861,7 @@ def test_a_robot_that_does_not_answer_is_held_and_then_stopped():
     arm.waiting = lambda: arm.now
     for _ in range(6):
         state = robot.step(turned(state, 0.01))
-    assert robot.status == 0
+    assert robot.status == ""
     for _ in range(10):
         arm.now += 0.001
         try:
@@ -865,8 +869,8 @@ def test_a_robot_that_does_not_answer_is_held_and_then_stopped():
         except SafetyStop as stop:
             told = str(stop)
     assert told == (
-        "The robot was stopped by G4 answer to a command: a command that was sent 0.760 s ago is not answered, and at "
-        "most 0.3 s are allowed: commands do not arrive, or late; look at the network and at who else commands the "
+        "The robot was stopped by answer to a command (G4): a command that was sent 0.760 s ago is not answered, and "
+        "at most 0.3 s are allowed: commands do not arrive, or late; look at the network and at who else commands the "
         "robot, 10 ticks on end. When it is safe, call resume()."
     )
 
@@ -885,10 +889,10 @@ def test_an_arm_that_is_measured_too_fast_is_held_and_stopped_when_it_goes_on():
     arm._measure = run_away
     robot.step(turned(state, 0.01))
     held = robot.step(turned(state, 0.02)).command
-    assert robot.status == 0
+    assert robot.status == ""
     for _ in range(2):
         np.testing.assert_array_equal(robot.step(turned(state, 0.03)).command, held)
-        assert robot.status == 8
+        assert robot.status == "measured joint speed (G8)"
     with pytest.raises(SafetyStop) as caught:
         robot.step(turned(state, 0.03))
     assert caught.value.guard == "measured joint speed"

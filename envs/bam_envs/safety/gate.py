@@ -1,11 +1,10 @@
 """SafeRobot: the one gate between whoever commands a live robot and the robot.
 
-Every command goes through the guards of `bam_envs.safety`. A command or state that cannot be used makes the
-robot hold at once: an arm is sent its last command again, a base zero. Several such ticks in a row, or a measurement
-beyond the data sheet, stop the robot until a person calls `resume`.
+Every command passes the guards of `bam_envs.safety`. If a command or state cannot be used, the robot holds at once: an
+arm is sent its last command again, a base zero. Several such ticks in a row, or a measurement beyond the data sheet,
+stop the robot until a person calls `resume`.
 
-Longer than most files here: the gate and the seal of what it lets through stand side by side, so that nobody else can
-make one.
+Longer than most files here: the gate stands beside the seal of what it lets through, so that nobody else can make one.
 """
 
 from __future__ import annotations
@@ -20,19 +19,30 @@ from typing import Any, NoReturn, Protocol, cast, final
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.core.errors import InvalidValue, ResetNeeded, RobotFault, SafetyStop, StaleState
+from bam_envs.core.errors import InvalidValue, ResetNeeded, RobotFault, SafetyStop, StaleState, StartNotReached
 from bam_envs.core.robot import Initial, Robot, RobotSpec, RobotState, Rows
-from bam_envs.safety.arm_guards import ToolPosition
 from bam_envs.safety.following import Following
-from bam_envs.safety.guard import Guard, Limits, Sealed, Tick, is_base, joint_columns, require_bounded
+from bam_envs.safety.guard import (
+    Guard,
+    Limits,
+    Sealed,
+    Tick,
+    ToolPosition,
+    columns_in,
+    is_base,
+    joint_columns,
+    position_range,
+    require_bounded,
+)
 from bam_envs.safety.guards import LATE, Freshness, Shape, default_guards
-from bam_envs.safety.start_pose import StartPose
 
 __all__ = ["ClearedCommand", "Limits", "LiveRobot", "SafeRobot"]
 
 Array = NDArray[np.float64]
 GRIPPER_TIME = 1.0
-"""Longest that the gripper is waited for before an arm goes to its start pose [s]."""
+"""Longest wait for the gripper to open before an arm goes to its start pose [s]."""
+GRIPPER_NEAR = 0.002
+"""The gripper is open when it is this near to its widest [m]."""
 FRESH_LOOKS, FRESH_PAUSE = 50, 0.005
 """How often a fresh state is looked for before a motion begins, and the time between two looks [s]."""
 
@@ -41,7 +51,7 @@ FRESH_LOOKS, FRESH_PAUSE = 50, 0.005
 class ClearedCommand(metaclass=Sealed):
     """A command that passed the guards, for one robot and one tick. Only a `SafeRobot` makes one.
 
-    It has nothing that could be set: what it says is kept apart from it.
+    It has no attribute that could be set: its content is kept outside of it.
     """
 
     __slots__ = ("__weakref__",)
@@ -65,7 +75,7 @@ class ClearedCommand(metaclass=Sealed):
         return self._entry()[1]
 
     def for_robot(self, robot: object) -> Array:
-        """The same, for the robot that it was cleared for.
+        """`command`, if it was cleared for `robot`.
 
         Raises:
             InvalidValue: As of `command`, or it was cleared for another robot.
@@ -96,43 +106,23 @@ def _clear(robot: object, command: Array) -> ClearedCommand:
     return cleared
 
 
-class LiveRobot(Protocol):
+class LiveRobot(Robot, Protocol):
     """A `Robot` that takes cleared commands only, and whose `reset` moves nothing: it measures.
 
-    One that answers commands has ``waiting() -> float`` too: for how long it has owed the answer to one [s].
+    One that answers commands also has ``waiting() -> float``: how long it has owed the answer to one [s].
     """
-
-    @property
-    def spec(self) -> RobotSpec:
-        """As of any robot."""
-
-    @property
-    def num_robots(self) -> int:
-        """1."""
 
     needs_clearance: bool
     """True."""
 
-    def connect(self) -> None:
-        """As of any robot."""
-
-    def reset(self, rows: Rows, initial: Initial) -> RobotState:
-        """Measure; put the object of a simulated robot where `initial` says."""
-
-    def step(self, command: ClearedCommand) -> RobotState:
-        """Send `command`, and return the state one period later."""
+    def step(self, command: Array | ClearedCommand) -> RobotState:
+        """Send `command`, and return the state one period later; any but a cleared one is refused."""
 
     def measure(self) -> RobotState:
         """The newest state."""
 
     def age(self) -> float:
         """Age of the newest state [s]."""
-
-    def halt(self) -> None:
-        """As of any robot."""
-
-    def close(self) -> None:
-        """As of any robot."""
 
 
 @final
@@ -144,8 +134,8 @@ class SafeRobot(metaclass=Sealed):
 
     Args:
         robot: One robot, simulated or live.
-        guards: More guards, asked before the others, which have the last word.
-        limits: How far the guards let it go; those of a live robot are inside `guard.BOUNDS`.
+        guards: Further guards, asked before the default ones, which have the last word.
+        limits: How far the guards let the robot go; those of a live robot are inside `guard.BOUNDS`.
         tool_position: Forward kinematics of an arm that is no UR5e, (n, k) [rad] to (n, 3) [m].
         clock: Monotonic clock [s].
 
@@ -205,7 +195,7 @@ class SafeRobot(metaclass=Sealed):
         every = (*self._further, *self._guards)
         self._counts = {guard.name: {"altered": 0, "held": 0, "stopped": 0} for guard in every}
         self._stopped: tuple[str, str] | None = None
-        self._bad, self._halts, self._status = 0, 0, 0
+        self._bad, self._halts, self._status = 0, 0, ""
         self._sent_at: float | None = None
         self._forget()
         if self._live is not None:
@@ -251,8 +241,8 @@ class SafeRobot(metaclass=Sealed):
         return self._limits
 
     @property
-    def status(self) -> int:
-        """Number of the last guard that changed the last command, or made the robot hold; 0 for none."""
+    def status(self) -> str:
+        """The last guard that changed the last command, or held the robot: ``"joint speed (G8)"``; empty for none."""
         return self._status
 
     @property
@@ -270,9 +260,9 @@ class SafeRobot(metaclass=Sealed):
         return 0.0 if self._live is None else float(self._live.age())
 
     def report(self) -> dict[str, dict[str, Any]]:
-        """For each guard: number, limit, unit, commands that it altered, ticks that it held, and stops of the robot.
+        """For each guard: number, limit, unit, commands altered, ticks held, and stops of the robot.
 
-        What was altered on the way to a start pose is not counted.
+        Commands that were altered on the way to a start pose are not counted.
         """
         return {
             guard.name: {
@@ -305,7 +295,7 @@ class SafeRobot(metaclass=Sealed):
         halts = self._halts
         try:
             tick = self._tick(goal, approach)
-        except RobotFault:  # nobody knows where it is, and a base would go on
+        except RobotFault:  # nobody knows where it is, and a base would drive on
             self.halt()
             raise
         fault = self._fault(tick)
@@ -321,21 +311,21 @@ class SafeRobot(metaclass=Sealed):
         measured, period = self._measured(), self.spec.period
         before = np.full_like(measured, np.nan) if self._before is None else self._before
         self._before = measured
-        velocity, time_passed = self._velocity(measured, before), min(period, pause or period)
+        time_passed = min(period, pause or period)
         waiting = getattr(self._live, "waiting", None)
         return Tick(
-            goal,
-            goal.copy(),
-            last,
-            self._speed * time_passed,
-            measured,
-            before,
-            velocity,
-            self.age(),
-            time_passed,
-            pause,
-            0.0 if waiting is None else float(waiting()),
-            approach,
+            goal=goal,
+            command=goal.copy(),
+            last=last,
+            last_step=self._speed * time_passed,
+            measured=measured,
+            before=before,
+            velocity=self._velocity(measured, before),
+            age=self.age(),
+            period=time_passed,
+            pause=pause,
+            waiting=0.0 if waiting is None else float(waiting()),
+            approach=approach,
         )
 
     def _pause(self) -> float:
@@ -393,36 +383,26 @@ class SafeRobot(metaclass=Sealed):
         return measured
 
     def _fresh_state(self) -> RobotState:
-        """The newest state. An old one is waited out for a little: after a pause of this process newer ones lie unread.
+        """The newest state. An old one is waited out briefly: after a pause of this process newer ones lie unread.
 
         Raises:
-            StaleState: None came.
+            StaleState: None came. An old state is no place to begin at: even holding there would be a motion.
         """
+        limit = next(guard.limit_value for guard in self._guards if isinstance(guard, Freshness))
         for _ in range(FRESH_LOOKS):
-            fresh = self._is_fresh()  # asked first: what is measured afterwards can only be newer
+            fresh = self.age() <= limit  # asked first: what is measured afterwards can only be newer
             state: RobotState = self._live.measure()
             if fresh:
                 return state
             time.sleep(FRESH_PAUSE)
-        self._require_fresh()
-        return cast(RobotState, self._live.measure())
-
-    def _is_fresh(self) -> bool:
-        age = self.age()
-        return all(age <= guard.limit_value for guard in self._guards if isinstance(guard, Freshness))
-
-    def _require_fresh(self) -> None:
-        """An old state is no place to begin at: even to hold there would be a motion."""
-        age = self.age()
-        for guard in self._guards:
-            if isinstance(guard, Freshness) and not age <= guard.limit_value:
-                raise StaleState(
-                    f"The newest state is {age:.3f} s old, and a motion begins at a state of at most "
-                    f"{guard.limit_value:g} s. Nothing was sent; look at the link, at what publishes the state, and at "
-                    "whether this computer is busy.",
-                    age,
-                    guard.limit_value,
-                )
+        if (age := self.age()) <= limit:
+            return cast(RobotState, self._live.measure())
+        raise StaleState(
+            f"The newest state is {age:.3f} s old, and a motion begins at a state of at most {limit:g} s. Nothing was "
+            "sent; look at the link, at what publishes the state, and at whether this computer is busy.",
+            age,
+            limit,
+        )
 
     def _restart_guards(self) -> None:
         for guard in (*self._further, *self._guards):
@@ -445,7 +425,7 @@ class SafeRobot(metaclass=Sealed):
         return None
 
     def _limit(self, tick: Tick) -> None:
-        self._bad = self._status = 0
+        self._bad, self._status = 0, ""
         for guard in self._further:
             asked = _copy(tick)
             if guard.limit(asked):
@@ -457,7 +437,7 @@ class SafeRobot(metaclass=Sealed):
                 self._note(guard, "altered")
 
     def _note(self, guard: Guard, what: str) -> None:
-        self._status = int(guard.number[1:])
+        self._status = guard.title
         self._counts[guard.name][what] += 1
 
     def _hold(self, tick: Tick, guard: Guard, reason: str) -> None:
@@ -499,7 +479,7 @@ class SafeRobot(metaclass=Sealed):
         self._counts[guard.name]["stopped"] += 1
         why = self.not_ready()
         said = "" if why is None else f"not ready: {why}: "
-        self._stopped = guard.name, f"{guard.number} {guard.name}: {said}{reason}"
+        self._stopped = guard.name, f"{guard.title}: {said}{reason}"
         message = f"The robot was stopped by {self._stopped[1]}. When it is safe, call resume()."
         if isinstance(guard, Freshness):
             raise StaleState(message, self.age(), guard.limit_value)
@@ -511,7 +491,7 @@ class SafeRobot(metaclass=Sealed):
             raise SafetyStop(name, f"The robot is still stopped by {reason}. When it is safe, call resume().")
 
     def resume(self) -> None:
-        """Let a stopped robot move again: a person's decision, never a program's. It begins where it is."""
+        """Let a stopped robot move again, from where it is. A person decides this, never a program."""
         self._stopped, self._bad, self._last, self._sent_at, self._before = None, 0, None, None, None
         self._forgive()
 
@@ -524,7 +504,7 @@ class SafeRobot(metaclass=Sealed):
             SafetyStop: A guard stopped the robot, now or earlier.
         """
         self._require_free()
-        start = None if self._is_base else StartPose(self.spec, self.limits, initial)
+        start = None if self._is_base else _StartPose(self.spec, self.limits, initial)
         if self._live is None:
             self._forget()
         else:
@@ -542,11 +522,11 @@ class SafeRobot(metaclass=Sealed):
 
     def _take(self, state: RobotState) -> RobotState:
         """Begin anew with `state`."""
-        self._state, self._before, self._bad, self._status = state, None, 0, 0
+        self._state, self._before, self._bad, self._status = state, None, 0, ""
         self._require_in_range(state)
         return state
 
-    def _approach(self, start: StartPose) -> None:
+    def _approach(self, start: _StartPose) -> None:
         """Open the gripper where the arm is, then go to `start`."""
         opened = start.opened(self._begin_at(0.0))
         self._go(opened, GRIPPER_TIME, lambda: start.is_open(self._measured()))
@@ -555,7 +535,7 @@ class SafeRobot(metaclass=Sealed):
             self.halt()
             raise start.failure(self._measured(), self.not_ready())
 
-    def _is_reached(self, start: StartPose) -> bool:
+    def _is_reached(self, start: _StartPose) -> bool:
         return start.is_reached(self._measured(), self._begin_at(0.0))
 
     def _go(self, goal: Array, longest: float, done: Callable[[], bool]) -> None:
@@ -566,7 +546,7 @@ class SafeRobot(metaclass=Sealed):
             self._advance(goal, approach=True)
 
     def halt(self) -> None:
-        """Stop moving and keep the link; what comes next begins where the robot is. From any thread; never raises."""
+        """Stop moving and keep the link; the next command begins where the robot is. From any thread; never raises."""
         self._halts += 1
         self._last = self._sent_at = None
         self._robot.halt()
@@ -575,6 +555,71 @@ class SafeRobot(metaclass=Sealed):
         """Halt, then drop the link."""
         self._robot.close()
         self._forget()
+
+
+class _StartPose:
+    """Where an arm's episode starts: as a command, whether the arm is there, and what is missing.
+
+    Args:
+        spec: Of the arm.
+        limits: Tolerance, time and position margin.
+        initial: Its ``joint_position`` is the pose; the gripper is open.
+
+    Raises:
+        InvalidValue: The pose is outside the position limits.
+    """
+
+    def __init__(self, spec: RobotSpec, limits: Limits, initial: Initial) -> None:
+        self._limits = limits
+        self._joints, self._grippers = columns_in(spec.command, "rad"), columns_in(spec.command, "m")
+        self._names = [spec.command.labels[column] for column in self._joints]
+        self.command: Array = np.array(spec.command.high)  # (m,)
+        self.command[self._joints] = np.asarray(initial.signals["joint_position"], dtype=np.float64)[0]
+        self._require_inside(*position_range(spec, limits))
+
+    def _require_inside(self, low: Array, high: Array) -> None:
+        for name, column in zip(self._names, self._joints, strict=True):
+            if not low[column] <= self.command[column] <= high[column]:
+                raise InvalidValue(
+                    f"The start pose has {name} at {self.command[column]:.3f} rad, outside the {low[column]:.3f} to "
+                    f"{high[column]:.3f} rad that the guards allow. Choose another start, or a smaller position_margin."
+                )
+
+    def opened(self, here: Array) -> Array:
+        """The command `here` (m,) with the gripper open."""
+        command: Array = here.copy()
+        command[self._grippers] = self.command[self._grippers]
+        return command
+
+    def is_open(self, measured: Array) -> bool:
+        """Whether the gripper is measured open; one that is not measured (NaN) is not waited for."""
+        return not (np.abs(self.command - measured)[self._grippers] > GRIPPER_NEAR).any()
+
+    def joints_off(self, measured: Array) -> dict[str, float]:
+        """The joints that are not there, with how far they have to go [rad]."""
+        way = (self.command - measured)[self._joints]
+        near = self._limits.reset_tolerance
+        return {name: float(far) for name, far in zip(self._names, way, strict=True) if not abs(far) <= near}
+
+    def is_near(self, measured: Array) -> bool:
+        """Whether joints and gripper are measured there."""
+        return self.is_open(measured) and not self.joints_off(measured)
+
+    def is_reached(self, measured: Array, sent: Array) -> bool:
+        """Whether all joints are measured there, and were told to be."""
+        told = bool((sent == self.command)[self._joints].all())
+        return told and not self.joints_off(measured)
+
+    def failure(self, measured: Array, why: str | None = None) -> StartNotReached:
+        """The error that names the joints, and `why` the robot cannot move, if it says so."""
+        off = self.joints_off(measured)
+        where = ", ".join(f"{name} is {far:+.3f} rad from it" for name, far in off.items()) or "it is on its way"
+        said = "" if why is None else f"Not ready: {why}. "
+        return StartNotReached(
+            f"{said}The arm did not reach its start pose in {self._limits.reset_timeout:g} s: {where}. "
+            "Look for what holds it, or raise the limit reset_timeout.",
+            off,
+        )
 
 
 def _copied(state: RobotState) -> RobotState:
