@@ -81,7 +81,7 @@ def serve_robot() -> None:
     from bam_envs.robots.profiles.profile import load_profile
     from bam_envs.rosbridge.server.server import BridgeServer
 
-    robot = ServedRobot(FakeRobot(1), dead_man=0.1)
+    robot = ServedRobot(FakeRobot(1), command_timeout=0.1)
     robot.connect()
     robot.reset(np.arange(1), Initial({"joint_position": np.array([HOME])}, np.zeros(1, np.int64)))
     with BridgeServer(port=0) as server:

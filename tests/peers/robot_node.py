@@ -22,7 +22,7 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 PERIOD = 0.01
-DEAD_MAN = 0.1
+COMMAND_TIMEOUT = 0.1
 MAX_SPEED = math.pi
 MAX_GRIPPER_SPEED = 0.2
 # Commands that wait for this node; so many that its report lacks none.
@@ -110,7 +110,7 @@ class Robot:
         return response
 
     def tick(self):
-        if self.target != self.position and time.monotonic() - self.commanded_at > DEAD_MAN:
+        if self.target != self.position and time.monotonic() - self.commanded_at > COMMAND_TIMEOUT:
             self.holds += 1
             self.target, self.gripper_target = list(self.position), self.gripper
         before = self.position

@@ -18,7 +18,7 @@ POSITIONS, GRIPPER = "/forward_position_controller/commands", "/gripper/commands
 ARRAY = "std_msgs/Float64MultiArray"
 FAR = 1.0
 NEAR = 0.6
-"""What a joint turns at its full speed until the dead-man stops it is half of this [rad]."""
+"""What a joint turns at its full speed until the command timeout stops it is half of this [rad]."""
 
 
 @pytest.fixture(params=["via", "rclpy"])
@@ -128,7 +128,7 @@ class Watch:
 
 
 def test_it_stops_by_itself_when_commands_stop(served):
-    """A single command goes far; the dead-man ends the motion on its way."""
+    """A single command goes far; the command timeout ends the motion on its way."""
     watch, link = Watch(), RosbridgeLink(served("realtime"))
     joints, gripper, states = (link.namespace + topic for topic in (POSITIONS, GRIPPER, "/joint_states"))
     with contextlib.closing(link):

@@ -65,7 +65,7 @@ _RESET_TIMEOUT = 3.0
 """Longest that a fresh state, or a scene, is waited for [s]."""
 _HALT_WAITS = 0.05
 """Longest that a halt waits for a command that is being sent, so as to come after it [s]."""
-_BY_HAND = "stop it by hand if it moves; a robot with a dead-man stops by itself"
+_BY_HAND = "stop it by hand if it moves; a robot with a command timeout stops by itself"
 _HALT_NOT_SENT = f"%s: the halt could not be sent, %s: {_BY_HAND}."
 _AS_SAID = ". Nothing was sent, and nothing is kept"
 _FAR, _CANNOT_BE_FAR = 0.3, 1.0

@@ -181,7 +181,7 @@ class RobotProfile:
     """Time between two commands [s]."""
     max_age: float
     """Oldest state that is acted on [s]."""
-    dead_man: float
+    command_timeout: float
     """For how long a command means something [s]; see `command_life`."""
     limits: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Limits of the guards that differ from their defaults, by their names in `bam_envs.safety.guards`."""
@@ -202,7 +202,7 @@ class RobotProfile:
 
         The robot would else rest in the middle of a slow task whenever the next command is a little late.
         """
-        return max(self.dead_man, 2.0 * period)
+        return max(self.command_timeout, 2.0 * period)
 
     def source(self, signal: str) -> Source:
         """Where `signal` comes from."""

@@ -32,7 +32,9 @@ class Box:
     def __init__(self, robot, initial, realtime):
         profile = load_profile("mir100" if isinstance(robot, SimulatedBase) else "ur5e")
         self.server = BridgeServer(port=0).start()
-        self.robot = ServedRobot(robot, dead_man=profile.dead_man, zero_rests=profile.kind == "base", realtime=realtime)
+        self.robot = ServedRobot(
+            robot, command_timeout=profile.command_timeout, zero_rests=profile.kind == "base", realtime=realtime
+        )
         self.robot.connect()
         self.robot.reset(ROW, initial)
         self.service = RobotService(self.robot, profile, self.server, CommandLease(0.5))

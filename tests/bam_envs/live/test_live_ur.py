@@ -83,7 +83,7 @@ def test_in_real_time_a_step_is_a_period(served, make, env_id):
 
 
 def test_at_ten_hertz_a_command_means_something_for_two_periods(served, make):
-    """Else the arm would rest between two commands: the profile's dead-man is one period of this task."""
+    """Else the arm would rest between two commands: the profile's command timeout is one period of this task."""
     live = make("bam/ur-reach-v0", robot=served("bam/ur-reach-v0"), ur_model="ur5e")
     live.reset(seed=1)
     assert live.unwrapped.robot.info.text == "ur5e, served in real time; it rests 0.2 s after the last command"

@@ -284,7 +284,7 @@ def test_a_halt_that_cannot_be_sent_is_told_once(server, robot_on, connect, capl
     server.close()
     assert robot._cut.wait(DEADLINE)
     robot._state.mailbox.wait_for(lambda slots: not (robot._halting.is_up or robot._control.is_up), DEADLINE)
-    text = "stop it by hand if it moves; a robot with a dead-man stops by itself."
+    text = "stop it by hand if it moves; a robot with a command timeout stops by itself."
     if told:
         assert raised(LinkLost, lambda: gate.step(gate.state.command)) == (
             f"{server.url}: the link is down. Nothing was sent, and nothing is kept; {text}"

@@ -49,7 +49,7 @@ def serve(request):
 
     def start(robot, realtime, joints=START):
         server = BridgeServer(port=0).start()
-        served = ServedRobot(robot, dead_man=0.2, realtime=realtime)
+        served = ServedRobot(robot, command_timeout=0.2, realtime=realtime)
         served.connect()
         served.reset(ROW, Initial({"joint_position": np.array([joints])}, ROW))
         service = RobotService(served, load_profile("ur5e"), server, CommandLease(0.5))

@@ -238,7 +238,7 @@ def _take_robot(env: Env, profile: RobotProfile, realtime: bool) -> ServedRobot:
     inner: Any = env.unwrapped
     resting = any(sink.hold == "zero" for way in profile.commands.values() for sink in way)
     life = profile.command_life(inner.robot.spec.period)
-    robot = ServedRobot(inner.robot, dead_man=life, zero_rests=resting, realtime=realtime)
+    robot = ServedRobot(inner.robot, command_timeout=life, zero_rests=resting, realtime=realtime)
     inner.robot = robot
     env.reset()
     return robot

@@ -264,7 +264,7 @@ class RobotService:
             envelopes = encode_state(self._profile, state, 0, stamp(self._clock()), self._answered)
             self._bus.publish_all([(self._namespace + topic, message) for topic, _, message in envelopes])
             self._connected = True
-        except LinkLost as error:  # nobody hears it, and the dead-man holds the robot
+        except LinkLost as error:  # nobody hears it, and the command timeout holds the robot
             if self._connected:
                 _log.warning("%s: %s", self._profile.name, error)
             self._connected = False
@@ -272,7 +272,7 @@ class RobotService:
 
 def _text(robot: ServedRobot, profile: RobotProfile) -> str:
     if robot.realtime:
-        return f"{profile.name}, served in real time; it rests {robot.dead_man:g} s after the last command"
+        return f"{profile.name}, served in real time; it rests {robot.command_timeout:g} s after the last command"
     return f"{profile.name}, served in lockstep: its time goes on with commands, {robot.spec.period:g} s each"
 
 

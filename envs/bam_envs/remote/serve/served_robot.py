@@ -1,4 +1,4 @@
-"""One robot that an environment, topics and a clock use together: how time passes for it, and its dead-man.
+"""One robot that an environment, topics and a clock use together: how time passes for it, and its command timeout.
 
 Two ways time passes. Fast: a period passes at once with each step, and none between steps. In real time: a clock calls
 `ServedRobot.tick`, a command is executed over the period that follows it, and without fresh commands the robot rests.
@@ -31,7 +31,7 @@ class ServedRobot:
 
     Args:
         robot: What moves.
-        dead_man: For how long a command means something [s].
+        command_timeout: For how long a command means something [s].
         zero_rests: Whether a command of zeros is rest, as for speeds; else it rests where it is.
         realtime: How time passes; see the module.
         now: Monotonic clock [s].
@@ -41,13 +41,13 @@ class ServedRobot:
         self,
         robot: Robot,
         *,
-        dead_man: float,
+        command_timeout: float,
         zero_rests: bool = False,
         realtime: bool = False,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self.spec, self.num_robots = robot.spec, robot.num_robots
-        self.dead_man, self.realtime = dead_man, realtime
+        self.command_timeout, self.realtime = command_timeout, realtime
         self.tick_period = robot.spec.period / (PARTS if hasattr(robot, "slices") else 1)
         """Time between two ticks [s]."""
         self.state: RobotState | None = None
@@ -57,7 +57,7 @@ class ServedRobot:
         self._robot, self._zero_rests, self._now = robot, zero_rests, now
         self._changed = threading.Condition(threading.RLock())
         self._target: Array = np.zeros((self.num_robots, len(robot.spec.command.labels)))
-        self._expires = -math.inf  # when the dead-man lets go; never while a step is waited for
+        self._expires = -math.inf  # when the command times out; never while a step is waited for
         self._resting = True
         self._parts: Iterator[RobotState] = iter(())
         self._left = 0  # parts of this period still to come
@@ -104,7 +104,7 @@ class ServedRobot:
             self._expires, order = math.inf, self._orders
             if not self._changed.wait_for(lambda: self._over(order), _LONGEST_WAIT):
                 raise RemoteError(f"The clock of {self.spec.name} has stood still for {_LONGEST_WAIT:g} s.")
-            self._expires = self._now() + self.dead_man
+            self._expires = self._now() + self.command_timeout
             return self._newest()
 
     def _over(self, order: int) -> bool:
@@ -128,7 +128,7 @@ class ServedRobot:
         return self.state
 
     def follow(self, command: Array, *, at_once: bool = True) -> None:
-        """Execute `command` (n, m) from the next tick on, for no longer than the dead-man lasts.
+        """Execute `command` (n, m) from the next tick on, at most for the command timeout.
 
         Args:
             command: Finite. Shape: (n, m).
@@ -136,7 +136,7 @@ class ServedRobot:
         """
         with self._changed:
             self._target = command
-            self._expires, self._resting = self._now() + self.dead_man, False
+            self._expires, self._resting = self._now() + self.command_timeout, False
             self._orders += 1
             # With one part to go, a command that came a little early is not worth losing that part for.
             if at_once and self._left != 1:

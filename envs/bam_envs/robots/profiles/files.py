@@ -73,4 +73,9 @@ def _parsed(where: str, text: str) -> Table:
         data = tomllib.loads(text) if language == "TOML" else yaml.safe_load(text)
     except (ValueError, RecursionError, yaml.YAMLError) as error:  # YAML's dates and numbers are left to Python's
         raise InvalidValue(f"{where} is not {language}: {' '.join(str(error).split())}.") from error
-    return require_table(data, where)
+    table = dict(require_table(data, where))
+    if "dead_man" in table:  # what command_timeout was called before
+        if "command_timeout" in table:
+            raise InvalidValue(f"{where}: command_timeout comes twice: dead_man is its former name. Give one of them.")
+        table["command_timeout"] = table.pop("dead_man")
+    return table

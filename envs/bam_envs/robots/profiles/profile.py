@@ -75,7 +75,7 @@ class _Head:
     robot: str = ""
     period: float | None = None
     max_age: float | None = None
-    dead_man: float | None = None
+    command_timeout: float | None = None
     limits: Mapping[str, float] = field(default_factory=dict)
     rename: Mapping[str, str] = field(default_factory=dict)
     frames: Mapping[str, str] = field(default_factory=dict)
@@ -104,7 +104,7 @@ def _profile(where: str, table: Table) -> RobotProfile:
     head = read_table(_Head, {key: value for key, value in table.items() if key not in _TABLES}, where)
     _require_positive(where, {"period": head.period})
     _require_age(where, head.max_age)
-    _require_age(where, head.dead_man, "dead_man")
+    _require_age(where, head.command_timeout, "command_timeout")
     _require_limits(where, head.limits)
     spec = _robot(where, head, table)
     state = tuple(_ignoring(source, head.ignore) for source in _state(where, table, spec))
@@ -125,7 +125,7 @@ def _profile(where: str, table: Table) -> RobotProfile:
         commands={way: tuple(map(new_name, sinks)) for way, sinks in commands.items()},
         period=spec.period,
         max_age=head.max_age or _AGES[head.kind],
-        dead_man=head.dead_man or _AGES[head.kind],
+        command_timeout=head.command_timeout or _AGES[head.kind],
         limits=head.limits,
         cameras=tuple(map(new_name, cameras)),
         readiness=tuple(map(new_name, readiness)),
@@ -140,7 +140,7 @@ def _require_positive(where: str, numbers: Mapping[str, float | None]) -> None:
 
 
 def _require_age(where: str, age: float | None, key: str = "max_age") -> None:
-    """States that are older mean nothing any more, nor do commands (`dead_man`)."""
+    """States that are older mean nothing any more, nor do commands (`command_timeout`)."""
     _, top, unit = BOUNDS["max_age"]
     _require_positive(where, {key: age})
     if age is not None and age > top:

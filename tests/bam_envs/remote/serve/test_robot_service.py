@@ -39,7 +39,7 @@ class Service:
 
     def __init__(self, bus, robot, realtime, lease=None, **options):
         self.bus, self.lease = bus, lease or CommandLease(5.0)
-        self.robot = ServedRobot(robot, dead_man=0.1, realtime=realtime)
+        self.robot = ServedRobot(robot, command_timeout=0.1, realtime=realtime)
         self.robot.connect()
         self.robot.reset(np.zeros(1, dtype=np.int64), initial())
         self.service = RobotService(self.robot, UR5E, bus, self.lease, **options)
@@ -565,7 +565,9 @@ def test_nothing_is_published_where_nobody_listens(serve, bus):
 def base(bus):
     """A base in real time whose clocks are set by hand: ``tick()`` is one part of a period."""
     profile, now = load_profile("mir100"), [0.0]
-    robot = ServedRobot(SimulatedBase(1), dead_man=profile.dead_man, zero_rests=True, realtime=True, now=lambda: now[0])
+    robot = ServedRobot(
+        SimulatedBase(1), command_timeout=profile.command_timeout, zero_rests=True, realtime=True, now=lambda: now[0]
+    )
     robot.connect()
     robot.reset(np.zeros(1, dtype=np.int64), Initial({}, np.zeros(1, dtype=np.int64)))
     service = RobotService(robot, profile, bus, CommandLease(5.0))

@@ -52,7 +52,7 @@ def serve(hands):
     served = []
 
     def make(robot, **options):
-        served.append(ServedRobot(robot, dead_man=0.1, now=hands, **options))
+        served.append(ServedRobot(robot, command_timeout=0.1, now=hands, **options))
         served[-1].connect()
         served[-1].reset(ROWS, initial())
         return served[-1]
@@ -123,7 +123,7 @@ def test_without_fresh_commands_the_arm_rests_where_it_is(serve, hands):
     np.testing.assert_allclose(served.state.signals["joint_velocity"], 0.0, atol=1e-3)
 
 
-def test_after_the_dead_man_a_command_begins_from_where_the_arm_is(serve, hands):
+def test_after_the_command_timeout_a_command_begins_from_where_the_arm_is(serve, hands):
     served = serve(SimulatedArm(1), realtime=True)
     served.follow(command(0.1))
     ticks(served, hands, 50)
@@ -168,7 +168,7 @@ def test_halt_stops_at_once_and_again_changes_nothing(serve, hands):
     np.testing.assert_array_equal(served.target(), rest)
 
 
-def test_a_closed_gripper_keeps_holding_after_the_dead_man(serve, hands):
+def test_a_closed_gripper_keeps_holding_after_the_command_timeout(serve, hands):
     served = serve(SimulatedArm(1), realtime=True)
     for _ in range(10):
         served.follow(command(0.0, 0.0))
@@ -195,7 +195,7 @@ def test_a_robot_that_says_no_set_point_rests_where_it_was_measured(serve, hands
 
 
 def test_a_step_in_real_time_waits_for_the_clock():
-    served = ServedRobot(SimulatedArm(1), dead_man=0.1, realtime=True)
+    served = ServedRobot(SimulatedArm(1), command_timeout=0.1, realtime=True)
     served.connect()
     served.reset(ROWS, initial())
     clock = Ticker(served.tick, 0.001)
@@ -207,7 +207,7 @@ def test_a_step_in_real_time_waits_for_the_clock():
 
 
 def test_a_halt_ends_a_step_that_is_waited_for_in_time():
-    served = ServedRobot(SimulatedArm(1), dead_man=0.1, realtime=True)
+    served = ServedRobot(SimulatedArm(1), command_timeout=0.1, realtime=True)
     served.connect()
     served.reset(ROWS, initial())
     states = []
@@ -254,7 +254,7 @@ def test_a_fault_stays_until_a_reset(serve, realtime):
 
 
 def test_a_fault_reaches_the_step_that_waits():
-    served = ServedRobot(Failing(1), dead_man=0.1, realtime=True)
+    served = ServedRobot(Failing(1), command_timeout=0.1, realtime=True)
     served.connect()
     served.reset(ROWS, initial())
     clock = Ticker(served.tick, 0.001)
@@ -296,7 +296,7 @@ def test_what_else_the_robot_can_is_there(serve):
 
 
 def test_time_stands_still_before_the_first_reset_and_after_the_end(hands):
-    served = ServedRobot(SimulatedArm(1), dead_man=0.1, realtime=True, now=hands)
+    served = ServedRobot(SimulatedArm(1), command_timeout=0.1, realtime=True, now=hands)
     served.halt()
     served.tick()
     assert served.state is None
@@ -308,7 +308,7 @@ def test_time_stands_still_before_the_first_reset_and_after_the_end(hands):
 
 
 def test_a_step_that_waits_is_told_of_the_end():
-    served = ServedRobot(SimulatedArm(1), dead_man=0.1, realtime=True)
+    served = ServedRobot(SimulatedArm(1), command_timeout=0.1, realtime=True)
     served.connect()
     served.reset(ROWS, initial())
     failures = []

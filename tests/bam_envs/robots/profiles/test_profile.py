@@ -86,7 +86,7 @@ def test_the_ur5e_whose_controller_interpolates():
 def test_the_ur5e_is_the_simulated_arm():
     profile, arm = load_profile("ur5e"), arm_spec("ur5e", with_object=True)
     assert profile.spec() == arm
-    assert (profile.kind, profile.period, profile.max_age, profile.dead_man) == ("arm", 0.05, 0.1, 0.1)
+    assert (profile.kind, profile.period, profile.max_age, profile.command_timeout) == ("arm", 0.05, 0.1, 0.1)
     assert [signal.name for signal in profile.signals[5:]] == ["tool_position", "tool_quaternion"]
     assert profile.source("joint_velocity").names == JOINTS
     position, trajectory = profile.sinks("position"), profile.sinks("trajectory")
@@ -99,7 +99,7 @@ def test_the_ur5e_is_the_simulated_arm():
 def test_the_mir100():
     profile = load_profile("mir100")
     assert profile.spec() == base_spec()
-    assert (profile.kind, profile.period, profile.max_age, profile.dead_man) == ("base", 0.1, 0.5, 0.5)
+    assert (profile.kind, profile.period, profile.max_age, profile.command_timeout) == ("base", 0.1, 0.5, 0.5)
     sizes = {signal.name: len(signal.labels) for signal in profile.signals}
     assert sizes == {"base_pose": 3, "base_velocity": 2, "f_scan": 501, "b_scan": 511}
     assert {source.topic for source in profile.state} == {"/odom", "/robot_pose", "/f_scan", "/b_scan"}
@@ -252,7 +252,7 @@ ignore: [finger_joint, elbow_joint]
         ("period = 0.02", "period = true", "FILE: period must be a finite number, not True."),
         ("period = 0.02", "period = nan", "FILE: period must be a finite number, not nan."),
         ("period = 0.02", "period = -1", "FILE: period must be above 0, not -1."),
-        ("period = 0.02", "period = 0.02\ndead_man = 1e9", "FILE: dead_man may be 1 s at most, not 1e+09."),
+        ("period = 0.02", "period = 0.02\ndead_man = 1e9", "FILE: command_timeout may be 1 s at most, not 1e+09."),
         ("period = 0.02", "", "FILE: give robot (ur5e, mir100), or [command] with max_rate, and period."),
         ("period = 0.02", 'robot = "ur5"', "FILE: Unknown robot 'ur5'. Did you mean 'ur5e'?"),
         ("period = 0.02", "period = 0.02\nstate = 3", "FILE is not TOML: "),
@@ -470,3 +470,11 @@ def test_a_renamed_command_is_another_controllers(write):
     assert profile.sinks("trajectory")[1].controller == "scaled_joint_trajectory_controller"
     assert profile.readiness == ()
     assert [sink.controller for sink in load_profile("ur5e").sinks()] == ["", "forward_position_controller"]
+
+
+def test_the_former_name_of_the_command_timeout(write):
+    assert load_profile(write('extends = "ur5e"\ndead_man = 0.2\n')).command_timeout == 0.2
+    assert load_profile(write('extends = "ur5e"\ncommand_timeout = 0.3\n')).command_timeout == 0.3
+    assert refusal(write('extends = "ur5e"\ncommand_timeout = 0.3\ndead_man = 0.2\n')) == (
+        "FILE: command_timeout comes twice: dead_man is its former name. Give one of them."
+    )
