@@ -41,11 +41,11 @@ def start_rows(
     options: Mapping[str, Any] | None = None,
 ) -> RobotState:
     """Begin a new episode on `rows`; the state of all rows."""
-    begin: Any = task.begin
-    initial = begin(rows, rngs, options) if options else begin(rows, rngs)
+    sample: Any = task.sample_initial
+    initial = sample(rows, rngs, options) if options else sample(rows, rngs)
     robot.connect()
     state = robot.reset(rows, initial)
-    task.start(rows, state)
+    task.on_reset(rows, state)
     return state
 
 

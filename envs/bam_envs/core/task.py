@@ -51,8 +51,8 @@ class Task(Protocol):
     """Observation, command, reward and end for `num_rows` rows; the same code for one live robot and many simulated.
 
     A task may have two more attributes. ``reset_options`` names the options that an environment's `reset` takes; such a
-    task's `begin` has a third argument, ``options``, a mapping of those that were given. ``ends_by_itself`` is True for
-    one that counts its own steps and terminates at its time limit; no time limit is put around it.
+    task's `sample_initial` has a third argument, ``options``, a mapping of those that were given. ``ends_by_itself`` is
+    True for one that counts its own steps and terminates at its time limit; no time limit is put around it.
     """
 
     num_rows: int
@@ -63,10 +63,10 @@ class Task(Protocol):
     observation_labels: tuple[Label, ...]
     action_labels: tuple[Label, ...]
 
-    def begin(self, rows: Rows, rngs: Sequence[np.random.Generator]) -> Initial:
+    def sample_initial(self, rows: Rows, rngs: Sequence[np.random.Generator]) -> Initial:
         """Sample targets and start states for `rows`, each from its own generator."""
 
-    def start(self, rows: Rows, state: RobotState) -> None:
+    def on_reset(self, rows: Rows, state: RobotState) -> None:
         """The robots of `rows` are at their start; note what was measured. `state` has all n rows."""
 
     def observe(self, state: RobotState) -> Floats:

@@ -164,7 +164,7 @@ class IsaacReachTask:
             ),
         )
 
-    def begin(
+    def sample_initial(
         self, rows: Rows, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] = MappingProxyType({})
     ) -> Initial:
         """A target in `TARGETS`; the joints where the last episode ended, or at `DEFAULT`."""
@@ -195,7 +195,7 @@ class IsaacReachTask:
             self._rngs[row] = rng
         return joints
 
-    def start(self, rows: Rows, state: RobotState) -> None:
+    def on_reset(self, rows: Rows, state: RobotState) -> None:
         """There is nothing to note."""
 
     def observe(self, state: RobotState) -> Floats:

@@ -106,7 +106,7 @@ class DriveTask:
         """Hook: which episodes are over because something went wrong. Shape: (n,)."""
         raise NotImplementedError
 
-    def begin(
+    def sample_initial(
         self, rows: Rows, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] | None = None
     ) -> Initial:
         """A start pose; the target is chosen when it is known where the base really is."""
@@ -122,7 +122,7 @@ class DriveTask:
         self._draws[rows] = draws
         return Initial({"base_pose": start, **self.scene(rows, draws)}, seeds)
 
-    def start(self, rows: Rows, state: RobotState) -> None:
+    def on_reset(self, rows: Rows, state: RobotState) -> None:
         """Choose the target from where the base is.
 
         Raises:

@@ -98,7 +98,7 @@ class PickTask:
         """For how many steps the object has been high enough. Shape: (n,)."""
         self._sense: CubeSense | None = None
 
-    def begin(self, rows: Rows, rngs: Sequence[np.random.Generator]) -> Initial:
+    def sample_initial(self, rows: Rows, rngs: Sequence[np.random.Generator]) -> Initial:
         """A tool position above the table, a cube pose on it."""
         draws = np.stack([rng.random(6) for rng in rngs])
         seeds = np.array([rng.integers(2**63) for rng in rngs], dtype=np.int64)
@@ -109,7 +109,7 @@ class PickTask:
         joints = GEOMETRY.reach_down(tool, np.zeros(len(rows)))
         return Initial({"joint_position": joints, "object_pose": cube}, seeds)
 
-    def start(self, rows: Rows, state: RobotState) -> None:
+    def on_reset(self, rows: Rows, state: RobotState) -> None:
         """Note the measured joints and how high the object lies."""
         self.control.start(rows, state.signals["joint_position"][rows])
         self.rest_height[rows] = state.signals["object_position"][rows, 2]

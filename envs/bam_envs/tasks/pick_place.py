@@ -73,16 +73,16 @@ class PickPlaceTask(PickTask):
         self.picked = np.zeros(num_rows, dtype=bool)
         """Whether the object has been lifted by `PICKED` in this episode. Shape: (n,)."""
 
-    def begin(self, rows: Rows, rngs: Sequence[np.random.Generator]) -> Initial:
+    def sample_initial(self, rows: Rows, rngs: Sequence[np.random.Generator]) -> Initial:
         """As for picking, and a goal at least `GOAL_DISTANCE` from the cube."""
-        initial = super().begin(rows, rngs)
+        initial = super().sample_initial(rows, rngs)
         for row, rng, cube in zip(rows, rngs, initial.signals["object_pose"], strict=True):
             self.goal[row] = sample_goal(rng, cube[:2])
         return initial
 
-    def start(self, rows: Rows, state: RobotState) -> None:
+    def on_reset(self, rows: Rows, state: RobotState) -> None:
         """As for picking; nothing has been picked up yet."""
-        super().start(rows, state)
+        super().on_reset(rows, state)
         self.picked[rows] = False
 
     def observe(self, state: RobotState) -> Floats:

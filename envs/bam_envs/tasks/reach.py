@@ -71,14 +71,14 @@ class ReachTask:
         self.goal = np.zeros((num_rows, 3))
         """Goals [m]. Shape: (n, 3)."""
 
-    def begin(self, rows: Rows, rngs: Sequence[np.random.Generator]) -> Initial:
+    def sample_initial(self, rows: Rows, rngs: Sequence[np.random.Generator]) -> Initial:
         """Joint positions about `HOME`; a goal in `GOAL_AREA`."""
         draws = np.stack([rng.random(9) for rng in rngs])
         seeds = np.array([rng.integers(2**63) for rng in rngs], dtype=np.int64)
         self.goal[rows] = GOAL_AREA[0] + draws[:, 6:] * (GOAL_AREA[1] - GOAL_AREA[0])
         return Initial({"joint_position": HOME + START_NOISE * (2 * draws[:, :6] - 1)}, seeds)
 
-    def start(self, rows: Rows, state: RobotState) -> None:
+    def on_reset(self, rows: Rows, state: RobotState) -> None:
         """Nothing is kept: commands go on from the one that was really sent last."""
 
     def observe(self, state: RobotState) -> Floats:

@@ -98,7 +98,7 @@ class UrAvoidanceTask(UrObstacleTask):
             rs_state_to_info=rs_state_to_info,
         )
 
-    def begin(
+    def sample_initial(
         self, rows: Rows, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] = MappingProxyType({})
     ) -> Initial:
         """The pose, and an obstacle that goes up and down or stays."""
@@ -109,7 +109,7 @@ class UrAvoidanceTask(UrObstacleTask):
         obstacle = wave_signals(draws) if place is None else {"obstacle_position": place}
         return Initial({"joint_position": joints, **obstacle}, seeds)
 
-    def start(self, rows: Rows, state: RobotState) -> None:
+    def on_reset(self, rows: Rows, state: RobotState) -> None:
         """The reference is the pose that was asked for, wherever exactly the arm is."""
 
     def score(self, state: RobotState, action: Floats) -> Score:

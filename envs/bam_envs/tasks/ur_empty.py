@@ -88,7 +88,7 @@ class UrEmptyTask:
         """Steps since each episode began. Shape: (n,)."""
         self._held = np.zeros((num_rows, 6))  # normalised start, where fixed joints stay
 
-    def begin(
+    def sample_initial(
         self, rows: Rows, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] | None = None
     ) -> Initial:
         """The start pose, or what the options say."""
@@ -96,7 +96,7 @@ class UrEmptyTask:
         seeds = np.array([rng.integers(2**63) for rng in rngs], dtype=np.int64)
         return Initial({"joint_position": np.tile(joints, (len(rows), 1))}, seeds)
 
-    def start(self, rows: Rows, state: RobotState) -> None:
+    def on_reset(self, rows: Rows, state: RobotState) -> None:
         """Fixed joints stay where they are measured."""
         self._held[rows] = normalised(self.model, state.signals["joint_position"][rows])
         self.elapsed[rows] = 0

@@ -148,7 +148,7 @@ class UrReachTask:
         self._continues = np.zeros(num_rows, dtype=bool)  # whether the last episode was a success, which ended ...
         self._last_end = np.tile(START, (num_rows, 1))  # ... here
 
-    def begin(
+    def sample_initial(
         self, rows: Rows, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] | None = None
     ) -> Initial:
         """The start pose, or what the options say; a target in the workspace."""
@@ -184,7 +184,7 @@ class UrReachTask:
             )
         return target
 
-    def start(self, rows: Rows, state: RobotState) -> None:
+    def on_reset(self, rows: Rows, state: RobotState) -> None:
         """Fixed joints stay where they are measured."""
         self._held[rows] = normalised(self.model, state.signals["joint_position"][rows])
         self._actions[:, rows], self.elapsed[rows] = 0.0, 0

@@ -163,7 +163,7 @@ class UrTrackTask(UrObstacleTask):
         waits = Label("waits", "1 while the last waypoint of a segment waits for the arm", "1", low=0.0)
         return (*super()._labels(), *joint_labels("to_", "the waypoint", "/ joint limit", bound), waits)
 
-    def begin(
+    def sample_initial(
         self, rows: Rows, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] = MappingProxyType({})
     ) -> Initial:
         """The first waypoint, and an obstacle on a path or staying."""
@@ -187,7 +187,7 @@ class UrTrackTask(UrObstacleTask):
             paths = [draw_path(rng, around) for rng, around in zip(rngs, samples, strict=True)]
         return {"obstacle_path": np.stack(paths), "obstacle_samples": np.array(samples, dtype=np.float64)}
 
-    def start(self, rows: Rows, state: RobotState) -> None:
+    def on_reset(self, rows: Rows, state: RobotState) -> None:
         """The reference is the first waypoint, wherever exactly the arm is."""
 
     def _columns(self, sense: ObstacleSense) -> list[Array]:

@@ -226,8 +226,8 @@ class TaskContract:
 
 def _start(task: Task, robot: Robot, rows: Rows, seed: int) -> RobotState:
     """Begin an episode on `rows`; row k of them is seeded ``seed + k``."""
-    state = robot.reset(rows, task.begin(rows, [np.random.default_rng(seed + k) for k in range(len(rows))]))
-    task.start(rows, state)
+    state = robot.reset(rows, task.sample_initial(rows, [np.random.default_rng(seed + k) for k in range(len(rows))]))
+    task.on_reset(rows, state)
     return state
 
 

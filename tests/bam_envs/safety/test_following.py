@@ -41,7 +41,7 @@ class Trial:
         self.safe = SafeRobot(self.driven, limits=limits, tool_position=tool, clock=self.driven.clock)
         self.env = RobotEnv(self.safe, self.task)
         self.safe.connect()
-        initial = self.task.begin(ROW, [np.random.default_rng(seed)])
+        initial = self.task.sample_initial(ROW, [np.random.default_rng(seed)])
         signals = dict(initial.signals)
         if "joint_position" in signals:
             signals["joint_position"] = signals["joint_position"] + way * np.array([1.0, 0.3, 0.3, 1.0, 1.0, -1.0])

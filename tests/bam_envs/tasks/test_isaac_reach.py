@@ -63,7 +63,7 @@ class TestIsaacReachParity(IsaacReach):
 
 def began(options=None, **arguments):
     task = IsaacReachTask(**arguments)
-    task.initial = task.begin(ROW, [np.random.default_rng(0)], options or {})
+    task.initial = task.sample_initial(ROW, [np.random.default_rng(0)], options or {})
     return task
 
 
@@ -117,7 +117,7 @@ def test_with_parity_the_frame_is_robo_gyms():
 
 def test_targets():
     task = IsaacReachTask(200)
-    task.begin(np.arange(200), [np.random.default_rng(seed) for seed in range(200)])
+    task.sample_initial(np.arange(200), [np.random.default_rng(seed) for seed in range(200)])
     for axis, low, high in ((0, 0.35, 0.65), (1, -0.2, 0.2), (2, 0.15, 0.5)):
         values = task.target[:, axis]
         assert low <= values.min() < low + 0.02
@@ -224,18 +224,20 @@ def test_it_goes_on_from_where_it_ended():
             ({"continue_except_collision": False}, {}, DEFAULT),
         ):
             task = IsaacReachTask(parity=parity, **options)
-            first = task.begin(ROW, [rng], {"ee_target_pose": facing(ended, parity=parity)}).signals["joint_position"]
+            first = task.sample_initial(ROW, [rng], {"ee_target_pose": facing(ended, parity=parity)}).signals[
+                "joint_position"
+            ]
             np.testing.assert_array_equal(first[0], DEFAULT)
             assert task.score(state(ended, **end), QUIET).terminated[0]
-            np.testing.assert_array_equal(task.begin(ROW, [rng]).signals["joint_position"][0], start)
-            np.testing.assert_array_equal(task.begin(ROW, [rng]).signals["joint_position"][0], DEFAULT)
+            np.testing.assert_array_equal(task.sample_initial(ROW, [rng]).signals["joint_position"][0], start)
+            np.testing.assert_array_equal(task.sample_initial(ROW, [rng]).signals["joint_position"][0], DEFAULT)
 
 
 def test_it_does_not_go_on_from_an_episode_that_was_broken_off():
     task, rng = IsaacReachTask(), np.random.default_rng(0)
-    task.begin(ROW, [rng], {"ee_target_pose": facing(DEFAULT, 0.1)})
+    task.sample_initial(ROW, [rng], {"ee_target_pose": facing(DEFAULT, 0.1)})
     task.score(state(np.array(DEFAULT) + 0.1), QUIET)
-    np.testing.assert_array_equal(task.begin(ROW, [rng]).signals["joint_position"][0], DEFAULT)
+    np.testing.assert_array_equal(task.sample_initial(ROW, [rng]).signals["joint_position"][0], DEFAULT)
 
 
 def test_a_seed_and_an_option_say_where_it_starts(make):
@@ -256,11 +258,13 @@ def test_a_seed_and_an_option_say_where_it_starts(make):
 def test_saved_memory_goes_on_from_where_it_ended():
     task, rng = IsaacReachTask(), np.random.default_rng(0)
     ended = np.array(DEFAULT) + 0.1
-    task.begin(ROW, [rng], {"ee_target_pose": facing(ended)})
+    task.sample_initial(ROW, [rng], {"ee_target_pose": facing(ended)})
     task.score(state(ended), QUIET)
     other = IsaacReachTask()
     other.load_state_dict(task.state_dict())
-    np.testing.assert_array_equal(other.begin(ROW, [np.random.default_rng(1)]).signals["joint_position"][0], ended)
+    np.testing.assert_array_equal(
+        other.sample_initial(ROW, [np.random.default_rng(1)]).signals["joint_position"][0], ended
+    )
 
 
 def test_options():
@@ -324,11 +328,11 @@ def test_what_counts_as_success():
         ({"ee_rotation_threshold": 0.09}, False),
     ):
         task = IsaacReachTask(**options)
-        task.begin(ROW, [np.random.default_rng(0)], given)
+        task.sample_initial(ROW, [np.random.default_rng(0)], given)
         assert task.score(state(near), QUIET).success[0] == success
     for options, success in (({}, False), ({"ee_distance_threshold": 0.11}, True)):
         task = IsaacReachTask(**options)
-        task.begin(ROW, [np.random.default_rng(0)], {"ee_target_pose": facing(DEFAULT, 0.1)})
+        task.sample_initial(ROW, [np.random.default_rng(0)], {"ee_target_pose": facing(DEFAULT, 0.1)})
         assert task.score(state(np.array(DEFAULT)), QUIET).success[0] == success
     with pytest.raises(InvalidValue, match="ee_rotation_threshold must be above 0 rad, not 0"):
         IsaacReachTask(ee_rotation_threshold=0)
@@ -337,11 +341,11 @@ def test_what_counts_as_success():
 def test_a_target_may_stand():
     task, pose = IsaacReachTask(2, ee_target_pose=[0.5, 0.1, 0.3, 0.0, math.pi / 2, 1.0]), [0.4, 0.0, 0.2, 0, 0, 0]
     rows, rngs = np.arange(2), [np.random.default_rng(seed) for seed in (0, 1)]
-    task.begin(rows, rngs)
+    task.sample_initial(rows, rngs)
     np.testing.assert_array_equal(task.target, [[0.5, 0.1, 0.3]] * 2)
-    task.begin(rows, rngs, {"ee_target_pose": pose})
+    task.sample_initial(rows, rngs, {"ee_target_pose": pose})
     np.testing.assert_array_equal(task.target, [pose[:3]] * 2)
-    task.begin(rows, rngs, {"ee_target_pose": None})
+    task.sample_initial(rows, rngs, {"ee_target_pose": None})
     np.testing.assert_array_equal(task.target, [[0.5, 0.1, 0.3]] * 2)
     with pytest.raises(InvalidValue, match="ee_target_pose must be 6 finite numbers"):
         IsaacReachTask(ee_target_pose=[1, 2, 3])

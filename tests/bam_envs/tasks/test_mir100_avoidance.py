@@ -35,8 +35,8 @@ def at(x, y, yaw=0.0, *, scan=None, touching=None):
 
 def begun(start=(0.0, -2.5, 0.0), target=(0.0, 2.5, 0.0), **options):
     task = Mir100AvoidanceTask(1, **options)
-    task.begin(ROW, [np.random.default_rng(0)], {"start_pose": start, "target_pose": target})
-    task.start(ROW, at(*start))
+    task.sample_initial(ROW, [np.random.default_rng(0)], {"start_pose": start, "target_pose": target})
+    task.on_reset(ROW, at(*start))
     return task
 
 
@@ -164,10 +164,10 @@ def test_success(parity, reward):
 
 def test_samples():
     rows, task = np.arange(2000), Mir100AvoidanceTask(2000)
-    signals = task.begin(rows, [np.random.default_rng(seed) for seed in rows]).signals
+    signals = task.sample_initial(rows, [np.random.default_rng(seed) for seed in rows]).signals
     pose, boxes = signals["base_pose"], signals["obstacle_pose"]
     np.testing.assert_array_equal(boxes, task.obstacles)
-    task.start(rows, RobotState({"base_pose": pose}, np.zeros(2000), np.zeros((2000, 2))))
+    task.on_reset(rows, RobotState({"base_pose": pose}, np.zeros(2000), np.zeros((2000, 2))))
     assert 0.45 < (pose[:, 1] > 0).mean() < 0.55
     assert (pose[:, 1] * task.target[:, 1] < 0).all()
     columns = [
@@ -186,8 +186,8 @@ def test_samples():
 def test_the_target_is_across_from_where_a_live_base_stands(y, low, high):
     task = Mir100AvoidanceTask()
     for seed in range(20):
-        task.begin(ROW, [np.random.default_rng(seed)])
-        task.start(ROW, at(0.0, y))
+        task.sample_initial(ROW, [np.random.default_rng(seed)])
+        task.on_reset(ROW, at(0.0, y))
         assert low <= task.target[0, 1] <= high
 
 

@@ -25,9 +25,9 @@ def at(x, y, yaw=0.0, v=0.0, w=0.0):
 
 def begun(start=(0.0, 0.0, 0.0), target=(3.0, 4.0, 0.0), **options):
     task = Mir100NavigationTask(1, **options)
-    initial = task.begin(ROW, [np.random.default_rng(0)], {"start_pose": start, "target_pose": target})
+    initial = task.sample_initial(ROW, [np.random.default_rng(0)], {"start_pose": start, "target_pose": target})
     np.testing.assert_array_equal(initial.signals["base_pose"], [start])
-    task.start(ROW, at(*start))
+    task.on_reset(ROW, at(*start))
     return task
 
 
@@ -138,9 +138,9 @@ def test_time_limits(make, make_rows):
 def test_samples():
     task = Mir100NavigationTask(2000)
     rows = np.arange(2000)
-    pose = task.begin(rows, [np.random.default_rng(seed) for seed in rows]).signals["base_pose"]
+    pose = task.sample_initial(rows, [np.random.default_rng(seed) for seed in rows]).signals["base_pose"]
     state = RobotState({"base_pose": pose}, np.zeros(2000), np.zeros((2000, 2)))
-    task.start(rows, state)
+    task.on_reset(rows, state)
     for values, low, high in ((pose[:, 0], -2, 2), (pose[:, 1], -2, 2), (pose[:, 2], -math.pi, math.pi)):
         assert values.min() == pytest.approx(low, abs=0.02)
         assert values.max() == pytest.approx(high, abs=0.02)
@@ -152,8 +152,8 @@ def test_samples():
 def test_the_target_is_far_from_where_a_live_base_stands():
     task = Mir100NavigationTask()
     for seed in range(50):
-        task.begin(ROW, [np.random.default_rng(seed)])
-        task.start(ROW, at(0.9, -0.9))
+        task.sample_initial(ROW, [np.random.default_rng(seed)])
+        task.on_reset(ROW, at(0.9, -0.9))
         assert task.distance(at(0.9, -0.9))[0] >= 1.0
 
 
@@ -209,9 +209,9 @@ def test_none_is_no_pose(make):
 
 def test_a_robot_that_stays_where_it_is_is_not_started_elsewhere():
     task = Mir100NavigationTask()
-    task.begin(ROW, [np.random.default_rng(0)], {"start_pose": [1.0, 0.0, 0.0]})
+    task.sample_initial(ROW, [np.random.default_rng(0)], {"start_pose": [1.0, 0.0, 0.0]})
     with pytest.raises(InvalidValue) as caught:
-        task.start(ROW, at(0.5, 0.0))
+        task.on_reset(ROW, at(0.5, 0.0))
     assert str(caught.value) == (
         "start_pose: this robot stays where it is, at [0.5, 0.0, 0.0], and does not start at [1.0, 0.0, 0.0] "
         "(x, y [m], yaw [rad]). Drive it there, or leave start_pose out."

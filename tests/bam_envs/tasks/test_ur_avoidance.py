@@ -55,7 +55,7 @@ class TestAvoidanceOfAStillObstacle(Avoidance):
 def began(options=None, **arguments):
     """A task at the start of an episode, and what it began with."""
     task = UrAvoidanceTask(**arguments)
-    initial = task.begin(ROW, [np.random.default_rng(0)], options or {})
+    initial = task.sample_initial(ROW, [np.random.default_rng(0)], options or {})
     return task, initial
 
 
@@ -84,7 +84,7 @@ def test_where_it_starts():
 
 def test_how_the_obstacle_is_drawn():
     task = UrAvoidanceTask(200)
-    initial = task.begin(np.arange(200), [np.random.default_rng(seed) for seed in range(200)])
+    initial = task.sample_initial(np.arange(200), [np.random.default_rng(seed) for seed in range(200)])
     amplitude, frequency = initial.signals["obstacle_wave"].T
     middle = initial.signals["obstacle_position"]
     assert (frequency == 0.125).all()

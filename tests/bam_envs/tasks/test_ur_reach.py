@@ -32,9 +32,9 @@ def state_at(joints, collision=False):
 
 def begun(parity=False, target=None, **options):
     task = UrReachTask(parity=parity, **options)
-    task.begin(np.arange(1), [np.random.default_rng(0)])
+    task.sample_initial(np.arange(1), [np.random.default_rng(0)])
     task.target[0] = above([0, 0, 0.4]) if target is None else target
-    task.start(np.arange(1), state_at(START))
+    task.on_reset(np.arange(1), state_at(START))
     return task
 
 
@@ -339,7 +339,7 @@ def test_wrist_1_of_the_modular_environment():
     """Of robo-gym's it starts at 0, and an action reaches the whole of its range."""
     for parity, start, end in ((False, START, -3.48), (True, STRAIGHT, -2 * np.pi)):
         task = UrReachTask(modular=True, parity=parity)
-        begun = task.begin(np.arange(1), [np.random.default_rng(0)]).signals["joint_position"]
+        begun = task.sample_initial(np.arange(1), [np.random.default_rng(0)]).signals["joint_position"]
         np.testing.assert_array_equal(begun, [start])
         near = end + 0.01
         command = task.command(np.array([[0, 0, 0, -1, 0]], np.float32), state_at([0, 0, 0, near, 0, 0]))
@@ -348,12 +348,12 @@ def test_wrist_1_of_the_modular_environment():
 
 def test_modular_targets_are_the_origin_in_parity():
     task = UrReachTask(modular=True, parity=True)
-    task.begin(np.arange(1), [np.random.default_rng(0)])
+    task.sample_initial(np.arange(1), [np.random.default_rng(0)])
     assert task.target.tolist() == [[0.0, 0.0, 0.0]]
-    task.begin(np.arange(1), [np.random.default_rng(0)], {"ee_target_pose": far_pose()})
+    task.sample_initial(np.arange(1), [np.random.default_rng(0)], {"ee_target_pose": far_pose()})
     np.testing.assert_array_equal(task.target[0], far_pose()[:3])
     task = UrReachTask(modular=True)
-    task.begin(np.arange(1), [np.random.default_rng(0)])
+    task.sample_initial(np.arange(1), [np.random.default_rng(0)])
     np.testing.assert_array_equal(task.target[0], workspace_point(UR5, np.random.default_rng(0)))
 
 
@@ -361,17 +361,19 @@ def test_reset_options_may_stand():
     """RLlib and vectors of environments reset without options."""
     rows, rngs = np.arange(2), [np.random.default_rng(seed) for seed in (0, 1)]
     task = UrReachTask(2, ee_target_pose=tuple(far_pose()), randomize_start=True)
-    joints = task.begin(rows, rngs).signals["joint_position"]
+    joints = task.sample_initial(rows, rngs).signals["joint_position"]
     np.testing.assert_array_equal(task.target, [far_pose()[:3]] * 2)
     assert (joints[0] != joints[1]).all()
-    joints = task.begin(rows, rngs, {"randomize_start": False, "ee_target_pose": None}).signals["joint_position"]
+    joints = task.sample_initial(rows, rngs, {"randomize_start": False, "ee_target_pose": None}).signals[
+        "joint_position"
+    ]
     np.testing.assert_array_equal(joints, [START] * 2)
     np.testing.assert_array_equal(task.target, [far_pose()[:3]] * 2)
     goes_on = UrReachTask(continue_on_success=True)
-    goes_on.begin(np.arange(1), rngs[:1])
+    goes_on.sample_initial(np.arange(1), rngs[:1])
     joints = np.array(START) + 0.1
     goes_on.target[0] = UR5.geometry.tool_position(joints[None])[0]
     goes_on.score(state_at(joints), ONES[None])
-    np.testing.assert_array_equal(goes_on.begin(np.arange(1), rngs[:1]).signals["joint_position"][0], joints)
+    np.testing.assert_array_equal(goes_on.sample_initial(np.arange(1), rngs[:1]).signals["joint_position"][0], joints)
     with pytest.raises(InvalidValue, match=r"ee_target_pose must be 6 finite numbers, not \[1\]"):
         UrReachTask(ee_target_pose=[1])

@@ -59,7 +59,7 @@ def began(tmp_path):
 
     def begin(options=None, **arguments):
         task = UrTrackTask(trajectory=str(path), **arguments)
-        task.initial = task.begin(ROW, [np.random.default_rng(0)], options or {})
+        task.initial = task.sample_initial(ROW, [np.random.default_rng(0)], options or {})
         return task
 
     return begin
@@ -208,7 +208,7 @@ def test_what_is_seen(began, parity):
 def test_paths_of_the_obstacle():
     """Closed, 80 to 120 s around, away from the base and its axis."""
     task = UrTrackTask(30)
-    signals = task.begin(np.arange(30), [np.random.default_rng(seed) for seed in range(30)]).signals
+    signals = task.sample_initial(np.arange(30), [np.random.default_rng(seed) for seed in range(30)]).signals
     points, samples = signals["obstacle_path"], signals["obstacle_samples"]
     assert (samples >= 8000).all()
     assert (samples < 12000).all()
@@ -227,19 +227,19 @@ def test_paths_of_the_obstacle():
 def test_fixed_paths_come_one_after_the_other_with_parity():
     task = UrTrackTask(parity=True, fixed_paths=True)
     rngs = [np.random.default_rng(seed) for seed in range(52)]
-    begun = [task.begin(ROW, [rng]).signals for rng in rngs]
+    begun = [task.sample_initial(ROW, [rng]).signals for rng in rngs]
     assert {float(one["obstacle_samples"][0]) for one in begun} == {4000.0}
     paths = [one["obstacle_path"].tobytes() for one in begun]
     assert len(set(paths)) == 50
     assert paths[:2] == paths[50:]
     again = UrTrackTask(parity=True, fixed_paths=True)
-    assert again.begin(ROW, [np.random.default_rng(99)]).signals["obstacle_path"].tobytes() == paths[0]
+    assert again.sample_initial(ROW, [np.random.default_rng(99)]).signals["obstacle_path"].tobytes() == paths[0]
 
 
 def test_fixed_paths_are_drawn_from_fifty():
     task, drawn = UrTrackTask(fixed_paths=True), set()
     for seed in range(300):
-        drawn.add(task.begin(ROW, [np.random.default_rng(seed)]).signals["obstacle_path"].tobytes())
+        drawn.add(task.sample_initial(ROW, [np.random.default_rng(seed)]).signals["obstacle_path"].tobytes())
     assert 45 <= len(drawn) <= 50
 
 

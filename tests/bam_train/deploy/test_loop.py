@@ -91,7 +91,7 @@ def test_a_slow_policy_or_a_process_that_stood_still_stops_a_live_robot(takes, a
     driven = DrivenRobot(SimulatedArm(with_object=False))
     env = RobotEnv(SafeRobot(driven, clock=driven.clock), ReachTask())
     driven.connect()
-    driven.place(ReachTask().begin(np.zeros(1, np.int64), [np.random.default_rng(7)]))
+    driven.place(ReachTask().sample_initial(np.zeros(1, np.int64), [np.random.default_rng(7)]))
     policy = Right(np.zeros(6, np.float32))
     decide = policy.act
 
