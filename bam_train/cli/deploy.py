@@ -1,7 +1,7 @@
 """`bam-deploy`: drive a robot with a checkpoint's frozen policy, at the environment's own rate, without torch.
 
-A signal ends it at any moment, so nothing else is imported before signals are answered; and one whose exception Python
-discarded, as it does in the callbacks of an import, is seen again before anything moves.
+A signal ends it at any moment; one whose exception Python discarded, as it does in the callbacks of an import, is
+raised again before anything moves.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.consent import guards_of, plan_lines, require_consent
 from bam_train.cli.console import is_terminal, make_console, say, tell
-from bam_train.cli.program import guarded, parse, prepare
-from bam_train.cli.signal_memory import SignalMemory
+from bam_train.cli.program import parse, run_program
+from bam_train.signals import SignalMemory
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from bam_envs.core.timing import Pacer
     from bam_train.checkpoint import Checkpoint
-    from bam_train.cli.deploy_config import DeployConfig
+    from bam_train.cli.flags import DeployConfig
     from bam_train.deploy.agents import Watcher
     from bam_train.deploy.journal import Journal
     from bam_train.deploy.loop import Deployment
@@ -115,11 +115,6 @@ def _require_sane(config: DeployConfig) -> None:
     """Refuse what cannot be, before anything is loaded."""
     from bam_train.errors import SettingsError
 
-    for name, value, least in (("episodes", config.episodes, 1), ("seed", config.seed, 0)):
-        if value < least:
-            raise SettingsError(f"{name}: expected at least {least}, found {value}")
-    if config.rate is not None and not (config.rate > 0 and math.isfinite(config.rate)):
-        raise SettingsError(f"rate: expected more than 0 Hz, found {config.rate:g}")
     if config.rate is not None and config.fast:
         raise SettingsError("--fast does not wait for deadlines, so --rate has no meaning with it; give one of the two")
     if config.transport is not None and not place_of(config).transport:
@@ -185,16 +180,14 @@ def period_of(config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, An
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the console script."""
-    prepare()
-    sys.exit(guarded(lambda: _main(arguments), "bam-deploy"))
+    run_program(lambda: _main(arguments), "bam-deploy")
 
 
 def _main(arguments: Sequence[str] | None) -> int:
     with SignalMemory() as signals:
-        from bam_train.cli.deploy_config import DeployConfig
+        from bam_train.cli.flags import DeployConfig
 
-        config = parse(DeployConfig, "bam-deploy", DeployConfig.__doc__ or "", arguments)
-        return deploy_checkpoint(config, signals)
+        return deploy_checkpoint(parse(DeployConfig, "bam-deploy", arguments), signals)
 
 
 if __name__ == "__main__":

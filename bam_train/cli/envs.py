@@ -4,24 +4,14 @@ from __future__ import annotations
 
 import json as json_module
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import groupby
-from typing import Annotated, Any
-
-import tyro
+from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.console import tell
-from bam_train.cli.program import run_program
+from bam_train.cli.program import parse, run_program
 
-
-@dataclass(frozen=True)
-class EnvsConfig:
-    """List our environments, or describe one (any Gymnasium id): spaces, rate, name and unit of every number."""
-
-    env: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="[ID]")] = None
-    """The environment to describe, e.g. bam/pick; without it, all of ours are listed."""
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Print JSON."""
+if TYPE_CHECKING:
+    from bam_train.cli.flags import EnvsConfig
 
 
 def show_environments(config: EnvsConfig) -> None:
@@ -163,8 +153,13 @@ def _cell(value: Any) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the console script."""
-    description = EnvsConfig.__doc__ or ""
-    run_program(show_environments, EnvsConfig, prog="bam-envs", description=description, arguments=arguments)
+    run_program(lambda: _main(arguments), "bam-envs")
+
+
+def _main(arguments: Sequence[str] | None) -> None:
+    from bam_train.cli.flags import EnvsConfig
+
+    show_environments(parse(EnvsConfig, "bam-envs", arguments))
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json as json_module
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -11,11 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.console import say, tell
-from bam_train.cli.program import guarded, run_program
+from bam_train.cli.program import parse, run_program
 
 if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
-    from bam_train.cli.eval_config import EvalConfig
+    from bam_train.cli.flags import EvalConfig
     from bam_train.evaluation import EvaluationReport
     from bam_train.policy import FrozenPolicy
 
@@ -36,10 +35,9 @@ class Subject:
 def evaluate_checkpoint(config: EvalConfig) -> int:
     """The program, with its arguments read."""
     from bam_train.environments import make_rows, require_fit
-    from bam_train.evaluation import default_rows, evaluate, require_range
+    from bam_train.evaluation import default_rows, evaluate
     from bam_train.video import require_video_path
 
-    require_range(config.episodes, config.seed, config.num_envs, video_episodes=config.video_episodes)
     video = None if config.video is None else require_video_path(config.video)
     subject = _subject(config)
     if video is not None:
@@ -191,15 +189,13 @@ def _progress(done: int, episodes: int) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the console script."""
-    sys.exit(guarded(lambda: _main(arguments), "bam-eval"))
+    run_program(lambda: _main(arguments), "bam-eval")
 
 
-def _main(arguments: Sequence[str] | None) -> None:
-    from bam_train.cli.eval_config import EvalConfig
+def _main(arguments: Sequence[str] | None) -> int:
+    from bam_train.cli.flags import EvalConfig
 
-    run_program(
-        evaluate_checkpoint, EvalConfig, prog="bam-eval", description=EvalConfig.__doc__ or "", arguments=arguments
-    )
+    return evaluate_checkpoint(parse(EvalConfig, "bam-eval", arguments))
 
 
 if __name__ == "__main__":

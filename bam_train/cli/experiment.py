@@ -6,16 +6,12 @@ import argparse
 import contextlib
 import signal
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from bam_train.cli.consent import plan_lines, require_consent
-from bam_train.cli.program import TOGETHER, Terminated
-from bam_train.cli.signal_memory import SignalMemory
-from bam_train.cli.stop_signals import StopSignals
+from bam_train.signals import SignalMemory, handled, interrupt
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -45,10 +41,10 @@ class ScriptParser(argparse.ArgumentParser):
         """
         known, rest = self.parse_known_args(args, namespace)
         if rest:
-            from bam_train.values import closest
+            from bam_envs.core.wording import did_you_mean
 
             options = [text for action in self._actions for text in action.option_strings]
-            self.error(f"unknown option {rest[0]!r}. {closest(rest[0].partition('=')[0], options)}")
+            self.error(f"unknown option {rest[0]!r}. {did_you_mean(rest[0].partition('=')[0], options)}")
         return known
 
     def add_environment(self, own: str) -> None:
@@ -140,32 +136,18 @@ def signals_ask() -> Iterator[Callable[[], bool]]:
         KeyboardInterrupt: A signal came; of SIGTERM and SIGHUP, `Terminated`.
     """
     came: list[int] = []
-    first = 0.0
 
-    def hear(number: int, frame: FrameType | None) -> None:
-        nonlocal first
-        if came and number == came[0] != signal.SIGINT and time.monotonic() < first + TOGETHER:
-            return
+    def hear(number: int) -> None:
         if came:
-            _raise(number)
+            interrupt(number)
         came.append(number)
-        first = time.monotonic()
         again = "Ctrl-C again" if number == signal.SIGINT else "another signal"
         print(f"finishing the update and saving; {again} quits at once", file=sys.stderr, flush=True)
 
-    heard = [number for number in StopSignals.SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
-    before = [(number, signal.signal(number, hear)) for number in heard]
-    try:
+    with handled(hear):
         yield lambda: bool(came)
-    finally:
-        for number, handler in before:
-            signal.signal(number, handler)
     if came:
-        _raise(came[0])
-
-
-def _raise(number: int) -> NoReturn:
-    raise KeyboardInterrupt if number == signal.SIGINT else Terminated(number)
+        interrupt(came[0])
 
 
 @contextlib.contextmanager

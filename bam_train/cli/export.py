@@ -3,41 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import tyro
+from typing import TYPE_CHECKING
 
 from bam_train.cli.console import say, tell
-from bam_train.cli.program import run_program
+from bam_train.cli.program import parse, run_program
 
 if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
+    from bam_train.cli.flags import ExportConfig
     from bam_train.compat.rllib.export import Exported
     from bam_train.trainers.output import Output
-
-
-@dataclass(frozen=True)
-class ExportConfig:
-    """Turn a checkpoint directory of RLlib into a checkpoint.zip that can be evaluated and deployed."""
-
-    directory: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")]
-    """What algo.save_to_path or algo.save wrote, or the folder of a policy in it; of the current API or the old one."""
-    env: Annotated[str | None, tyro.conf.arg(metavar="ID")] = None
-    """Environment it was trained on; by default what the directory says."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Where the checkpoint goes (default checkpoints/<env>-rllib-<algo>.zip)."""
-    algo: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Algorithm that trained it; by default what the directory says."""
-    policy: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Which policy, where the directory has several."""
-    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")] = ()
-    """env_kwargs.NAME=VALUE: an argument of the environment, any number of times; it wins over the directory's."""
-    trust_pickle: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Unpickle files that cannot be read otherwise, which runs whatever code is in them."""
-    force: bool = False
-    """Overwrite the checkpoint at --out instead of adding a number to its name."""
 
 
 def export_directory(config: ExportConfig) -> int:
@@ -89,9 +64,13 @@ def _summary(exported: Exported, checkpoint: Checkpoint) -> list[str]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the console script."""
-    run_program(
-        export_directory, ExportConfig, prog="bam-export", description=ExportConfig.__doc__ or "", arguments=arguments
-    )
+    run_program(lambda: _main(arguments), "bam-export")
+
+
+def _main(arguments: Sequence[str] | None) -> int:
+    from bam_train.cli.flags import ExportConfig
+
+    return export_directory(parse(ExportConfig, "bam-export", arguments))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
-"""What every program of ours shares: flags out of a frozen dataclass, every expected failure one line and a status.
+"""What every program shares: flags out of a frozen dataclass, every expected failure one line and a status.
 
-Only tyro is imported before the flags are parsed, so that ``--help`` is quick.
+Only the standard library is imported before signals are handled, and only tyro before the flags are parsed, so that
+Ctrl-C is one line at any moment and ``--help`` is quick.
 """
 
 from __future__ import annotations
@@ -8,18 +9,16 @@ from __future__ import annotations
 import contextlib
 import errno
 import io
-import math
 import os
 import re
 import signal
 import sys
-import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
-from types import FrameType
-from typing import TextIO, TypeVar
+from dataclasses import is_dataclass
+from typing import Any, TextIO, TypeVar, get_args
 
 from bam_train.cli.console import say, show_logs_and_tracebacks
+from bam_train.signals import SIGNALS, SignalMemory, Terminated
 
 Config = TypeVar("Config")
 
@@ -38,10 +37,6 @@ EXTRAS = {
 }
 """Optional package to the extra of bam-train that brings it."""
 
-TOGETHER = 0.5
-"""A signal of a program that comes again within this time is the same one [s]: ``timeout`` sends SIGTERM to the process
-and then to its group. Ctrl-C is a person's, and counts each time."""
-
 LONGEST = 2000
 """Characters of an error line; a file or a server may bring a name of millions."""
 
@@ -49,71 +44,92 @@ INTERRUPTED = 130
 """Exit status of a program that Ctrl-C ended (128 + SIGINT)."""
 
 
-def run_program(
-    main: Callable[[Config], int | None],
-    config: type[Config],
-    *,
-    prog: str,
-    description: str,
-    arguments: Sequence[str] | None = None,
-) -> None:
-    """Parse the command line into `config`, run `main`, and exit with its status.
+def run_program(main: Callable[[], int | None], prog: str) -> None:
+    """Run `main`, which returns an exit status (None for 0), and exit with it.
 
     Args:
-        main: The program; returns its exit status, None for 0.
-        config: A frozen dataclass; one field is one flag.
+        main: The program; it parses its own command line.
         prog: The program's name, as it starts each error line.
-        description: First line of ``--help``.
-        arguments: Instead of those of the process.
 
     Raises:
         SystemExit: Always.
     """
-    prepare()
-    sys.exit(guarded(lambda: main(parse(config, prog, description, arguments)), prog))
-
-
-def prepare() -> None:
-    """What comes before everything: where modules of the user are found, and how Python's own texts are shown."""
     sys.path.append(os.getcwd())  # --env my_module:Env-v0, as with python -m; last, so that it hides nothing
     show_logs_and_tracebacks()
+    sys.exit(guarded(main, prog))
 
 
-def parse(config: type[Config], prog: str, description: str, arguments: Sequence[str] | None) -> Config:
+def parse(config: type[Config], prog: str, arguments: Sequence[str] | None = None) -> Config:
     """The command line as a `config`; what is wrong with it becomes one line, with status 2.
+
+    Args:
+        config: A frozen dataclass; one field is one flag, its docstring the description.
+        prog: The program's name.
+        arguments: Instead of those of the process.
 
     Raises:
         SystemExit: After ``--help`` (0), or a command line that cannot be read (2).
+        SettingsError: A value is outside the range of its field.
     """
     import tyro
 
-    one_way = (tyro.conf.FlagCreatePairsOff,)  # --force, no --no-force
+    no_pairs = (tyro.conf.FlagCreatePairsOff,)  # --force, no --no-force
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
-            return tyro.cli(config, prog=prog, description=description, args=arguments, config=one_way)
+            parsed = tyro.cli(config, prog=prog, description=config.__doc__, args=arguments, config=no_pairs)
     except SystemExit as stop:
         if stop.code:
-            _complain(prog, f"{usage_error(box.getvalue())} Run {prog} --help")
+            _complain(prog, f"{usage_error(box.getvalue(), config)} Run {prog} --help")
         raise
+    from bam_envs.core.validation import check_fields
+    from bam_envs.core.wording import as_flag
+    from bam_train.errors import SettingsError
+
+    check_fields(parsed, as_flag, SettingsError)
+    return parsed
 
 
-def usage_error(box: str) -> str:
+def usage_error(box: str, config: type[Any]) -> str:
     """What tyro's box of several lines says, in one.
 
-    Examples: ``unknown option --enb, did you mean --env?``, ``--steps cannot be 'x'.``
+    Examples: ``unknown option --enb, did you mean --env?``, ``--steps: expected a whole number, found 'x'.``
     """
     text = " ".join(re.sub(r"[─│╭╮╰╯]+|-{4,}|(?<!\S)[|+](?!\S)", " ", box).split())  # drawn in ASCII where it must be
     text = re.split(r" For full helptext| Argument helptext", text)[0]
     if match := re.search(r"Unrecognized options: (.*?)(?: Perhaps you meant: .*?(--[\w-]+).*)?$", text):
         return f"unknown option {match[1].split(',')[0]}{f', did you mean {match[2]}?' if match[2] else '.'}"
-    if match := re.search(r"Error parsing (\S+?):? .*(?:from \[|: )('.*?')", text):
-        return f"{match[1]} cannot be {match[2]}."
+    if match := re.search(r"Error parsing (\S+?):? .*(?:from \[|: )'(.*?)'", text):
+        return _wrong_value(match[1], match[2], config)
     if match := re.search(r"Missing value for argument '(\S+)'", text):
         return f"{match[1]} needs a value." if match[1].startswith("--") else f"{match[1].upper()} is missing."
     if match := re.search(r"Missing from \S+: (\S+)", text):
         return f"{match[1]} is missing."
     return f"{text}."
+
+
+def _wrong_value(flag: str, found: str, config: type[Any]) -> str:
+    from bam_envs.core.validation import expected
+
+    kind = _type_of(flag.lstrip("-").replace("-", "_"), config)
+    if kind is None:
+        return f"{flag} cannot be {found!r}."
+    wanted = expected(kind)
+    with contextlib.suppress(ValueError):
+        if "whole number" in wanted and float(found).is_integer():  # 1e5
+            return f"{flag}: expected {wanted}, found {found!r}; write {float(found):.0f}."
+    return f"{flag}: expected {wanted}, found {found!r}."
+
+
+def _type_of(field: str, config: type[Any]) -> Any:
+    """The annotation of a field of `config` or of a dataclass in it; None if there is no such field."""
+    from bam_envs.core.validation import type_hints
+
+    hints = type_hints(config)
+    inner = [
+        part for hint in hints.values() for part in get_args(hint)[:1] if isinstance(part, type) and is_dataclass(part)
+    ]
+    return hints.get(field) or next((kind for part in inner if (kind := _type_of(field, part))), None)
 
 
 def guarded(main: Callable[[], int | None], prog: str) -> int:
@@ -154,49 +170,16 @@ def _expected(prog: str, error: Exception) -> int:
     return 1
 
 
-class Terminated(KeyboardInterrupt):
-    """A signal other than Ctrl-C asked for the end; Ray, waiting in C++, hears of no other kind of exception.
-
-    Attributes:
-        signal: Which.
-    """
-
-    def __init__(self, number: int) -> None:
-        self.signal = signal.Signals(number)
-        super().__init__(self.signal)  # what it is made from, so that it can be copied
-
-
 @contextlib.contextmanager
 def _terminable() -> Iterator[None]:
-    """Within this, SIGTERM and SIGHUP raise `Terminated`, so that what is open is closed; in the main thread only.
-
-    One that comes again at once is the same one: it does not interrupt the closing.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    first, came = -math.inf, 0
-
-    def stop(number: int, _: FrameType | None) -> None:
-        nonlocal first, came
-        if time.monotonic() < first + TOGETHER:
-            return
-        first, came = time.monotonic(), number
-        raise Terminated(number)
-
-    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]  # not on Windows
-    heard = [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]  # nohup ignores SIGHUP
-    before = [(number, signal.signal(number, stop)) for number in heard]
-    try:
-        yield
-    except KeyboardInterrupt as error:
-        if came and not isinstance(error, Terminated):  # Ray raises one of its own instead
-            raise Terminated(came) from None
-        raise
-    finally:
-        for number, handler in before:
-            signal.signal(number, handler)
+    """Within this, SIGTERM and SIGHUP raise `Terminated`, so that what is open is closed."""
+    with SignalMemory([number for number in SIGNALS if number != signal.SIGINT]) as signals:
+        try:
+            yield
+        except KeyboardInterrupt as error:
+            if not isinstance(error, Terminated):  # Ray raises one of its own instead
+                signals.raise_again()
+            raise
 
 
 def _silence(stream: TextIO) -> None:

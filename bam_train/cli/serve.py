@@ -1,62 +1,55 @@
-"""`bam-serve`: an environment and its simulated robot for many clients, over rosbridge, TCP or ROS 2.
-
-It is stopped by signals only, at any moment, so nothing else is imported before they are answered.
-"""
+"""`bam-serve`: an environment and its simulated robot for many clients, over rosbridge, TCP or ROS 2."""
 
 from __future__ import annotations
 
-import sys
+import logging
 import threading
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from bam_train.cli.program import guarded, run_program
-from bam_train.cli.signal_memory import SignalMemory
+from bam_train.cli.console import ShownFormatter, say
+from bam_train.cli.program import parse, run_program
+from bam_train.signals import SignalMemory
 
 if TYPE_CHECKING:
     from bam_envs.remote.serve.describe import Env
-    from bam_train.cli.serve_config import ServeConfig
+    from bam_train.cli.serve_flags import ServeConfig
 
 _LOOK = 1.0
 """How often it is seen to that everything still runs [s]."""
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of the console script."""
-    sys.exit(guarded(lambda: _main(arguments), "bam-serve"))
-
-
-def _main(arguments: Sequence[str] | None) -> None:
-    from bam_train.cli.serve_config import ServeConfig
-
-    run_program(serve, ServeConfig, prog="bam-serve", description=ServeConfig.__doc__ or "", arguments=arguments)
-
-
-def serve(config: ServeConfig) -> int:
+def serve(config: ServeConfig, signals: SignalMemory) -> int:
     """The program, with its arguments read."""
-    import logging
+    from bam_envs.remote.serve.program import ServedEnvironment
 
+    _require_host(config.serving.bind)
     config.serving.require_sane()
-    with SignalMemory() as signals:
-        from bam_envs.remote.serve.program import ServedEnvironment
-        from bam_train.cli.console import ShownFormatter
-
-        handler = logging.StreamHandler()
-        handler.setFormatter(ShownFormatter("bam-serve: %(message)s"))
-        logging.basicConfig(level=logging.WARNING, handlers=[handler])
-        with ServedEnvironment(consented_env(config), config.serving, _tell) as served:
-            for line in served.endpoints:
-                _tell(line)
-            forever = threading.Event()
-            while not forever.wait(_LOOK):
-                signals.raise_again()
-                served.require_running()
+    handler = logging.StreamHandler()
+    handler.setFormatter(ShownFormatter("bam-serve: %(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler])
+    with ServedEnvironment(consented_env(config), config.serving, _tell) as served:
+        for line in served.endpoints:
+            _tell(line)
+        forever = threading.Event()
+        while not forever.wait(_LOOK):
+            signals.raise_again()
+            served.require_running()
     return 0
 
 
-def _tell(line: str) -> None:
-    from bam_train.cli.console import say
+def _require_host(bind: str) -> None:
+    """Refuse an address with a port, which has a flag of its own."""
+    from bam_train.errors import SettingsError
 
+    host, colon, port = bind.rpartition(":")
+    if colon and ":" not in host and port.isdecimal():
+        raise SettingsError(
+            f"--bind: expected an address without a port, found {bind!r}; give --bind {host} --port {port}"
+        )
+
+
+def _tell(line: str) -> None:
     say(f"bam-serve: {line}")
 
 
@@ -90,10 +83,7 @@ def make_env(config: ServeConfig) -> Env:
     """
     from bam_envs.core.registry import resolve_id
     from bam_train.environments import make_env, make_rows
-    from bam_train.errors import SettingsError
 
-    if config.num_envs < 1:
-        raise SettingsError(f"--num-envs: expected at least 1, found {config.num_envs}")
     env_id, kwargs = resolve_id(config.env), env_kwargs(config.set)
     _require_known(env_id, kwargs)
     return make_env(env_id, kwargs) if config.num_envs == 1 else make_rows(env_id, kwargs, config.num_envs)
@@ -126,6 +116,18 @@ def env_kwargs(assignments: Sequence[str]) -> dict[str, Any]:
             raise SettingsError(f"--set {text}: expected the name of an argument, found one with a dot")
         kwargs[path[0]] = value
     return kwargs
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of the console script."""
+    run_program(lambda: _main(arguments), "bam-serve")
+
+
+def _main(arguments: Sequence[str] | None) -> int:
+    with SignalMemory() as signals:
+        from bam_train.cli.serve_flags import ServeConfig
+
+        return serve(parse(ServeConfig, "bam-serve", arguments), signals)
 
 
 if __name__ == "__main__":

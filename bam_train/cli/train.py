@@ -2,108 +2,35 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import signal
+import sys
 import time
-from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import tyro
+from collections.abc import Iterator, Sequence
+from dataclasses import fields
+from typing import TYPE_CHECKING
 
 from bam_train.cli.console import count, tell
-from bam_train.cli.program import run_program
+from bam_train.cli.program import parse, run_program
+from bam_train.signals import handled
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from bam_train.checkpoint import Checkpoint
+    from bam_train.cli.flags import TrainConfig
     from bam_train.settings import TrainSettings
     from bam_train.trainers.copies import Copies
     from bam_train.trainers.output import Output
+    from bam_train.trainers.run import TrainingRun
     from bam_train.trainers.run_folder import RunFolder
     from bam_train.trainers.trainer import Trainer
 
 _STARTED = time.monotonic()
 
-
-def _flag(metavar: str) -> object:
-    """A flag that shows what it takes, and no default: what is not given is not set."""
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
-
-
-Text = Annotated[str | None, _flag("NAME")]
-Whole = Annotated[int | None, _flag("N")]
-Share = Annotated[float | None, _flag("SHARE")]
-File = Annotated[Path | None, _flag("FILE")]
-
-
-@dataclass(frozen=True)
-class TrainConfig:
-    """Flags of `bam-train`; what is not given comes from ``--config``, the preset, then the algorithm's defaults."""
-
-    env: Text = None
-    """Environment: any Gymnasium id, such as bam/pick, CartPole-v1 or some_module:Env-v0."""
-    algo: Text = None
-    """Algorithm: ppo, a2c, sac, td3, ddpg, dqn, tqc, trpo, qrdqn, crossq or recurrent-ppo.
-    With --trainer rllib: ppo, appo, impala, sac, tqc, dqn, bc, marwil, cql or iql."""
-    trainer: Text = None
-    """Library that trains: sb3 (default) or rllib."""
-    steps: Whole = None
-    """Environment steps of the whole run, also after --resume."""
-    seed: Whole = None
-    """Seed of weights, exploration and environments."""
-    num_envs: Whole = None
-    """Environments stepped side by side, in all: the runners of rllib share them."""
-    num_env_runners: Whole = None
-    """Processes of rllib that collect samples (default 0: the trainer's own does)."""
-    num_learners: Whole = None
-    """Processes of rllib that update the weights (default 0: the trainer's own does)."""
-    num_gpus: Whole = None
-    """GPUs that learners of rllib use in all (default RLLIB_NUM_GPUS, else 0)."""
-    address: Annotated[str | None, _flag("auto|HOST:PORT")] = None
-    """Ray cluster that rllib trains on; by default it starts one on this computer, for this run."""
-    data: Annotated[str | None, _flag("FOLDER")] = None
-    """Recorded episodes that bc, marwil, cql and iql of rllib learn from: Parquet files, also at an fsspec address."""
-    device: Text = None
-    """Where to compute: auto, cpu, cuda, cuda:1."""
-    threads: Whole = None
-    """Threads that torch computes with (default 1: more is slower on small networks)."""
-    config: File = None
-    """File of settings, .toml or .json, such as --print-config writes."""
-    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")] = ()
-    """One setting, any number of times: learning_rate=lin_3e-4, policy_kwargs.net_arch=[64,64],
-    env_kwargs.randomize=true."""
-    print_config: bool = False
-    """Print all settings of the run as JSON, and do not train."""
-    out: File = None
-    """Where the best checkpoint goes (default checkpoints/<env>-<algo>.zip)."""
-    copy_to: Annotated[str | None, _flag("URL")] = None
-    """Copy every checkpoint that goes to --out to an fsspec address too, such as s3://bucket/runs/."""
-    resume: File = None
-    """Checkpoint to go on from, with its settings and up to --steps in all."""
-    until_success: Share = None
-    """Stop once this share of evaluation episodes succeeds, such as 0.99."""
-    eval_every: Whole = None
-    """Steps between two evaluations (default a twentieth of the run)."""
-    eval_episodes: Whole = None
-    """Episodes of one evaluation."""
-    transport: Annotated[str | None, _flag("URL,...")] = None
-    """Train on an environment that runs elsewhere, such as ws://host:9090/name or tcp://host:port, or on several."""
-    ca_file: File = None
-    """Certificates that wss:// trusts instead of the system's."""
-    token_file: File = None
-    """File with the token that the servers ask for."""
-    force: bool = False
-    """Overwrite the checkpoint at --out instead of adding a number to its name."""
-    runs: Path = Path("runs")
-    """Folder in which the run's own folder is made."""
-
-
 _NOT_SETTINGS = frozenset({"config", "set", "print_config", "out", "copy_to", "resume", "force", "runs"})
-
-
-def main() -> None:
-    """Run the program."""
-    description = "Train a policy and keep the best as one checkpoint.zip."
-    run_program(train, TrainConfig, prog="bam-train", description=description)
 
 
 def train(config: TrainConfig) -> int:
@@ -180,14 +107,12 @@ def _title(settings: TrainSettings, checkpoint: Checkpoint | None) -> str:
 
 def _run(trainer: Trainer, folder: RunFolder, output: Output, copies: Copies | None, title: str) -> int:
     """Train to the end and say how it went; returns the exit status."""
-    from bam_train.cli.stop_signals import StopSignals
-    from bam_train.cli.train_display import make_display
-    from bam_train.cli.train_summary import summarise
+    from bam_train.cli.train_display import make_display, summarise
     from bam_train.trainers.run import TrainingRun
 
     display = make_display(title)
     run = TrainingRun(trainer, folder, output.path, display, output.best, copies=copies)
-    with StopSignals(run) as signals:
+    with stopped_by_signals(run) as came:
         try:
             with display:
                 for notice in [*output.notices, *trainer.notices]:
@@ -198,7 +123,61 @@ def _run(trainer: Trainer, folder: RunFolder, output: Output, copies: Copies | N
         summarise(trainer.settings, outcome, folder, time.monotonic() - _STARTED)
     if outcome.failure is not None:
         raise outcome.failure
-    return signals.status
+    return 128 + came[0] if came else 0
+
+
+@contextlib.contextmanager
+def stopped_by_signals(run: TrainingRun) -> Iterator[list[int]]:
+    """Within this, the first signal asks `run` to stop after its update, the second ends the process there and then.
+
+    Gives the signals that came. Once one came, the next ends the process even after leaving: what is left to do then is
+    not worth waiting for.
+    """
+    came: list[int] = []
+
+    def stop(number: int) -> None:
+        if came:
+            _quit(run, number)
+        came.append(number)
+        doing = "all is saved; ending" if run.done else "finishing the update and saving"
+        run.stop()
+        again = "Ctrl-C again" if number == signal.SIGINT else "another signal"
+        _write(f"{doing}; {again} quits at once\n")
+
+    with contextlib.ExitStack() as handlers:
+        handlers.enter_context(handled(stop))
+        yield came
+        if came:
+            handlers.pop_all()
+
+
+def _quit(run: TrainingRun, number: int) -> None:
+    """End the process here, wherever it is: an exception might be caught, or wait for threads."""
+    from bam_train.trainers.at_quit import before_quitting
+
+    kept = f"the last checkpoint on the disk is {run.last}" if run.last else "no checkpoint had been saved yet"
+    _write(f"bam-train: quit at once; {kept}\n")
+    run.folder.remove_unfinished()
+    before_quitting()
+    os._exit(128 + number)
+
+
+def _write(line: str) -> None:
+    """To standard error, not by print: the signal may have come in the middle of one."""
+    show_cursor = b"\x1b[?25h" if sys.stderr.isatty() else b""  # a live panel has hidden it
+    with contextlib.suppress(OSError):  # nobody reads it any more
+        os.write(2, show_cursor + line.encode())
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of the console script."""
+    run_program(lambda: _main(arguments), "bam-train")
+
+
+def _main(arguments: Sequence[str] | None) -> int:
+    from bam_train.cli.flags import TrainConfig
+
+    return train(parse(TrainConfig, "bam-train", arguments))
 
 
 if __name__ == "__main__":

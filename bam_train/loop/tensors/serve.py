@@ -6,7 +6,6 @@ import multiprocessing
 import os
 import pickle
 import random
-import signal
 import threading
 import traceback
 from collections.abc import Callable
@@ -19,13 +18,14 @@ import torch
 
 from bam_train.errors import LoopError
 from bam_train.loop.workspace import Workspace
+from bam_train.signals import drop_handlers
 
 _LOOK_AGAIN = 1.0  # seconds between two looks at whether the parent is alive
 
 
 def serve(connection: Connection, payload: Any, seed: int | None, noise: int) -> None:
     """The other end: answer commands until told to exit, or until the parent is gone."""
-    _drop_handlers()
+    drop_handlers()
     threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
     torch.set_num_threads(1)  # as many processes as cores; and OpenMP's threads do not survive a fork
     server = _Server()
@@ -36,16 +36,6 @@ def serve(connection: Connection, payload: Any, seed: int | None, noise: int) ->
         except (EOFError, OSError):
             return
         _answer(connection, lambda data=data: server.obey(*pickle.loads(data)))  # type: ignore[misc]
-
-
-def _drop_handlers() -> None:
-    """Forget the signal handlers that a fork has copied, then let the signals come that waited for this."""
-    for number in signal.valid_signals():
-        if callable(signal.getsignal(number)):
-            signal.signal(number, signal.SIG_DFL)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends this process
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, signal.valid_signals())
 
 
 def _answer(connection: Connection, work: Callable[[], Any]) -> None:

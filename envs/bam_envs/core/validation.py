@@ -117,14 +117,14 @@ def type_hints(kind: type[Any]) -> dict[str, Any]:
 
 
 def expected(kind: Any) -> str:
-    """What fits the annotation `kind`, in words: ``a whole number from 0 to 65535``."""
+    """What fits the annotation `kind`, but None, in words: ``a whole number from 0 to 65535``."""
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is Annotated:
         metas = [one for one in arguments[1:] if isinstance(one, Meta)]
         said = next((meta.description for meta in metas if meta.description), None)
         return said or expected(arguments[0]) + "".join(map(_range, metas))
     if origin in (Union, types.UnionType):
-        return " or ".join(map(expected, arguments))
+        return " or ".join(expected(one) for one in arguments if one is not type(None))
     if origin is Literal:
         return " or ".join(map(repr, arguments))
     base = origin or kind
@@ -139,7 +139,6 @@ def expected(kind: Any) -> str:
 
 
 _WORDS: dict[Any, str] = {
-    type(None): "none",
     bool: "true or false",
     int: "a whole number",
     float: "a number",
@@ -214,6 +213,6 @@ def _parts(value: Any, kind: Any, name: str) -> list[tuple[str, Any, Any]]:
     if isinstance(value, (list, tuple)) and origin in (list, tuple, Sequence):
         each = arguments if origin is tuple and arguments[-1] is not ... else (arguments[0],) * len(value)
         return [(f"{name}[{i}]", one, wanted) for i, (one, wanted) in enumerate(zip(value, each, strict=False))]
-    if isinstance(value, Mapping) and is_dataclass(kind):
+    if isinstance(value, Mapping) and isinstance(kind, type) and is_dataclass(kind):
         return [(f"{name}.{key}", value[key], hint) for key, hint in type_hints(kind).items() if key in value]
     return []

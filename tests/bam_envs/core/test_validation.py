@@ -53,7 +53,7 @@ def test_what_fits_is_converted(value: Any, kind: Any, found: Any) -> None:
         (math.nan, Positive, "it: expected a number above 0, found nan"),
         (math.inf, Positive, "it: expected a number above 0, found inf"),
         (-math.inf, Finite, "it: expected a number that is finite, found -inf"),
-        (1.5, Fraction | None, "it: expected a number from 0 to 1 or none, found 1.5"),
+        (1.5, Fraction | None, "it: expected a number from 0 to 1, found 1.5"),
         (True, PositiveInt, "it: expected a whole number of at least 1, found True"),
         (1.5, PositiveInt, "it: expected a whole number of at least 1, found 1.5"),
         (0.0, PositiveInt, "it: expected a whole number of at least 1, found 0.0"),

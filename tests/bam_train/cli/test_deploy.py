@@ -76,7 +76,7 @@ def test_deadlines_are_reported(corridor_checkpoint, run):
 def test_the_environment_gives_the_rate(corridor_checkpoint, corridor):
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.deploy import period_of
-    from bam_train.cli.deploy_config import DeployConfig
+    from bam_train.cli.flags import DeployConfig
 
     path = corridor_checkpoint()
     with gym.make(corridor) as env:
@@ -153,10 +153,10 @@ def test_a_fault_still_gives_the_report(corridor_checkpoint, corridor, run, monk
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--episodes", "-1"], "episodes: expected at least 1, found -1"),
-        (["--seed", "-1"], "seed: expected at least 0, found -1"),
-        (["--rate", "0"], "rate: expected more than 0 Hz, found 0"),
-        (["--rate", "nan"], "rate: expected more than 0 Hz, found nan"),
+        (["--episodes", "-1"], "--episodes: expected a whole number of at least 1, found -1"),
+        (["--seed", "-1"], "--seed: expected a whole number of at least 0, found -1"),
+        (["--rate", "0"], "--rate: expected a number above 0, found 0.0"),
+        (["--rate", "nan"], "--rate: expected a number above 0, found nan"),
         (
             ["--rate", "5", "--fast"],
             "--fast does not wait for deadlines, so --rate has no meaning with it; give one of the two",

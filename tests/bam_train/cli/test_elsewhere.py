@@ -21,8 +21,9 @@ from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.ros.codec import read_info
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.deploy import main as deploy
+from bam_train.cli.flags import TrainConfig
 from bam_train.cli.program import guarded
-from bam_train.cli.train import TrainConfig, train
+from bam_train.cli.train import train
 
 PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
 

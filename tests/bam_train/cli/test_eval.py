@@ -116,11 +116,11 @@ def test_other_spaces(corridor_checkpoint, run):
 
 
 def test_bad_numbers_and_files_are_refused_before_anything_is_loaded(run, tmp_path):
-    assert refused(run, "no.zip", "--episodes", -3) == "episodes: expected at least 1, found -3"
-    assert refused(run, "no.zip", "--seed", -1) == "seed: expected at least 0, found -1"
-    assert refused(run, "no.zip", "--num-envs", 0) == "num_envs: expected at least 1, found 0"
+    assert refused(run, "no.zip", "--episodes", -3) == "--episodes: expected a whole number of at least 1, found -3"
+    assert refused(run, "no.zip", "--seed", -1) == "--seed: expected a whole number of at least 0, found -1"
+    assert refused(run, "no.zip", "--num-envs", 0) == "--num-envs: expected a whole number of at least 1, found 0"
     assert refused(run, "no.zip", "--video-episodes", 0, "--video", tmp_path / "a.gif") == (
-        "video_episodes: expected at least 1, found 0"
+        "--video-episodes: expected a whole number of at least 1, found 0"
     )
     film = tmp_path / "films" / "a.gif"
     assert refused(run, "no.zip", "--video", film) == f"{film}: there is no folder {tmp_path}/films; make it first"

@@ -12,8 +12,8 @@ import pytest
 from bam_envs.core.errors import LinkLost
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.experiment import ScriptParser, environment_of, open_env, require_place, signals_ask, whole
-from bam_train.cli.program import Terminated
 from bam_train.errors import SettingsError
+from bam_train.signals import Terminated
 
 PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
 DESCRIPTION = "What it does.\n\nExamples:\n  python scripts/try.py --steps 3   a few\n"

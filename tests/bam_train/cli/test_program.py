@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import logging
 import os
 import signal
@@ -17,14 +16,14 @@ import pytest
 from bam_envs.core.errors import MissingExtra, UnknownName
 from bam_train.cli import console
 from bam_train.cli.console import count, duration, number, percent
-from bam_train.cli.program import Terminated, guarded, run_program, usage_error
+from bam_train.cli.program import guarded, parse, run_program, usage_error
 from bam_train.errors import OutputError, SettingsError
 from bam_train.shown import rich_text, shown
 
 
 @dataclass(frozen=True)
 class Flags:
-    """Some flags."""
+    """Does things."""
 
     steps: int = 3
     """How many."""
@@ -34,7 +33,7 @@ class Flags:
 
 def ended(arguments, main=lambda flags: 0):
     with pytest.raises(SystemExit) as caught:
-        run_program(main, Flags, prog="prog", description="Does things.", arguments=arguments)
+        run_program(lambda: main(parse(Flags, "prog", arguments)), "prog")
     return caught.value.code
 
 
@@ -57,7 +56,8 @@ def test_help_and_a_typo(capsys):
     [
         (["--stps", "5"], "prog: unknown option --stps, did you mean --steps? Run prog --help\n"),
         (["--qqq"], "prog: unknown option --qqq. Run prog --help\n"),
-        (["--steps", "many"], "prog: --steps cannot be 'many'. Run prog --help\n"),
+        (["--steps", "many"], "prog: --steps: expected a whole number, found 'many'. Run prog --help\n"),
+        (["--steps", "1e5"], "prog: --steps: expected a whole number, found '1e5'; write 100000. Run prog --help\n"),
         (["--steps"], "prog: --steps needs a value. Run prog --help\n"),
         (["stray"], "prog: unknown option stray. Run prog --help\n"),
     ],
@@ -176,11 +176,6 @@ def test_sigterm_is_one_line_and_its_status(capsys):
     assert capsys.readouterr().err == "prog: ended by SIGTERM\n"
 
 
-def test_a_signal_can_travel():
-    """Ray and concurrent.futures make exceptions anew out of their arguments."""
-    assert copy.copy(Terminated(signal.SIGTERM)).signal == signal.SIGTERM
-
-
 def test_a_signal_that_comes_twice_at_once_does_not_interrupt_the_closing(capsys):
     closed = []
 
@@ -220,24 +215,26 @@ def test_ctrl_c_while_flags_are_imported_is_one_line():
     """So nothing slow is imported before signals are answered."""
     code = (
         "import signal, sys\n"
-        "from bam_train.cli import deploy, eval\n"
+        "from bam_train.cli import deploy, envs, eval, export, serve, train\n"
         "class Interrupted:\n"
         "    def find_spec(self, name, *_):\n"
         "        if name == 'tyro': signal.raise_signal(signal.SIGINT)\n"
         "sys.meta_path.insert(0, Interrupted())\n"
-        "for program in (deploy, eval):\n"
+        "for program in (deploy, envs, eval, export, serve, train):\n"
         "    try: program.main(['--help'])\n"
         "    except SystemExit as end: print(end.code)\n"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
-    assert (done.stdout, done.stderr) == ("130\n130\n", "bam-deploy: interrupted\nbam-eval: interrupted\n")
+    names = ("deploy", "envs", "eval", "export", "serve", "train")
+    assert done.stdout == "130\n" * 6
+    assert done.stderr == "".join(f"bam-{name}: interrupted\n" for name in names)
 
 
 def test_the_box_of_a_terminal_without_unicode_is_one_line_too():
     lines = ["+- Unrecognized options ---+", "| Unrecognized options: --qqq |", "| -------- |", "| For full helptext |"]
     box = "\n".join([*lines, "+------+"])
-    assert usage_error(box) == "unknown option --qqq."
+    assert usage_error(box, Flags) == "unknown option --qqq."
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")

@@ -7,9 +7,7 @@ import sys
 
 import pytest
 
-from bam_train.cli.program import Terminated
 from bam_train.cli.serve import env_kwargs, main
-from bam_train.cli.signal_memory import SignalMemory
 from bam_train.errors import SettingsError
 
 
@@ -76,7 +74,7 @@ def test_wrong_flags_are_one_line(run):
         ),
         (["--set", "robot=ws://127.0.0.1:1", "--set", "randomise=1"], "env_kwargs: unknown setting 'randomise'"),
         (["--set", "robot=ws://127.0.0.1:1"], "ws://127.0.0.1:1: refused: nothing listens there."),
-        (["--num-envs", "0"], "--num-envs: expected at least 1, found 0"),
+        (["--num-envs", "0"], "--num-envs: expected a whole number of at least 1, found 0"),
         (["--env", "CartPole-v1", "--token-file", "/no/such"], "The token file /no/such cannot be read: No such file"),
         (
             ["--env", "CartPole-v1", "--cert", "/no/such", "--port", "0"],
@@ -84,6 +82,10 @@ def test_wrong_flags_are_one_line(run):
         ),
         (["--env", "CartPole-v1", "--via", "ws://127.0.0.1:1"], "ws://127.0.0.1:1: refused: nothing listens there."),
         (["--env", "CartPole-v1", "--image-format", "gif"], "The image format must be png or jpeg, not 'gif'."),
+        (
+            ["--bind", "0.0.0.0:9091"],
+            "--bind: expected an address without a port, found '0.0.0.0:9091'; give --bind 0.0.0.0 --port 9091",
+        ),
         (["--namespace", "a b"], "--namespace must be letters, digits and _, such as bam_001, not 'a b'."),
     ],
 )
@@ -115,24 +117,3 @@ def test_help_names_every_flag(run):
     assert status == 0
     flags = ("env", "num-envs", "set", "port", "bind", "namespace", "tcp", "via", "rclpy", "realtime", "fast", "lease")
     assert all(f"--{flag}" in out for flag in (*flags, "cert", "key", "token-file", "ca-file", "image-format"))
-
-
-def test_a_signal_that_was_lost_is_raised_again():
-    def lose(number, error):
-        with SignalMemory() as signals:
-            signals.raise_again()
-            with pytest.raises(error):
-                signal.raise_signal(number)
-            with pytest.raises(error):
-                signals.raise_again()
-
-    def terminate(number, frame):
-        raise Terminated(number)
-
-    lose(signal.SIGINT, KeyboardInterrupt)
-    before = signal.signal(signal.SIGTERM, terminate)
-    try:
-        lose(signal.SIGTERM, Terminated)
-        assert signal.getsignal(signal.SIGTERM) is terminate
-    finally:
-        signal.signal(signal.SIGTERM, before)

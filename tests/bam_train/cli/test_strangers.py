@@ -10,18 +10,11 @@ import pytest
 
 from bam_train.checkpoint import GOLDEN, safetensors_file
 from bam_train.cli import deploy, eval, train
-from bam_train.cli.program import run_program
-
-
-def resume(arguments):
-    description = "Train."
-    run_program(train.train, train.TrainConfig, prog="bam-train", description=description, arguments=arguments)
-
 
 PROGRAMS = {
     "bam-deploy": (deploy.main, lambda path: [str(path), "--fast"]),
     "bam-eval": (eval.main, lambda path: [str(path)]),
-    "bam-train": (resume, lambda path: ["--resume", str(path)]),
+    "bam-train": (train.main, lambda path: ["--resume", str(path)]),
 }
 BOX = {"type": "Box", "shape": [1], "dtype": "float32", "low": 0.0, "high": 4.0}
 TITLE = "\x1b]0;mine\x07\x1b[2J"

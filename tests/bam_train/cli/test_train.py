@@ -14,8 +14,9 @@ import pytest
 from stable_baselines3 import PPO
 
 from bam_train.checkpoint import Checkpoint
+from bam_train.cli.flags import TrainConfig
 from bam_train.cli.program import guarded
-from bam_train.cli.train import TrainConfig, train
+from bam_train.cli.train import train
 from bam_train.policy import FrozenPolicy
 
 SHORT = ("n_steps=32", "batch_size=32", "n_epochs=2", "policy_kwargs.net_arch=[8]")

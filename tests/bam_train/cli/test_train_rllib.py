@@ -19,8 +19,9 @@ pytest.importorskip("ray.rllib")
 import psutil
 
 from bam_train.checkpoint import Checkpoint
+from bam_train.cli.flags import TrainConfig
 from bam_train.cli.program import guarded
-from bam_train.cli.train import TrainConfig, train
+from bam_train.cli.train import train
 
 SMALL = ("train_batch_size_per_learner=256", "minibatch_size=64", "num_epochs=1", "model_config.fcnet_hiddens=[8]")
 BASE = {"env": "bam/reach", "algo": "ppo", "trainer": "rllib", "steps": 256, "eval_episodes": 2, "set": SMALL}

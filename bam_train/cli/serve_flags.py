@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 
 from bam_envs.remote.serve.options import ServeOptions
+from bam_train.cli.flags import Assignments, Count
 
 
 @dataclass(frozen=True)
@@ -16,9 +17,9 @@ class ServeConfig:
 
     env: Annotated[str, tyro.conf.arg(metavar="ID")] = "bam/pick"
     """Environment: any Gymnasium id."""
-    num_envs: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    num_envs: Annotated[Count, tyro.conf.arg(metavar="N")] = 1
     """Environments stepped together; several have no robot topics."""
-    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    set: Assignments = ()
     """One keyword argument of the environment, any number of times: randomize=true."""
     yes: bool = False
     """Do not ask before clients may move a real robot (--set robot=ws://...)."""

@@ -1,0 +1,147 @@
+"""Ctrl-C (SIGINT), SIGTERM and SIGHUP: the one place where this process decides what they do.
+
+Python runs a handler in the main thread, between two bytecodes of whatever runs there. So handlers are installed in the
+main thread only; in any other one, everything here does nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from types import FrameType
+from typing import Any, NoReturn
+
+SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""What asks a program to end; Windows has no SIGHUP."""
+
+TOGETHER = 0.5
+"""A signal of a program that comes again within this time is the same one [s]: ``timeout`` sends SIGTERM to the process
+and then to its group. Ctrl-C is a person's, and counts each time."""
+
+
+class Terminated(KeyboardInterrupt):
+    """A signal other than Ctrl-C asked for the end; Ray, waiting in C++, hears of no other kind of exception.
+
+    Attributes:
+        signal: Which.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.signal = signal.Signals(number)
+        super().__init__(self.signal)  # what it is made from, so that it can be copied
+
+
+def interrupt(number: int) -> NoReturn:
+    """Raise what the signal `number` stands for.
+
+    Raises:
+        KeyboardInterrupt: For Ctrl-C; for any other signal `Terminated`, which is one too.
+    """
+    raise KeyboardInterrupt if number == signal.SIGINT else Terminated(number)
+
+
+class _Handler:
+    """Passes signals on to `handle`, except one of a program that comes again at once."""
+
+    def __init__(self, handle: Callable[[int], object], around: object) -> None:
+        self._handle = handle
+        # Nested handlers share the time of the first signal, which may have ended the inner one.
+        self._first: list[float] = around._first if isinstance(around, _Handler) else [-math.inf]
+
+    def __call__(self, number: int, _: FrameType | None) -> None:
+        now = time.monotonic()
+        if number != signal.SIGINT:
+            if now < self._first[0] + TOGETHER:
+                return
+            self._first[0] = now
+        self._handle(number)
+
+
+@contextlib.contextmanager
+def handled(
+    handle: Callable[[int], object], numbers: Sequence[int] = SIGNALS, *, ignored_too: bool = False
+) -> Iterator[Callable[[], None]]:
+    """Within this, `handle` is called with the number of each signal; gives what restores the old handlers before.
+
+    Args:
+        handle: Runs in the main thread; what it raises comes out of whatever runs there.
+        numbers: Which signals.
+        ignored_too: Whether to handle also those that are ignored, as ``nohup`` does with SIGHUP and a shell with the
+            SIGINT of a background job.
+    """
+    before: dict[int, Any] = {}
+
+    def restore() -> None:
+        while before:
+            signal.signal(*before.popitem())
+
+    if threading.current_thread() is threading.main_thread():
+        unheard = (None,) if ignored_too else (None, signal.SIG_IGN)  # None: of a handler that is not Python's
+        before.update((n, signal.getsignal(n)) for n in numbers if signal.getsignal(n) not in unheard)
+    for number, around in list(before.items()):
+        signal.signal(number, _Handler(handle, around))
+    try:
+        yield restore
+    finally:
+        restore()
+
+
+@contextlib.contextmanager
+def waiting() -> Iterator[None]:
+    """Within this, signals interrupt nothing; on leaving, the first one does what it would have done."""
+    came: list[int] = []
+    with handled(came.append):
+        yield
+    if came:
+        signal.raise_signal(came[0])
+
+
+class SignalMemory:
+    """Within this, signals interrupt, and are remembered.
+
+    Python discards what is raised in callbacks such as ``__del__`` and those of an import, so a program asks again
+    before anything moves.
+    """
+
+    def __init__(self, numbers: Sequence[int] = SIGNALS) -> None:
+        self.came: list[int] = []
+        """The signals that came, in order."""
+        self._numbers = numbers
+        self._stack = contextlib.ExitStack()
+
+    def __enter__(self) -> SignalMemory:
+        self._stack.enter_context(handled(self._handle, self._numbers))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def _handle(self, number: int) -> None:
+        self.came.append(number)
+        interrupt(number)
+
+    def raise_again(self) -> None:
+        """Raise for a signal that came before now, if one did.
+
+        Raises:
+            KeyboardInterrupt: As of `interrupt`.
+        """
+        if self.came:
+            interrupt(self.came[0])
+
+
+def drop_handlers() -> None:
+    """In a forked process: forget the handlers that the fork has copied, then let signals come that it held back.
+
+    Ctrl-C reaches the whole group of processes and is the parent's to handle; SIGTERM ends this process at once.
+    """
+    for number in signal.valid_signals():
+        if callable(signal.getsignal(number)):
+            signal.signal(number, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, signal.valid_signals())
