@@ -74,7 +74,7 @@ def serve_echo() -> None:
 def serve_robot() -> None:
     """The embedded server with a robot that moves at once, and a camera of 640 x 480 at 30 Hz."""
     from bam_envs.core.robot import Initial
-    from bam_envs.remote.serve.command import CommandLease
+    from bam_envs.remote.serve.command_lease import CommandLease
     from bam_envs.remote.serve.robot_service import RobotService
     from bam_envs.remote.serve.served_robot import ServedRobot
     from bam_envs.robots.fake import FakeRobot

@@ -12,7 +12,7 @@ from bam_train.cli.program import parse, run_program
 from bam_train.signals import SignalMemory
 
 if TYPE_CHECKING:
-    from bam_envs.remote.serve.describe import Env
+    from bam_envs.remote.serve.env_server import Env
     from bam_train.cli.serve_flags import ServeConfig
 
 _LOOK = 1.0
@@ -21,7 +21,7 @@ _LOOK = 1.0
 
 def serve(config: ServeConfig, signals: SignalMemory) -> int:
     """The program, with its arguments read."""
-    from bam_envs.remote.serve.program import ServedEnvironment
+    from bam_envs.remote.serve.served_environment import ServedEnvironment
 
     _require_host(config.serving.bind)
     config.serving.require_sane()

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from bam_envs.remote.serve.options import ServeOptions
+from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_train.cli.flags import Assignments, Count
 
 

@@ -69,7 +69,7 @@ def test_public_names():
     assert bam_envs.__all__ == ["ENVIRONMENTS"]
 
 
-@pytest.mark.parametrize("package", ["robots", "serve", "transports"])
+@pytest.mark.parametrize("package", ["robots", "remote"])
 def test_names_of_packages_are_there_when_they_are_used(package):
     module = importlib.import_module(f"bam_envs.{package}")
     for name in module.__all__:

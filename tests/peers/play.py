@@ -42,8 +42,7 @@ def plain(observation):
 
 
 def main(url, *options):
-    from bam_envs.remote.remote_env import RemoteEnv
-    from bam_envs.remote.transports.opening import open_transport
+    from bam_envs.remote.remote_env import RemoteEnv, open_transport
 
     env = RemoteEnv(open_transport(url, **dict(option.split("=") for option in options)))
     try:

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 import bam_envs  # noqa: F401 - registers the environments
-from bam_envs.remote.remote_env import RemoteEnv
-from bam_envs.remote.transports.local import LocalTransport
-from bam_envs.remote.transports.opening import open_transport
+from bam_envs.remote.remote_env import RemoteEnv, open_transport
+from bam_envs.remote.serve.local_transport import LocalTransport
 
 HERE = Path(__file__).parent
 play = runpy.run_path(str(HERE / "play.py"))["play"]

@@ -15,8 +15,8 @@ import pytest
 
 import bam_envs  # noqa: F401 - registers the environments
 from bam_envs.core.registry import ENVIRONMENTS
-from bam_envs.remote.serve.options import ServeOptions
-from bam_envs.remote.serve.program import ServedEnvironment
+from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_train.cli.program import guarded
 
 ROOT = Path(__file__).parents[2]

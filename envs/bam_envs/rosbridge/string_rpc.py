@@ -11,15 +11,15 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NoAnswer  # not the builtin before Python 3.11
 from dataclasses import replace
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, ProtocolError, RemoteError
 from bam_envs.ros.freshness import FreshnessCheck, Tagger, read_tag
-from bam_envs.rosbridge.answers import RecentAnswers
 from bam_envs.rosbridge.bounds import MOST_ITEMS
 from bam_envs.rosbridge.bus import Bus, Caller, Handler, Message
 from bam_envs.rosbridge.sessions import Sessions
@@ -33,6 +33,32 @@ ends of a topic found each other. The service executes one id once."""
 _MOST_WAITING = 64
 """Requests of a service that may be under way together."""
 _WORKERS = 8
+
+Answer = TypeVar("Answer")
+
+
+class RecentAnswers(Generic[Answer]):
+    """The newest answers by the key of their request, so that one that comes twice is executed once. Any thread.
+
+    Args:
+        size: How many are kept; the oldest goes first.
+    """
+
+    def __init__(self, size: int = 32) -> None:
+        self.size = size
+        """See above."""
+        self._lock = threading.Lock()
+        self._futures: OrderedDict[Hashable, Future[Answer]] = OrderedDict()
+
+    def claim(self, key: Hashable) -> tuple[Future[Answer], bool]:
+        """Where the answer to `key` will be, and whether it is for the caller to make it."""
+        with self._lock:
+            if key in self._futures:
+                return self._futures[key], False
+            future = self._futures[key] = Future()
+            if len(self._futures) > self.size:
+                self._futures.popitem(last=False)
+            return future, True
 
 
 class StringRpc:

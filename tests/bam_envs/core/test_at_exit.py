@@ -14,8 +14,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 import bam_envs  # noqa: F401 - registers the environments
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
-from bam_envs.remote.serve.options import ServeOptions
-from bam_envs.remote.serve.program import ServedEnvironment
+from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.rosbridge.link.link import RosbridgeLink
 from bam_envs.rosbridge.server.server import BridgeServer

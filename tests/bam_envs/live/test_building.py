@@ -10,7 +10,7 @@ from bam_envs.core.errors import InvalidValue, LinkLost, ProtocolError, UnknownN
 from bam_envs.core.robot import Initial, Robot, RobotState, Rows
 from bam_envs.live.building import live_robot, profile_limits
 from bam_envs.live.rosbridge import RosbridgeRobot
-from bam_envs.remote.serve.command import CommandLease
+from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.robot_service import RobotService
 from bam_envs.remote.serve.served_robot import ServedRobot
 from bam_envs.robots.fake import FakeRobot

@@ -14,10 +14,9 @@ from bam_envs.core.errors import InvalidValue, LinkLost, ResetNeeded
 from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.remote.remote_env import RemoteVectorEnv
 from bam_envs.remote.serve.env_server import EnvServer
+from bam_envs.remote.serve.local_transport import FakeEnv, FakeTransport, LocalTransport
 from bam_envs.remote.serve.tcp_server import TcpServer
-from bam_envs.remote.transports.fake import FakeEnv, FakeTransport
-from bam_envs.remote.transports.local import LocalTransport
-from bam_envs.remote.transports.tcp import TcpTransport
+from bam_envs.remote.tcp_transport import TcpTransport
 from bam_envs.testing.transports import MirrorEnv, assert_same_value
 
 PATIENCE = 10.0

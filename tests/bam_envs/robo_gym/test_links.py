@@ -6,8 +6,8 @@ import pytest
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.remote.serve.env_server import EnvServer
-from bam_envs.remote.serve.options import ServeOptions
-from bam_envs.remote.serve.program import ServedEnvironment
+from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_envs.remote.serve.tcp_server import TcpServer
 
 CASES = [

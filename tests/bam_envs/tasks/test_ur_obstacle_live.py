@@ -4,8 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from bam_envs.remote.serve.options import ServeOptions
-from bam_envs.remote.serve.program import ServedEnvironment
+from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.served_environment import ServedEnvironment
 
 ENVIRONMENTS = ("bam/ur-avoidance-v0", "bam/ur-track-v0", "bam/isaac-reach-v0")
 

@@ -15,8 +15,8 @@ import pytest
 from bam_envs.core.errors import LinkLost
 from bam_envs.live import bringup
 from bam_envs.remote.serve.env_server import EnvServer
-from bam_envs.remote.serve.options import ServeOptions
-from bam_envs.remote.serve.program import ServedEnvironment
+from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.ros.codec import read_info
 from bam_train.checkpoint import Checkpoint
@@ -248,7 +248,7 @@ def test_training_goes_on_elsewhere(bam_train, over_tcp):
 
 def test_a_link_that_drops_while_training_loses_nothing(bam_train, over_tcp, monkeypatch):
     url = over_tcp(gym.make("CartPole-v1"))
-    from bam_envs.remote.transports.tcp import TcpTransport
+    from bam_envs.remote.tcp_transport import TcpTransport
 
     steps, step = [], TcpTransport.step
 

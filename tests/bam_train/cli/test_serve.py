@@ -42,7 +42,7 @@ def test_it_serves_until_it_is_stopped(start, number, status, text):
 
 
 def test_it_says_who_is_in_command_and_one_line_for_each_way_in(start):
-    from bam_envs.remote.transports.tcp import TcpTransport
+    from bam_envs.remote.tcp_transport import TcpTransport
 
     process, _ = start("--env", "CartPole-v1", "--port", "0", "--tcp", "0", "--lease", "2.5")
     url = re.fullmatch(

@@ -27,8 +27,7 @@ from bam_envs.remote.gymapi.leaves import (
     to_numbers,
     to_pose,
 )
-from bam_envs.remote.transports.trees import tree_from_json, tree_to_json
-from bam_envs.remote.transports.values import exact, pack, unpack
+from bam_envs.remote.values import exact, pack, tree_from_json, tree_to_json
 from bam_envs.rosbridge.strict_json import dump_json, load_json
 
 DEFAULT = 1
@@ -87,7 +86,7 @@ class ActionCodec:
         prefix = message["prefix"]
         if prefix.startswith(PREFIX):
             tree = tree_from_json(load_json(prefix.removeprefix(PREFIX), "prefix").get("action"))
-            return unpack(self.space, tree, "action")
+            return exact(self.space, tree, "action")
         values = {**self._numbers(message, "continuous"), **self._numbers(message, "discrete"), **self._pose(message)}
         return joined(self.space, values)
 

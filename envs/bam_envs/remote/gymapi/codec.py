@@ -10,8 +10,8 @@ from bam_envs.remote.gymapi.actions import DEFAULT, ActionCodec
 from bam_envs.remote.gymapi.observations import ObservationCodec
 from bam_envs.remote.gymapi.responses import GymResponse, write_feedback
 from bam_envs.remote.gymapi.versions import JUNE_22, Version
-from bam_envs.remote.transports.transport import EnvSpecMessage, Info
-from bam_envs.remote.transports.values import pack, shown, unpack
+from bam_envs.remote.transport import EnvSpecMessage, Info
+from bam_envs.remote.values import exact, pack, shown
 
 Messages = Sequence[Mapping[str, Any]]
 
@@ -127,6 +127,6 @@ class EnvCodec:
 
     def _unpacked_final(self, tree: Any) -> Any:
         try:
-            return unpack(self.spec.observation_space, tree, "final_obs")
+            return exact(self.spec.observation_space, tree, "final_obs")
         except InvalidValue as error:
             raise ProtocolError(str(error)) from error

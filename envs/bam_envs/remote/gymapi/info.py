@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from bam_envs.core.errors import ProtocolError
-from bam_envs.remote.transports.transport import Info
-from bam_envs.remote.transports.trees import tree_from_json, tree_to_json
+from bam_envs.remote.transport import Info
+from bam_envs.remote.values import tree_from_json, tree_to_json
 from bam_envs.rosbridge.strict_json import dump_json
 
 _MOST_READABLE = 64

@@ -32,8 +32,7 @@ from bam_envs.remote.gymapi.leaves import (
     to_pose,
 )
 from bam_envs.remote.gymapi.versions import JUNE_22, Version
-from bam_envs.remote.transports.trees import tree_from_json, tree_to_json
-from bam_envs.remote.transports.values import exact, pack, unpack
+from bam_envs.remote.values import exact, pack, tree_from_json, tree_to_json
 from bam_envs.ros.images import (
     FORMATS,
     color_message,
@@ -154,7 +153,7 @@ def _write_numbers(leaf: Leaf, part: Any, fields: dict[str, Any]) -> bool:
 
 
 def _from_tree(leaf: Leaf, tree: Any) -> Any:
-    return unpack(leaf.space, tree_from_json(tree), leaf.name)
+    return exact(leaf.space, tree_from_json(tree), leaf.name)
 
 
 def _refuse_missing(leaves: list[Leaf]) -> None:

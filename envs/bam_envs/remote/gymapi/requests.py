@@ -18,8 +18,8 @@ import numpy as np
 from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.remote.gymapi.actions import PREFIX
 from bam_envs.remote.gymapi.versions import JUNE_22, Version
-from bam_envs.remote.transports.transport import Info
-from bam_envs.remote.transports.trees import plain_info, tree_from_json, tree_to_json
+from bam_envs.remote.transport import Info
+from bam_envs.remote.values import plain_info, tree_from_json, tree_to_json
 from bam_envs.ros.freshness import Tag, read_tag
 from bam_envs.ros.interfaces import complete, complete_known, request_type
 from bam_envs.rosbridge.strict_json import dump_json, load_json

@@ -12,7 +12,7 @@ from bam_envs.core.errors import BamEnvsError, InvalidValue, NotInCommand, Proto
 from bam_envs.remote.gymapi.info import read_info, write_info
 from bam_envs.remote.gymapi.requests import KIND, Message
 from bam_envs.remote.gymapi.versions import JUNE_22, Version, version_of_response
-from bam_envs.remote.transports.transport import Info
+from bam_envs.remote.transport import Info
 from bam_envs.ros.interfaces import complete_known, response_type
 from bam_envs.rosbridge.strict_json import dump_json
 

@@ -26,12 +26,11 @@ from bam_envs.remote.gymapi.requests import (
 from bam_envs.remote.gymapi.responses import write_failure, write_response
 from bam_envs.remote.gymapi.versions import JUNE_22, Version, version_named, version_of_bus, version_of_request
 from bam_envs.remote.serve.env_server import EnvServer
-from bam_envs.remote.transports.trees import spec_to_json
+from bam_envs.remote.transport import spec_to_json
 from bam_envs.ros.freshness import FreshnessCheck
-from bam_envs.rosbridge.answers import RecentAnswers
 from bam_envs.rosbridge.bus import Bus, Caller, Message
 from bam_envs.rosbridge.sessions import Sessions
-from bam_envs.rosbridge.string_rpc import StringRpcService
+from bam_envs.rosbridge.string_rpc import RecentAnswers, StringRpcService
 
 Feedback = list[dict[str, Any]]
 _log = logging.getLogger(__name__)

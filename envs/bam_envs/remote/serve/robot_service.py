@@ -22,7 +22,7 @@ import numpy as np
 
 from bam_envs.core.errors import LinkLost, ProtocolError, RemoteError, RobotFault
 from bam_envs.core.timing import Ticker
-from bam_envs.remote.serve.command import CommandLease
+from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.command_slot import CommandSlot, Order
 from bam_envs.remote.serve.served_robot import ServedRobot
 from bam_envs.ros.codec import (

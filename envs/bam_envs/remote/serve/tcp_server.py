@@ -7,25 +7,26 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, ProtocolError, RemoteError
 from bam_envs.remote.serve.env_server import EnvServer
-from bam_envs.remote.transports.frames import FrameSocket, encode
-from bam_envs.remote.transports.tcp_messages import (
+from bam_envs.remote.tcp_wire import (
+    FrameSocket,
+    Greeting,
     Hello,
     Request,
-    SpecCodec,
+    Reset,
+    Step,
     action_size,
-    read_hello,
-    read_request,
+    encode,
+    pack_result,
     refusal,
 )
-from bam_envs.remote.transports.trees import spec_to_json
-from bam_envs.remote.transports.values import Tree
-from bam_envs.ros.freshness import FreshnessCheck, Tag
+from bam_envs.remote.transport import spec_to_json
+from bam_envs.remote.values import Tree
+from bam_envs.ros.freshness import FreshnessCheck
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
 from bam_envs.rosbridge.tokens import Guesses, Tokens
 
@@ -67,7 +68,6 @@ class TcpServer:
     ) -> None:
         self.server, self.host, self.port = server, host, port
         self.max_clients, self.patience = max_clients, patience
-        self.codec = SpecCodec(server.spec())
         self.most = _ROOM + 2 * action_size(server.spec())
         """Largest request [bytes]."""
         self._tokens, self._guesses = Tokens(token, operator_token), Guesses()
@@ -210,7 +210,7 @@ class _Connection:
         self.host, self.client, self.session = host, f"{host}:{port}", ""
         self.caller: Caller | None = None  # known when it is let in
         self._owner, self._frames = owner, FrameSocket(sock)
-        self._answered: tuple[Tag, list[bytes | memoryview]] | None = None
+        self._answered: tuple[tuple[str, int, int], list[bytes | memoryview]] | None = None
         self._thread = threading.Thread(target=self._run, name=f"bam-tcp {self.client}", daemon=True)
 
     def start(self) -> None:
@@ -232,8 +232,8 @@ class _Connection:
         try:
             self._greet()
             while True:
-                tree = self._frames.receive(limit=self._owner.most, patience=self._owner.patience)
-                self._send(self._answer(read_request(tree)))
+                request = self._frames.receive(limit=self._owner.most, patience=self._owner.patience, kind=Request)
+                self._send(self._answer(request))
         except (ProtocolError, RemoteError) as error:
             self.refuse(str(error))
         except LinkLost:
@@ -243,7 +243,7 @@ class _Connection:
             self._owner.forget(self)
 
     def _greet(self) -> None:
-        hello = read_hello(self._frames.receive(time.monotonic() + _HELLO_TIMEOUT, _HELLO_LIMIT))
+        _, hello = self._frames.receive(time.monotonic() + _HELLO_TIMEOUT, _HELLO_LIMIT, kind=Greeting)
         self.client = f"{hello.name} ({self.client})"
         self._owner.admit(hello, self)
         self.session = hello.session
@@ -254,42 +254,25 @@ class _Connection:
 
     def _answer(self, request: Request) -> list[bytes | memoryview]:
         """The frame that answers `request`; one that came before gets the answer of before, and nothing moves."""
-        if self._answered is not None and _same(self._answered[0], request.tag):
+        tag = request.tag
+        if self._answered is not None and self._answered[0] == tag.number:
             return self._answered[1]
         try:
-            self._owner.freshness.require(request.tag)
-            parts = encode([request.tag.sequence, "ok", self._do(request)])
+            self._owner.freshness.require(tag.to_tag())
+            parts = encode([tag.sequence, "ok", self._do(request)])
         except BamEnvsError as error:
-            parts = encode(refusal(request.tag.sequence, error))
-        self._answered = (request.tag, parts)
+            parts = encode(refusal(tag.sequence, error))
+        self._answered = (tag.number, parts)
         return parts
 
     def _do(self, request: Request) -> Tree:
-        deadline = time.monotonic() + request.tag.deadline - request.tag.sent
-        return _ACTIONS[request.kind](self, request, deadline)
-
-    def _reset(self, request: Request, deadline: float) -> Tree:
-        seed, options, take = request.values
-        server, codec = self._owner.server, self._owner.codec
-        caller = self.caller or UNKNOWN_CALLER
-        begun = server.reset(self.client, seed, options, take=take is True, deadline=deadline, caller=caller)
-        return codec.pack_result(begun)
-
-    def _step(self, request: Request, deadline: float) -> Tree:
-        server, codec = self._owner.server, self._owner.codec
-        action = codec.unpack_action(request.values[0])
-        return codec.pack_result(server.step(self.client, action, deadline=deadline))
-
-    def _leave(self, request: Request, deadline: float) -> Tree:
-        self._owner.server.leave(self.client)
-
-
-_ACTIONS: dict[str, Callable[[_Connection, Request, float], Tree]] = {
-    "reset": _Connection._reset,
-    "step": _Connection._step,
-    "leave": _Connection._leave,
-}
-
-
-def _same(one: Tag, other: Tag) -> bool:
-    return (one.session, one.epoch, one.sequence) == (other.session, other.epoch, other.sequence)
+        server, deadline = self._owner.server, time.monotonic() + request.tag.lifetime
+        if isinstance(request, Reset):
+            caller, take = self.caller or UNKNOWN_CALLER, request.take is True
+            begun = server.reset(
+                self.client, request.seed, request.options, take=take, deadline=deadline, caller=caller
+            )
+            return pack_result(server.spec(), begun)
+        if isinstance(request, Step):
+            return pack_result(server.spec(), server.step(self.client, request.action, deadline=deadline))
+        return server.leave(self.client)

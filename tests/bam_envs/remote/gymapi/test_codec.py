@@ -14,7 +14,7 @@ from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.remote.gymapi.codec import EnvCodec
 from bam_envs.remote.gymapi.requests import GymRequest, RequestType, read_request, write_request
 from bam_envs.remote.gymapi.responses import read_response, write_response
-from bam_envs.remote.transports.transport import EnvSpecMessage
+from bam_envs.remote.transport import EnvSpecMessage
 from bam_envs.ros.interfaces import complete
 from bam_envs.testing.transports import assert_same_value
 
@@ -133,7 +133,7 @@ def test_as_many_feedback_as_rows():
     ("bam", "text"),
     [
         ({"observation": 3}, "info.bam.observation must be an object, not 3."),
-        ({"info": {"final_obs": {"array": ["<f4", [1], "AAAAAA=="]}}}, "final_obs must be an array of float32 (2,)"),
+        ({"info": {"final_obs": {"array": ["<f4", [1], "AAAAAA=="]}}}, "final_obs must have shape (2,), not (1,)."),
     ],
 )
 def test_exact_parts_that_do_not_fit(bam, text):

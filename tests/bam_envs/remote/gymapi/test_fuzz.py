@@ -12,8 +12,8 @@ from bam_envs.remote.gymapi.codec import EnvCodec
 from bam_envs.remote.gymapi.responses import read_response
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
-from bam_envs.remote.transports.transport import EnvSpecMessage
-from bam_envs.remote.transports.values import check
+from bam_envs.remote.transport import EnvSpecMessage
+from bam_envs.remote.values import exact
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER
 from bam_envs.testing.transports import MirrorEnv
 
@@ -100,4 +100,4 @@ def test_every_request_is_answered(service, request):
 def test_every_response_is_read_or_refused(space, message):
     codec = EnvCodec(EnvSpecMessage("x", space, spaces.Discrete(2)))
     with suppress(BamEnvsError):
-        check(space, codec.read_result(read_response(message))[0])
+        exact(space, codec.read_result(read_response(message))[0])

@@ -6,8 +6,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.registry import ENVIRONMENTS
-from bam_envs.remote.serve.describe import describe_env, same_name
-from bam_envs.remote.transports.fake import FakeEnv
+from bam_envs.remote.serve.env_server import describe_env, same_name
+from bam_envs.remote.serve.local_transport import FakeEnv
 
 
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
@@ -50,8 +50,8 @@ def test_rows_that_begin_anew_in_the_next_step_are_refused():
     with pytest.raises(InvalidValue) as caught:
         describe_env(envs)
     assert str(caught.value) == (
-        "The rows of a served vector environment must begin anew in the same step, not AutoresetMode.NEXT_STEP; make "
-        'it with vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP}.'
+        "The environments of a served vector environment must be reset in the same step, not AutoresetMode.NEXT_STEP; "
+        'make it with vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP}.'
     )
     describe_env(SyncVectorEnv([FakeEnv] * 2, autoreset_mode=AutoresetMode.SAME_STEP))
 

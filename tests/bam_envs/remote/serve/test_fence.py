@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import RemoteError
-from bam_envs.remote.serve.options import ServeOptions
-from bam_envs.remote.serve.program import ServedEnvironment
+from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.ros.codec import encode_command
 from bam_envs.ros.freshness import Tagger, read_echo, read_tag

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue, SafetyStop
-from bam_envs.remote.serve.options import ServeOptions
-from bam_envs.remote.serve.program import ServedEnvironment
+from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_envs.remote.serve.served_robot import ServedRobot
 
 NAVIGATION, AVOIDANCE = "bam/mir100-navigation-v0", "bam/mir100-avoidance-v0"

@@ -13,8 +13,8 @@ from websockets.exceptions import ConnectionClosed
 
 import bam_envs  # noqa: F401 - registers the environments
 from bam_envs.core.errors import RemoteError
-from bam_envs.remote.serve.options import ServeOptions
-from bam_envs.remote.serve.program import ServedEnvironment
+from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.served_environment import ServedEnvironment
 
 SERVICE, STATE = "/gym_env/gym_api_request", "/joint_states"
 

@@ -8,7 +8,7 @@ import pytest
 
 from bam_envs.core.errors import LinkLost, PhysicsDiverged
 from bam_envs.core.robot import Initial
-from bam_envs.remote.serve.command import CommandLease
+from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.robot_service import RobotService
 from bam_envs.remote.serve.served_robot import ServedRobot
 from bam_envs.robots.fake import FakeRobot

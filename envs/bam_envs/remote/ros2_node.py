@@ -1,0 +1,392 @@
+"""The Bus as a native ROS 2 node. rclpy is imported when it starts: it comes with ROS, not with this package."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import math
+import re
+import threading
+from array import array
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost
+from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller, Handler, Listener, Message, refusal_of
+
+_log = logging.getLogger(__name__)
+_DEPTH = 10
+"""Messages that ROS keeps for a slow reader."""
+_THREADS = 8
+"""Requests that are answered together."""
+_KIND = re.compile(r"(?P<package>[A-Za-z]\w*)/(?:(?:msg|srv)/)?(?P<name>[A-Za-z]\w*)")
+_LIST = re.compile(r"sequence<(?P<open>.+?)(?:, \d+)?>|(?P<fixed>.+)\[\d+\]")
+_BYTES = {"uint8", "octet", "byte"}
+_FLOATS = {"float": "f", "double": "d"}
+_INTEGERS = {f"{sign}int{bits}": (sign, bits) for sign in ("", "u") for bits in (8, 16, 32, 64)}
+_INSTALL = "pip install 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-std-msgs ros-jazzy-sensor-msgs ros-jazzy-geometry-msgs"
+
+
+class RclpyBus:
+    """Topics and services of one ROS 2 node.
+
+    ROS does not say who sent a message, nor when somebody leaves: callers are unknown, and `on_leave` never calls.
+
+    Args:
+        name: Of the node.
+        domain: ROS domain; None for that of the environment variable ROS_DOMAIN_ID.
+        serves: Whether it answers services, several at once; a client needs no pool of threads, which Python ends
+            before anybody can close it.
+    """
+
+    def __init__(self, name: str = "bam_serve", *, domain: int | None = None, serves: bool = True) -> None:
+        self.name, self._domain, self._serves = name, domain, serves
+        self.refused: dict[str, str] = {}
+        """Services that are not offered, and why."""
+        self._lock = threading.Lock()
+        self._publishers: dict[str, tuple[Any, Any]] = {}  # topic -> class of its messages, publisher
+        self._context: Any = None
+        self._node: Any = None  # topics
+        self._caller: Any = None  # services, which may take long: a node of their own, so that no topic waits for them
+        self._clients: dict[str, Any] = {}
+        self._waiting: set[threading.Event] = set()  # of calls for their answers
+        self._executors: list[Any] = []
+        self._threads: list[threading.Thread] = []
+
+    def start(self) -> None:
+        """Become a node. Its signals stay the program's.
+
+        Raises:
+            InvalidValue: rclpy is not here.
+        """
+        rclpy = need_rclpy("A ROS 2 node")
+        from rclpy.context import Context
+        from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
+        from rclpy.signals import SignalHandlerOptions
+
+        self._context = Context()
+        rclpy.init(context=self._context, domain_id=self._domain, signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            topics = SingleThreadedExecutor(context=self._context)
+            if self._serves:
+                services = MultiThreadedExecutor(_THREADS, context=self._context)
+            else:
+                services = SingleThreadedExecutor(context=self._context)
+            self._node = self._spinning(self.name, topics)
+            self._caller = self._spinning(f"{self.name}_services", services)
+        except BaseException:
+            self.close()
+            raise
+
+    def _spinning(self, name: str, executor: Any) -> Any:
+        """A new node, whose callbacks `executor` runs."""
+        import rclpy
+
+        node = rclpy.create_node(name, context=self._context, start_parameter_services=False)
+        executor.add_node(node)
+        thread = threading.Thread(target=_spin, args=(executor,), name=name, daemon=True)
+        thread.start()
+        self._executors.append(executor)
+        self._threads.append(thread)
+        return node
+
+    def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
+        """Say that `topic` of type `kind` will be published; a latched one repeats its last message to newcomers."""
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if latch else DurabilityPolicy.VOLATILE
+        with self._lock:
+            if topic not in self._publishers:
+                make, quality = interface(kind, "msg"), QoSProfile(depth=_DEPTH, durability=durability)
+                self._publishers[topic] = (make, self._require_node().create_publisher(make, topic, quality))
+
+    def publish(self, topic: str, message: Message) -> None:
+        """Send `message` on a topic that was advertised.
+
+        Raises:
+            LinkLost: The node is gone, or does not publish this topic.
+            InvalidValue: `message` does not fit its type, or a number in it is not finite.
+        """
+        if topic not in self._publishers:
+            raise LinkLost(f"{topic} is not advertised by the node {self.name}.")
+        make, publisher = self._publishers[topic]
+        made = to_message(make, message, topic)
+        with self._lock:  # not while it is being destroyed
+            self._require_node()
+            publisher.publish(made)
+
+    def publish_all(self, messages: Sequence[tuple[str, Message]]) -> None:
+        """Send several messages, each with its topic, in this order. Raises as `publish`."""
+        for topic, message in messages:
+            self.publish(topic, message)
+
+    def subscribe(self, topic: str, kind: str, listener: Listener) -> Callable[[], None]:
+        """Call `listener` for each message, until what is returned is called."""
+        said = ""  # a refusal is logged once, however often it comes in a row
+
+        def receive(message: Any) -> None:
+            nonlocal said
+            refusal = _refusal(listener, to_dict(message))
+            if refusal and refusal != said:
+                _log.warning("%s", refusal_of(topic, refusal))
+            said = refusal
+
+        node = self._require_node()
+        made = node.create_subscription(interface(kind, "msg"), topic, receive, _DEPTH)
+        return lambda: self._destroy(made)
+
+    def _destroy(self, subscription: Any) -> None:
+        with self._lock:
+            if self._node is not None:
+                self._node.destroy_subscription(subscription)
+
+    def serve(self, service: str, kind: str, handler: Handler) -> None:
+        """Answer `service`, always: ROS has no failed responses, and a client would wait for ever for a missing one.
+
+        Where the handler failed, the response is as ROS makes it, with the error's text where the type has room for it.
+        A service whose type is in no package here is not offered; see `refused`.
+        """
+        from rclpy.callback_groups import ReentrantCallbackGroup
+
+        try:
+            types = interface(kind, "srv")
+        except InvalidValue as error:
+            self.refused[service] = str(error)
+            return
+
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                return to_message(types.Response, handler(to_dict(request), UNKNOWN_CALLER), service)
+            except Exception as error:  # a handler that fails must not end the node
+                _log.warning("%s: %s", service, error, exc_info=not isinstance(error, BamEnvsError))
+                return _with_text(response, str(error))
+
+        self._require_node()
+        self._caller.create_service(types, service, answer, callback_group=ReentrantCallbackGroup())
+
+    def call(self, service: str, kind: str, request: Message, timeout: float) -> dict[str, Any]:
+        """The response of `service` to `request`.
+
+        Raises:
+            InvalidValue: `request` does not fit `kind`, or that is in no package here.
+            LinkLost: There was no answer within `timeout` [s], or before the node was closed.
+        """
+        types, answered = interface(kind, "srv"), threading.Event()
+        made = to_message(types.Request, request, service)
+        with self._lock:
+            self._require_node()
+            if service not in self._clients:
+                self._clients[service] = self._caller.create_client(types, service)
+            client = self._clients[service]
+            future = client.call_async(made)
+            self._waiting.add(answered)
+        future.add_done_callback(lambda _: answered.set())
+        answered.wait(timeout)
+        with self._lock:
+            self._waiting.discard(answered)
+            if not future.done():
+                if self._node is not None:
+                    client.remove_pending_request(future)
+                why = f"in {timeout:g} s" if self._node is not None else "before this node was closed"
+                raise LinkLost(f"{service} did not answer {why}; whether it did what was asked is unknown.")
+        return to_dict(future.result())
+
+    def fields(self, kind: str) -> dict[str, bool]:
+        """The fields of messages of type `kind`; to each, whether it is a list. Nothing for a type that is not here."""
+        try:
+            types = interface(kind, "msg").get_fields_and_field_types()
+        except InvalidValue:
+            return {}
+        return {name: is_list(type_name) for name, type_name in types.items()}
+
+    def is_offered(self, service: str) -> bool:
+        """Whether some node offers `service`."""
+        return any(name == service for name, _ in self._require_node().get_service_names_and_types())
+
+    def is_heard(self, topic: str) -> bool:
+        """Whether some node listens to `topic`."""
+        return bool(self._require_node().count_subscribers(topic))
+
+    def on_leave(self, callback: Callable[[Caller], None]) -> None:
+        """ROS does not say who leaves."""
+
+    def _require_node(self) -> Any:
+        if self._node is None:
+            raise LinkLost(f"The ROS 2 node {self.name} is not running.")
+        return self._node
+
+    def close(self) -> None:
+        """Leave the graph. As often as one likes."""
+        with self._lock:
+            nodes = [node for node in (self._node, self._caller) if node is not None]
+            self._node = self._caller = None
+            self._publishers, self._clients = {}, {}
+            for answered in self._waiting:
+                answered.set()
+        executors, threads = self._executors, self._threads
+        self._executors, self._threads = [], []
+        for executor in executors:
+            executor.shutdown()
+        for thread in threads:
+            thread.join()
+        for executor in executors:
+            _end_workers(executor)
+        for node in nodes:
+            node.destroy_node()
+        if self._context is not None:
+            self._context.try_shutdown()
+
+
+def _refusal(listener: Listener, message: Message) -> str:
+    """Why `listener` refuses `message`, which ROS has no way of telling its sender; empty if it does not."""
+    try:
+        listener(message, UNKNOWN_CALLER)
+    except BamEnvsError as error:
+        return str(error)
+    except Exception as error:  # it must not end the thread of every topic, among them the one that halts
+        _log.exception("a listener failed")
+        return f"{type(error).__name__}: {error}"
+    return ""
+
+
+def _spin(executor: Any) -> None:
+    from rclpy.executors import ExternalShutdownException
+
+    try:
+        executor.spin()
+    except ExternalShutdownException:
+        _log.info("the node was shut down")
+
+
+def _end_workers(executor: Any) -> None:
+    """Its own shutdown leaves the threads of a MultiThreadedExecutor waiting for ever."""
+    pool = getattr(executor, "_executor", None)
+    if pool is not None:
+        pool.shutdown()
+
+
+def _with_text(response: Any, text: str) -> Any:
+    """`response` with `text` in the field for people that many types have."""
+    if "message" in response.get_fields_and_field_types():
+        response.message = text
+    return response
+
+
+def need_rclpy(purpose: str) -> Any:
+    """The package rclpy.
+
+    Raises:
+        InvalidValue: It is not here.
+    """
+    try:
+        return importlib.import_module("rclpy")
+    except ModuleNotFoundError as error:
+        raise InvalidValue(
+            f"{purpose} needs {error.name}, which this Python does not have. Source a ROS 2 installation, such as "
+            f"/opt/ros/jazzy/setup.bash, or run: {_INSTALL}"
+        ) from error
+
+
+def interface(kind: str, family: str) -> Any:
+    """The class of `kind`, such as ``std_msgs/String``; `family` is ``msg`` or ``srv``.
+
+    Raises:
+        InvalidValue: It is no such name, or its package is not here.
+    """
+    match = _KIND.fullmatch(kind)
+    if match is None:
+        raise InvalidValue(f"A ROS type is called pkg/Type, not {kind!r}.")
+    module = f"{match['package']}.{family}"
+    try:
+        return getattr(importlib.import_module(module), match["name"])
+    except (ModuleNotFoundError, AttributeError) as error:
+        raise InvalidValue(f"{kind} is in no package of this Python; source a ROS 2 workspace that has it.") from error
+
+
+def to_dict(message: Any) -> dict[str, Any]:
+    """The fields of `message`, as rosbridge writes them; a byte array is `bytes`."""
+    types = message.get_fields_and_field_types()
+    return {name: _plain(getattr(message, name), kind) for name, kind in types.items()}
+
+
+def _plain(value: Any, kind: str) -> Any:
+    element = _element(kind)
+    if element in _BYTES:
+        return b"".join(value) if element == "octet" else bytes(value)
+    if element is not None:
+        return [_plain(one, element) for one in value] if "/" in element else _listed(value)
+    if "/" in kind:
+        return to_dict(value)
+    return value[0] if isinstance(value, bytes) else value
+
+
+def _listed(value: Any) -> list[Any]:
+    return value.tolist() if hasattr(value, "tolist") else list(value)
+
+
+def is_list(kind: str) -> bool:
+    """Whether fields of the type `kind`, as ROS 2 writes it, are lists."""
+    return _element(kind) is not None
+
+
+def _element(kind: str) -> str | None:
+    """What a list type is a list of; None for what is no list."""
+    match = _LIST.fullmatch(kind)
+    return None if match is None else match["open"] or match["fixed"]
+
+
+def to_message(make: Any, fields: Mapping[str, Any], where: str) -> Any:
+    """A message of the class `make`; fields that `fields` has not are as ROS makes them.
+
+    Raises:
+        InvalidValue: A field that the type has not, or a value that does not fit or is not finite.
+    """
+    message = make()
+    types = make.get_fields_and_field_types()
+    for name, value in fields.items():
+        if name not in types:
+            raise InvalidValue(f"{where} has no field {name!r}; it has {', '.join(types)}.")
+        setattr(message, name, _ros(value, types[name], getattr(message, name), f"{where}.{name}"))
+    return message
+
+
+def _ros(value: Any, kind: str, default: Any, where: str) -> Any:
+    element = _element(kind)
+    if element is None:
+        return _single(value, kind, type(default), where)
+    if element in _BYTES and isinstance(value, (bytes, bytearray)):
+        return [bytes([one]) for one in value] if element == "octet" else array("B", value)
+    if not isinstance(value, Sequence) or isinstance(value, (str, bytes, bytearray)):
+        raise InvalidValue(f"{where} must be {kind}, not {value!r}.")
+    make = interface(element, "msg") if "/" in element else None
+    values = [_single(one, element, make, f"{where}[{i}]") for i, one in enumerate(value)]
+    return array(_FLOATS[element], values) if kind.startswith("sequence") and element in _FLOATS else values
+
+
+def _single(value: Any, kind: str, make: Any, where: str) -> Any:
+    """The generated setters check nothing unless they are asked to, and what is wrong then goes wrong in C."""
+    if "/" in kind:
+        if not isinstance(value, Mapping):
+            raise InvalidValue(f"{where} must be an object with the fields of {kind}, not {value!r}.")
+        return to_message(make, value, where)
+    if kind in _FLOATS and _is_number(value):
+        return float(value)
+    if kind in _INTEGERS and _is_number(value) and value == int(value) and _fits(int(value), kind):
+        return int(value)
+    if kind == "boolean" and isinstance(value, bool):
+        return value
+    if kind.startswith(("string", "wstring")) and isinstance(value, str):
+        return value
+    if kind == "octet" and _is_number(value) and _fits(int(value), "uint8"):
+        return bytes([int(value)])
+    raise InvalidValue(f"{where} must be a {'finite ' if kind in _FLOATS else ''}{kind}, not {value!r}.")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _fits(value: int, kind: str) -> bool:
+    sign, bits = _INTEGERS[kind]
+    low, high = (0, 2**bits) if sign == "u" else (-(2 ** (bits - 1)), 2 ** (bits - 1))
+    return bool(low <= value < high)

@@ -1,0 +1,299 @@
+"""RosbridgeTransport: an environment behind the GymAPI service of a rosbridge server, ours or a BAM rack's."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import time
+from contextlib import suppress
+from typing import Any
+
+from gymnasium import Space
+
+from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, ProtocolError, RemoteError, UnknownName
+from bam_envs.remote.foreign_rack import ForeignRack, LastKnown
+from bam_envs.remote.gymapi.actions import DEFAULT
+from bam_envs.remote.gymapi.codec import EnvCodec
+from bam_envs.remote.gymapi.requests import (
+    KIND,
+    GymRequest,
+    RequestType,
+    base_name,
+    plain_seed,
+    refuse_foreign,
+    service_name,
+    whole_request,
+    write_request,
+)
+from bam_envs.remote.gymapi.responses import GymResponse, read_response
+from bam_envs.remote.transport import EnvSpecMessage, Info, spec_from_json, spec_to_json
+from bam_envs.ros.freshness import Tagger
+from bam_envs.rosbridge.endpoint import Endpoint
+from bam_envs.rosbridge.link.link import RosbridgeLink
+from bam_envs.rosbridge.sessions import is_over, read_session
+from bam_envs.rosbridge.string_rpc import StringRpc
+
+_QUESTIONS = 3
+"""How often it is asked who it is: a ROS 2 bridge makes a client for each call, and the answer is lost where it comes
+before the two ends have found each other."""
+CHANNELS = ("service", "topics")
+_CLOSE_TIMEOUT = 1.0  # [s]; a server that is gone must not hold up `close`
+
+
+class RosbridgeTransport:
+    """Carries an environment through rosbridge. One request at a time; `close` may be called from any thread.
+
+    A bam-train server describes its environment when it is asked. Another rack does not: then the spaces must be
+    given, and nothing is asked that it may not know.
+
+    Args:
+        url: ``ws://host:port/namespace`` or ``wss://…``; the namespace may be left out.
+        env_id: The environment that is wanted, as the server calls it; "" for the one that is there.
+        channel: ``"service"``, which every rack has, or ``"topics"``, a pair of topics, which our servers have and
+            which is several times faster through a real rosbridge.
+        timeout: Longest time for a request [s]; a rack's pick takes seconds.
+        connect_timeout: Longest time to connect [s].
+        name: What other clients are told of this one; computer and process by default.
+        ca_file: PEM file of the authorities to trust instead of the system's.
+        token: The server's shared secret, if it has one.
+        take: Take command from whoever has it.
+        observation_space: Of another rack; see `ForeignRack`.
+        action_space, num_envs, period, action_type, gymapi_version, autoreset: Likewise.
+
+    Raises:
+        InvalidValue: The URL or an option is not possible.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        env_id: str = "",
+        *,
+        channel: str = "service",
+        timeout: float = 30.0,
+        connect_timeout: float = 3.0,
+        name: str | None = None,
+        ca_file: str | None = None,
+        token: str | None = None,
+        take: bool = False,
+        observation_space: Space[Any] | None = None,
+        action_space: Space[Any] | None = None,
+        num_envs: int = 1,
+        period: float | None = None,
+        action_type: int = DEFAULT,
+        gymapi_version: str | None = None,
+        autoreset: bool | None = None,
+    ) -> None:
+        if channel not in CHANNELS:
+            raise InvalidValue(f"The channel must be service or topics, not {channel!r}.")
+        if timeout <= 0 or connect_timeout <= 0:
+            raise InvalidValue(f"Time-outs must be above 0 s, not {timeout:g} and {connect_timeout:g}.")
+        self.url, self.env_id, self.channel = url, env_id, channel
+        self.timeout, self.connect_timeout, self.take = timeout, connect_timeout, take
+        self._rack = ForeignRack(
+            observation_space, action_space, num_envs, period, action_type, gymapi_version, autoreset
+        )
+        self._version, self._last_known = self._rack.version, LastKnown()
+        self._name, self._tagger, self._lock = name, Tagger(), threading.Lock()
+        self._ca_file, self._token = ca_file, token
+        self._link = self._make_link()
+        self._rpc = self._make_rpc()
+        self._pid = os.getpid()
+        self._there: EnvCodec | None = None
+        self._described_epoch: int | None = None
+        self._known_epoch: int | None = None  # of the connection on which the state over there is known
+        self._closed = False
+
+    def connect(self) -> EnvSpecMessage:
+        """Open the link and learn what is there; moves nothing.
+
+        Raises:
+            NoServer: Nobody there, no such environment, or another rack whose spaces were not given.
+        """
+        with self._lock:
+            return self._connect().spec
+
+    def reset(self, seed: int | list[int | None] | None = None, options: Info | None = None) -> tuple[Any, Any]:
+        """Begin an episode; waits for a link that dropped as long as connecting may take."""
+        with self._lock:
+            there = self._connect()
+            self._known_epoch = None
+            request: dict[str, Any] = {"seed": plain_seed(seed), "options": options, "take": self.take}
+            if there.foreign:
+                refuse_foreign(request["seed"], options)
+            epoch = self._link.epoch
+            observation, *_, info = there.read_result(self._ask(RequestType.RESET, **request))
+            self._known_epoch = epoch
+            self._last_known.begin(observation)
+            return observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
+        """(observation, reward, terminated, truncated, info). Sent once, or not at all.
+
+        Raises:
+            LinkLost: Nothing was sent: the link is down, or it dropped or timed out since the last reset.
+        """
+        with self._lock:
+            there = self._there
+            if there is None or self._closed or self._known_epoch != self._link.epoch or os.getpid() != self._pid:
+                raise LinkLost(f"{self.url}: {self._why_unknown()}, and nothing was sent. Call reset() first.")
+            result = there.read_result(self._ask(RequestType.STEP, actions=there.write_actions(action)))
+            return self._last_known.instead(result, there.spec.vector) if self._begins_next(there) else result
+
+    def close(self) -> None:
+        """Let go of the environment there and drop the link; a request under way ends with `LinkLost`."""
+        if os.getpid() != self._pid:
+            return  # the link is the parent's
+        self._closed = True
+        if self._lock.acquire(blocking=False):
+            try:
+                self._leave()
+            finally:
+                self._lock.release()
+        self._rpc.close()
+        self._link.close()
+
+    def _begins_next(self, there: EnvCodec) -> bool:
+        """Whether what it observes at the end of an episode is the first observation of the next one."""
+        by_version = self._version is not None and self._version.june
+        return there.foreign and (by_version if self._rack.autoreset is None else self._rack.autoreset)
+
+    def _why_unknown(self) -> str:
+        if self._closed:
+            return "this transport is closed"
+        if self._there is None or os.getpid() != self._pid:
+            return "the link is not open"
+        return "the link was lost, so what the environment did since is unknown"
+
+    def _leave(self) -> None:
+        if self._there is not None and self._link.is_up:
+            # A server of ours finds out by itself that the link is gone.
+            with suppress(LinkLost, ProtocolError, RemoteError):
+                self._ask(RequestType.CLOSE, timeout=min(self.timeout, _CLOSE_TIMEOUT))
+
+    def _make_link(self) -> RosbridgeLink:
+        return RosbridgeLink(Endpoint(self.url, self._ca_file, self._token, self.connect_timeout), name="gymapi")
+
+    def _make_rpc(self) -> StringRpc:
+        return StringRpc(self._link, base_name(self._link.namespace), self._tagger)
+
+    def _connect(self) -> EnvCodec:
+        if self._closed:
+            raise LinkLost(f"{self.url}: this transport is closed; make a new one.")
+        if os.getpid() != self._pid:  # after a fork the link is the parent's, which must not notice
+            self._link, self._pid, self._tagger = self._make_link(), os.getpid(), Tagger()
+            self._rpc, self._there = self._make_rpc(), None
+        if self._there is None:
+            self._link.connect()
+        else:
+            self._link.wait_up(self.connect_timeout)
+        if self._there is None or self._described_epoch != self._link.epoch:
+            self._there = self._described()
+            if self.channel == "topics" and not self._there.foreign and not self._tagger.signs:
+                self._open_session()
+        return self._there
+
+    def _open_session(self) -> None:
+        """What is asked on topics can be read by everybody, and is signed."""
+        service = f"{base_name(self._link.namespace)}/session"
+        try:
+            answer = self._link.call(service, "std_srvs/Trigger", {}, self.connect_timeout)
+        except RemoteError:  # an older server
+            return
+        self._sign_with(read_session(answer, service))
+
+    def _sign_with(self, tagger: Tagger) -> None:
+        self._rpc.close()
+        self._tagger = tagger
+        self._rpc = self._make_rpc()
+
+    def _described(self) -> EnvCodec:
+        """What is there on this connection; it must be what was there on the one before."""
+        epoch, before = self._link.epoch, self._there
+        there = self._rack.codec(self.env_id) if self._rack.is_described else self._asked()
+        if before is not None and spec_to_json(before.spec) != spec_to_json(there.spec):
+            raise ProtocolError(f"{self.url}: it serves another environment than before: {there.spec.env_id}.")
+        self._described_epoch = self._known_epoch = epoch
+        return there
+
+    def _asked(self) -> EnvCodec:
+        """What is there, by its own words; an answer that says nothing of it is that of somebody else's rack."""
+        try:
+            response = self._introduction()
+        except RemoteError as error:  # no such service, or a rack that fails at what it does not know
+            return self._foreign(str(error))
+        except LinkLost as error:
+            raise NoServer(self.url, f"rosbridge is there, and {self._where()} is silent: {error}") from error
+        if response.error is not None and response.ours:
+            raise NoServer(self.url, str(response.error)) from response.error
+        spec = response.exact[0].get("spec") if response.exact else None
+        if spec is None:
+            return self._foreign(str(response.error or "it does not describe its environment"))
+        return EnvCodec(spec_from_json(spec))
+
+    def _introduction(self, questions: int = _QUESTIONS) -> GymResponse:
+        """What it answers when it is asked who it is; asked again while nothing comes, for that moves nothing."""
+        try:
+            return self._exchange(RequestType.NONE, None, timeout=max(self.connect_timeout, 1.0) / _QUESTIONS)
+        except RemoteError as error:
+            if not is_over(error):
+                raise
+            self._sign_with(Tagger())
+            return self._introduction(questions)
+        except LinkLost:
+            if questions == 1:
+                raise
+        return self._introduction(questions - 1)
+
+    def _foreign(self, reason: str) -> EnvCodec:
+        if "does not exist" in reason:  # the words of every bridge but one, whose text does not say
+            raise NoServer(self.url, f"{reason}. {self._remedy()}")
+        try:
+            return self._rack.codec(self.env_id)
+        except UnknownName as error:
+            raise NoServer(
+                self.url,
+                f"{self._where()}: {reason.rstrip('.')}; give observation_space and action_space, or an env_id that is "
+                f"registered here. {self._remedy()}",
+            ) from error
+
+    def _where(self) -> str:
+        namespace = self._link.namespace
+        return service_name(namespace) if self.channel == "service" else f"{base_name(namespace)}/request"
+
+    def _remedy(self) -> str:
+        namespace = f" --namespace {self._link.namespace.strip('/')}" if self._link.namespace else ""
+        return f"Start one: bam-serve --env {self.env_id or 'bam/pick'}{namespace}"
+
+    def _ask(self, kind: RequestType, **fields: Any) -> GymResponse:
+        """A success. Whatever else comes but a refusal, the state over there is unknown until the next reset."""
+        epoch = self._known_epoch if kind is RequestType.STEP else self._link.epoch
+        try:
+            response = self._exchange(kind, epoch, **fields)
+        except RemoteError:
+            raise
+        except BaseException:  # also Ctrl-C: the request may be under way
+            self._known_epoch = None
+            raise
+        if response.error is not None:
+            raise response.error
+        return response
+
+    def _exchange(
+        self, kind: RequestType, epoch: int | None, *, timeout: float | None = None, **fields: Any
+    ) -> GymResponse:
+        limit = self.timeout if timeout is None else timeout
+        foreign = self._there is not None and self._there.foreign
+        tag = None if foreign or epoch is None else self._tagger.next(epoch, limit)
+        client = self._name or f"{socket.gethostname()}:{self._pid}"
+        request = GymRequest(kind, client_id=client, env_name=self.env_id, tag=tag, **fields)
+        message = write_request(request, self._link.stamp(time.time()))
+        if foreign:
+            message = whole_request(message, self._version)
+        if self.channel == "topics":
+            response = read_response(self._rpc.call(message, limit))
+        else:
+            response = read_response(self._link.call(service_name(self._link.namespace), KIND, message, limit))
+        self._version = self._version or response.version
+        return response

@@ -1,0 +1,148 @@
+"""Transports within one process: `LocalTransport`, with the checks of the others, and `FakeTransport` for tests."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import Space, spaces
+from numpy.typing import NDArray
+
+from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, RemoteError
+from bam_envs.remote.serve.env_server import Env, EnvServer
+from bam_envs.remote.transport import EnvSpecMessage, Info, Seed
+
+
+class LocalTransport:
+    """Carries nothing anywhere. Results are those of the other transports bit for bit.
+
+    Args:
+        env: A Gymnasium environment, a vector environment (see `EnvServer`), or a server, which others may share.
+        client: The name of this client for a shared server.
+    """
+
+    def __init__(self, env: Env | EnvServer, client: str = "local") -> None:
+        self.server = env if isinstance(env, EnvServer) else EnvServer(env)
+        self.client = client
+        self._owned = not isinstance(env, EnvServer)
+        self._closed = False
+
+    def connect(self) -> EnvSpecMessage:
+        """Return the description of the environment."""
+        self._require_open()
+        return self.server.spec()
+
+    def reset(self, seed: Seed = None, options: Info | None = None) -> tuple[Any, Any]:
+        """Begin an episode; (observation, info)."""
+        return self._asked(lambda: self.server.reset(self.client, seed, options))
+
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
+        """(observation, reward, terminated, truncated, info)."""
+        return self._asked(lambda: self.server.step(self.client, action))
+
+    def close(self) -> None:
+        """Release the environment; one that no server shares is closed."""
+        self._closed = True
+        self.server.leave(self.client)
+        if self._owned:
+            self.server.close()
+
+    def _asked(self, call: Callable[[], Any]) -> Any:
+        self._require_open()
+        try:
+            return call()
+        except (RemoteError, InvalidValue):
+            raise
+        except BamEnvsError as error:  # as it would come back over a network
+            raise RemoteError(str(error)) from error
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise LinkLost("This transport is closed; make a new one.")
+
+
+class FakeEnv(gym.Env[Any, Any]):
+    """Its observations are samples of their space; the reward is the number of the step.
+
+    Args:
+        observation_space: Three numbers by default.
+        action_space: Two numbers from -1 to 1 by default.
+        episode_steps: Steps after which an episode is terminated.
+    """
+
+    def __init__(
+        self,
+        observation_space: Space[Any] | None = None,
+        action_space: Space[Any] | None = None,
+        episode_steps: int = 10,
+    ) -> None:
+        self.observation_space = observation_space or spaces.Box(-10.0, 10.0, (3,))
+        self.action_space = action_space or spaces.Box(-1.0, 1.0, (2,))
+        self.episode_steps, self.elapsed = episode_steps, 0
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
+        """Begin an episode; the info holds the options."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self.observation_space.seed(seed)
+        self.elapsed = 0
+        return self.observation_space.sample(), {"options": options or {}}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
+        """One step; the info holds the number of the step, also as an array."""
+        self.elapsed += 1
+        steps: NDArray[np.int32] = np.array([self.elapsed], np.int32)
+        info = {"elapsed": self.elapsed, "steps": steps}
+        return self.observation_space.sample(), float(self.elapsed), self.elapsed >= self.episode_steps, False, info
+
+
+class FakeTransport(LocalTransport):
+    """Records its calls, and fails when it is told to.
+
+    ::
+
+        transport = FakeTransport()
+        env = RemoteEnv(transport)
+        env.reset(seed=1)
+        transport.faults.append(LinkLost("the cable is out"))
+        env.step(env.action_space.sample())  # raises it
+        assert transport.calls == [("connect",), ("reset", 1, None), ("step", …)]
+
+    Args:
+        env: What it carries; a `FakeEnv` by default.
+    """
+
+    def __init__(self, env: Env | None = None) -> None:
+        super().__init__(FakeEnv() if env is None else env)
+        self.calls: list[tuple[Any, ...]] = []
+        """Every call: its name and its arguments."""
+        self.faults: deque[BaseException] = deque()
+        """Raised by the next calls of `reset` and `step`, one each, which do nothing then."""
+
+    def connect(self) -> EnvSpecMessage:
+        """Return the description of the environment."""
+        self.calls.append(("connect",))
+        return super().connect()
+
+    def reset(self, seed: Seed = None, options: Info | None = None) -> tuple[Any, Any]:
+        """Begin an episode; (observation, info)."""
+        self._record("reset", seed, options)
+        return super().reset(seed, options)
+
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
+        """(observation, reward, terminated, truncated, info)."""
+        self._record("step", action)
+        return super().step(action)
+
+    def close(self) -> None:
+        """Release the environment."""
+        self.calls.append(("close",))
+        super().close()
+
+    def _record(self, *call: Any) -> None:
+        self.calls.append(call)
+        if self.faults:
+            raise self.faults.popleft()

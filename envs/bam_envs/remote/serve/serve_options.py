@@ -1,0 +1,136 @@
+"""Where an environment is served, and how its time passes; imports nothing that serves."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from dataclasses import dataclass
+
+from bam_envs.core.errors import InvalidValue
+from bam_envs.remote.gymapi.versions import version_named
+from bam_envs.remote.serve.command_lease import LEASE_SECONDS
+
+_NAMESPACE = re.compile(r"(/[A-Za-z]\w*)*")
+
+
+@dataclass(frozen=True)
+class ServeOptions:
+    """Where an environment is served, and how its time passes."""
+
+    port: int = 9090
+    """Port of the rosbridge server; 0 takes a free one."""
+    bind: str = "127.0.0.1"
+    """Address to listen on; 127.0.0.1 is this computer alone, 0.0.0.0 every network it is in."""
+    namespace: str = ""
+    """Name before every topic and service, such as bam_001."""
+    tcp: int | None = None
+    """Serve the environment on this TCP port too, which is faster; 0 takes a free one."""
+    via: str | None = None
+    """Offer everything through the rosbridge server at this address (ws://10.0.0.5:9090) instead of one here."""
+    rclpy: bool = False
+    """Be a ROS 2 node instead of a rosbridge server; needs rclpy."""
+    realtime: bool = False
+    """Time passes as on the clock: the default of an environment with a robot."""
+    fast: bool = False
+    """Time passes only with steps and commands, as fast as they come: the default of other environments."""
+    lease: float = LEASE_SECONDS
+    """A client that gives no sign of life for so long may lose command to another one [s]."""
+    cert: str | None = None
+    """Certificate in PEM, for wss:// instead of ws://."""
+    key: str | None = None
+    """Its key, if it is in another file."""
+    token_file: str | None = None
+    """File with a secret that clients must show; with --via, the one to show there."""
+    operator_token_file: str | None = None
+    """File with another secret: who shows that one may take command from others."""
+    no_token: bool = False
+    """Listen on a network without a token: whoever reaches this computer may command what is served."""
+    ca_file: str | None = None
+    """With --via wss://: certificates to trust instead of the system's."""
+    image_format: str = "png"
+    """Images as png, which keeps every bit, or jpeg."""
+    gymapi_version: str | None = None
+    """Version of bam_msgs/GymAPI, where clients do not show theirs: 2025-05-24, 2025-06-17 or 2025-06-22 (default)."""
+
+    def require_sane(self) -> None:
+        """Refuse what excludes each other.
+
+        Raises:
+            InvalidValue: Names the flags.
+        """
+        pairs = (("realtime", "fast"), ("via", "rclpy"), ("via", "cert"), ("rclpy", "cert"))
+        for one, other in pairs:
+            if getattr(self, one) and getattr(self, other):
+                raise InvalidValue(f"--{one} and --{other} exclude each other; give one of the two.")
+        if self.cert and self.tcp is not None:
+            raise InvalidValue(
+                "--tcp carries everything in the clear, and --cert does not change that; leave one of the two out."
+            )
+        for flag, value, needed in (("key", self.key, "cert"), ("ca-file", self.ca_file, "via")):
+            if value and not getattr(self, needed):
+                raise InvalidValue(f"--{flag} means something only with --{needed}.")
+        if self.rclpy and self.token_file and self.tcp is None:
+            raise InvalidValue("--token-file protects nothing with --rclpy: ROS 2 has no token. Leave it out.")
+        self._require_guarded()
+        if not self.lease > 0:
+            raise InvalidValue(f"--lease must be above 0 s, not {self.lease:g}.")
+        for flag, port in (("port", self.port), ("tcp", self.tcp)):
+            if port is not None and not 0 <= port <= 65535:
+                raise InvalidValue(f"--{flag} must be 0 to 65535, not {port}.")
+        if self.gymapi_version is not None:
+            version_named(self.gymapi_version)
+        if not _NAMESPACE.fullmatch(self.prefix):
+            raise InvalidValue(f"--namespace must be letters, digits and _, such as bam_001, not {self.namespace!r}.")
+
+    def _require_guarded(self) -> None:
+        """Nobody is let in from a network by oversight.
+
+        Raises:
+            InvalidValue: Names the flags.
+        """
+        if self.no_token and self.token_file:
+            raise InvalidValue("--no-token and --token-file exclude each other; give one of the two.")
+        if self.operator_token_file and not self.listens:
+            raise InvalidValue("--operator-token-file means something only where clients connect to this program.")
+        if self._is_open and not self.token_file and not self.no_token:
+            raise InvalidValue(
+                f"Anybody who reaches {self._place} could command what is served here: give --token-file, or "
+                "--bind 127.0.0.1; or --no-token, if everybody there is to."
+            )
+
+    @property
+    def listens(self) -> bool:
+        """Whether clients connect to this program."""
+        return self.tcp is not None or not (self.via or self.rclpy)
+
+    @property
+    def _is_open(self) -> bool:
+        """Whether other computers reach it."""
+        return self.listens and not _is_loopback(self.bind)
+
+    @property
+    def _place(self) -> str:
+        return self.bind or "every address of this computer"
+
+    @property
+    def warning(self) -> str | None:
+        """What people should know of where it listens, in one line; None if there is nothing."""
+        if not self._is_open or self.cert:
+            return None
+        if self.no_token:
+            return f"Anybody who reaches {self._place} may command what is served here, as --no-token says."
+        clear = f"The token travels in the clear to {self._place}, and so does all else"
+        return f"{clear}: give --cert, or trust that network."
+
+    @property
+    def prefix(self) -> str:
+        """What stands before every name: ``/bam_001``, or nothing."""
+        stripped = self.namespace.strip("/")
+        return f"/{stripped}" if stripped else ""
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:  # a name: only this one is sure to stay on this computer
+        return host == "localhost"

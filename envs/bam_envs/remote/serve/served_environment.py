@@ -1,0 +1,250 @@
+"""Everything that `bam-serve` runs beside an environment: its robot's topics, its services, and what carries them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Any
+
+from bam_envs.core.errors import InvalidValue, LinkLost, RemoteError
+from bam_envs.remote.gymapi.requests import base_name, service_name
+from bam_envs.remote.ros2_node import RclpyBus
+from bam_envs.remote.serve.command_lease import CommandLease
+from bam_envs.remote.serve.env_server import Env, EnvServer
+from bam_envs.remote.serve.gymapi_service import GymApiService
+from bam_envs.remote.serve.refused import Refusals, refusal_lines
+from bam_envs.remote.serve.robot_service import RobotService
+from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.served_robot import ServedRobot
+from bam_envs.remote.serve.tcp_server import TcpServer
+from bam_envs.robots.profiles.profile import profile_for
+from bam_envs.ros.codec import INFO_SERVICE
+from bam_envs.ros.profile_tables import RobotProfile
+from bam_envs.rosbridge.bus import Bus
+from bam_envs.rosbridge.endpoint import Endpoint
+from bam_envs.rosbridge.link.link import RosbridgeLink
+from bam_envs.rosbridge.server.server import BridgeServer
+from bam_envs.rosbridge.tokens import read_token
+from bam_envs.safety.gate import SafeRobot
+
+_LOOK = 3.0
+"""How long a robot that may be there already may take to answer [s]."""
+
+
+class ServedEnvironment:
+    """An environment and everything that serves it. A context manager; entering starts it.
+
+    Args:
+        env: The environment; it is closed at the end.
+        options: Where and how.
+        tell: Called with a line for people whenever command changes hands, or a link comes and goes.
+
+    Raises:
+        InvalidValue: Options that exclude each other.
+        RemoteError: On entering: the server of `via` carries nothing of use.
+    """
+
+    def __init__(self, env: Env, options: ServeOptions, tell: Callable[[str], None] = lambda line: None) -> None:
+        options.require_sane()
+        self.env, self.options = env, options
+        self.endpoints: list[str] = []
+        """One line for each way in; known when it is started."""
+        self.lease = CommandLease(options.lease)
+        """Who is in command."""
+        self.bus: Bus | None = None
+        """What carries topics and services."""
+        self.tcp: TcpServer | None = None
+        """The TCP transport, if there is one."""
+        self._tell, self._stack = tell, ExitStack()
+        self._robot_service: RobotService | None = None
+        self._refusals: Refusals | None = None
+        self._token = _token(options.token_file, private=options.listens)
+        self._operator_token = _token(options.operator_token_file, private=True)
+
+    def __enter__(self) -> ServedEnvironment:
+        with ExitStack() as started:
+            started.callback(self.env.close)
+            self._start(started)
+            self._stack = started.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Halt the robot, say goodbye, close the environment. As often as one likes."""
+        self._stack.close()
+
+    def require_running(self) -> None:
+        """Nothing that it needs has ended.
+
+        Raises:
+            RemoteError: The robot's clock stands still.
+        """
+        if self._robot_service is not None and not self._robot_service.clock.running:
+            raise RemoteError("The clock of the robot stands still.")
+
+    def _start(self, started: ExitStack) -> None:
+        profile = _profile_of(self.env)
+        realtime = self.options.realtime or (profile is not None and not self.options.fast)
+        robot = None if profile is None else _take_robot(self.env, profile, realtime)
+        server = EnvServer(self.env, lease=self.lease, realtime=realtime and robot is None)
+        started.callback(server.close)
+        self.lease.on_change(self._say_command)
+        if self.options.warning is not None:
+            self._tell(self.options.warning)
+        self.bus = bus = self._open_bus(started)
+        if robot is not None and profile is not None:
+            self._require_own_names(bus)
+            self._robot_service = RobotService(robot, profile, bus, self.lease, namespace=self.prefix)
+            started.callback(self._robot_service.close)
+            self._robot_service.start()
+        started.callback(server.end)  # while the robot's clock still ticks: a step that runs waits for it
+        service = GymApiService(
+            server,
+            bus,
+            self.prefix,
+            image_format=self.options.image_format,
+            version=self.options.gymapi_version,
+        )
+        started.callback(service.close)
+        service.start()
+        name = server.spec().env_id
+        pace = "real time" if realtime else "fast"
+        offered = self._offered(profile, self._refused())
+        if offered:
+            self.endpoints.append(f"{name} on {self._where(bus)}, {pace}: {offered}")
+        if self.options.tcp is not None:
+            self.tcp = TcpServer(
+                server,
+                self.options.bind,
+                self.options.tcp,
+                token=self._token,
+                operator_token=self._operator_token,
+            )
+            started.callback(self.tcp.close)
+            self.tcp.start()
+            self.endpoints.append(f"{name} on {self.tcp.url}, the environment alone")
+
+    @property
+    def prefix(self) -> str:
+        """What stands before every name; that of the address of ``--via`` if no other is given."""
+        inherited = self.bus.namespace if isinstance(self.bus, RosbridgeLink) else ""
+        return self.options.prefix or inherited
+
+    def _open_bus(self, started: ExitStack) -> Bus:
+        options = self.options
+        if options.rclpy:
+            node = RclpyBus()
+            started.callback(node.close)
+            node.start()
+            return node
+        if options.via is not None:
+            link = RosbridgeLink(Endpoint(options.via, options.ca_file, self._token), name="serve")
+            started.callback(link.close)
+            link.on_down(self._say_down)
+            self._refusals = Refusals(link)
+            link.connect()
+            return link
+        server = BridgeServer(
+            options.bind,
+            options.port,
+            cert=options.cert,
+            key=options.key,
+            token=self._token,
+            operator_token=self._operator_token,
+        )
+        started.callback(server.close)
+        return server.start()
+
+    def _require_own_names(self, bus: Bus) -> None:
+        """Two robots under the same names would both do what a client tells one of them."""
+        if not isinstance(bus, RosbridgeLink):
+            return
+        service = self.prefix + INFO_SERVICE
+        try:
+            bus.call(service, "", {}, _LOOK)
+        except RemoteError:  # there is none
+            return
+        raise InvalidValue(
+            f"{self.options.via}: {service} answers there already, so another robot has these names. "
+            "Give this one names of its own: --namespace NAME."
+        )
+
+    def _refused(self) -> frozenset[str]:
+        """Names that the server of ``--via``, or ROS 2 here, does not carry; people are told why."""
+        if isinstance(self.bus, RclpyBus):
+            for name, reason in self.bus.refused.items():
+                self._tell(f"{name} is not offered: {reason}")
+            return frozenset(self.bus.refused)
+        if self._refusals is None:
+            return frozenset()
+        refused = self._refusals.look()
+        for line in refusal_lines(str(self.options.via), refused):
+            self._tell(line)
+        if self._refusals.unchecked:
+            self._tell(f"{self.options.via} does not say what it carries: rosapi, which lists it, does not run there.")
+        return frozenset(refused)
+
+    def _offered(self, profile: RobotProfile | None, refused: frozenset[str]) -> str:
+        """What is of use in spite of what is `refused`.
+
+        Raises:
+            RemoteError: Nothing, and there is no other way in.
+        """
+        prefix, base = self.prefix, base_name(self.prefix)
+        offered = [service_name(prefix)] if service_name(prefix) not in refused else []
+        if not offered and not refused & {f"{base}/request", f"{base}/reply"}:
+            offered = [f'{base}/request and reply (channel="topics")']
+        if profile is not None and _is_usable(profile, prefix, refused):
+            offered.append(f"a {profile.name}'s topics{f' under {prefix}' if prefix else ''}")
+        if not offered and self.options.tcp is None:
+            raise RemoteError(f"{self.options.via or 'ROS 2 here'} carries nothing of use of what is served here.")
+        return " and ".join(offered)
+
+    def _where(self, bus: Bus) -> str:
+        if isinstance(bus, RclpyBus):
+            return f"the ROS 2 graph as the node {bus.name}"
+        return str(getattr(bus, "url", "a bus"))
+
+    def _say_command(self, before: str | None, after: str | None) -> None:
+        self._tell(f"{before} is no longer in command" if after is None else f"{after} is in command")
+
+    def _say_down(self, error: LinkLost) -> None:
+        self._tell(f"{error} It is tried again until it is back; the robot rests meanwhile.")
+
+
+def _token(path: str | None, *, private: bool) -> str | None:
+    return None if path is None else read_token(path, private=private)
+
+
+def _profile_of(env: Env) -> RobotProfile | None:
+    """The topics of the environment's robot, if it is alone, simulated, and one that a profile describes."""
+    robot: Any = getattr(env.unwrapped, "robot", None)
+    if getattr(robot, "num_robots", 0) != 1 or isinstance(robot, SafeRobot):  # a live one has topics of its own
+        return None
+    try:
+        return profile_for(robot.spec)
+    except InvalidValue:  # then its environment is served without topics
+        return None
+
+
+def _take_robot(env: Env, profile: RobotProfile, realtime: bool) -> ServedRobot:
+    """Put a `ServedRobot` between the environment and its robot, at the start of an episode."""
+    inner: Any = env.unwrapped
+    resting = any(sink.hold == "zero" for way in profile.commands.values() for sink in way)
+    life = profile.command_life(inner.robot.spec.period)
+    robot = ServedRobot(inner.robot, command_timeout=life, zero_rests=resting, realtime=realtime)
+    inner.robot = robot
+    env.reset()
+    return robot
+
+
+def _is_usable(profile: RobotProfile, prefix: str, refused: frozenset[str]) -> bool:
+    """Whether every state gets out, and commands get in on one of the ways at least."""
+    ways = [{prefix + sink.topic for sink in way} for way in profile.commands.values()]
+    states = {prefix + source.topic for source in profile.state}
+    return not states & refused and any(not way & refused for way in ways)

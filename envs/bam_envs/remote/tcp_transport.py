@@ -1,0 +1,243 @@
+"""TcpTransport: an environment of ``bam-serve --tcp PORT``, for a network where rosbridge is too slow."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import time
+from contextlib import suppress
+from typing import Any
+from urllib.parse import urlsplit
+
+from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, ProtocolError, RemoteError
+from bam_envs.remote.tcp_wire import (
+    ForeignPeer,
+    FrameSocket,
+    Hello,
+    Leave,
+    Request,
+    Reset,
+    Step,
+    TagMessage,
+    content_of,
+    encode,
+    pack_action,
+    read_result,
+    tag_message,
+)
+from bam_envs.remote.transport import EnvSpecMessage, Info, Seed, plain_seed, spec_from_json, spec_to_json
+from bam_envs.remote.values import Tree, plain_info
+from bam_envs.ros.freshness import Tagger
+
+_LEAVE_TIMEOUT = 1.0  # [s]; a server that is gone must not hold up `close`
+
+
+class TcpTransport:
+    """Carries an environment over TCP. One request at a time; `close` may be called from any thread.
+
+    A link that dropped stays down until the next `reset`, and nothing is ever sent twice.
+
+    Args:
+        url: ``tcp://host:port``.
+        env_id: The environment that is wanted; "" for whatever is served.
+        timeout: Longest time for a request [s].
+        connect_timeout: Longest time to connect [s].
+        token: The server's shared secret, if it has one. Nothing is encrypted.
+        name: What other clients are told of this one; computer and process by default.
+        take: Take command from whoever has it.
+
+    Raises:
+        InvalidValue: `url` is not such a URL.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        env_id: str = "",
+        timeout: float = 30.0,
+        connect_timeout: float = 3.0,
+        token: str | None = None,
+        name: str | None = None,
+        take: bool = False,
+    ) -> None:
+        self.url, self.env_id, self.timeout, self.connect_timeout = url, env_id, timeout, connect_timeout
+        self.take = take
+        self._host, self._port = _address(url)
+        self._token, self._name = token or "", name
+        self._tagger, self._epoch = Tagger(), 0
+        self._lock = threading.Lock()
+        self._frames: FrameSocket | None = None
+        self._pid = 0
+        self._spec: EnvSpecMessage | None = None
+        self._closed = False
+
+    def connect(self) -> EnvSpecMessage:
+        """Open the link and ask what is there.
+
+        Raises:
+            NoServer: Nobody there, something else, or it refuses this client.
+        """
+        with self._lock:
+            return self._connected()
+
+    def reset(self, seed: Seed = None, options: Info | None = None) -> tuple[Any, Any]:
+        """Begin an episode; connects again if the link dropped."""
+        plain = plain_seed(seed, 2**64 - 1)
+        with self._lock:
+            spec = self._connected()
+            tag = self._tag(self.timeout)
+            tree = self._ask(Reset(tag, plain, None if options is None else plain_info(options), self.take))
+            return self._result(spec, tree, 2)
+
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
+        """(observation, reward, terminated, truncated, info)."""
+        with self._lock:
+            if self._spec is None or not self._is_up():
+                why = "this transport is closed" if self._closed else "the link is down"
+                raise LinkLost(f"{self.url}: {why}, and nothing was sent. Call reset() to connect again.")
+            packed = pack_action(self._spec, action)
+            return self._result(self._spec, self._ask(Step(self._tag(self.timeout), packed)), 5)
+
+    def close(self) -> None:
+        """Release the environment and drop the link; a request that is under way ends with `LinkLost`."""
+        self._closed = True
+        if self._lock.acquire(blocking=False):
+            try:
+                self._leave()
+            finally:
+                self._lock.release()
+        self._drop()
+
+    def _leave(self) -> None:
+        if self._is_up():
+            with suppress(LinkLost, ProtocolError, RemoteError):  # the server notices by itself that a link is gone
+                self._ask(Leave(self._tag(min(self.timeout, _LEAVE_TIMEOUT))))
+
+    def _is_up(self) -> bool:
+        return self._frames is not None and self._pid == os.getpid()
+
+    def _connected(self) -> EnvSpecMessage:
+        """What is there, over a link that is up."""
+        if self._closed:
+            raise LinkLost(f"{self.url}: this transport is closed; make a new one.")
+        if self._spec is not None and self._is_up():
+            return self._spec
+        self._forget_parent()
+        try:
+            spec = self._open()
+        except BaseException:
+            self._drop()
+            raise
+        if self._spec is not None and spec_to_json(self._spec) != spec_to_json(spec):
+            self._drop()
+            raise ProtocolError(f"{self.url}: it serves another environment than before: {spec.env_id}.")
+        if self._closed:  # meanwhile, by another thread, which found no link to drop
+            self._drop()
+            raise LinkLost(f"{self.url}: this transport is closed; make a new one.")
+        self._spec = spec
+        return spec
+
+    def _forget_parent(self) -> None:
+        """After a fork: the link and the session are the parent's, which must not notice."""
+        frames, self._frames = self._frames, None
+        if frames is not None:
+            frames.abandon()
+            self._tagger, self._epoch = Tagger(), 0
+
+    def _open(self) -> EnvSpecMessage:
+        deadline = time.monotonic() + self.connect_timeout
+        try:
+            self._frames = FrameSocket(_dial(self._host, self._port, deadline))
+        except OSError as error:
+            raise NoServer(self.url, f"{self._unreachable(error)}. {self._remedy()}") from error
+        self._pid, self._epoch = os.getpid(), self._epoch + 1
+        name = self._name or f"{socket.gethostname()}:{self._pid}"
+        hello = Hello(self._tagger.session, self._epoch, name, self._token, self.env_id)
+        try:
+            self._frames.send(encode(["hello", hello]), deadline)
+            return spec_from_json(content_of(self._frames.receive(deadline), 0))
+        except (ForeignPeer, RemoteError) as error:
+            raise NoServer(self.url, f"{error}") from error
+        except (LinkLost, ProtocolError) as error:
+            raise NoServer(self.url, f"not a bam-serve TCP server: {error}. {self._other_port()}") from error
+
+    def _unreachable(self, error: OSError) -> str:
+        if isinstance(error, ConnectionRefusedError):
+            return "nobody listens there (is the port open?)"
+        if isinstance(error, TimeoutError):
+            return f"no answer within {self.connect_timeout:g} s (is the address right, and no firewall between?)"
+        if isinstance(error, socket.gaierror):
+            return f"no computer is known by the name {self._host!r}"
+        return error.strerror or str(error)
+
+    def _remedy(self) -> str:
+        return f"Start one: bam-serve --env {self.env_id or 'bam/pick'} --tcp {self._port}"
+
+    def _other_port(self) -> str:
+        """The remedy where something else has the port."""
+        start = f"bam-serve --env {self.env_id or 'bam/pick'} --tcp PORT"
+        return f"If it is rosbridge, use ws://; else start one at a free port: {start}"
+
+    def _tag(self, limit: float) -> TagMessage:
+        return tag_message(self._tagger.next(self._epoch, limit))
+
+    def _ask(self, request: Request) -> Tree:
+        """The content of the answer to `request`. After anything else than an answer the link is down."""
+        frames, limit = self._frames, request.tag.lifetime
+        if frames is None:
+            raise LinkLost(f"{self.url}: the link is down.")
+        parts = encode(request)
+        deadline = time.monotonic() + limit
+        try:
+            frames.send(parts, deadline)
+            return content_of(frames.receive(deadline), request.tag.sequence)
+        except RemoteError:
+            raise
+        except LinkLost as error:
+            self._drop()
+            kind = type(request).__name__.lower()
+            raise LinkLost(f"{self.url}: {self._cause(error, deadline, kind, limit)}.") from error
+        except BaseException:  # also Ctrl-C: the answer may still come, and be taken for that of the next request
+            self._drop()
+            raise
+
+    def _cause(self, error: LinkLost, deadline: float, kind: str, limit: float) -> str:
+        if self._closed:
+            return "this transport was closed meanwhile"
+        return f"no answer to {kind} within {limit:g} s" if time.monotonic() >= deadline else str(error)
+
+    def _result(self, spec: EnvSpecMessage, tree: Tree, size: int) -> tuple[Any, ...]:
+        try:
+            return read_result(spec, tree, size)
+        except ProtocolError as error:
+            raise ProtocolError(f"{self.url}: {error}") from error
+
+    def _drop(self) -> None:
+        frames, self._frames = self._frames, None
+        if frames is not None and self._pid == os.getpid():
+            frames.close()
+
+
+def _dial(host: str, port: int, deadline: float) -> socket.socket:
+    """A socket that is connected before `deadline`, however many addresses the name has."""
+    refusal = OSError("it has no address")
+    for *_, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+        try:
+            return socket.create_connection((str(address[0]), int(address[1])), max(0.01, deadline - time.monotonic()))
+        except OSError as error:  # noqa: PERF203 - the next address may answer
+            refusal = error
+    raise refusal
+
+
+def _address(url: str) -> tuple[str, int]:
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname, parts.port
+        (host or "").encode("idna")
+    except ValueError as error:  # brackets, the port, or a name that cannot be looked up
+        raise InvalidValue(f"{url!r} is not a TCP address: {error}.") from error
+    if parts.scheme != "tcp" or not host or not port or parts.path.strip("/"):
+        raise InvalidValue(f"A TCP address is tcp://host:port, such as tcp://10.0.0.5:5555, not {url!r}.")
+    return host, port

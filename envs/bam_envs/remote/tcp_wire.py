@@ -1,0 +1,414 @@
+"""The protocol of the TCP transport: messages, and the frames that carry them.
+
+Each message is one frame:
+
+============  =====  ========================================================================
+part          bytes  what
+============  =====  ========================================================================
+mark          3      ``bam``
+version       1      of this table
+header size   4      big-endian
+body size     4      big-endian
+header        any    MessagePack of a tree; an array in it is its dtype, shape and place in the body
+body          any    the arrays, each at a multiple of 16
+============  =====  ========================================================================
+
+=========  ==========================================  =========================================
+message    tree                                        content of the answer
+=========  ==========================================  =========================================
+hello      ["hello", {session, epoch, name, token,     the description of the environment
+           env_id, end}]
+reset      ["reset", tag, seed, options, take]         [observation, info]
+step       ["step", tag, action]                       [observation, reward, terminated,
+                                                       truncated, info]
+leave      ["leave", tag]                              None
+=========  ==========================================  =========================================
+
+An answer is [number of the request, "ok", content] or [number, kind of the error, its text]. Of a batch of
+environments, each value has one entry for each.
+
+`encode` and `decode` are pure; `FrameSocket` owns the socket.
+"""
+
+from __future__ import annotations
+
+import math
+import socket
+import struct
+import time
+from contextlib import suppress
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from gymnasium import spaces
+from msgspec.msgpack import Ext
+from numpy.typing import NDArray
+
+from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NotInCommand, ProtocolError, RemoteError
+from bam_envs.remote.transport import EnvSpecMessage
+from bam_envs.remote.values import Tree, exact, number_dtype, pack, shown
+from bam_envs.ros.freshness import Tag
+
+MARK, VERSION = b"bam", 1
+MAX_FRAME = 256 * 1024 * 1024
+"""Largest frame [bytes]."""
+_PREFIX = struct.Struct("!3sBII")
+_ALIGN = 16
+_ARRAY, _SCALAR = 1, 2
+_MAX_HEADER, _MAX_DIMENSIONS = 2**24, 32
+_KEEPALIVE = {"TCP_KEEPIDLE": 4, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT": 3}
+"""A computer that vanished without a word is noticed after 10 s."""
+_MOST_PARTS = 512  # below IOV_MAX of every system
+_SMALL = 32768  # bytes that are copied together quicker than listed
+
+
+class Hello(msgspec.Struct, frozen=True):
+    """The first message of a client."""
+
+    session: Annotated[str, msgspec.Meta(min_length=1)]
+    """One client, from its start to its end."""
+    epoch: int
+    """Counts its connections."""
+    name: str
+    """What other clients are told of it."""
+    token: str
+    """The shared secret, or ""."""
+    env_id: str
+    """The environment that it wants; "" for any."""
+    end: str = "\r\n\r\n"
+    """The blank line makes a server of HTTP answer at once."""
+
+
+class TagMessage(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """A `Tag` without a signature: who sent a request when, and for how long it means anything."""
+
+    session: str
+    epoch: int
+    sequence: int
+    sent: float
+    deadline: float
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.lifetime < math.inf:
+            raise ValueError("Expected a deadline after the time of sending")
+
+    @property
+    def lifetime(self) -> float:
+        """Time from its sending to its deadline [s]."""
+        return self.deadline - self.sent
+
+    @property
+    def number(self) -> tuple[str, int, int]:
+        """Which request of which connection it is."""
+        return self.session, self.epoch, self.sequence
+
+    def to_tag(self) -> Tag:
+        """What a `FreshnessCheck` takes."""
+        return Tag(self.session, self.epoch, self.sequence, self.sent, self.deadline)
+
+
+def tag_message(tag: Tag) -> TagMessage:
+    """`tag` as it travels."""
+    return TagMessage(tag.session, tag.epoch, tag.sequence, tag.sent, tag.deadline)
+
+
+class Reset(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="reset"):
+    """Begin an episode."""
+
+    tag: TagMessage
+    seed: Any
+    options: Any
+    take: Any
+    """Whether to take command from whoever has it."""
+
+
+class Step(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="step"):
+    """Do an action."""
+
+    tag: TagMessage
+    action: Any
+
+
+class Leave(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="leave"):
+    """Release the environment."""
+
+    tag: TagMessage
+
+
+Request = Reset | Step | Leave
+"""A message after the hello."""
+Greeting = tuple[Literal["hello"], Hello]
+"""The hello, as it travels."""
+_Answer = tuple[int, str, Any]
+
+
+def refusal(sequence: int, error: BamEnvsError) -> Tree:
+    """The answer that something went wrong."""
+    return [sequence, "NotInCommand" if isinstance(error, NotInCommand) else "RemoteError", str(error)]
+
+
+def content_of(answer: Tree, sequence: int) -> Tree:
+    """The content of `answer`, which must be that to request number `sequence`.
+
+    Raises:
+        NotInCommand: The answer is that another client is in command.
+        RemoteError: The answer is that something went wrong.
+        ProtocolError: It is no answer, or one to another request.
+    """
+    try:
+        number, kind, content = msgspec.convert(answer, _Answer)
+    except msgspec.ValidationError:
+        number, kind, content = -1, "", None
+    if number != sequence:
+        raise ProtocolError(f"Expected the answer to request {sequence}, found {shown(answer)}.")
+    if kind == "ok":
+        return content
+    raise (NotInCommand if kind == "NotInCommand" else RemoteError)(str(content))
+
+
+def action_size(spec: EnvSpecMessage) -> int:
+    """What an action holds at most, of all environments [bytes]; about, where its space does not say."""
+    try:
+        return 8 * spaces.flatdim(spec.action_space) * spec.num_envs
+    except (NotImplementedError, ValueError):  # sequences may be of any length
+        return 2**22
+
+
+def pack_action(spec: EnvSpecMessage, action: Any) -> Tree:
+    """The tree of an action. Raises InvalidValue if it does not fit."""
+    return _pack_each(spec, spec.action_space, spec.each(action), "action")
+
+
+def pack_result(spec: EnvSpecMessage, result: tuple[Any, ...]) -> Tree:
+    """(observation, …, info) as a list."""
+    observation, *between, info = result
+    space = spec.observation_space
+    if spec.vector:
+        final = [{**one, "final_obs": pack(space, one["final_obs"])} if "final_obs" in one else one for one in info]
+        return [_pack_each(spec, space, observation, "observation"), *between, final]
+    return [pack(space, observation, "observation"), *between, info]
+
+
+def _pack_each(spec: EnvSpecMessage, space: spaces.Space[Any], values: Any, name: str) -> Tree:
+    """The tree of a value, or of one for each environment: of a Box one array, which travels quicker than many."""
+    if not spec.vector:
+        return pack(space, values[0], name)
+    trees = [pack(space, one, f"{name} of environment {i}") for i, one in enumerate(values)]
+    return np.stack(trees) if isinstance(space, spaces.Box) else trees
+
+
+def read_result(spec: EnvSpecMessage, tree: Tree, size: int) -> tuple[Any, ...]:
+    """The result of `size` values that `pack_result` was given.
+
+    Raises:
+        ProtocolError: It is something else.
+    """
+    if not isinstance(tree, list) or len(tree) != size:
+        raise ProtocolError(f"Expected a result of {size} values, found {shown(tree)}.")
+    observation, *between, info = tree
+    space = spec.observation_space
+    try:
+        if not spec.vector:
+            return exact(space, observation, "observation"), *between, info
+        for column in tree:
+            if not isinstance(column, list) and not (isinstance(column, np.ndarray) and column.ndim):
+                raise ProtocolError(f"Expected a list with one value for each environment, found {shown(column)}.")
+            if len(column) != spec.num_envs:
+                raise ProtocolError(f"Expected values of {spec.num_envs} environments, found {shown(column)}.")
+        each = [exact(space, one, f"observation of environment {i}") for i, one in enumerate(observation)]
+        final = [{**one, "final_obs": exact(space, one["final_obs"])} if "final_obs" in one else one for one in info]
+    except InvalidValue as error:
+        raise ProtocolError(str(error)) from error
+    return each, *between, final
+
+
+class ForeignPeer(ProtocolError):  # noqa: N818 - reads as what was found
+    """The other end speaks something else; the text says what, as far as one can tell."""
+
+
+def encode(message: Tree) -> list[bytes | memoryview]:
+    """The parts of a frame, to be sent one after the other; arrays are not copied.
+
+    Raises:
+        ProtocolError: The frame would be larger than `MAX_FRAME`, or something in it cannot be sent.
+    """
+    body = _Body()
+    try:
+        header = msgspec.msgpack.encode(message, enc_hook=body.add)
+    except (ValueError, OverflowError, RecursionError) as error:
+        raise ProtocolError(f"A message cannot be sent: {str(error).rstrip('.')}.") from error
+    if len(header) + body.size > MAX_FRAME:
+        raise ProtocolError(f"A message of {len(header) + body.size} bytes is too large; {MAX_FRAME} are allowed.")
+    parts = [_PREFIX.pack(MARK, VERSION, len(header), body.size), header, *body.parts]
+    return [b"".join(parts)] if body.size <= _SMALL else parts
+
+
+class _Body:
+    """Collects the arrays of a tree."""
+
+    def __init__(self) -> None:
+        self.parts: list[bytes | memoryview] = []
+        self.size = 0
+
+    def add(self, value: Any) -> Ext:
+        """What stands for `value` in the header."""
+        if isinstance(value, np.generic):
+            return Ext(_SCALAR, msgspec.msgpack.encode([value.dtype.str, value.tobytes()]))
+        if not isinstance(value, np.ndarray):
+            raise ProtocolError(f"{shown(value)} cannot be sent.")
+        content = msgspec.msgpack.encode([value.dtype.str, value.shape, self.size])
+        if value.size:
+            self.parts.append(value.reshape(-1).view(np.uint8).data)
+            padding = -value.nbytes % _ALIGN
+            if padding:
+                self.parts.append(bytes(padding))
+            self.size += value.nbytes + padding
+        return Ext(_ARRAY, content)
+
+
+def read_prefix(prefix: bytes | bytearray) -> tuple[int, int]:
+    """Sizes of header and body.
+
+    Raises:
+        ForeignPeer: The other end speaks another protocol, or another version of this.
+    """
+    mark, version, header, body = _PREFIX.unpack(prefix)
+    if mark != MARK:
+        hint = "; rosbridge servers have ws:// URLs" if bytes(prefix).startswith((b"HTTP", b"<")) else ""
+        raise ForeignPeer(f"not a bam-serve TCP server: it says {bytes(prefix)!r}{hint}")
+    if version != VERSION:
+        raise ForeignPeer(
+            f"version {version} of the protocol there, {VERSION} here; install one bam-train on both sides"
+        )
+    return header, body
+
+
+def decode(header: bytes | memoryview, body: NDArray[np.uint8], kind: Any = Any) -> Any:
+    """The message of the type `kind` in a frame; its arrays lie in `body`.
+
+    Raises:
+        ProtocolError: It is damaged, or of another type.
+    """
+
+    def restore(code: int, data: memoryview) -> Any:
+        if code == _SCALAR:
+            dtype, raw = msgspec.msgpack.decode(data)
+            return np.frombuffer(raw, number_dtype(dtype))[0]
+        dtype, shape, start = msgspec.msgpack.decode(data)
+        if len(shape) > _MAX_DIMENSIONS:
+            raise ValueError(f"an array has at most {_MAX_DIMENSIONS} dimensions, not {len(shape)}")
+        numbers = number_dtype(dtype)
+        stop = start + math.prod(shape) * numbers.itemsize
+        return body[start:stop].view(numbers).reshape(shape)
+
+    try:
+        return msgspec.msgpack.decode(header, type=kind, ext_hook=restore)
+    except msgspec.ValidationError as error:
+        raise ProtocolError(f"Expected {_EXPECTED.get(kind, 'a message')}: {error}.") from error
+    except (msgspec.MsgspecError, ValueError, TypeError, IndexError, OverflowError, RecursionError) as error:
+        raise ProtocolError(f"A message is damaged: {error}.") from error
+
+
+_EXPECTED = {Greeting: "a hello", Request: "a request"}
+
+
+class FrameSocket:
+    """Sends and receives frames over a connected socket, each within a deadline. One thread for each direction.
+
+    Args:
+        sock: It is closed with this.
+    """
+
+    def __init__(self, sock: socket.socket) -> None:
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for name, value in _KEEPALIVE.items():
+            if hasattr(socket, name):  # not every system lets one say how soon
+                sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+        self._socket = sock
+
+    def send(self, parts: list[bytes | memoryview], deadline: float = math.inf) -> None:
+        """Send a frame of `encode` before `deadline` [s, monotonic].
+
+        Raises:
+            LinkLost: The other end is gone, or takes nothing.
+        """
+        try:
+            while parts:
+                self._set_timeout(deadline)
+                sent = self._socket.sendmsg(parts[:_MOST_PARTS])
+                parts = _rest(parts, sent)
+        except OSError as error:
+            raise LinkLost(error.strerror or str(error)) from error
+
+    def receive(
+        self, deadline: float = math.inf, limit: int = MAX_FRAME, patience: float = math.inf, kind: Any = Any
+    ) -> Any:
+        """Receive a frame before `deadline` [s, monotonic].
+
+        Args:
+            deadline: See above.
+            limit: Largest frame [bytes].
+            patience: Longest time from its first byte to its last [s].
+            kind: Type of its message.
+
+        Raises:
+            LinkLost: The other end is gone, or silent.
+            ProtocolError: It sent something else, or too much.
+        """
+        prefix = bytearray(_PREFIX.size)
+        try:
+            self._fill(memoryview(prefix), deadline, patience)
+            header, body = read_prefix(prefix)
+            if header + body > limit:
+                raise ProtocolError(f"A message of {header + body} bytes is too large; {limit} are allowed.")
+            if header > _MAX_HEADER:
+                raise ProtocolError(f"A header of {header} bytes is too large; {_MAX_HEADER} are allowed.")
+            buffer = np.empty(header + body + _ALIGN, np.uint8)
+            # The body begins where arrays of all kinds may begin.
+            start = -(buffer.ctypes.data + header) % _ALIGN
+            view = buffer.data[start : start + header + body]
+            self._fill(view, min(deadline, time.monotonic() + patience))
+        except OSError as error:
+            raise LinkLost(error.strerror or str(error)) from error
+        return decode(view[:header], buffer[start + header : start + header + body], kind)
+
+    def _fill(self, view: memoryview, deadline: float, patience: float = math.inf) -> None:
+        filled = 0
+        while filled < len(view):
+            self._set_timeout(deadline)
+            count = self._socket.recv_into(view[filled:])
+            if not count:
+                raise ConnectionResetError("the other end closed the connection")
+            if not filled:
+                deadline = min(deadline, time.monotonic() + patience)
+            filled += count
+
+    def _set_timeout(self, deadline: float) -> None:
+        if deadline == math.inf:
+            self._socket.settimeout(None)
+            return
+        left = deadline - time.monotonic()
+        if left <= 0:
+            raise TimeoutError("timed out")
+        self._socket.settimeout(left)
+
+    def abandon(self) -> None:
+        """Close it here after a fork; the connection is the parent's and stays up."""
+        self._socket.close()
+
+    def close(self) -> None:
+        """Close it; a thread that waits for a frame gets `LinkLost`. Idempotent, from any thread."""
+        with suppress(OSError):  # it was closed before, by either end
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+
+
+def _rest(parts: list[bytes | memoryview], sent: int) -> list[bytes | memoryview]:
+    """What is left of `parts` after `sent` bytes."""
+    for i, part in enumerate(parts):
+        if sent < len(part):
+            return [memoryview(part)[sent:], *parts[i + 1 :]]
+        sent -= len(part)
+    return []

@@ -1,0 +1,143 @@
+"""The Transport protocol: what carries a whole environment, one or a batch of them, to wherever it runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from gymnasium import Space
+
+from bam_envs.core.errors import InvalidValue, ProtocolError
+from bam_envs.core.spaces import space_from_json, space_to_json
+from bam_envs.remote.values import plain_info, shown, tree_from_json, tree_to_json
+
+Info = dict[str, Any]
+Seed = int | list[int | None] | None
+"""Of a reset: one, or one for each environment of a batch."""
+
+
+@dataclass(frozen=True)
+class EnvSpecMessage:
+    """The description of the environment at the other end."""
+
+    env_id: str
+    """Its Gymnasium id, such as bam/pick-v0."""
+    observation_space: Space[Any]
+    """Of a single environment."""
+    action_space: Space[Any]
+    """Of a single environment."""
+    num_envs: int = 1
+    """Environments stepped together."""
+    vector: bool = False
+    """Whether values are lists with one entry for each environment."""
+    autoreset: bool = True
+    """With `vector`, whether an environment whose episode ends is reset in the same step; always so on our servers."""
+    period: float | None = None
+    """Time between two actions [s]; None if the other end does not say."""
+    max_episode_steps: int | None = None
+    """The time limit there; `truncated` comes from there."""
+    signals: Mapping[str, Any] = field(default_factory=dict)
+    """What `describe()` of the environment there returns; empty if the other end does not say."""
+
+    def each(self, action: Any) -> list[Any]:
+        """The action of each environment.
+
+        Raises:
+            InvalidValue: There are too many or too few.
+        """
+        if not self.vector:
+            return [action]
+        try:
+            each = list(action)
+        except TypeError:  # a number, or an array without an axis
+            each = []
+        if len(each) != self.num_envs:
+            raise InvalidValue(
+                f"There must be one action for each of {self.num_envs} environments, not {shown(action)}."
+            )
+        return each
+
+
+def plain_seed(seed: Any, largest: float = math.inf) -> Seed:
+    """A seed, or one for each environment, as Python's numbers.
+
+    Raises:
+        InvalidValue: It is not a whole number from 0 to `largest`.
+    """
+    if seed is None:
+        return None
+    if isinstance(seed, (list, tuple, np.ndarray)):
+        return [plain_seed(one, largest) for one in seed]  # type: ignore[misc]
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed <= largest:
+        upper = f"to {largest}" if largest < math.inf else "on"
+        raise InvalidValue(f"A seed must be a whole number from 0 {upper}, not {seed!r}.")
+    return int(seed)
+
+
+def spec_to_json(spec: EnvSpecMessage) -> dict[str, Any]:
+    """What a server says of its environment, as strict JSON values."""
+    return {
+        "env_id": spec.env_id,
+        "observation_space": space_to_json(spec.observation_space),
+        "action_space": space_to_json(spec.action_space),
+        "num_envs": spec.num_envs,
+        "vector": spec.vector,
+        "period": spec.period,
+        "max_episode_steps": spec.max_episode_steps,
+        "signals": tree_to_json(plain_info(spec.signals)),
+    }
+
+
+def spec_from_json(value: Mapping[str, Any]) -> EnvSpecMessage:
+    """The environment that `spec_to_json` described.
+
+    Raises:
+        ProtocolError: `value` is no such description.
+    """
+    try:
+        return EnvSpecMessage(
+            env_id=str(value["env_id"]),
+            observation_space=space_from_json(value["observation_space"]),
+            action_space=space_from_json(value["action_space"]),
+            num_envs=int(value["num_envs"]),
+            vector=bool(value["vector"]),
+            period=None if value["period"] is None else float(value["period"]),
+            max_episode_steps=None if value["max_episode_steps"] is None else int(value["max_episode_steps"]),
+            signals=tree_from_json(value["signals"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise ProtocolError(f"Expected the description of an environment, found {shown(value)}: {error}.") from error
+
+
+@runtime_checkable
+class Transport(Protocol):
+    """Carries `reset` and `step`. The constructor does no I/O.
+
+    With ``spec.vector`` every value has one entry for each environment: observations and actions are lists, reward,
+    terminated and truncated lists of numbers, and info is a list of dicts, in which an environment that was reset in
+    the same step has ``final_obs`` and ``final_info``. Without ``spec.autoreset`` none is: then `reset` resets all.
+    """
+
+    def connect(self) -> EnvSpecMessage:
+        """Open the link and ask what is there. Moves nothing; idempotent.
+
+        Raises:
+            NoServer: Nobody there, or nobody who knows this environment.
+        """
+
+    def reset(self, seed: Seed = None, options: Info | None = None) -> tuple[Any, Any]:
+        """Begin an episode; (observation, info).
+
+        Raises:
+            LinkLost: The link dropped, or there was no answer in time.
+            RemoteError: The other end refused or failed.
+        """
+
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
+        """(observation, reward, terminated, truncated, info). Raises as `reset` does; never sent twice."""
+
+    def close(self) -> None:
+        """Release the environment there, which halts its robot, and drop the link. Idempotent."""

@@ -1,0 +1,98 @@
+import pytest
+
+from bam_envs.core.errors import InvalidValue
+from bam_envs.remote.serve.serve_options import ServeOptions
+
+
+def test_the_defaults_are_possible():
+    ServeOptions().require_sane()
+
+
+def test_a_token_of_the_tcp_port_beside_a_ros_2_node():
+    ServeOptions(rclpy=True, token_file="t", tcp=0).require_sane()
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"realtime": True, "fast": True}, "--realtime and --fast exclude each other; give one of the two."),
+        ({"via": "ws://a", "rclpy": True}, "--via and --rclpy exclude each other; give one of the two."),
+        ({"via": "ws://a", "cert": "c"}, "--via and --cert exclude each other; give one of the two."),
+        ({"rclpy": True, "cert": "c"}, "--rclpy and --cert exclude each other; give one of the two."),
+        (
+            {"cert": "c", "tcp": 0},
+            "--tcp carries everything in the clear, and --cert does not change that; leave one of the two out.",
+        ),
+        ({"key": "k"}, "--key means something only with --cert."),
+        ({"ca_file": "k"}, "--ca-file means something only with --via."),
+        (
+            {"rclpy": True, "token_file": "t"},
+            "--token-file protects nothing with --rclpy: ROS 2 has no token. Leave it out.",
+        ),
+        ({"no_token": True, "token_file": "t"}, "--no-token and --token-file exclude each other; give one of the two."),
+        (
+            {"via": "ws://a", "operator_token_file": "t"},
+            "--operator-token-file means something only where clients connect to this program.",
+        ),
+        ({"lease": 0.0}, "--lease must be above 0 s, not 0."),
+        ({"lease": float("nan")}, "--lease must be above 0 s, not nan."),
+        ({"port": -1}, "--port must be 0 to 65535, not -1."),
+        ({"tcp": 65536}, "--tcp must be 0 to 65535, not 65536."),
+        ({"namespace": "a b"}, "--namespace must be letters, digits and _, such as bam_001, not 'a b'."),
+        ({"namespace": "1a"}, "--namespace must be letters, digits and _, such as bam_001, not '1a'."),
+    ],
+)
+def test_what_cannot_be(options, text):
+    with pytest.raises(InvalidValue) as error:
+        ServeOptions(**options).require_sane()
+    assert str(error.value) == text
+
+
+CLEAR = "The token travels in the clear to {}, and so does all else: give --cert, or trust that network."
+OPEN = "Anybody who reaches {} may command what is served here, as --no-token says."
+REFUSED = (
+    "Anybody who reaches {} could command what is served here: give --token-file, or --bind 127.0.0.1; or --no-token, "
+    "if everybody there is to."
+)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({}, None),
+        ({"bind": "127.0.0.5"}, None),
+        ({"bind": "::1"}, None),
+        ({"bind": "localhost", "tcp": 0}, None),
+        ({"bind": "0.0.0.0", "no_token": True}, OPEN.format("0.0.0.0")),
+        ({"bind": "", "no_token": True}, OPEN.format("every address of this computer")),
+        ({"bind": "0.0.0.0", "token_file": "t"}, CLEAR.format("0.0.0.0")),
+        ({"bind": "0.0.0.0", "token_file": "t", "rclpy": True, "tcp": 0}, CLEAR.format("0.0.0.0")),
+        ({"bind": "0.0.0.0", "token_file": "t", "cert": "c"}, None),
+        ({"bind": "0.0.0.0", "via": "ws://a"}, None),
+        ({"bind": "0.0.0.0", "rclpy": True}, None),
+    ],
+)
+def test_what_stands_open_is_said(options, text):
+    ServeOptions(**options).require_sane()
+    assert ServeOptions(**options).warning == text
+
+
+@pytest.mark.parametrize(
+    ("options", "place"),
+    [
+        ({"bind": "0.0.0.0"}, "0.0.0.0"),
+        ({"bind": "::"}, "::"),
+        ({"bind": ""}, "every address of this computer"),
+        ({"bind": "robot.lab", "cert": "c"}, "robot.lab"),
+        ({"bind": "0.0.0.0", "rclpy": True, "tcp": 0}, "0.0.0.0"),
+    ],
+)
+def test_no_network_without_a_token_by_oversight(options, place):
+    with pytest.raises(InvalidValue) as error:
+        ServeOptions(**options).require_sane()
+    assert str(error.value) == REFUSED.format(place)
+
+
+@pytest.mark.parametrize(("name", "prefix"), [("", ""), ("/", ""), ("a", "/a"), ("/a/b_1/", "/a/b_1")])
+def test_the_prefix_of_every_name(name, prefix):
+    assert ServeOptions(namespace=name).prefix == prefix

@@ -1,0 +1,294 @@
+import threading
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from bam_envs.core.errors import InvalidValue, NoServer, NotInCommand, RemoteError, RobotFault
+from bam_envs.core.registry import ENVIRONMENTS
+from bam_envs.remote.rosbridge_transport import RosbridgeTransport
+from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.served_environment import ServedEnvironment
+from bam_envs.remote.serve.served_robot import ServedRobot
+from bam_envs.remote.tcp_transport import TcpTransport
+from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.robots.ur5e import arm_spec
+from bam_envs.ros.codec import encode_command, read_info
+from bam_envs.rosbridge.endpoint import Endpoint
+from bam_envs.rosbridge.link.link import RosbridgeLink
+from bam_envs.rosbridge.server.server import BridgeServer
+from bam_envs.testing.transports import assert_same_value
+
+UR5E = load_profile("ur5e")
+ARM = arm_spec("ur5e", with_object=True)
+RISE = np.array([0.0, 0.0, 0.5, 0.0, 0.0], dtype=np.float32)
+
+
+@pytest.fixture
+def serve():
+    """Start a `ServedEnvironment`; what it told is in its ``lines``."""
+    served = []
+
+    def start(env_id="bam/pick-v0", num_envs=1, env=None, **options):
+        if env is None:
+            env = gym.make_vec(env_id, num_envs) if num_envs > 1 else gym.make(env_id, disable_env_checker=True)
+        lines = []
+        served.append(ServedEnvironment(env, ServeOptions(**{"port": 0, **options}), lines.append))
+        served[-1].lines = lines
+        return served[-1].__enter__()
+
+    yield start
+    for one in served:
+        one.close()
+        one.close()
+
+
+@pytest.fixture
+def link():
+    """Open a link to a URL."""
+    links = []
+
+    def open_link(url, **options):
+        links.append(RosbridgeLink(Endpoint(url, **options)))
+        links[-1].connect()
+        return links[-1]
+
+    yield open_link
+    for one in links:
+        one.close()
+
+
+@pytest.fixture
+def transport():
+    """Open a transport: ``transport(class, url)``."""
+    opened = []
+
+    def open_one(kind, url, **options):
+        opened.append(kind(url, **options))
+        opened[-1].connect()
+        return opened[-1]
+
+    yield open_one
+    for one in opened:
+        one.close()
+
+
+def send(link, joints, prefix=""):
+    command = np.concatenate([joints, [0.085]])
+    for topic, kind, message in encode_command(UR5E, ARM, command, None):
+        link.advertise(prefix + topic, kind)
+        link.publish(prefix + topic, message)
+
+
+def wait_for(condition, bus, timeout=10.0):
+    """Wait until `condition` is true, looking after each answer of the server."""
+    for _ in range(int(timeout / 0.01)):
+        if condition():
+            return
+        bus.call("/rosapi/get_time", "rosapi/GetTime", {}, timeout)
+    pytest.fail("it never became true")
+
+
+def test_an_environment_with_its_robot(serve):
+    served = serve(tcp=0)
+    rosbridge, tcp = served.endpoints
+    assert rosbridge == f"bam/pick-v0 on {served.bus.url}, real time: /gym_env/gym_api_request and a ur5e's topics"
+    assert tcp == f"bam/pick-v0 on {served.tcp.url}, the environment alone"
+    served.require_running()
+
+
+def test_fast_in_a_namespace(serve):
+    served = serve(fast=True, namespace="bam_001")
+    assert served.endpoints == [
+        f"bam/pick-v0 on {served.bus.url}, fast: /bam_001/gym_env/gym_api_request and a ur5e's topics under /bam_001"
+    ]
+
+
+def test_an_environment_without_a_robot_has_no_topics(serve, transport):
+    served = serve("CartPole-v1")
+    assert served.endpoints == [f"CartPole-v1 on {served.bus.url}, fast: /gym_env/gym_api_request"]
+    observation, _ = transport(RosbridgeTransport, served.bus.url).reset(3)
+    np.testing.assert_array_equal(observation, gym.make("CartPole-v1").reset(seed=3)[0])
+
+
+def test_several_rows_have_no_topics(serve, transport):
+    served = serve(num_envs=3)
+    assert served.endpoints == [f"bam/pick-v0 on {served.bus.url}, fast: /gym_env/gym_api_request"]
+    assert transport(RosbridgeTransport, served.bus.url).connect().num_envs == 3
+
+
+@pytest.mark.parametrize("kind", [RosbridgeTransport, TcpTransport])
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_the_environment_is_the_one_in_process_bit_for_bit(serve, transport, make, actions_of, env_id, kind):
+    options = {"rs_state_to_info": True} if ENVIRONMENTS[env_id].parity else {}
+    local = make(env_id, **options)
+    served = serve(env=gym.make(env_id, disable_env_checker=True, **options), fast=True, tcp=0)
+    remote = transport(kind, served.bus.url if kind is RosbridgeTransport else served.tcp.url)
+    assert_same_value(remote.reset(5), local.reset(seed=5), "reset")
+    for action in actions_of(0, 20, local.action_space.shape[0]):
+        ours, theirs = local.step(action), remote.step(action)
+        assert_same_value(tuple(theirs), ours, "step")
+        if ours[2]:
+            break
+
+
+def test_in_real_time_a_step_is_a_period(serve, transport):
+    served = serve(tcp=0)
+    remote = transport(TcpTransport, served.tcp.url)
+    remote.reset(5)
+    robot = served.env.unwrapped.robot
+    before = robot.state.stamp[0]
+    for _ in range(3):
+        remote.step(RISE)
+    assert isinstance(robot, ServedRobot)
+    assert robot.state.stamp[0] - before >= 0.15 - 1e-9
+
+
+def test_it_ends_at_once_while_a_client_steps(serve, transport):
+    served = serve()
+    remote, several, failed = transport(RosbridgeTransport, served.bus.url), threading.Event(), []
+
+    def play():
+        try:
+            for number in range(1000):
+                remote.step(RISE)
+                if number == 2:
+                    several.set()
+        except RobotFault as fault:
+            failed.append(fault)
+
+    remote.reset(5)
+    player = threading.Thread(target=play)
+    player.start()
+    assert several.wait(10.0)
+    ending = threading.Thread(target=served.close)
+    ending.start()
+    ending.join(5.0)
+    assert not ending.is_alive()  # a step would wait longer for a clock that stands still
+    player.join(10.0)
+    assert len(failed) == 1
+    ending.join()
+
+
+def test_real_time_needs_a_period(serve):
+    with pytest.raises(InvalidValue, match=r"does not say its period, so it has no real time; serve it with --fast\."):
+        serve("Taxi-v3", env=Timeless(), realtime=True)
+
+
+class Timeless(gym.Env):
+    observation_space = action_space = gym.spaces.Discrete(2)
+    metadata = {}  # noqa: RUF012 - Gymnasium's attribute
+    closed = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return 0, {}
+
+    def step(self, action):
+        return 0, 0.0, False, False, {}
+
+    def close(self):
+        self.closed += 1
+
+
+def test_topics_and_environment_are_one_robot_with_one_client_in_command(serve, link, transport):
+    served = serve(fast=True, tcp=0)
+    client, remote = link(served.bus.url), transport(TcpTransport, served.tcp.url)
+    robot = served.env.unwrapped.robot
+    start = robot.state.signals["joint_position"][0].copy()
+    send(client, start + 0.01)
+    wait_for(lambda: robot.state.stamp[0] > 0.049, client)  # one command, one period
+    np.testing.assert_allclose(robot.setpoint[0, :6], start + 0.01)
+    with pytest.raises(NotInCommand, match="is in command, not"):
+        remote.reset(1)
+    client.close()
+    other = link(served.bus.url)
+    wait_for(lambda: served.lease.holder is None, other)
+    remote.reset(1)
+    said = []
+    other.on_status(lambda status: said.append(status["msg"]))
+    send(other, start + 0.02)
+    wait_for(lambda: said, other)
+    assert "is in command, not" in said[0]
+    assert [line.rpartition(" is ")[2] for line in served.lines] == ["in command", "no longer in command", "in command"]
+
+
+def test_it_says_what_the_robot_is(serve, link):
+    served = serve(fast=True, namespace="cell")
+    answer = link(served.bus.url).call("/cell/bam/robot", "std_srvs/Trigger", {}, 5.0)
+    info = read_info(answer["message"], "/cell/bam/robot")
+    assert (info.name, info.simulated, info.lockstep, info.period) == ("ur5e", True, True, 0.05)
+
+
+def test_through_somebody_elses_server(serve, link, transport):
+    with BridgeServer(port=0) as theirs:
+        served = serve(fast=True, via=f"{theirs.url}/lab")
+        assert served.endpoints == [
+            f"bam/pick-v0 on {served.bus.url}, fast: /lab/gym_env/gym_api_request and a ur5e's topics under /lab"
+        ]
+        for channel in ("service", "topics"):
+            remote = transport(RosbridgeTransport, f"{theirs.url}/lab", channel=channel, take=True)
+            local = gym.make("bam/pick-v0", disable_env_checker=True)
+            np.testing.assert_array_equal(remote.reset(5)[0], local.reset(seed=5)[0])
+            np.testing.assert_array_equal(remote.step(RISE)[0], local.step(RISE)[0])
+            remote.close()
+            local.close()
+        client = link(theirs.url)
+        send(client, served.env.unwrapped.robot.state.signals["joint_position"][0], "/lab")
+        wait_for(lambda: served.lease.holder == "a sender without a name", client)
+    assert any("It is tried again until it is back; the robot rests meanwhile." in line for line in served.lines)
+
+
+def test_a_robot_that_is_there_already_is_not_doubled(serve):
+    with BridgeServer(port=0) as theirs:
+        serve(fast=True, via=theirs.url)
+        env = gym.make("bam/pick-v0", disable_env_checker=True)
+        with pytest.raises(InvalidValue) as caught:
+            serve(env=env, fast=True, via=theirs.url)
+        assert str(caught.value) == (
+            f"{theirs.url}: /bam/robot answers there already, so another robot has these names. "
+            "Give this one names of its own: --namespace NAME."
+        )
+        serve(fast=True, via=theirs.url, namespace="cell_2")
+        with pytest.raises(InvalidValue, match="/cell_2/bam/robot answers there already"):
+            serve(fast=True, via=theirs.url, namespace="cell_2")
+
+
+def test_what_stands_open_is_told(serve, monkeypatch):
+    monkeypatch.setattr(ServeOptions, "warning", "it stands open")
+    assert serve("CartPole-v1").lines == ["it stands open"]
+
+
+def test_nobody_at_the_address_of_the_other_server(serve):
+    env = Timeless()
+    with pytest.raises(NoServer, match=r"^ws://127\.0\.0\.1:1: refused"):
+        serve(env=env, via="ws://127.0.0.1:1")
+    assert env.closed > 0
+
+
+def test_what_was_started_ends_if_the_rest_cannot_start(serve):
+    env = Timeless()
+    with BridgeServer(port=0) as theirs:
+        with pytest.raises(InvalidValue, match=f"Port {theirs.port} on 127.0.0.1 is in use"):
+            serve(env=env, port=theirs.port)
+        assert env.closed > 0
+        with pytest.raises(InvalidValue, match=f"Cannot listen on 127.0.0.1 port {theirs.port}"):
+            serve(tcp=theirs.port)
+
+
+def test_a_token(serve, link, transport, tmp_path):
+    path = tmp_path / "token"
+    path.write_text(" secret \n")
+    path.chmod(0o600)
+    served = serve("CartPole-v1", token_file=str(path), tcp=0)
+    with pytest.raises(NoServer, match="token"):
+        link(served.bus.url)
+    link(served.bus.url, token="secret")
+    transport(TcpTransport, served.tcp.url, token="secret")
+
+
+def test_a_clock_that_ended_is_noticed(serve):
+    served = serve()
+    served._robot_service.clock.stop()
+    with pytest.raises(RemoteError, match=r"The clock of the robot stands still\."):
+        served.require_running()

@@ -1,0 +1,88 @@
+"""Transports of URLs."""
+
+import pytest
+
+from bam_envs.core.errors import InvalidValue
+from bam_envs.remote.remote_env import open_transport
+from bam_envs.remote.rosbridge_transport import RosbridgeTransport
+from bam_envs.remote.tcp_transport import TcpTransport
+
+
+def test_each_scheme_has_its_class():
+    tcp = open_transport("tcp://127.0.0.1:5555", env_id="bam/pick", timeout=2.0)
+    assert type(tcp) is TcpTransport
+    assert (tcp.url, tcp.env_id, tcp.timeout) == ("tcp://127.0.0.1:5555", "bam/pick", 2.0)
+    assert type(open_transport("ws://127.0.0.1:9090/bam_001")) is RosbridgeTransport
+    assert type(open_transport("wss://robot.example:9090")) is RosbridgeTransport
+
+
+@pytest.mark.parametrize(
+    ("url", "text"),
+    [
+        (
+            "tcq://x:1",
+            "tcq://x:1: Unknown transport 'tcq'. Did you mean 'tcp'? It must be one of tcp://, ws://, wss://, ",
+        ),
+        (
+            "10.0.0.5:9090",
+            "A transport is a URL such as tcp://10.0.0.5:5555 or ws://10.0.0.5:9090, not '10.0.0.5:9090'.",
+        ),
+        ("ws://", "A transport is a URL such as tcp://10.0.0.5:5555 or ws://10.0.0.5:9090, not 'ws://'."),
+        ("", "A transport is a URL such as tcp://10.0.0.5:5555 or ws://10.0.0.5:9090, not ''."),
+        ("tcp://x", "A TCP address is tcp://host:port, such as tcp://10.0.0.5:5555, not 'tcp://x'."),
+        ("tcp://x:0", "A TCP address is tcp://host:port, such as tcp://10.0.0.5:5555, not 'tcp://x:0'."),
+        ("tcp://x:1/space", "A TCP address is tcp://host:port, such as tcp://10.0.0.5:5555, not 'tcp://x:1/space'."),
+        ("tcp://a..b:1", "'tcp://a..b:1' is not a TCP address: "),
+        ("tcp://[::1:1", "'tcp://[::1:1' is not a TCP address: Invalid IPv6 URL."),
+        ("tcp://x:99999", "'tcp://x:99999' is not a TCP address: Port out of range 0-65535."),
+    ],
+)
+def test_what_is_no_address(url, text):
+    with pytest.raises(InvalidValue) as caught:
+        open_transport(url)
+    assert str(caught.value).startswith(text)
+
+
+def test_options_that_a_transport_does_not_have():
+    with pytest.raises(InvalidValue) as caught:
+        open_transport("tcp://x:1", channel="topics")
+    assert str(caught.value) == (
+        "tcp://x:1 takes no channel; its options are timeout, connect_timeout, token, name, take."
+    )
+
+
+@pytest.mark.parametrize("url", ["tcp://x:1", "ws://x:1"])
+def test_certificates_without_tls(url):
+    with pytest.raises(InvalidValue) as caught:
+        open_transport(url, ca_file="ca.pem")
+    assert str(caught.value) == (
+        f"{url}: ca_file says whom wss:// trusts, and this address is without TLS; leave it out."
+    )
+    open_transport("wss://x:1", ca_file="ca.pem")
+
+
+@pytest.mark.parametrize("url", ["tcp://x:1", "ws://x:1", "ros2://x"])
+def test_how_long_an_answer_is_waited_for(url):
+    assert open_transport(url, timeout=None).timeout == 30.0
+    assert open_transport(url, timeout=2.5).timeout == 2.5
+
+
+def test_a_token_file(tmp_path):
+    path = tmp_path / "token"
+    path.write_text("geheim\n")
+    assert open_transport("tcp://x:1", token_file=str(path))._token == "geheim"
+    with pytest.raises(InvalidValue) as caught:
+        open_transport("tcp://x:1", token_file=str(tmp_path / "none"))
+    assert str(caught.value) == f"The token file {tmp_path / 'none'} cannot be read: No such file or directory."
+
+
+@pytest.mark.parametrize("url", ["tcp://x:1", "ws://x:1"])
+@pytest.mark.parametrize(
+    ("content", "text"), [(b" \n", "is empty; put a secret into it."), (b"\xff", "cannot be read: it is not text.")]
+)
+def test_a_token_file_that_holds_none(tmp_path, url, content, text):
+    path = tmp_path / "token"
+    path.write_bytes(content)
+    with pytest.raises(InvalidValue) as caught:
+        open_transport(url, token_file=str(path))
+    assert str(caught.value) == f"The token file {path} {text}"

@@ -1,0 +1,203 @@
+"""Whole environments through the embedded rosbridge server."""
+
+import socket
+import threading
+from contextlib import closing
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, NotInCommand, ProtocolError
+from bam_envs.remote.rosbridge_transport import RosbridgeTransport
+from bam_envs.remote.serve.env_server import EnvServer
+from bam_envs.remote.serve.gymapi_service import GymApiService
+from bam_envs.remote.transport import Transport
+from bam_envs.rosbridge.link.link import RosbridgeLink
+from bam_envs.rosbridge.server.server import BridgeServer
+from bam_envs.testing import TransportContract
+from bam_envs.testing.transports import MirrorEnv
+
+CAMERA = spaces.Box(0, 255, (8, 12, 3), np.uint8)
+
+
+class TestService(TransportContract):
+    channel = "service"
+
+    def make(self, env) -> Transport:
+        self.server = BridgeServer(port=0).start()
+        self.service = GymApiService(EnvServer(env), self.server, "bam_001").start()
+        return RosbridgeTransport(f"{self.server.url}/bam_001", channel=self.channel)
+
+    def finish(self) -> None:
+        self.service.close()
+        self.server.close()
+
+
+class TestTopics(TestService):
+    channel = "topics"
+
+
+@pytest.mark.parametrize("channel", ["service", "topics"])
+def test_after_a_time_out_nothing_is_sent_before_a_reset(served, open_to, channel):
+    begun, go_on = threading.Event(), threading.Event()
+
+    class Slow(MirrorEnv):
+        def step(self, action):
+            if not go_on.is_set():
+                begun.set()
+                go_on.wait(10)
+            return super().step(action)
+
+    env = served(Slow(spaces.Discrete(3)))
+    transport = open_to(channel=channel, timeout=0.3)
+    transport.reset()
+    with pytest.raises(LinkLost, match=r"did not answer in 0\.3 s"):
+        transport.step(1)
+    assert begun.is_set()
+    text = "the link was lost, so what the environment did since is unknown, and nothing was sent. Call reset"
+    with pytest.raises(LinkLost, match=text):
+        transport.step(2)
+    go_on.set()
+    transport.reset()
+    transport.step(0)
+    assert [int(one) for one in env.seen] == [1, 0]
+
+
+@pytest.mark.parametrize("channel", ["service", "topics"])
+def test_a_cut_link_needs_a_reset_and_comes_back(served, open_to, server, channel):
+    env = served(MirrorEnv(spaces.Discrete(3)))
+    transport = open_to(channel=channel)
+    transport.reset()
+    transport.step(1)
+    server.close()
+    with pytest.raises(LinkLost):
+        transport.step(2)
+    with BridgeServer(port=server.port) as again:
+        served(env, on=again)
+        with pytest.raises(LinkLost, match=r"nothing was sent\. Call reset\(\) first\."):
+            transport.step(2)
+        transport.reset()
+        transport.step(0)
+        assert [int(one) for one in env.seen] == [1, 0]
+        transport.close()
+
+
+def test_another_environment_after_a_cut_is_told(served, open_to, server):
+    served(MirrorEnv(spaces.Discrete(3)))
+    transport = open_to()
+    transport.reset()
+    server.close()
+    with BridgeServer(port=server.port) as again:
+        served(MirrorEnv(spaces.Discrete(4)), on=again)
+        with pytest.raises(ProtocolError, match=r"it serves another environment than before: bam/pick-v0\."):
+            transport.reset()
+        transport.close()
+
+
+NO_FORCE = (
+    r"for 2 s\. Taking it by force needs the operator's token: start bam-serve with --operator-token-file, and show "
+    r"that one\.$"
+)
+
+
+def test_one_client_is_in_command(served, open_to):
+    served(MirrorEnv(spaces.Discrete(3)))
+    ann, bob, eve = open_to(name="ann"), open_to(name="bob"), open_to(name="eve", take=True, token="operator")
+    ann.reset()
+    with pytest.raises(NotInCommand, match=r"^ann \(127\.0\.0\.1:\d+\) is in command, not bob \(127\.0\.0\.1:\d+\)"):
+        bob.reset()
+    with pytest.raises(NotInCommand, match=NO_FORCE):
+        open_to(name="bob", take=True).reset()
+    eve.reset()
+    with pytest.raises(NotInCommand, match=r"^eve \(127\.0\.0\.1:\d+\) is in command, not ann#.*"):
+        ann.step(1)
+    eve.close()
+    bob.reset()
+    bob.step(1)
+
+
+@pytest.mark.parametrize("channel", ["service", "topics"])
+def test_who_leaves_behind_another_server_gives_command_up_at_once(served, open_to, server, channel):
+    env = MirrorEnv(spaces.Discrete(3))
+    with closing(RosbridgeLink(server.url)) as link:
+        link.connect()
+        served(env, on=link)
+        ann, bob = open_to(name="ann", channel=channel), open_to(name="bob", channel=channel)
+        ann.reset()
+        with pytest.raises(NotInCommand):
+            bob.reset()
+        ann.close()
+        bob.reset()
+        bob.close()
+
+
+def test_seeds_of_rows_and_options_reach_our_servers(served, open_to):
+    env = served(MirrorEnv(spaces.Discrete(3)))
+    transport = open_to()
+    for seed in (0, 5, 2**31, 2**40):
+        transport.reset(seed=np.int64(seed), options={"a": [1, 2.5], "b": None})
+        assert env.given[-1] == (seed, {"a": [1, 2.5], "b": None})
+
+
+@pytest.mark.parametrize("channel", ["service", "topics"])
+def test_an_environment_that_is_not_there(served, open_to, channel):
+    served(MirrorEnv(spaces.Discrete(3)))
+    with pytest.raises(NoServer, match="There is no environment 'bam/reach' here; bam/pick-v0 is served"):
+        open_to(env_id="bam/reach", channel=channel).connect()
+    assert open_to(env_id="Pick", channel=channel).connect().env_id == "bam/pick-v0"
+
+
+def test_nothing_is_served_in_that_namespace(served, open_to):
+    served(MirrorEnv(spaces.Discrete(3)))
+    with pytest.raises(NoServer) as error:
+        open_to("bam_002").connect()
+    assert "/bam_002/gym_env/gym_api_request does not exist. Start one: bam-serve" in str(error.value)
+    assert str(error.value).endswith("Start one: bam-serve --env bam/pick --namespace bam_002")
+
+
+def test_nobody_answers_on_the_topics(server, open_to):
+    with pytest.raises(NoServer, match="rosbridge is there, and /bam_001/gym_env/request is silent: "):
+        open_to(channel="topics", connect_timeout=1.0).connect()
+
+
+def test_no_server_at_all():
+    with closing(socket.create_server(("127.0.0.1", 0))) as listener:
+        url = f"ws://127.0.0.1:{listener.getsockname()[1]}"
+    with pytest.raises(NoServer, match=r"(?i)refused"):
+        RosbridgeTransport(url).connect()
+
+
+def test_closed_is_closed(served, open_to):
+    served(MirrorEnv(spaces.Discrete(3)))
+    transport = open_to()
+    transport.reset()
+    transport.close()
+    for call in (transport.connect, transport.reset, lambda: transport.step(1)):
+        with pytest.raises(LinkLost, match="this transport is closed"):
+            call()
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"channel": "pigeon"}, "The channel must be service or topics, not 'pigeon'."),
+        ({"timeout": 0}, "Time-outs must be above 0 s, not 0 and 3."),
+        ({"num_envs": 0}, "num_envs must be at least 1, not 0."),
+    ],
+)
+def test_options_that_are_not_possible(options, text):
+    with pytest.raises(InvalidValue) as error:
+        RosbridgeTransport("ws://127.0.0.1:9090", **options)
+    assert str(error.value) == text
+
+
+@pytest.mark.parametrize("channel", ["service", "topics"])
+def test_pictures_on_both_channels(served, open_to, channel):
+    env = served(MirrorEnv(spaces.Dict(front=CAMERA, wrist=CAMERA)))
+    transport = open_to(channel=channel)
+    transport.reset()
+    value = env.action_space.sample()
+    back = transport.step(value)[0]
+    for name in ("front", "wrist"):
+        np.testing.assert_array_equal(back[name], value[name])

@@ -1,0 +1,175 @@
+"""Every space through every transport of ours, bit for bit, there and back."""
+
+import json
+from contextlib import closing
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import Space, spaces
+from gymnasium.vector.utils import concatenate, create_empty_array
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+
+from bam_envs.core.errors import InvalidValue
+from bam_envs.remote.serve.env_server import EnvServer
+from bam_envs.remote.serve.local_transport import LocalTransport
+from bam_envs.remote.serve.tcp_server import TcpServer
+from bam_envs.remote.tcp_transport import TcpTransport
+from bam_envs.remote.values import exact, pack, tree_from_json, tree_to_json
+from bam_envs.testing.transports import MirrorEnv, assert_same_value
+
+DTYPES = ("float16", "float32", "float64", "uint8", "int8", "int32", "int64", "uint64")
+
+
+@st.composite
+def boxes(draw: st.DrawFn) -> spaces.Box:
+    dtype = np.dtype(draw(st.sampled_from(DTYPES)))
+    shape = draw(st.one_of(st.just(()), array_shapes(max_dims=3, max_side=3)))
+    if dtype.kind != "f":
+        limits = np.iinfo(dtype)
+        return spaces.Box(limits.min, limits.max, shape, dtype)  # type: ignore[arg-type]
+    low, high = draw(st.sampled_from([(-np.inf, np.inf), (-1, 1), (0, np.inf), (-np.inf, 0)]))
+    return spaces.Box(low, high, shape, dtype)  # type: ignore[arg-type]
+
+
+@st.composite
+def multi_discretes(draw: st.DrawFn) -> spaces.MultiDiscrete:
+    shape = draw(array_shapes(max_dims=2, max_side=3))
+    nvec = draw(arrays(np.int64, shape, elements=st.integers(1, 9)))
+    return spaces.MultiDiscrete(nvec, start=draw(arrays(np.int64, shape, elements=st.integers(-9, 9))))
+
+
+@st.composite
+def texts(draw: st.DrawFn) -> spaces.Text:
+    charset = "".join(sorted(draw(st.sets(st.characters(codec="utf-8"), min_size=1, max_size=5))))
+    return spaces.Text(draw(st.integers(1, 9)), min_length=0, charset=charset)
+
+
+LEAVES = st.one_of(
+    boxes(),
+    st.builds(lambda n, start: spaces.Discrete(n, start=start), st.integers(1, 99), st.integers(-9, 9)),
+    multi_discretes(),
+    st.builds(spaces.MultiBinary, st.one_of(st.integers(1, 9), st.lists(st.integers(1, 4), min_size=2, max_size=3))),
+    texts(),
+)
+SPACES = st.recursive(
+    LEAVES,
+    lambda inner: st.one_of(
+        st.dictionaries(st.text(max_size=5), inner, max_size=3).map(lambda some: spaces.Dict(list(some.items()))),  # type: ignore[arg-type]
+        st.lists(inner, max_size=3).map(spaces.Tuple),
+        st.builds(lambda one, stack: spaces.Sequence(one, stack=stack and has_length(one)), inner, st.booleans()),
+    ),
+    max_leaves=5,
+)
+
+
+def has_length(space: Space[Any]) -> bool:
+    """Whether a stack of `space` shows how many there are: an empty Dict or Tuple has nothing to stack."""
+    inner = getattr(space, "spaces", None)
+    if inner is None:
+        return not isinstance(space, spaces.Sequence) or has_length(space.feature_space)
+    return bool(inner) and all(has_length(one) for one in (inner.values() if isinstance(inner, dict) else inner))
+
+
+def values(space: Space[Any]) -> st.SearchStrategy[Any]:
+    """Values of `space`: every float and integer that it holds, infinities where its bounds are."""
+    return _VALUES[type(space)](space)
+
+
+def _box_values(space: spaces.Box) -> st.SearchStrategy[Any]:
+    dtype = space.dtype
+    if dtype.kind != "f":
+        return arrays(dtype, space.shape, elements=st.integers(int(np.iinfo(dtype).min), int(np.iinfo(dtype).max)))
+    low, high = (float(bound.flat[0]) for bound in (space.low, space.high))
+    bounds = {"min_value": None if np.isinf(low) else low, "max_value": None if np.isinf(high) else high}
+    numbers = st.floats(**bounds, allow_nan=False, width=8 * dtype.itemsize)
+    inside = numbers.filter(lambda number: low <= number <= high)
+    return arrays(dtype, space.shape, elements=inside)
+
+
+def _items(space: spaces.Sequence) -> st.SearchStrategy[Any]:
+    items = st.lists(values(space.feature_space), max_size=3).map(tuple)
+    return items.map(lambda some: _stacked(space.feature_space, some)) if space.stack else items
+
+
+def _stacked(feature: Space[Any], items: tuple[Any, ...]) -> Any:
+    empty = create_empty_array(feature, len(items))
+    return concatenate(feature, items, empty) if items else empty
+
+
+_VALUES: dict[type, Any] = {
+    spaces.Box: _box_values,
+    spaces.Discrete: lambda space: st.integers(int(space.start), int(space.start + space.n) - 1).map(np.int64),
+    spaces.MultiDiscrete: lambda space: st.integers(0, 2**32).map(lambda seed: _sample(space, seed)),
+    spaces.MultiBinary: lambda space: arrays(np.int8, space.shape, elements=st.integers(0, 1)),
+    spaces.Text: lambda space: st.text(st.sampled_from(space.character_list), max_size=space.max_length),
+    spaces.Dict: lambda space: st.fixed_dictionaries({key: values(one) for key, one in space.spaces.items()}),
+    spaces.Tuple: lambda space: st.tuples(*[values(one) for one in space.spaces]),
+    spaces.Sequence: _items,
+}
+
+
+def _sample(space: Space[Any], seed: int) -> Any:
+    space.seed(seed)
+    return space.sample()
+
+
+@st.composite
+def cases(draw: st.DrawFn) -> tuple[Space[Any], list[Any]]:
+    """A space and some values of it."""
+    space = draw(SPACES)
+    return space, [draw(values(space)) for _ in range(3)]
+
+
+def there_and_back(transport, env, values):
+    transport.connect()
+    transport.reset(seed=1)
+    for value in values:
+        assert_same_value(transport.step(value)[0], value, "observation")
+        assert_same_value(env.seen[-1], value, "action")
+
+
+@settings(max_examples=300, deadline=None)
+@given(cases())
+def test_local(case):
+    space, values = case
+    env = MirrorEnv(space)
+    there_and_back(LocalTransport(env), env, values)
+
+
+@settings(max_examples=200, deadline=None)
+@given(cases())
+def test_tcp(case):
+    space, values = case
+    env = MirrorEnv(space)
+    with TcpServer(EnvServer(env)) as server, closing(TcpTransport(server.url)) as transport:
+        there_and_back(transport, env, values)
+
+
+@settings(max_examples=300, deadline=None)
+@given(cases())
+def test_strict_json(case):
+    space, values = case
+    for value in values:
+        text = json.dumps(tree_to_json(pack(space, value)), allow_nan=False)
+        assert_same_value(exact(space, tree_from_json(json.loads(text))), value, "value")
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float32", "float64"])
+def test_nan_is_refused_everywhere(dtype):
+    inner = spaces.Box(-np.inf, np.inf, (2, 3), dtype)
+    space = spaces.Dict({"x": spaces.Tuple([spaces.Discrete(2), spaces.Sequence(inner)])})
+    array = np.zeros((2, 3), dtype)
+    array[1, 2] = np.nan
+    env = MirrorEnv(space)
+    with TcpServer(EnvServer(env)) as server:
+        for transport in (LocalTransport(env), TcpTransport(server.url)):
+            transport.connect()
+            transport.reset()
+            with pytest.raises(InvalidValue) as caught:
+                transport.step({"x": (0, (np.zeros((2, 3), dtype), array))})
+            assert str(caught.value) == "action['x'][1][1][1, 2] is NaN; only numbers are sent."
+            transport.close()
+    assert env.seen == []

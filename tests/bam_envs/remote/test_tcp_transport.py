@@ -1,0 +1,376 @@
+"""TcpTransport: what it says when nobody is there, and what it does when the link drops."""
+
+import contextlib
+import multiprocessing
+import os
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, ProtocolError, RemoteError
+from bam_envs.remote.serve.env_server import EnvServer
+from bam_envs.remote.serve.local_transport import FakeEnv
+from bam_envs.remote.serve.tcp_server import TcpServer
+from bam_envs.remote.tcp_transport import TcpTransport
+from bam_envs.remote.tcp_wire import FrameSocket, encode
+from bam_envs.remote.transport import spec_to_json
+from bam_envs.testing.transports import MirrorEnv
+
+PATIENCE = 10.0
+ACTION = np.zeros(2, np.float32)
+
+
+@pytest.fixture
+def env():
+    return MirrorEnv(spaces.Box(-1, 1, (2,)))
+
+
+@pytest.fixture
+def server(env):
+    with TcpServer(EnvServer(env)) as server:
+        yield server
+
+
+@contextlib.contextmanager
+def answering(*answers):
+    """A server that gives each connection these answers, one after each frame, and then hangs up; its URL."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    asked = []
+
+    def serve():
+        with contextlib.suppress(OSError):
+            while True:
+                sock, _ = listener.accept()
+                frames = FrameSocket(sock)
+                for answer in answers:
+                    with contextlib.suppress(ProtocolError, LinkLost):
+                        asked.append(frames.receive(time.monotonic() + PATIENCE))
+                        answer(sock, frames, asked[-1])
+                frames.close()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield f"tcp://127.0.0.1:{listener.getsockname()[1]}", asked
+    finally:
+        listener.shutdown(socket.SHUT_RDWR)
+        listener.close()
+        thread.join(PATIENCE)
+
+
+def welcome(sock, frames, tree):
+    spec = EnvServer(FakeEnv()).spec()
+    frames.send(encode([0, "ok", spec_to_json(spec)]), time.monotonic() + PATIENCE)
+
+
+def hang_up(sock, frames, tree):
+    pass
+
+
+def saying(data):
+    return lambda sock, frames, tree: sock.sendall(data)
+
+
+def telling(kind, content):
+    return lambda sock, frames, tree: frames.send(encode([tree[1][2], kind, content]), time.monotonic() + PATIENCE)
+
+
+def refused(url, **options):
+    transport = TcpTransport(url, **options)
+    with pytest.raises(NoServer) as caught:
+        transport.connect()
+    transport.close()
+    assert caught.value.url == url
+    return str(caught.value).removeprefix(f"{url}: ")
+
+
+def test_nobody_listens():
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    assert refused(f"tcp://127.0.0.1:{port}") == (
+        f"nobody listens there (is the port open?). Start one: bam-serve --env bam/pick --tcp {port}"
+    )
+    assert refused(f"tcp://127.0.0.1:{port}", env_id="bam/reach").endswith(f"bam-serve --env bam/reach --tcp {port}")
+
+
+def test_a_name_that_nobody_has():
+    text = refused("tcp://nobody.invalid:5555")
+    assert text == ("no computer is known by the name 'nobody.invalid'. Start one: bam-serve --env bam/pick --tcp 5555")
+
+
+def test_somebody_listens_and_says_nothing():
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        url = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        begun = time.monotonic()
+        assert refused(url, connect_timeout=0.05).startswith(
+            "not a bam-serve TCP server: timed out. If it is rosbridge, use ws://; "
+        )
+        assert time.monotonic() - begun < 3
+
+
+def test_somebody_who_hangs_up():
+    with answering(hang_up) as (url, _):
+        assert refused(url) == (
+            "not a bam-serve TCP server: the other end closed the connection. If it is rosbridge, use ws://; "
+            "else start one at a free port: bam-serve --env bam/pick --tcp PORT"
+        )
+
+
+def test_a_server_of_http():
+    with answering(saying(b"HTTP/1.1 400 Bad Request\r\n\r\n")) as (url, _):
+        assert refused(url) == (
+            "not a bam-serve TCP server: it says b'HTTP/1.1 400'; rosbridge servers have ws:// URLs"
+        )
+
+
+def test_a_real_server_of_websockets():
+    from websockets.sync.server import serve
+
+    with serve(lambda connection: None, "127.0.0.1", 0) as other:
+        thread = threading.Thread(target=other.serve_forever)
+        thread.start()
+        text = refused(f"tcp://127.0.0.1:{other.socket.getsockname()[1]}")
+        other.shutdown()
+        thread.join(PATIENCE)
+    assert text.startswith("not a bam-serve TCP server: ")
+
+
+def test_another_version():
+    with answering(saying(b"bam\x07" + bytes(8))) as (url, _):
+        assert refused(url) == "version 7 of the protocol there, 1 here; install one bam-train on both sides"
+
+
+@pytest.mark.parametrize("content", [{}, 3, {"env_id": "x"}])
+def test_a_description_that_is_none(content):
+    answer = lambda sock, frames, tree: frames.send(encode([0, "ok", content]), time.monotonic() + PATIENCE)  # noqa: E731
+    with answering(answer) as (url, _):
+        assert refused(url).startswith("not a bam-serve TCP server: Expected the description of an environment, found ")
+
+
+def test_the_constructor_does_no_io():
+    TcpTransport("tcp://nobody.invalid:1").close()
+
+
+def test_requests_carry_session_epoch_sequence_and_deadline():
+    with answering(welcome, telling("ok", [np.zeros(3, np.float32), {}])) as (url, asked):
+        transport = TcpTransport(url, timeout=7.0)
+        transport.connect()
+        transport.reset(5)
+        transport.close()
+    kind, (session, epoch, sequence, sent, deadline), seed, options, take = asked[1]
+    assert (kind, seed, options, take) == ("reset", 5, None, False)
+    assert (session, epoch, sequence) == (asked[0][1]["session"], 1, 1)
+    assert round(deadline - sent, 3) == 7.0
+
+
+def test_a_lost_link_stays_down_until_a_reset_and_nothing_is_sent_again(env):
+    server = TcpServer(EnvServer(env))
+    server.start()
+    transport = TcpTransport(server.url)
+    transport.connect()
+    transport.reset()
+    server.close()
+    with pytest.raises(LinkLost) as caught:
+        transport.step(ACTION)
+    assert str(caught.value) == f"{server.url}: the other end closed the connection."
+    again = TcpServer(EnvServer(env), port=server.port)
+    again.start()
+    with pytest.raises(LinkLost) as caught:
+        transport.step(ACTION)
+    assert str(caught.value) == (
+        f"{server.url}: the link is down, and nothing was sent. Call reset() to connect again."
+    )
+    assert env.seen == []
+    transport.reset()
+    transport.step(ACTION)
+    assert len(env.seen) == 1
+    transport.close()
+    again.close()
+
+
+def test_no_answer_in_time_is_a_lost_link_and_the_server_does_not_act_later(env):
+    server = TcpServer(EnvServer(env))
+    server.start()
+    transport = TcpTransport(server.url)
+    transport.connect()
+    transport.reset()
+    transport.timeout = 0.1
+    with server.server.lock, pytest.raises(LinkLost) as caught:
+        transport.step(ACTION)
+    assert str(caught.value) == f"{server.url}: no answer to step within 0.1 s."
+    transport.close()
+    server.close()
+    assert env.seen == []
+
+
+def test_a_server_that_answers_something_else():
+    with answering(welcome, telling("ok", [np.zeros(4, np.float32), {}])) as (url, _):
+        transport = TcpTransport(url)
+        transport.connect()
+        with pytest.raises(ProtocolError) as caught:
+            transport.reset()
+        assert str(caught.value) == (f"{url}: observation must have shape (3,), not (4,).")
+        transport.close()
+
+
+def test_a_server_that_sends_nan():
+    with answering(welcome, telling("ok", [np.float32([0, np.nan, 0]), {}])) as (url, _):
+        transport = TcpTransport(url)
+        transport.connect()
+        with pytest.raises(ProtocolError) as caught:
+            transport.reset()
+        assert str(caught.value) == f"{url}: observation[1] is NaN; only numbers are sent."
+        transport.close()
+
+
+def test_an_answer_to_another_request_drops_the_link():
+    wrong = lambda sock, frames, tree: frames.send(encode([99, "ok", None]), time.monotonic() + PATIENCE)  # noqa: E731
+    with answering(welcome, wrong) as (url, _):
+        transport = TcpTransport(url)
+        transport.connect()
+        with pytest.raises(ProtocolError) as caught:
+            transport.reset()
+        assert str(caught.value) == "Expected the answer to request 1, found [99, 'ok', None]."
+        with pytest.raises(LinkLost):
+            transport.step(np.zeros(2, np.float32))
+        transport.close()
+
+
+def test_another_environment_after_a_reconnect_is_refused(env):
+    server = TcpServer(EnvServer(env))
+    server.start()
+    transport = TcpTransport(server.url)
+    transport.connect()
+    server.close()
+    other = TcpServer(EnvServer(FakeEnv()), port=server.port)
+    other.start()
+    with pytest.raises(LinkLost):
+        transport.reset()
+    with pytest.raises(ProtocolError) as caught:
+        transport.reset()
+    assert str(caught.value) == f"{server.url}: it serves another environment than before: FakeEnv."
+    transport.close()
+    other.close()
+
+
+def test_an_error_of_the_environment_leaves_the_link_up(server, env):
+    transport = TcpTransport(server.url)
+    transport.connect()
+    transport.reset()
+    env.fault = ZeroDivisionError("by nought")
+    with pytest.raises(RemoteError) as caught:
+        transport.step(ACTION)
+    assert str(caught.value) == "ZeroDivisionError: by nought"
+    transport.reset()
+    transport.step(ACTION)
+    transport.close()
+
+
+def test_closing_ends_a_request_that_is_under_way(server):
+    transport = TcpTransport(server.url)
+    transport.connect()
+    transport.reset()
+    told, waiting = [], threading.Event()
+
+    def step():
+        waiting.set()
+        with pytest.raises(LinkLost) as caught:
+            transport.step(ACTION)
+        told.append(str(caught.value))
+
+    with server.server.lock:
+        thread = threading.Thread(target=step)
+        thread.start()
+        waiting.wait(PATIENCE)
+        deadline = time.monotonic() + PATIENCE
+        while not transport._lock.locked() and time.monotonic() < deadline:
+            pass
+        transport.close()
+        thread.join(PATIENCE)
+    assert len(told) == 1
+    assert "closed" in told[0]
+
+
+def test_closing_while_it_connects_leaves_no_link(server, monkeypatch):
+    transport = TcpTransport(server.url)
+    open_link = transport._open
+
+    def slow():
+        spec = open_link()
+        frames, transport._frames = transport._frames, None  # as if close() came before there was a link
+        transport.close()
+        transport._frames = frames
+        return spec
+
+    monkeypatch.setattr(transport, "_open", slow)
+    with pytest.raises(LinkLost) as caught:
+        transport.connect()
+    assert str(caught.value) == f"{server.url}: this transport is closed; make a new one."
+    assert transport._frames is None
+
+
+@pytest.mark.parametrize(
+    ("seed", "text"),
+    [
+        (-1, "A seed must be a whole number from 0 to 18446744073709551615, not -1."),
+        ([2**64], f"A seed must be a whole number from 0 to 18446744073709551615, not {2**64}."),
+    ],
+)
+def test_seeds_that_do_not_travel(server, seed, text):
+    transport = TcpTransport(server.url)
+    with pytest.raises(InvalidValue) as caught:
+        transport.reset(seed)
+    assert str(caught.value) == text
+    transport.close()
+
+
+def test_seeds_of_numpy_are_numbers(server, env):
+    transport = TcpTransport(server.url)
+    transport.reset(np.int64(3))
+    assert env.given[-1][0] == 3
+    assert type(env.given[-1][0]) is int
+    transport.close()
+
+
+def test_options_reach_the_environment(server, env):
+    transport = TcpTransport(server.url)
+    transport.reset(options={"easy": True, "at": np.arange(2)})
+    assert env.given[-1][1]["easy"] is True
+    np.testing.assert_array_equal(env.given[-1][1]["at"], [0, 1])
+    transport.close()
+
+
+def steps_in_child(transport, other_url, connection):
+    try:
+        transport.step(ACTION)
+    except LinkLost as error:
+        connection.send(str(error))
+    fresh = TcpTransport(other_url)
+    fresh.reset()
+    connection.send(fresh.step(ACTION)[1])
+    fresh.close()
+    connection.close()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*:DeprecationWarning")
+def test_a_link_of_the_parent_is_not_the_childs(server):
+    with TcpServer(EnvServer(MirrorEnv(spaces.Box(-1, 1, (2,))))) as other:
+        transport = TcpTransport(server.url)
+        transport.reset()
+        here, there = multiprocessing.Pipe()
+        child = multiprocessing.get_context("fork").Process(target=steps_in_child, args=(transport, other.url, there))
+        child.start()
+        assert here.poll(PATIENCE)
+        assert here.recv() == f"{server.url}: the link is down, and nothing was sent. Call reset() to connect again."
+        assert here.poll(PATIENCE)
+        assert here.recv() == 1 / 7
+        child.join(PATIENCE)
+        assert transport.step(ACTION)[1] == 1 / 7
+        transport.close()
+        here.close()
+        there.close()
