@@ -5,9 +5,9 @@ import subprocess
 from tests.peers.conftest import ROS
 
 FILES = (
-    "tests/bam_envs/remote/serve/test_rclpy_bus.py",
-    "tests/bam_envs/remote/serve/test_rclpy_messages.py",
-    "tests/bam_envs/remote/transports/test_rclpy.py",
+    "tests/bam_envs/remote/test_ros2_node.py",
+    "tests/bam_envs/remote/test_ros2_messages.py",
+    "tests/bam_envs/remote/test_ros2_transport.py",
 )
 
 
