@@ -14,7 +14,7 @@ from bam_envs.remote.remote_env import RemoteVectorEnv
 from bam_envs.remote.rosbridge_transport import RosbridgeTransport
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
-from bam_envs.rosbridge.link.link import RosbridgeLink
+from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.testing.transports import MirrorEnv
 from tests.gymapi_versions import JUNE_17, JUNE_22, RESET, STEP, VERSIONS, Client, Rack
 

@@ -7,7 +7,7 @@ import time
 import pytest
 
 from bam_envs.core.errors import LinkLost, RemoteError
-from bam_envs.rosbridge.link.link import RosbridgeLink
+from bam_envs.rosbridge.client import RosbridgeLink
 
 GRIPPER = "/gripper/commands"
 ARRAY = "std_msgs/Float64MultiArray"

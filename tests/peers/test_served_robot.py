@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import bam_envs  # noqa: F401 - registers the environments
-from bam_envs.rosbridge.link.link import RosbridgeLink
+from bam_envs.rosbridge.client import RosbridgeLink
 
 player = runpy.run_path(str(Path(__file__).parent / "play.py"))
 POSITIONS, GRIPPER = "/forward_position_controller/commands", "/gripper/commands"

@@ -18,7 +18,7 @@ from bam_envs.ros.messages import bare_type, same_type
 from bam_envs.ros.profile_tables import RobotProfile, Sink
 
 if TYPE_CHECKING:
-    from bam_envs.rosbridge.link.link import RosbridgeLink
+    from bam_envs.rosbridge.client import RosbridgeLink
 
 _ASK_AGAIN = 0.1
 TIMEOUT = 3.0

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import ProtocolError, ResetNeeded, StaleState
-from bam_envs.live.mailbox import Letter
+from bam_envs.live.mailbox import Letter, Mailbox
 from bam_envs.live.state import SourceAge
 from bam_envs.ros.images import message_bytes, read_color_message, read_depth_message
 from bam_envs.ros.messages import read_stamp, require_message
 from bam_envs.ros.profile_tables import CameraSource
+from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
-from bam_envs.rosbridge.link.cbor_stream import CborStream
 
 Pixels = NDArray[Any]
 FIRST_IMAGE = 3.0
@@ -53,23 +53,21 @@ class CameraImage:
 
 
 class _Feed:
-    """The images of one topic, decoded only when they are asked for."""
+    """The newest image of one topic, on a connection and in a thread of its own."""
 
-    def __init__(self, stream: CborStream) -> None:
-        self._stream = stream
-        self._letter: Letter | None = None
+    def __init__(self, endpoint: Endpoint, topic: str, kind: str, clock: Callable[[], float]) -> None:
+        mailbox = self._mailbox = Mailbox(clock)
+        self._link = RosbridgeLink(endpoint, name="camera")
+        self._link.subscribe(topic, kind, lambda message, caller: mailbox.put(("",), message), compression="cbor")
 
     def open(self) -> None:
-        self._stream.start()
+        self._link.connect()
 
     def newest(self) -> Letter | None:
-        arrival, letter = self._stream.latest(), self._letter
-        if arrival is not None and (letter is None or letter.message is not arrival.message):
-            self._letter = Letter(arrival.message, arrival.at, 1 if letter is None else letter.number + 1)
-        return self._letter
+        return self._mailbox.newest().get("")
 
     def close(self) -> None:
-        self._stream.close()
+        self._link.close()
 
 
 class LiveCamera:
@@ -120,7 +118,7 @@ class LiveCamera:
 
     def _new_feed(self) -> _Feed:
         endpoint = Endpoint(self.url, self._ca_file, self._token)
-        return _Feed(CborStream(endpoint, self._topic, self.source.type, clock=self._clock))
+        return _Feed(endpoint, self._topic, self.source.type, self._clock)
 
     def _await_first(self, feed: _Feed) -> None:
         deadline = time.monotonic() + FIRST_IMAGE

@@ -15,7 +15,7 @@ from bam_envs.rosbridge.bus import Caller, Listener, Message
 
 if TYPE_CHECKING:
     from bam_envs.live.bringup import TopicTypes
-    from bam_envs.rosbridge.link.link import RosbridgeLink
+    from bam_envs.rosbridge.client import RosbridgeLink
 
 FIRST_WITHIN = 0.3
 """Longest that what a robot says of itself once, and keeps for newcomers, is waited for [s]."""

@@ -49,9 +49,9 @@ from bam_envs.ros.codec import HALT_TOPIC, SCENE_TOPIC, RobotInfo, encode_sink
 from bam_envs.ros.command_messages import has_room
 from bam_envs.ros.freshness import Tag
 from bam_envs.ros.profile_tables import RobotProfile
+from bam_envs.rosbridge.client import RosbridgeLink
+from bam_envs.rosbridge.client_connection import bare_reason
 from bam_envs.rosbridge.endpoint import Endpoint
-from bam_envs.rosbridge.link.connection import bare_reason
-from bam_envs.rosbridge.link.link import RosbridgeLink
 from bam_envs.rosbridge.sessions import is_over
 from bam_envs.rosbridge.string_rpc import StringRpc
 from bam_envs.safety.gate import ClearedCommand
@@ -347,18 +347,15 @@ class RosbridgeRobot:
                     self._owed[tag.sequence] = self._sent_at
 
     def _ask(self, control: RosbridgeLink, command: Array, tag: Tag) -> None:
-        """Send as `_send`, and wait for the answer; that they were sent need not be waited for before."""
-        halts, messages, take_back = self._halts, self._messages(control, command, tag), _nothing
+        """Send as `_send`, and wait for the answer."""
+        halts, messages = self._halts, self._messages(control, command, tag)
         self._state.expect(tag.echo)
-        try:
-            with self._sending:
-                if self._halts == halts:
-                    self._note_driving()
-                    take_back = control.begin_publishing(messages, self._on_refusal)
-                    self._sent = command.copy()
-            self._await_answer()
-        finally:
-            take_back()
+        with self._sending:
+            if self._halts == halts:
+                self._note_driving()
+                control.publish_all(messages)
+                self._sent = command.copy()
+        self._await_answer()
 
     def _note_driving(self) -> None:
         self._commanded = self._drove = True
@@ -504,7 +501,3 @@ class RosbridgeRobot:
             refusal = self._refusals[0]
             self._refusals.clear()
             raise refusal
-
-
-def _nothing() -> None:
-    """Take nothing back: nothing was sent."""

@@ -12,7 +12,7 @@ from bam_envs.ros.freshness import Tagger
 from bam_envs.rosbridge.sessions import LEASE_TOPIC, LEAVE, RENEW, SESSION_SERVICE, read_session
 
 if TYPE_CHECKING:
-    from bam_envs.rosbridge.link.link import RosbridgeLink
+    from bam_envs.rosbridge.client import RosbridgeLink
 
 _EVERY = 0.5
 """Time between two signs of life of who drives [s]; the robot's side waits for several (`CommandLease`)."""

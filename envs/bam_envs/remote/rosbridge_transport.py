@@ -29,8 +29,8 @@ from bam_envs.remote.gymapi.requests import (
 from bam_envs.remote.gymapi.responses import GymResponse, read_response
 from bam_envs.remote.transport import EnvSpecMessage, Info, spec_from_json, spec_to_json
 from bam_envs.ros.freshness import Tagger
+from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
-from bam_envs.rosbridge.link.link import RosbridgeLink
 from bam_envs.rosbridge.sessions import is_over, read_session
 from bam_envs.rosbridge.string_rpc import StringRpc
 

@@ -1,7 +1,7 @@
 """The Bus protocol: topics and services, whoever carries them.
 
 Three carry them: the embedded server inside its own process (`bam_envs.rosbridge.server`), a link to a rosbridge
-server (`bam_envs.rosbridge.link`), and a native ROS 2 node (`bam_envs.remote.ros2_node`). Messages are plain
+server (`bam_envs.rosbridge.client`), and a native ROS 2 node (`bam_envs.remote.ros2_node`). Messages are plain
 dicts in the JSON form of rosbridge; a byte array is `bytes`. Types are written ``pkg/Type``; ``pkg/msg/Type`` and
 ``pkg/srv/Type`` are taken too.
 """

@@ -1,4 +1,4 @@
-"""What a WebSocket frame of rosbridge holds: strict JSON, CBOR, JSON inside a PNG, fragments of any of the texts."""
+"""What a WebSocket frame of rosbridge holds: JSON, CBOR with typed arrays (RFC 8746), JSON inside a PNG."""
 
 from __future__ import annotations
 
@@ -10,28 +10,26 @@ import sys
 import zlib
 from array import array
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 import cbor2
+import numpy as np
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
-from bam_envs.ros.interfaces import Field, describe, normal_name, variants
-from bam_envs.rosbridge.bounds import require_bounded
+from bam_envs.ros.checks import MAX_DEPTH
+from bam_envs.ros.interfaces import Field, describe, normal_name, require_plain, variants
 
 COMPRESSIONS = ("none", "png", "cbor")
 """How a message may be packed for a subscriber."""
-LONGEST_ID = 256
-"""Most characters of an id: it is kept, and said again, for as long as what it names is unfinished."""
-LARGEST_ID = 2**53
-"""Largest id that is a number: what every JSON reader holds exactly."""
-_MOST_FRAGMENTS = 10_000
-"""Of one outgoing message: a smaller fragment size would cost more than it carries."""
+MOST_ITEMS = 100_000
+"""Largest number of values in one JSON message of a client: lists and objects count, and each thing in them. An image
+is one text."""
+MOST_ITEMS_OF_A_SERVER = 4_000_000
+"""The same for messages of a server: an image may come as a list of numbers."""
+_NOT_BRACKETS = bytes(set(range(256)) - set(b'"[]{}'))
+_ONE_KIND = bytes.maketrans(b"{}", b"[]")
 
-_EMPTY = 100
-"""About what a fragment without any text costs [bytes]."""
-
-# RFC 8746: tag of a little-endian typed array, with the type code of `array`.
+# Tags of typed arrays by type, little-endian, with the type code of `array`.
 _TYPED = {
     "int8": (72, "b"),
     "int16": (77, "h"),
@@ -43,20 +41,133 @@ _TYPED = {
     "float32": (85, "f"),
     "float64": (86, "d"),
 }
+# All tags: 64-71 unsigned, 72-79 signed, 80-86 floating point; of each first the big-endian ones, by size. 68 is
+# "clamped" bytes, 76 is reserved, and 83 and 87 are quadruple precision, which NumPy does not have everywhere.
+_DTYPES = {
+    tag: np.dtype(name)
+    for tag, name in (
+        *zip(range(64, 72), ("u1", ">u2", ">u4", ">u8", "u1", "<u2", "<u4", "<u8"), strict=True),
+        *zip((72, 73, 74, 75, 77, 78, 79), ("i1", ">i2", ">i4", ">i8", "<i2", "<i4", "<i8"), strict=True),
+        *zip((80, 81, 82, 84, 85, 86), (">f2", ">f4", ">f8", "<f2", "<f4", "<f8"), strict=True),
+    )
+}
+
+# ---- decoding
 
 
 def decode_frame(data: str | bytes) -> dict[str, Any]:
-    """The message in one frame: a JSON object, alone and bounded (`bounds`). A binary frame holds the same in UTF-8.
+    """The message in a frame of a client: one JSON object, alone and bounded. A binary frame holds the same in UTF-8.
 
     NaN and infinities are read, so that what refuses them can say in which message and field they were.
 
     Raises:
-        ProtocolError: Not one JSON object, too much in it, too deeply nested.
+        ProtocolError: Not one JSON object, too many values, too deeply nested.
     """
-    value = _decode_json(data.encode(errors="surrogatepass") if isinstance(data, str) else data)
+    return _object(data, MOST_ITEMS, _STRICT)
+
+
+def decode_server_frame(data: bytes) -> dict[str, Any]:
+    """The message in a frame of a server, in JSON or CBOR; NaN and Infinity, which are not JSON but sent, are None.
+
+    Raises:
+        ProtocolError: As `decode_frame`, or of `decode_cbor`.
+    """
+    # No text in UTF-8 begins with a byte from 0x80 to 0xbf, and an object in CBOR does.
+    return decode_cbor(data) if b"\x80" <= data[:1] <= b"\xbf" else _object(data, MOST_ITEMS_OF_A_SERVER, _PATIENT)
+
+
+def require_bounded(data: bytes, most_items: int = MOST_ITEMS) -> None:
+    """Refuse JSON that is too much work, from a few passes over its bytes in C.
+
+    Args:
+        data: In UTF-8.
+        most_items: Largest number of values. Commas and brackets in texts count too.
+
+    Raises:
+        ProtocolError: There are more, or lists and objects are too deeply nested.
+    """
+    openings = data.count(b"[") + data.count(b"{")
+    if openings + data.count(b",") > most_items:
+        raise ProtocolError(f"Message: expected at most {most_items} values, found more.")
+    if openings > MAX_DEPTH and _is_deep(data):
+        raise ProtocolError(f"Message: expected at most {MAX_DEPTH} lists and objects in one another, found more.")
+
+
+def _is_deep(data: bytes) -> bool:
+    if b"\\" in data:
+        data = data.replace(b"\\\\", b"").replace(b'\\"', b"")
+    outside = b"".join(data.translate(_ONE_KIND, _NOT_BRACKETS).split(b'"')[::2])  # every second part is in a text
+    for _ in range(MAX_DEPTH):  # each pass removes the innermost pairs
+        outside = outside.replace(b"[]", b"")
+    return b"[" in outside
+
+
+def _object(data: str | bytes, most_items: int, decoder: json.JSONDecoder) -> dict[str, Any]:
+    data = data.encode(errors="surrogatepass") if isinstance(data, str) else data
+    require_bounded(data, most_items)
+    try:
+        value = decoder.decode(data.decode())
+    except UnicodeDecodeError as error:
+        raise ProtocolError(f"Message: expected text in UTF-8: {error.reason} at byte {error.start}.") from None
+    except RecursionError:
+        raise ProtocolError("Message: too deeply nested.") from None
+    except ValueError as error:  # JSONDecodeError, and Python's own limit for the digits of an integer
+        if str(error).startswith("Extra data"):
+            raise ProtocolError("Message: expected one in a frame, found more behind it.") from None
+        raise ProtocolError(f"Message: expected JSON: {error}.") from None
     if not isinstance(value, dict):
         raise ProtocolError(f"Message: expected an object, found {describe(value)}.")
     return value
+
+
+def decode_cbor(frame: bytes) -> dict[str, Any]:
+    """A message in CBOR; typed arrays in it become read-only arrays, shape (n,), in the byte order of this machine.
+
+    Raises:
+        ProtocolError: It is not CBOR, not an object, or has a tag that is no typed array.
+    """
+    try:
+        # cbor2 5 and 6 give a tag hook different arguments, so the tags are replaced afterwards.
+        message = _untag(cbor2.loads(frame))
+    except (cbor2.CBORDecodeError, ValueError, RecursionError) as error:
+        raise ProtocolError(f"expected CBOR, found {frame[:20]!r}: {error}") from error
+    if not isinstance(message, dict):
+        raise ProtocolError(f"expected an object in CBOR, found a {type(message).__name__}")
+    return message
+
+
+def _untag(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _untag(part) for name, part in value.items()}
+    if isinstance(value, list):
+        return [_untag(part) for part in value]
+    if not isinstance(value, cbor2.CBORTag):
+        return value
+    dtype = _DTYPES.get(value.tag)
+    if dtype is None or not isinstance(value.value, bytes):
+        raise ProtocolError(f"CBOR tag {value.tag} on a {type(value.value).__name__}: expected a typed array, 64 to 86")
+    if len(value.value) % dtype.itemsize:
+        raise ProtocolError(
+            f"CBOR tag {value.tag}: expected a multiple of {dtype.itemsize} bytes, found {len(value.value)}"
+        )
+    array = np.frombuffer(value.value, dtype)
+    return array if dtype.isnative else array.astype(dtype.newbyteorder("="))
+
+
+# ---- encoding
+
+
+def encode_frame(message: Mapping[str, Any]) -> str:
+    """A message of a client as JSON in ASCII; `bytes` in it become base64.
+
+    Raises:
+        InvalidValue: A number in it is not finite, or something is not plain; names the place.
+    """
+    try:
+        return encode_json(message)
+    except (TypeError, ValueError, RecursionError) as error:
+        require_plain(message, "message")
+        raise InvalidValue(f"message: expected plain values, found something else: {error}.") from error
 
 
 def encode_json(message: Mapping[str, Any]) -> str:
@@ -76,169 +187,15 @@ def encode_png(text: str) -> str:
     return base64.b64encode(b"\x89PNG\r\n\x1a\n" + chunks).decode("ascii")
 
 
+def _chunk(name: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+
 def encode_cbor(message: Mapping[str, Any], kind: str | None = None) -> bytes:
-    """A message as CBOR. The lists of numbers in ``msg``, of type `kind`, travel as typed arrays (RFC 8746)."""
+    """A message as CBOR. The lists of numbers in ``msg``, of type `kind`, travel as typed arrays."""
     if kind is not None:
         message = {**message, "msg": _typed(normal_name(kind), message["msg"])}
     return cbor2.dumps(message)
-
-
-def split(text: str, size: int, name: str) -> list[str]:
-    """`text` as messages ``fragment`` with `size` characters of it in each; `text` itself if it is short enough."""
-    if len(text) <= size:
-        return [text]
-    size = max(size, math.ceil(len(text) / _MOST_FRAGMENTS))
-    starts = range(0, len(text), size)
-    return [
-        encode_json({"op": "fragment", "id": name, "data": text[at : at + size], "num": num, "total": len(starts)})
-        for num, at in enumerate(starts)
-    ]
-
-
-@dataclass
-class _Parts:
-    total: int
-    deadline: float
-    texts: dict[int, str] = field(default_factory=dict)
-    size: int = 0
-    """Bytes: a text that is not ASCII takes up to four for a character."""
-
-
-class Fragments:
-    """Puts the fragments of one connection together again, in whatever order they come.
-
-    Args:
-        max_size: Most bytes that all unfinished messages may hold together.
-        lifetime: How long a message may stay unfinished [s].
-        max_messages: Most unfinished messages.
-    """
-
-    def __init__(self, max_size: int, lifetime: float = 10.0, max_messages: int = 16) -> None:
-        self.max_size, self.lifetime, self.max_messages = max_size, lifetime, max_messages
-        self._unfinished: dict[str | int, _Parts] = {}
-
-    @property
-    def size(self) -> int:
-        """What the unfinished messages hold [bytes]."""
-        return sum(parts.size for parts in self._unfinished.values())
-
-    def clear(self) -> None:
-        """Give all of them up."""
-        self._unfinished.clear()
-
-    @property
-    def deadline(self) -> float | None:
-        """When the first unfinished message is given up [s], clock of the caller; None if there is none."""
-        return min((parts.deadline for parts in self._unfinished.values()), default=None)
-
-    def add(self, message: Mapping[str, Any], now: float) -> str | None:
-        """Take a message ``fragment``; returns the whole text when it was the last one missing.
-
-        Raises:
-            ProtocolError: It does not fit; what there was of its message is given up.
-        """
-        name = _fragment_id(message.get("id"))
-        try:
-            return self._add(name, message, now)
-        except ProtocolError:
-            self._unfinished.pop(name, None)
-            raise
-
-    def expire(self, now: float) -> list[str | int]:
-        """Give up what is too old; returns the ids."""
-        late = [name for name, parts in self._unfinished.items() if parts.deadline <= now]
-        for name in late:
-            del self._unfinished[name]
-        return late
-
-    def _add(self, name: str | int, message: Mapping[str, Any], now: float) -> str | None:
-        num, total = _count(message, "num"), _count(message, "total")
-        data = message.get("data")
-        if not isinstance(data, str):
-            raise ProtocolError(f"fragment.data: expected a text, found {describe(data)}.")
-        parts = self._unfinished.get(name) or self._begin(name, total, now)
-        if total != parts.total or not num < total or parts.texts.get(num, data) != data:
-            raise ProtocolError(f"Fragment {num} of {total} of {name!r} does not fit the ones before it.")
-        if num not in parts.texts:
-            parts.texts[num] = data
-            # An empty fragment costs memory too.
-            parts.size += len(data) * (1 if data.isascii() else 4) + _EMPTY
-            self._require_room()
-        if len(parts.texts) < total:
-            return None
-        del self._unfinished[name]
-        return "".join(parts.texts[place] for place in range(total))
-
-    def _begin(self, name: str | int, total: int, now: float) -> _Parts:
-        if len(self._unfinished) >= self.max_messages:
-            raise ProtocolError(f"Fragments of {self.max_messages} messages are unfinished; send one to its end first.")
-        return self._unfinished.setdefault(name, _Parts(total, now + self.lifetime))
-
-    def _require_room(self) -> None:
-        if self.size > self.max_size:
-            raise ProtocolError(f"Fragments: expected at most {self.max_size} bytes, found {self.size}.")
-
-
-def _fragment_id(name: object) -> str | int:
-    if isinstance(name, bool) or not isinstance(name, (str, int)):
-        raise ProtocolError(f"fragment.id: expected a text, found {describe(name)}.")
-    if isinstance(name, str) and len(name) > LONGEST_ID:
-        raise ProtocolError(f"fragment.id: expected at most {LONGEST_ID} characters, found {len(name)}.")
-    if isinstance(name, int) and abs(name) > LARGEST_ID:
-        raise ProtocolError(f"fragment.id: expected an integer of 53 bits, found {describe(name)}.")
-    return name
-
-
-def _count(message: Mapping[str, Any], name: str) -> int:
-    value = message.get(name)
-    # The Python servers send the total as a float with a fraction: 8.52 for 8 fragments.
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < 2**31:
-        raise ProtocolError(f"fragment.{name}: expected a number >= 0, found {describe(value)}.")
-    return int(value)
-
-
-_ENCODER = json.JSONEncoder(
-    separators=(",", ":"), allow_nan=False, check_circular=False, default=lambda value: _base64(value)
-)
-_DECODER = json.JSONDecoder()
-
-
-def _base64(value: object) -> str:
-    if not isinstance(value, bytes):
-        raise InvalidValue(f"Message: expected plain values, found {describe(value)}.")
-    return base64.b64encode(value).decode("ascii")
-
-
-def _utf8(data: bytes) -> str:
-    try:
-        return data.decode()
-    except UnicodeDecodeError as error:
-        raise ProtocolError(f"Message: expected text in UTF-8: {error.reason} at byte {error.start}.") from None
-
-
-def _decode_json(data: bytes) -> Any:
-    require_bounded(data)
-    text = _utf8(data)
-    start = _skip(text, 0)
-    try:
-        value, end = _DECODER.raw_decode(text, start)
-    except RecursionError:
-        raise ProtocolError("Message: too deeply nested.") from None
-    except ValueError as error:  # JSONDecodeError, and Python's own limit for the digits of an integer
-        raise ProtocolError(f"Message: expected JSON: {error}.") from None
-    if _skip(text, end) < len(text):
-        raise ProtocolError("Message: expected one in a frame, found more behind it.")
-    return value
-
-
-def _skip(text: str, at: int) -> int:
-    while at < len(text) and text[at] in " \t\r\n":
-        at += 1
-    return at
-
-
-def _chunk(name: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
 
 def _typed(kind: str, message: Mapping[str, Any]) -> dict[str, Any]:
@@ -256,3 +213,14 @@ def _typed_field(one: Field, value: Any) -> Any:
     if isinstance(value, list):
         return [_typed(one.type, item) if isinstance(item, dict) else item for item in value]
     return _typed(one.type, value) if isinstance(value, dict) else value
+
+
+def _base64(value: object) -> str:
+    if not isinstance(value, bytes):
+        raise InvalidValue(f"Message: expected plain values, found {describe(value)}.")
+    return base64.b64encode(value).decode("ascii")
+
+
+_ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False, check_circular=False, default=_base64)
+# json.loads and json.dumps with options would make one for each message.
+_STRICT, _PATIENT = json.JSONDecoder(), json.JSONDecoder(parse_constant=lambda _: None)

@@ -8,7 +8,7 @@ import math
 from typing import Any
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
-from bam_envs.rosbridge.bounds import require_bounded
+from bam_envs.rosbridge.encoding import require_bounded
 
 _MOST_ITEMS = 4_000_000
 """An image may come as a list of numbers."""

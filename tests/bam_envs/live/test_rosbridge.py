@@ -203,19 +203,6 @@ def test_a_robot_that_answers_commands_owes_an_answer_to_what_does_not_arrive(se
     assert robot.waiting() == 0.0
 
 
-def test_in_lockstep_a_command_that_cannot_be_sent_is_told_at_once(server, robot_on, connect, simulation):
-    scripted = robot_on(server, info=simulation)
-    robot, gate = connect(server.url)
-    connection = robot._control._keeper.up
-    connection.held_up(True)
-    text = raised(LinkLost, lambda: gate.step(gate.state.command))
-    assert text == f"{server.url}: the server does not read what it is sent. Nothing more was sent."
-    assert scripted.on(JOINT_COMMANDS) == []
-    connection.held_up(False)
-    gate.step(gate.state.command)
-    assert len(scripted.on(JOINT_COMMANDS)) == 1
-
-
 def test_lockstep_without_an_answer(server, robot_on, connect, simulation, monkeypatch):
     monkeypatch.setattr("bam_envs.live.rosbridge.ANSWER_TIMEOUT", 0.2)
     scripted = robot_on(server, info=simulation)

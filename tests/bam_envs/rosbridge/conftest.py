@@ -199,8 +199,8 @@ def new_scripted():
 @pytest.fixture
 def new_link():
     """Make a connected `RosbridgeLink`; closed at the end. Options are of the link, or of its endpoint."""
+    from bam_envs.rosbridge.client import RosbridgeLink
     from bam_envs.rosbridge.endpoint import Endpoint
-    from bam_envs.rosbridge.link.link import RosbridgeLink
 
     made = []
 

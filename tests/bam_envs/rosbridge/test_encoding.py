@@ -10,7 +10,8 @@ import pytest
 from PIL import Image
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
-from bam_envs.rosbridge.encoding import Fragments, decode_frame, encode_cbor, encode_json, encode_png, split
+from bam_envs.rosbridge.encoding import decode_frame, encode_cbor, encode_json, encode_png
+from bam_envs.rosbridge.fragments import Fragments, split
 
 DEEP = "Message: expected at most 32 lists and objects in one another, found more."
 MANY = "Message: expected at most 100000 values, found more."

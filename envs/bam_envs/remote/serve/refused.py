@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from bam_envs.core.errors import RemoteError
-from bam_envs.rosbridge.link.link import RosbridgeLink
+from bam_envs.rosbridge.client import RosbridgeLink
 
 _WITHIN, _AGAIN, _ANSWER = 3.0, 0.2, 3.0
 """Longest that a ROS graph takes to know of what was declared, time between two looks, longest answer [s]."""

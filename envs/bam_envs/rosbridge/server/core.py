@@ -16,11 +16,12 @@ from bam_envs.core.errors import BamEnvsError, InvalidValue, ProtocolError
 from bam_envs.ros.interfaces import complete
 from bam_envs.rosbridge.bus import Caller, Handler, Listener, Message, refusal_of
 from bam_envs.rosbridge.encoding import decode_frame
+from bam_envs.rosbridge.fragments import Id, read_id
 from bam_envs.rosbridge.server.operations import Operations
 from bam_envs.rosbridge.server.packets import Packet, Publication
 from bam_envs.rosbridge.server.rosapi import rosapi
 from bam_envs.rosbridge.server.services import Services, new_service
-from bam_envs.rosbridge.server.session import Event, Id, Invoke, Limits, Session, canonical, read_id
+from bam_envs.rosbridge.server.session import Event, Invoke, Limits, Session, canonical
 from bam_envs.rosbridge.server.topics import Topics
 
 T = TypeVar("T")

@@ -8,6 +8,7 @@ from typing import Any
 
 from bam_envs.core.errors import BamEnvsError, ProtocolError
 from bam_envs.ros.interfaces import complete
+from bam_envs.rosbridge.fragments import read_id
 from bam_envs.rosbridge.server.packets import Publication, Wire, pack
 from bam_envs.rosbridge.server.services import (
     Request,
@@ -23,7 +24,6 @@ from bam_envs.rosbridge.server.session import (
     Send,
     Session,
     read_flag,
-    read_id,
     read_name,
     read_number,
     read_text,

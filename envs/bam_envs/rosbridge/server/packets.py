@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from bam_envs.rosbridge.encoding import encode_cbor, encode_json, encode_png, split
+from bam_envs.rosbridge.encoding import encode_cbor, encode_json, encode_png
+from bam_envs.rosbridge.fragments import split
 
 _NUMBERS = itertools.count(1)
 NEVER_SPLIT = 2**31

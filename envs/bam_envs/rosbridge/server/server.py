@@ -28,11 +28,10 @@ from bam_envs.rosbridge.bus import Caller, Handler, Listener, Message
 from bam_envs.rosbridge.server.connection import BridgeConnection
 from bam_envs.rosbridge.server.core import Bridge, Incoming
 from bam_envs.rosbridge.server.door import Door, listening_error, tls_context
-from bam_envs.rosbridge.server.loop_thread import LoopThread
 from bam_envs.rosbridge.server.options import ServerOptions
 from bam_envs.rosbridge.server.packets import Publication
 from bam_envs.rosbridge.server.session import Invoke, Send, Session
-from bam_envs.rosbridge.server.workers import Workers
+from bam_envs.rosbridge.threads import LoopThread, Workers
 from bam_envs.rosbridge.tokens import Tokens
 
 __all__ = ["BridgeServer", "ServerOptions"]

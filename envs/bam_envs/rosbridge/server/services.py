@@ -23,8 +23,9 @@ from bam_envs.ros.interfaces import (
     variants,
 )
 from bam_envs.rosbridge.bus import Handler
+from bam_envs.rosbridge.fragments import Id
 from bam_envs.rosbridge.server.packets import Packet, Wire, pack
-from bam_envs.rosbridge.server.session import Event, Id, Invoke, Send, Session
+from bam_envs.rosbridge.server.session import Event, Invoke, Send, Session
 
 _LENIENT = ("bam_msgs/GymAPI",)
 """Types that are still growing: what a newer end says beside is ignored, as on every other way to an environment."""

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 from bam_envs.core.errors import ProtocolError
 from bam_envs.ros.interfaces import describe
 from bam_envs.rosbridge.bus import Caller, Handler, Message
-from bam_envs.rosbridge.encoding import COMPRESSIONS, LARGEST_ID, LONGEST_ID, Fragments
+from bam_envs.rosbridge.encoding import COMPRESSIONS
+from bam_envs.rosbridge.fragments import Fragments, Id
 from bam_envs.rosbridge.server.packets import NEVER_SPLIT, Packet, Wire, pack
 
 if TYPE_CHECKING:
@@ -23,9 +24,6 @@ LEVELS = ("none", "error", "warning", "info")
 _NAME = re.compile(r"/?[A-Za-z_~][\w~]*(?:/[\w~]+)*", re.ASCII)
 _LONGEST = 256
 _LARGEST = 2**53
-
-Id = str | int | None
-"""What a client calls an interaction; None if it does not."""
 
 
 @dataclass(frozen=True)
@@ -133,18 +131,6 @@ def read_text(message: Mapping[str, Any], name: str) -> str:
     value = message.get(name)
     if not isinstance(value, str) or not value:
         raise ProtocolError(f"{name}: expected a text, found {describe(value)}.")
-    return value
-
-
-def read_id(message: Mapping[str, Any]) -> Id:
-    """The id: a text or an integer, if there is one."""
-    value = message.get("id")
-    if isinstance(value, bool) or not (value is None or isinstance(value, (str, int))):
-        raise ProtocolError(f"id: expected a text or an integer, found {describe(value)}.")
-    if isinstance(value, str) and len(value) > LONGEST_ID:
-        raise ProtocolError(f"id: expected at most {LONGEST_ID} characters, found {len(value)}.")
-    if isinstance(value, int) and abs(value) > LARGEST_ID:
-        raise ProtocolError(f"id: expected an integer of 53 bits, found {describe(value)}.")
     return value
 
 

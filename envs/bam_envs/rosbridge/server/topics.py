@@ -11,8 +11,9 @@ from bam_envs.core.errors import ProtocolError
 from bam_envs.ros.interfaces import describe, normal_name
 from bam_envs.rosbridge.bus import Listener
 from bam_envs.rosbridge.encoding import COMPRESSIONS
+from bam_envs.rosbridge.fragments import Id
 from bam_envs.rosbridge.server.packets import Publication, Wire
-from bam_envs.rosbridge.server.session import Id, Send, Session
+from bam_envs.rosbridge.server.session import Send, Session
 
 
 @dataclass(frozen=True)

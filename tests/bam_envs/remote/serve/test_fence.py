@@ -14,7 +14,7 @@ from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.ros.codec import encode_command
 from bam_envs.ros.freshness import Tagger, read_echo, read_tag
 from bam_envs.ros.messages import tag_text
-from bam_envs.rosbridge.link.link import RosbridgeLink
+from bam_envs.rosbridge.client import RosbridgeLink
 
 UR5E = load_profile("ur5e")
 ACTION = np.array([0.3, -0.4, 0.4, 0.1, -0.2], np.float32)

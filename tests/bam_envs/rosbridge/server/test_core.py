@@ -9,7 +9,7 @@ from PIL import Image
 
 from bam_envs.core.errors import InvalidValue, NotInCommand, RemoteError
 from bam_envs.rosbridge.bus import Caller
-from bam_envs.rosbridge.encoding import split
+from bam_envs.rosbridge.fragments import split
 from bam_envs.rosbridge.server.core import Bridge
 from bam_envs.rosbridge.server.session import Invoke, Limits, Send
 

@@ -3,7 +3,7 @@ import threading
 
 import pytest
 
-from bam_envs.rosbridge.server.loop_thread import LoopThread
+from bam_envs.rosbridge.threads import LoopThread
 
 DEADLINE = 10.0
 

@@ -1,6 +1,6 @@
 import threading
 
-from bam_envs.rosbridge.server.workers import Workers
+from bam_envs.rosbridge.threads import Workers
 
 DEADLINE = 10.0
 

@@ -30,7 +30,7 @@ def test_a_request_is_answered_off_the_network_thread(scripted, link):
     ]
     _ask(scripted, "/act")
     assert _answers(scripted) == [("call:7", {"success": True, "message": "1 ''"}, True)]
-    assert threads == ["bam-link-control-service"]
+    assert threads == ["bam-link-control-service-0"]
 
 
 def test_a_handler_may_call_through_its_own_link(scripted, link):

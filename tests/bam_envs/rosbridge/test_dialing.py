@@ -8,8 +8,8 @@ import threading
 import pytest
 
 from bam_envs.core.errors import InvalidValue, NoServer
+from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Address, Endpoint
-from bam_envs.rosbridge.link.link import RosbridgeLink
 
 START = (
     "Start one with `bam-serve --env bam/pick --port {port}` "
@@ -74,8 +74,8 @@ def test_silent_behind_tls():
     with socket.create_server(("127.0.0.1", 0)) as silent:
         url = f"wss://127.0.0.1:{silent.getsockname()[1]}"
         assert _failure(url) == (
-            f"{url}: no connection within 0.3 s. Is the address right, is the machine on, "
-            "does it speak TLS (wss://), is a firewall between?"
+            f"{url}: the port is open, and what listens there says nothing within 0.3 s. "
+            "Is it a rosbridge server? Does it speak TLS? If not, use ws://."
         )
 
 
@@ -96,7 +96,7 @@ def test_something_that_is_no_web_server(answering):
     url = answering(b"220 mail.example.org ESMTP\r\n\r\n")
     assert _failure(url) == (
         f"{url}: something listens there that is no WebSocket server "
-        '(Unsupported HTTP version "220"). If it has TLS, use wss://.'
+        "(unsupported protocol; expected HTTP/1.1: 220 mail.example.org ESMTP). If it has TLS, use wss://."
     )
 
 
@@ -104,7 +104,7 @@ def test_something_that_hangs_up(answering):
     url = answering(b"\x15\x03\x03\x00\x02\x02\x0a")
     assert _failure(url) == (
         f"{url}: something listens there that is no WebSocket server "
-        "(peer dropped the TCP connection without previous WebSocket closing handshake). If it has TLS, use wss://."
+        "(connection closed while reading HTTP status line). If it has TLS, use wss://."
     )
 
 
@@ -148,7 +148,7 @@ def test_a_token_that_is_refused(new_scripted, status, caplog):
     url = new_scripted(status=status).url
     expected = f"{url}: the token was refused (HTTP {status}). Give the server's token (--token-file)."
     assert _failure(url, token="wrong") == expected
-    assert caplog.records == []  # Autobahn would say it too, in its own words
+    assert caplog.records == []  # websockets would say it too, in its own words
 
 
 def test_what_will_not_change_is_not_tried_twice(new_scripted):
@@ -197,7 +197,7 @@ def test_no_tls_to_a_server_with_it(new_scripted, certificates):
     url = new_scripted(context=certificates("127.0.0.1")[1]).url.replace("wss://", "ws://")
     assert _failure(url) == (
         f"{url}: something listens there that is no WebSocket server "
-        "(peer dropped the TCP connection without previous WebSocket closing handshake). If it has TLS, use wss://."
+        "(connection closed while reading HTTP status line). If it has TLS, use wss://."
     )
 
 

@@ -1,7 +1,7 @@
 """What a client has declared: its topics, subscriptions and services, and the listeners of each topic.
 
-Kept here over every connection, because each new one must be told all of it again. One subscription per topic goes to
-the server, whatever the number of listeners: a server sends one stream per topic, and ends it at the first unsubscribe.
+It outlives connections, because each new one must be told all of it again. The server gets one subscription per topic,
+whatever the number of listeners: it sends one stream per topic, and ends it at the first unsubscribe.
 """
 
 from __future__ import annotations
@@ -21,9 +21,7 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass
 class _Subscription:
-    kind: str
-    throttle_ms: int
-    queue_length: int
+    request: dict[str, Any]
     listeners: dict[object, Listener] = field(default_factory=dict)
 
 
@@ -32,18 +30,17 @@ class Declarations:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._topics: dict[str, tuple[str, bool]] = {}
+        self._topics: dict[str, dict[str, Any]] = {}
         self._subscriptions: dict[str, _Subscription] = {}
-        self._services: dict[str, tuple[str, Handler]] = {}
+        self._services: dict[str, tuple[dict[str, Any], Handler]] = {}
 
     # ---- declaring: each returns what to tell the server
 
     def advertise(self, topic: str, kind: str, latch: bool) -> dict[str, Any]:
         """`topic` will be published."""
+        request = {"op": "advertise", "id": f"advertise:{topic}", "topic": topic, "type": normal_name(kind)}
         with self._lock:
-            known = self._topics.setdefault(topic, (normal_name(kind), latch))
-            _require_same("topic", topic, known[0], kind)
-            return _advertise(topic, *known)
+            return _same_type(self._topics.setdefault(topic, {**request, "latch": latch}), topic, kind)
 
     def unadvertise(self, topic: str) -> dict[str, Any]:
         """`topic` will be published no more."""
@@ -57,25 +54,28 @@ class Declarations:
             raise InvalidValue(f"Topic {topic!r} was not advertised: call advertise(topic, type) before publish.")
 
     def subscribe(
-        self, topic: str, kind: str, listener: Listener, throttle_ms: int, queue_length: int
+        self, topic: str, kind: str, listener: Listener, throttle_ms: int, queue_length: int, compression: str
     ) -> tuple[object, dict[str, Any]]:
         """`listener` wants `topic`. Returns a key to remove it by, too.
 
         The lowest throttle of all listeners of a topic counts, for the server sends one stream.
         """
-        _require_whole("throttle_ms", throttle_ms)
-        _require_whole("queue_length", queue_length)
+        wish = {"throttle_rate": throttle_ms, "queue_length": queue_length}
+        for name, value in (("throttle_ms", throttle_ms), ("queue_length", queue_length)):
+            # The Python servers drop a subscription without a word for anything but an integer.
+            if type(value) is not int or value < 0:
+                raise InvalidValue(f"{name} is {value!r}: expected a whole number, 0 or more.")
+        request = {"op": "subscribe", "id": f"subscribe:{topic}", "topic": topic, "type": normal_name(kind), **wish}
+        if compression != "none":
+            request["compression"] = compression
         key = object()
         with self._lock:
-            entry = self._subscriptions.get(topic)
-            if entry is None:
-                entry = self._subscriptions[topic] = _Subscription(normal_name(kind), throttle_ms, queue_length)
-            _require_same("topic", topic, entry.kind, kind)
-            entry.throttle_ms = min(entry.throttle_ms, throttle_ms)
-            entry.queue_length = min(entry.queue_length, queue_length)
+            entry = self._subscriptions.setdefault(topic, _Subscription(request))
+            known = _same_type(entry.request, topic, kind)
+            entry.request = {**known, **{name: min(known[name], value) for name, value in wish.items()}}
             # A new table each time, so that the fan-out can walk over the old one without a lock.
             entry.listeners = {**entry.listeners, key: listener}
-            return key, _subscribe(topic, entry)
+            return key, entry.request
 
     def unsubscribe(self, topic: str, key: object) -> dict[str, Any] | None:
         """The listener of `key` wants `topic` no more. None if others still do, or it is gone already."""
@@ -91,11 +91,12 @@ class Declarations:
 
     def serve(self, service: str, kind: str, handler: Handler) -> dict[str, Any]:
         """`handler` answers `service`."""
+        request = {"op": "advertise_service", "id": f"serve:{service}", "service": service, "type": normal_name(kind)}
         with self._lock:
             if service in self._services:
                 raise InvalidValue(f"Service {service!r} is served by this client already.")
-            self._services[service] = (normal_name(kind), handler)
-            return _serve(service, self._services[service][0])
+            self._services[service] = (request, handler)
+        return request
 
     # ---- using
 
@@ -105,7 +106,7 @@ class Declarations:
         return None if found is None else found[1]
 
     def deliver(self, topic: str, message: Mapping[str, Any]) -> None:
-        """Give a message to each listener of `topic`. What one of them raises is logged and harms no other."""
+        """Give a message to each listener of `topic`. What one of them raises is logged, and the others still hear."""
         entry = self._subscriptions.get(topic)
         for listener in () if entry is None else entry.listeners.values():
             _give(topic, message, listener)
@@ -113,11 +114,8 @@ class Declarations:
     def greeting(self) -> list[dict[str, Any]]:
         """Everything, for a server that knows nothing yet."""
         with self._lock:
-            return [
-                *(_advertise(topic, kind, latch) for topic, (kind, latch) in self._topics.items()),
-                *(_serve(service, kind) for service, (kind, _) in self._services.items()),
-                *(_subscribe(topic, entry) for topic, entry in self._subscriptions.items()),
-            ]
+            services = (request for request, _ in self._services.values())
+            return [*self._topics.values(), *services, *(entry.request for entry in self._subscriptions.values())]
 
     def farewell(self) -> list[dict[str, Any]]:
         """What to take back before leaving: some servers keep a service that nobody answers any more."""
@@ -133,35 +131,11 @@ def _give(topic: str, message: Mapping[str, Any], listener: Listener) -> None:
         listener(message, UNKNOWN_CALLER)
     except BamEnvsError as error:
         _LOG.info("a message was refused: %s", refusal_of(topic, error))
-    except Exception:  # a listener is foreign code, and the others must hear the message all the same
+    except Exception:  # listeners are foreign code
         _LOG.exception("%s: a listener failed", topic)
 
 
-def _advertise(topic: str, kind: str, latch: bool) -> dict[str, Any]:
-    return {"op": "advertise", "id": f"advertise:{topic}", "topic": topic, "type": kind, "latch": latch}
-
-
-def _serve(service: str, kind: str) -> dict[str, Any]:
-    return {"op": "advertise_service", "id": f"serve:{service}", "service": service, "type": kind}
-
-
-def _subscribe(topic: str, entry: _Subscription) -> dict[str, Any]:
-    return {
-        "op": "subscribe",
-        "id": f"subscribe:{topic}",
-        "topic": topic,
-        "type": entry.kind,
-        "throttle_rate": entry.throttle_ms,
-        "queue_length": entry.queue_length,
-    }
-
-
-def _require_same(what: str, name: str, known: str, kind: str) -> None:
-    if known != normal_name(kind):
-        raise InvalidValue(f"{what.capitalize()} {name!r} is of type {known} here already; found {kind!r}.")
-
-
-def _require_whole(name: str, value: object) -> None:
-    # The Python servers drop a subscription without a word for anything but an integer.
-    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-        raise InvalidValue(f"{name} is {value!r}: expected a whole number, 0 or more.")
+def _same_type(known: dict[str, Any], topic: str, kind: str) -> dict[str, Any]:
+    if known["type"] != normal_name(kind):
+        raise InvalidValue(f"Topic {topic!r} is of type {known['type']} here already; found {kind!r}.")
+    return known

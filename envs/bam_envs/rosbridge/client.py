@@ -1,0 +1,541 @@
+"""A link to a rosbridge server, for a robot: what is sent is sent now or not at all.
+
+A thread of its own connects, reads and writes, so that a slow listener of one link never delays the halt on another.
+While the link is down, publishing and calling raise at once, and nothing is kept: after a cut the server gets the
+declarations (topics, subscriptions, services) again and no message from before it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as NoResultYet
+from functools import partial
+from typing import Any
+
+from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NoServer, ProtocolError, RemoteError
+from bam_envs.ros.interfaces import describe, normal_name
+from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller, Handler, Listener, Message
+from bam_envs.rosbridge.client_connection import Connection, Heartbeat, ServerClock, bare_reason, tell_all
+from bam_envs.rosbridge.declarations import Declarations
+from bam_envs.rosbridge.encoding import encode_frame
+from bam_envs.rosbridge.endpoint import Endpoint
+from bam_envs.rosbridge.threads import LoopThread, Workers
+
+_LOG = logging.getLogger(__name__)
+_FIRST_DELAY, _LONGEST_DELAY = 0.05, 2.0
+_STEADY = 2.0
+"""A connection that lasted so long [s] is worth trying again at once."""
+_SEND_WITHIN = 0.5
+_LEAVE_WITHIN = 3.0
+_STATUSES_KEPT = 20
+_MOST_ANSWERING = 64
+"""Requests of the server that are answered at the same time; more of them are refused."""
+_ENDED = "Timeout exceeded"
+"""What servers say of a call that they end; rosbridge from 2.2 on does after 5 s, if it is told no other time."""
+_NEARLY = 0.9
+
+
+class RosbridgeLink:
+    """A client of a rosbridge server; a `Bus` that can also call services.
+
+    Args:
+        endpoint: The server; the text of a URL stands for `Endpoint(url)`.
+        name: What it is for; in the names of its threads.
+        max_message: Largest message, in either direction [bytes].
+        clock: Our wall clock [s].
+
+    Raises:
+        InvalidValue: The address is not the one of a rosbridge server.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint | str,
+        *,
+        name: str = "control",
+        max_message: int = 64 * 1024 * 1024,
+        clock: Callable[[], float] = time.time,
+    ) -> None:
+        self._endpoint = Endpoint(endpoint) if isinstance(endpoint, str) else endpoint
+        self.url, self.namespace, self.name = self._endpoint.address.url, self._endpoint.address.namespace, name
+        self.statuses: deque[dict[str, Any]] = deque(maxlen=_STATUSES_KEPT)
+        """The last `status` messages of the server."""
+        self.epoch = 0
+        """Counts the connections; 0 before the first."""
+        self._max_message, self._clock = max_message, clock
+        self._declarations = Declarations()
+        # A declaration and its announcement must reach the network thread in the same order.
+        self._declaring = threading.Lock()
+        self._up: Connection | None = None
+        self._why = "not connected yet: call connect()"
+        self._server, self._seen_ros = ServerClock(), None
+        self._beat: Heartbeat | None = None
+        self._down_callbacks: list[Callable[[LinkLost], None]] = []
+        self._status_callbacks: list[Callable[[Mapping[str, Any]], None]] = []
+        self._numbers = itertools.count(1)
+        self._workers, self._answering = Workers(_MOST_ANSWERING, f"bam-link-{name}-service"), 0
+        self._thread = LoopThread(f"bam-link-{name}")
+        self._main_task: asyncio.Task[None] | None = None
+        self._connecting, self._changed = threading.Lock(), threading.Condition()
+        self._closed, self._pid = False, os.getpid()
+
+    # ---- connecting
+
+    def connect(self) -> None:
+        """Connect, and see that the server answers. Afterwards the link comes back by itself whenever it drops.
+
+        Raises:
+            NoServer: There is none, or not one that can be used; the text says which of many reasons.
+            InvalidValue: The CA file cannot be read.
+            LinkLost: The link was closed, or dropped and is not back yet.
+        """
+        self._require_waiting_allowed("connect")
+        with self._connecting:
+            self._require_open()
+            if self._thread.was_started:
+                self.wait_up(self._endpoint.connect_timeout)
+                return
+            try:
+                self._thread.start(self._main)
+            except BaseException:  # also Ctrl-C: nobody would know of a connection that came about later
+                self._thread.post(self._stop)
+                self._thread = LoopThread(f"bam-link-{self.name}")
+                raise
+
+    def close(self) -> None:
+        """Leave with a closing handshake, and stay away. Idempotent; a forked child leaves the parent's link alone."""
+        if self._pid != os.getpid():
+            return
+        self._closed = True
+        with self._changed:
+            self._changed.notify_all()
+        self._thread.post(self._stop)
+        if not self._thread.is_current:
+            if not self._thread.join(_LEAVE_WITHIN):
+                _LOG.warning("%s: not closed properly: a listener holds up the network thread.", self.url)
+            self._workers.close()
+
+    @property
+    def is_up(self) -> bool:
+        """Whether a message can be sent now."""
+        return self._up is not None and self._up.is_open
+
+    def wait_up(self, timeout: float) -> None:
+        """Wait until the link is up.
+
+        Raises:
+            LinkLost: It is not, after `timeout` [s].
+        """
+        self._require_waiting_allowed("wait_up")
+        with self._changed:
+            self._changed.wait_for(lambda: self._up is not None or self._closed, timeout)
+        if self._up is None:
+            raise LinkLost(f"{self.url}: the link is down ({self._why}).")
+
+    def on_down(self, callback: Callable[[LinkLost], None]) -> None:
+        """Call `callback` with the reason each time the link drops, but not when it is closed.
+
+        On the network thread: it must return at once.
+        """
+        self._down_callbacks.append(callback)
+
+    def heartbeat(self, every: float = 0.2, lost_after: float = 1.0) -> None:
+        """From now on ask the server for a sign of life, and drop the link when it gives none for `lost_after` [s].
+
+        The question is a WebSocket ping: a bridge answers it also while it holds everything else back for a call.
+
+        Raises:
+            InvalidValue: Not 0 < every < lost_after.
+        """
+        beat = self._beat = Heartbeat(every, lost_after)
+        self._thread.post(lambda: None if self._up is None else self._up.watch(beat))
+
+    @property
+    def last_answer_age(self) -> float:
+        """How long the server has said nothing [s]; infinite while the link is down."""
+        return float("inf") if self._up is None else time.monotonic() - self._up.heard_at
+
+    # ---- the server's time
+
+    @property
+    def ros(self) -> str | None:
+        """``"ros1"`` or ``"ros2"``, by how the server spells a time; None until it has shown that."""
+        return self._server.ros or self._seen_ros
+
+    @property
+    def clock_offset(self) -> float | None:
+        """Our wall clock minus the server's [s]; None where it tells no time."""
+        return self._server.offset
+
+    def stamp(self, t: float) -> dict[str, int]:
+        """A time [s] as the server spells it; as ROS 2 does where that is not known."""
+        seconds, nanoseconds = divmod(round(t * 1e9), 1_000_000_000)
+        if self.ros == "ros1":
+            return {"secs": seconds, "nsecs": nanoseconds}
+        return {"sec": seconds, "nanosec": nanoseconds}
+
+    # ---- topics
+
+    @property
+    def declared(self) -> dict[str, tuple[str, str]]:
+        """What was declared: id of the declaration, which a `status` may name -> topic or service, and type."""
+        return {one["id"]: (one.get("topic") or one["service"], one["type"]) for one in self._declarations.greeting()}
+
+    def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
+        """Say that `topic` of type `kind` will be published."""
+        self._declare(lambda: self._declarations.advertise(topic, kind, latch))
+
+    def unadvertise(self, topic: str) -> None:
+        """Say that `topic` will be published no more."""
+        self._declare(lambda: self._declarations.unadvertise(topic))
+
+    def publish(self, topic: str, message: Message) -> None:
+        """Send `message` now, or not at all: on return it has been written to the socket.
+
+        Raises:
+            LinkLost: It was not sent, and is not kept.
+            InvalidValue: A number in it is not finite or not plain, or the topic was not advertised.
+        """
+        self.publish_all([(topic, message)])
+
+    def publish_all(self, messages: Sequence[tuple[str, Message]]) -> None:
+        """Send several messages, each on its topic, in this order: all of them or none.
+
+        Raises:
+            LinkLost: As `publish`.
+            InvalidValue: As `publish`.
+        """
+        connection = self._require_up()
+        for topic, _ in messages:
+            self._declarations.require_advertised(topic)
+        self._send(connection, *(encode_frame({"op": "publish", "topic": one, "msg": msg}) for one, msg in messages))
+
+    def subscribe(
+        self,
+        topic: str,
+        kind: str,
+        listener: Listener,
+        *,
+        throttle_ms: int = 0,
+        queue_length: int = 0,
+        compression: str = "none",
+    ) -> Callable[[], None]:
+        """Call `listener` for each message on the network thread, until what is returned is called.
+
+        Args:
+            topic: Its name.
+            kind: Its type.
+            listener: Must return at once. Other listeners of the topic are independent of it.
+            throttle_ms: Least time between two messages [ms]; the server drops the others.
+            queue_length: How many messages the server keeps while they are throttled, the newest; 0: none.
+            compression: ``"none"`` for JSON, or ``"cbor"`` for images and large arrays, which JSON makes seven times
+                slower; their typed arrays come as NumPy arrays, byte arrays as `bytes`.
+
+        Raises:
+            InvalidValue: The topic has another type here already, or a number is not whole.
+        """
+        key: object = None
+
+        def declare() -> dict[str, Any]:
+            nonlocal key
+            key, request = self._declarations.subscribe(topic, kind, listener, throttle_ms, queue_length, compression)
+            return request
+
+        self._declare(declare)
+        return lambda: self._declare(lambda: self._declarations.unsubscribe(topic, key))
+
+    def on_status(self, callback: Callable[[Mapping[str, Any]], None]) -> None:
+        """Call `callback` with each `status` message; on the network thread."""
+        self._status_callbacks.append(callback)
+
+    def on_leave(self, callback: Callable[[Caller], None]) -> None:
+        """A rosbridge server does not say who sends a message, nor who left: `callback` is never called."""
+
+    # ---- services
+
+    def call(self, service: str, kind: str, args: Message, timeout: float) -> dict[str, Any]:
+        """Ask `service` of type `kind`, and wait for its response.
+
+        With an empty `kind` the server looks the type up. For a service that may not exist: a server that is told the
+        type waits for the service to appear, and one that is not says at once that there is none.
+
+        Raises:
+            LinkLost: The link is down, drops while waiting, or no answer comes in `timeout` [s], or in the time that
+                the server itself allows. In the first case nothing was sent; in the others what was asked may have been
+                done.
+            RemoteError: The service, or the server, refused or failed.
+            ProtocolError: The response is none.
+            InvalidValue: A number in `args` is not finite or not plain; `timeout` is none; or called on the network
+                thread.
+        """
+        self._require_waiting_allowed("call")
+        if not isinstance(timeout, int | float) or not 0.0 < timeout < float("inf"):
+            raise InvalidValue(f"{service}: timeout is {timeout!r}: expected a time above 0 s, for a call can be lost.")
+        connection, identity, answer = self._require_up(), f"call:{next(self._numbers)}", Future[dict[str, Any]]()
+        # Servers that know the field `timeout` end the call then, and not after a shorter time of their own.
+        request = {"op": "call_service", "id": identity, "service": service, "args": args, "timeout": timeout}
+        frame = encode_frame({**request, "type": normal_name(kind)} if kind else request)
+        begun = time.monotonic()
+        self._hand_over(lambda: connection.ask(identity, frame, answer))
+        try:
+            said = answer.result(timeout)
+        except NoResultYet as error:
+            self._thread.post(lambda: connection.forget(identity))
+            raise LinkLost(f"{self.url}: {service} did not answer in {timeout:g} s; it may still be at it.") from error
+        if said.get("result") is False and _ENDED in str(said.get("values")):
+            raise self._given_up(service, time.monotonic() - begun, timeout)
+        return _response(service, said)
+
+    def _given_up(self, service: str, waited: float, timeout: float) -> LinkLost:
+        if waited > _NEARLY * timeout:
+            return LinkLost(f"{self.url}: {service} did not answer in {timeout:g} s; it may still be at it.")
+        return LinkLost(
+            f"{self.url}: the server gave up {service} after {waited:.1f} s, and {timeout:g} s were asked for; it may "
+            f"still be at it. Start the bridge with default_call_service_timeout:={timeout:.1f}, or use a pair of "
+            'topics instead of the service (channel="topics").'
+        )
+
+    def serve(self, service: str, kind: str, handler: Handler) -> None:
+        """Answer `service` of type `kind` through the server: always, also when the handler fails."""
+        self._declare(lambda: self._declarations.serve(service, kind, handler))
+
+    # ---- any thread: sending
+
+    def _send(self, connection: Connection, *frames: str) -> None:
+        self._hand_over(lambda: connection.send(*frames))
+
+    def _hand_over(self, work: Callable[[], None]) -> None:
+        """Run `work` on the network thread now, or not at all: one that waited too long is taken back."""
+        if self._thread.is_current:
+            work()
+            return
+        done: Future[None] = Future()
+
+        def run() -> None:
+            if done.set_running_or_notify_cancel():
+                try:
+                    done.set_result(work())
+                except BaseException as error:
+                    done.set_exception(error)
+
+        try:
+            if not self._thread.post(run):
+                raise LinkLost(f"{self.url}: the link is down ({self._why}). Nothing was sent, and nothing is kept.")
+            done.result(_SEND_WITHIN)
+        except NoResultYet:
+            if done.cancel():
+                raise LinkLost(
+                    f"{self.url}: the network thread took nothing for {_SEND_WITHIN:g} s; nothing was sent. "
+                    "A listener must return at once: do work in another thread."
+                ) from None
+            done.result()
+        finally:
+            done.cancel()  # also after Ctrl-C: what was not sent by now is not to be sent any more
+
+    def _declare(self, declare: Callable[[], dict[str, Any] | None]) -> None:
+        """Note a declaration; tell it now if there is a connection: the greeting of the next one contains it anyway."""
+        self._require_process()
+        with self._declaring:
+            request = declare()
+            if request is not None:
+                self._thread.post(partial(self._tell, request, encode_frame(request)))
+
+    def _require_up(self) -> Connection:
+        self._require_process()
+        connection = self._up
+        if connection is None:
+            raise LinkLost(f"{self.url}: the link is down ({self._why}). Nothing was sent, and nothing is kept.")
+        return connection
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise LinkLost(f"{self.url}: this link was closed. Make a new one.")
+
+    def _require_process(self) -> None:
+        if self._pid != os.getpid():
+            raise InvalidValue(
+                f"This link to {self.url} was made in process {self._pid}, and this is a fork of it. "
+                "Make and connect a link in the child itself."
+            )
+
+    def _require_waiting_allowed(self, method: str) -> None:
+        self._require_process()
+        if self._thread.is_current:
+            raise InvalidValue(
+                f"{method}() waits for the network, and a listener called it on the network thread. "
+                "Hand the work to another thread."
+            )
+
+    # ---- the network thread: connections, one after the other
+
+    async def _main(self, ready: Future[None]) -> None:
+        self._main_task = asyncio.current_task()
+        try:
+            connection = await self._first()
+            ready.set_result(None)
+            await self._stay_connected(connection)
+        except asyncio.CancelledError:  # by `_stop`; not `finally`, which would run in a forked child, too
+            if not ready.done():
+                ready.set_exception(LinkLost(f"{self.url}: this link was closed. Make a new one."))
+            await self._leave()
+
+    def _stop(self) -> None:
+        if self._main_task is not None:
+            self._main_task.cancel()
+
+    async def _first(self) -> Connection:
+        timeout = self._endpoint.connect_timeout
+        deadline, delay = time.monotonic() + timeout, _FIRST_DELAY
+        while True:
+            self._require_open()
+            try:
+                return await self._open(deadline - time.monotonic())
+            except NoServer as error:
+                # What refuses may still be starting; everything else will stay as it is.
+                if not isinstance(error.__cause__, ConnectionRefusedError) or time.monotonic() + delay >= deadline:
+                    raise
+            await asyncio.sleep(delay)
+            delay = min(2 * delay, _LONGEST_DELAY)
+
+    async def _stay_connected(self, connection: Connection) -> None:
+        delay = _FIRST_DELAY
+        while True:
+            since = time.monotonic()
+            await connection.ended.wait()
+            # One that breaks at once, again and again, must not be tried again at once.
+            if time.monotonic() - since > _STEADY:
+                delay = _FIRST_DELAY
+            while connection.error is not None:
+                await asyncio.sleep(delay)
+                delay = min(2 * delay, _LONGEST_DELAY)
+                try:
+                    connection = await self._open(self._endpoint.connect_timeout)
+                except BamEnvsError as error:
+                    self._why = bare_reason(self.url, error)
+                except Exception as error:  # a link that gives up is worse than one that tries again
+                    _LOG.exception("%s: connecting failed", self.url)
+                    self._why = f"{type(error).__name__}: {error}"
+
+    async def _open(self, timeout: float) -> Connection:
+        connection = Connection(self._endpoint, self.epoch + 1, self._max_message, self._take, self._note_end)
+        await connection.open(timeout, self._clock)
+        try:
+            for request in self._declarations.greeting():
+                frame = connection.announced[request["id"]] = encode_frame(request)
+                connection.send(frame)
+            self._require_open()
+        except BamEnvsError as error:
+            connection.drop(error)
+            raise
+        connection.watch(self._beat)
+        self.epoch, self._server = connection.epoch, connection.clock
+        with self._changed:
+            self._up = connection
+            self._changed.notify_all()
+        return connection
+
+    def _note_end(self, connection: Connection, error: BamEnvsError) -> None:
+        if connection is self._up:
+            self._up, self._why = None, bare_reason(self.url, error)
+            tell_all(self._down_callbacks, LinkLost(str(error)))
+
+    async def _leave(self) -> None:
+        self._why = "it was closed; make a new one"
+        connection, self._up = self._up, None
+        if connection is not None:
+            try:
+                connection.send(*map(encode_frame, self._declarations.farewell()))
+            except LinkLost as error:
+                _LOG.debug("no farewell: %s", error)
+            await connection.close()
+
+    def _tell(self, request: Mapping[str, Any], frame: str) -> None:
+        connection, identity = self._up, request["id"]
+        if connection is None or connection.announced.get(identity) == frame:
+            return
+        connection.announced[identity] = frame
+        try:
+            connection.send(frame)
+        except LinkLost as error:
+            _LOG.warning("%s was not declared: %s", identity, error)
+
+    # ---- the network thread: receiving
+
+    def _take(self, connection: Connection, message: dict[str, Any]) -> None:
+        operation = message.get("op")
+        if operation == "publish":
+            topic, content = message.get("topic"), message.get("msg")
+            if not isinstance(topic, str) or not isinstance(content, Mapping):
+                raise ProtocolError(f"a published message has topic {topic!r} and msg {describe(content)}")
+            if self.ros is None:
+                self._seen_ros = _ros_of(content)
+            self._declarations.deliver(topic, content)
+        elif operation == "call_service":
+            self._answer(connection, message)
+        elif operation == "status":
+            self.statuses.append(message)
+            tell_all(self._status_callbacks, message)
+        else:
+            connection.pass_over(f"a message with op {operation!r:.40}")
+
+    def _answer(self, connection: Connection, request: dict[str, Any]) -> None:
+        """Have a request answered off the network thread, which waits for nobody."""
+        service = request.get("service")
+        response = {"op": "service_response", "service": service, "id": request.get("id")}
+        handler = self._declarations.handler(str(service))
+        refusal = f"Service {service} is not served here" if handler is None else ""
+        if self._answering >= _MOST_ANSWERING:
+            refusal = f"{_MOST_ANSWERING} requests are being answered already"
+        if handler is None or refusal:
+            connection.send(encode_frame({**response, "values": refusal, "result": False}))
+            return
+        self._answering += 1
+        self._workers.submit(partial(self._run_handler, connection, handler, request, response))
+
+    def _run_handler(
+        self, connection: Connection, handler: Handler, request: dict[str, Any], response: dict[str, Any]
+    ) -> None:
+        args = request.get("args")
+        try:
+            values = dict(handler(args if isinstance(args, Mapping) else {}, UNKNOWN_CALLER))
+            frame = encode_frame({**response, "values": values, "result": True})
+        except BamEnvsError as error:
+            frame = encode_frame({**response, "values": str(error), "result": False})
+        except Exception as error:  # handlers are foreign code, and the caller waits for an answer in every case
+            _LOG.exception("%s: the handler failed", response["service"])
+            frame = encode_frame({**response, "values": f"{type(error).__name__}: {error}", "result": False})
+        self._thread.post(self._note_answered)
+        try:
+            self._send(connection, frame)
+        except BamEnvsError as gone:
+            _LOG.warning("%s: the response could not be sent: %s", response["service"], gone)
+
+    def _note_answered(self) -> None:
+        self._answering -= 1
+
+
+def _response(service: str, answer: Mapping[str, Any]) -> dict[str, Any]:
+    values = answer.get("values")
+    if answer.get("result") is False:
+        raise RemoteError(values if isinstance(values, str) and values else f"{service} failed: {values!r}.")
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        raise ProtocolError(f"{service}: expected a response with fields, found {values!r}.")
+    return values
+
+
+def _ros_of(message: Mapping[str, Any]) -> str | None:
+    header = message.get("header")
+    stamp = header.get("stamp") if isinstance(header, Mapping) else None
+    if not isinstance(stamp, Mapping):
+        return None
+    return "ros2" if "sec" in stamp else "ros1" if "secs" in stamp else None

@@ -1,0 +1,368 @@
+"""One WebSocket connection of a client, from its handshake to its end. Everything here runs on the network thread.
+
+A connection never comes back: what was handed to it and not sent when it ended is refused, and cannot reach the server
+over the next one.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from websockets.asyncio.client import ClientConnection
+from websockets.asyncio.server import broadcast
+from websockets.exceptions import ConnectionClosed
+from websockets.protocol import State
+
+from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NoServer, ProtocolError, RemoteError
+from bam_envs.rosbridge.dialing import CLOSE_WITHIN, open_socket, silent_bridge
+from bam_envs.rosbridge.encoding import decode_server_frame, encode_frame
+from bam_envs.rosbridge.endpoint import Endpoint
+from bam_envs.rosbridge.fragments import Fragments
+
+T = TypeVar("T")
+_LOG = logging.getLogger(__name__)
+_CLOCK_PROBES = 3
+_LOOK = 0.5
+"""Time between two looks at a connection that has no heartbeat [s]."""
+_MOST_UNSENT = 1024 * 1024
+"""Bytes that wait for the server to read, from which on nothing more is sent."""
+_MOST_PASSED_OVER = 20
+"""Meaningless messages of one connection, after which it is ended."""
+_TOO_LARGE = 1009
+"""WebSocket's close code for a message above the limit."""
+_DEAD_NODE = "context is invalid"
+"""What rosbridge_suite answers to everything after its node was told to end."""
+
+
+def bare_reason(url: str, error: BamEnvsError) -> str:
+    """What `error` says, without the address and the full stop: for a text that begins with the address."""
+    return str(error).removeprefix(f"{url}: ").rstrip(".")
+
+
+def tell_all(callbacks: Iterable[Callable[[T], None]], news: T) -> None:
+    """Call each callback with `news`; an exception in one is logged, and the others are called all the same."""
+    for callback in callbacks:
+        _tell_one(callback, news)
+
+
+def _tell_one(callback: Callable[[T], None], news: T) -> None:
+    try:
+        callback(news)
+    except Exception:  # callbacks are foreign code
+        _LOG.exception("a callback of a link failed")
+
+
+@dataclass(frozen=True)
+class Heartbeat:
+    """How often to ask a server for a sign of life, and when to give up."""
+
+    every: float
+    """Time between two pings [s]."""
+    lost_after: float
+    """Silence after which the link is lost [s]."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.every < self.lost_after:
+            raise InvalidValue(
+                f"Heartbeat: every {self.every} s, lost_after {self.lost_after} s. Expected 0 < every < lost_after."
+            )
+
+
+@dataclass(frozen=True)
+class ServerClock:
+    """What a server says of itself and its time."""
+
+    ros: str | None = None
+    """``"ros1"`` or ``"ros2"``, by how it spells a time; None where it tells none."""
+    offset: float | None = None
+    """Our wall clock minus the server's [s], to within half the round trip; None where it tells none."""
+
+
+class Connection:
+    """One connection.
+
+    Args:
+        endpoint: The server.
+        epoch: Its number among the connections of a link.
+        max_message: Largest message, in either direction [bytes].
+        on_message: Takes each message that is not an answer: publish, call_service, status.
+        on_end: Called once, when it has ended, before whoever waits for an answer is told.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        epoch: int,
+        max_message: int,
+        on_message: Callable[[Connection, dict[str, Any]], None],
+        on_end: Callable[[Connection, BamEnvsError], None],
+    ) -> None:
+        self.url, self.epoch = endpoint.address.url, epoch
+        self.error: BamEnvsError | None = None
+        """Why it ended; None before."""
+        self.ended = asyncio.Event()
+        """Set when it has ended."""
+        self.heard_at = time.monotonic()
+        """When the server last gave a sign of life [s, monotonic]. Any thread may read it."""
+        self.announced: dict[str, str] = {}
+        """What has been declared on it: id of the declaration -> its frame."""
+        self.clock = ServerClock()
+        """What the server says of its time; known once it is open."""
+        self._endpoint, self._max_message = endpoint, max_message
+        self._on_message, self._on_end = on_message, on_end
+        self._socket: ClientConnection | None = None
+        self._tasks: list[asyncio.Task[None]] = []
+        self._ready = False  # whether the server has answered a request
+        self._pending: dict[str, Future[dict[str, Any]]] = {}
+        self._fragments = Fragments(max_message)
+        self._passed_over = 0
+
+    async def open(self, timeout: float, clock: Callable[[], float]) -> None:
+        """Connect, and see that a rosbridge server answers.
+
+        Args:
+            timeout: For everything together [s].
+            clock: Our wall clock [s].
+
+        Raises:
+            NoServer: One of many reasons, each with its own text; a `ConnectionRefusedError` is its cause where the
+                server may just not be up yet.
+            InvalidValue: The CA file cannot be read.
+        """
+        deadline = time.monotonic() + timeout
+        self._socket = await open_socket(self._endpoint, timeout, self._max_message)
+        self.heard_at = time.monotonic()
+        self._start(self._read(self._socket))
+        try:
+            self.clock = await asyncio.wait_for(self._first_answer(clock), deadline - time.monotonic())
+            self._ready = True
+        except asyncio.TimeoutError as error:
+            raise silent_bridge(self.url, timeout) from error
+        finally:
+            if not self._ready:
+                self.drop(LinkLost(f"{self.url}: no answer."))
+
+    def watch(self, beat: Heartbeat | None) -> None:
+        """From now on end the connection when the server gives no sign of life, or does not finish closing."""
+        if self._socket is not None and self.error is None:
+            for task in self._tasks[1:]:
+                task.cancel()
+            self._start(self._watch(self._socket, beat))
+
+    def _start(self, work: Any) -> None:
+        self._tasks.append(asyncio.get_running_loop().create_task(work))
+
+    async def _first_answer(self, clock: Callable[[], float]) -> ServerClock:
+        best, best_trip = ServerClock(), float("inf")
+        for probe in range(_CLOCK_PROBES):
+            asked = clock()
+            found = await self._ask_time(f"ready:{self.epoch}:{probe}")
+            answered = clock()
+            if found is None:
+                break
+            if answered - asked < best_trip:
+                best_trip, best = answered - asked, _read_clock(found, (asked + answered) / 2)
+        return best
+
+    async def _ask_time(self, identity: str) -> Mapping[str, Any] | None:
+        # Any answer will do, also that there is no such service: it comes from the part that does the work.
+        request = {"op": "call_service", "id": identity, "service": "/rosapi/get_time", "type": "rosapi/GetTime"}
+        answer: Future[dict[str, Any]] = Future()
+        try:
+            self.ask(identity, encode_frame({**request, "args": {}}), answer)
+            values = (await asyncio.wrap_future(answer)).get("values")
+        except RemoteError:
+            return None
+        except NoServer:
+            raise
+        except LinkLost as error:
+            reason = bare_reason(self.url, error).removeprefix("the link dropped: ")
+            raise NoServer(self.url, f"closed the connection before it answered a request: {reason}.") from error
+        if isinstance(values, str) and _DEAD_NODE in values:
+            text = f"its ROS node has ended and its socket has not ({values}). Restart the bridge."
+            raise NoServer(self.url, text)
+        found = values.get("time") if isinstance(values, Mapping) else None
+        return found if isinstance(found, Mapping) else None
+
+    # ---- sending
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a message can be sent. Any thread may ask."""
+        return self.error is None and self._socket is not None and self._socket.state is State.OPEN
+
+    def send(self, *frames: str) -> None:
+        """Write frames to the socket now, all of them or none.
+
+        Raises:
+            LinkLost: The connection has ended, or the server does not read.
+            InvalidValue: A frame is larger than allowed.
+        """
+        socket = self._socket
+        if socket is None or self.error is not None:
+            why = "not open" if self.error is None else bare_reason(self.url, self.error)
+            raise LinkLost(f"{self.url}: the link is down ({why}). Nothing was sent.")
+        if not self.is_open or socket.transport.is_closing():
+            raise LinkLost(f"{self.url}: the link is being closed. Nothing was sent.")
+        if socket.transport.get_write_buffer_size() > _MOST_UNSENT:
+            raise LinkLost(f"{self.url}: the server does not read what it is sent. Nothing more was sent.")
+        largest = max(map(len, frames), default=0)
+        if largest > self._max_message:
+            raise InvalidValue(
+                f"{self.url}: a message of {largest} bytes is above the limit of {self._max_message}; nothing was "
+                "sent. Send less at once, or raise max_message on both ends."
+            )
+        for frame in frames:
+            # `send` of websockets would wait while the server does not read, and send late what is stale by then.
+            broadcast([socket], frame)
+
+    def ask(self, identity: str, frame: str, answer: Future[dict[str, Any]]) -> None:
+        """Send a request; `answer` gets the whole response, or why there is none.
+
+        Raises:
+            LinkLost: See `send`.
+            InvalidValue: See `send`.
+        """
+        self.send(frame)
+        self._pending[identity] = answer
+
+    def forget(self, identity: str) -> None:
+        """Nobody waits for this answer any more."""
+        self._pending.pop(identity, None)
+
+    # ---- ending
+
+    def drop(self, error: BamEnvsError) -> None:
+        """End it at once, without a word to the server; what is still unsent is thrown away."""
+        self._end(error)
+        if self._socket is not None:
+            self._socket.transport.abort()
+
+    async def close(self) -> None:
+        """End it with a closing handshake, or without one where the server does not take part in time."""
+        if self._socket is not None and self.error is None:
+            self._end(LinkLost(f"{self.url}: the link was closed."))
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._socket.close(), CLOSE_WITHIN)
+        self.drop(LinkLost(f"{self.url}: the link was closed."))
+
+    def _end(self, error: BamEnvsError) -> None:
+        if self.error is not None:
+            return
+        self.error = error
+        self._on_end(self, error)
+        pending, self._pending = self._pending, {}
+        for answer in pending.values():
+            if not answer.done():
+                answer.set_exception(error)
+        for task in self._tasks:
+            if task is not asyncio.current_task():
+                task.cancel()
+        self.ended.set()
+
+    async def _watch(self, socket: ClientConnection, beat: Heartbeat | None) -> None:
+        self.heard_at, closing_since = time.monotonic(), float("inf")
+        while True:
+            pause = _LOOK
+            if beat is not None:
+                pause = max(0.0, min(beat.every, self.heard_at + beat.lost_after - time.monotonic()))
+                # A server that does not read what waits for it answers no ping either.
+                if self.is_open and not socket.transport.get_write_buffer_size():
+                    with contextlib.suppress(ConnectionClosed):
+                        (await socket.ping()).add_done_callback(self._ponged)
+            woken = time.monotonic() + pause
+            await asyncio.sleep(pause)
+            now = time.monotonic()
+            if beat is not None and now - woken > beat.every:
+                self.heard_at = now  # this process itself stood still, and what came meanwhile is still unread
+            if beat is not None and now - self.heard_at >= beat.lost_after:
+                self.drop(LinkLost(f"{self.url}: nothing from the server for {beat.lost_after:g} s."))
+                return
+            closing_since = float("inf") if self.is_open else min(closing_since, now)
+            if now - closing_since > CLOSE_WITHIN:
+                self.drop(LinkLost(f"{self.url}: the link dropped: the server did not finish closing it."))
+                return
+
+    def _ponged(self, pong: asyncio.Future[float]) -> None:
+        if not pong.cancelled() and pong.exception() is None:
+            self.heard_at = time.monotonic()
+
+    # ---- receiving
+
+    async def _read(self, socket: ClientConnection) -> None:
+        try:
+            while True:
+                frame = await socket.recv(decode=False)
+                self.heard_at = time.monotonic()
+                try:
+                    self._dispatch(decode_server_frame(frame))
+                except BamEnvsError as error:  # a meaningless message, or an answer to it that cannot be sent
+                    self.pass_over(str(error))
+        except ConnectionClosed as end:
+            self._end(self._reason(end))
+
+    def _reason(self, end: ConnectionClosed) -> BamEnvsError:
+        if end.sent is not None and end.sent.code == _TOO_LARGE and not end.rcvd_then_sent:
+            return ProtocolError(
+                f"{self.url}: the server sent a message above the limit of {self._max_message} bytes. "
+                "Take compressed images, or raise max_message."
+            )
+        if end.rcvd is not None:
+            said = ", ".join(filter(None, (f"code {end.rcvd.code}", end.rcvd.reason)))
+            return LinkLost(f"{self.url}: the link dropped: the server closed it with {said}.")
+        why = f": {end.__cause__}" if end.__cause__ is not None and str(end.__cause__) else ""
+        return LinkLost(f"{self.url}: the link dropped: the connection was cut{why}.")
+
+    def pass_over(self, text: str) -> None:
+        """Take note of a message that means nothing here; a server that sends many of them is left."""
+        _LOG.info("%s: passed over: %s", self.url, text)
+        self._passed_over += 1
+        if self._passed_over == _MOST_PASSED_OVER:
+            self.drop(
+                ProtocolError(
+                    f"{self.url}: the server sends what is no rosbridge message, {self._passed_over} times by now: "
+                    f"{text}. Is it the right port?"
+                )
+            )
+
+    def _dispatch(self, message: dict[str, Any]) -> None:
+        operation, identity = message.get("op"), str(message.get("id"))
+        if operation == "service_response":
+            self._resolve(identity, message)
+        elif operation == "fragment":
+            self._fragments.expire(self.heard_at)
+            whole = self._fragments.add(message, self.heard_at)
+            if whole is not None:
+                self._dispatch(decode_server_frame(whole.encode()))
+        # Before the server is known to be one: later on, a request of its own may have an id like ours.
+        elif operation == "call_service" and not self._ready and identity in self._pending:
+            text = "an echo server: it sends back what it is sent. Is it the right port?"
+            self._resolve(identity, NoServer(self.url, text))
+        else:
+            # A server may answer a request that it cannot read with a status of the same id, and with nothing else.
+            if operation == "status" and message.get("level") == "error":
+                self._resolve(identity, RemoteError(str(message.get("msg"))))
+            self._on_message(self, message)
+
+    def _resolve(self, identity: str, outcome: dict[str, Any] | BamEnvsError) -> None:
+        answer = self._pending.pop(identity, None)
+        if answer is None or answer.done():
+            return
+        if isinstance(outcome, BamEnvsError):
+            answer.set_exception(outcome)
+        else:
+            answer.set_result(outcome)
+
+
+def _read_clock(found: Mapping[str, Any], now: float) -> ServerClock:
+    for ros, seconds, nanoseconds in (("ros2", "sec", "nanosec"), ("ros1", "secs", "nsecs")):
+        if isinstance(found.get(seconds), int) and isinstance(found.get(nanoseconds), int):
+            return ServerClock(ros, now - found[seconds] - found[nanoseconds] * 1e-9)
+    return ServerClock()

@@ -1,0 +1,141 @@
+"""Threads that do not keep a program from ending: an asyncio loop in one, and a pool for work that takes its time."""
+
+from __future__ import annotations
+
+import asyncio
+import queue
+import threading
+import time
+from collections.abc import Callable, Coroutine
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeoutError
+from typing import Any, TypeVar
+
+from bam_envs.core.errors import LinkLost
+
+T = TypeVar("T")
+_PATIENCE = 10.0
+
+
+class LoopThread:
+    """Runs one coroutine to its end in an asyncio loop of its own.
+
+    Args:
+        name: Of the thread.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._thread: threading.Thread | None = None
+
+    @property
+    def was_started(self) -> bool:
+        """Whether `start` was called."""
+        return self._thread is not None
+
+    @property
+    def is_current(self) -> bool:
+        """Whether the caller runs in this thread."""
+        return threading.current_thread() is self._thread
+
+    def start(self, main: Callable[[Future[None]], Coroutine[Any, Any, None]]) -> None:
+        """Run ``main(ready)`` in the thread; returns when `ready` has its result, or raises its exception."""
+        ready: Future[None] = Future()
+        thread = threading.Thread(target=self._run, args=(main, ready), name=self._name, daemon=True)
+        thread.start()
+        self._thread = thread
+        ready.result()
+
+    def join(self, timeout: float | None = None) -> bool:
+        """Wait for the end of the thread, from any other thread; False if it still runs after `timeout` [s]."""
+        if self._thread is None or self.is_current:
+            return True
+        self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    def post(self, work: Callable[[], object]) -> bool:
+        """Schedule `work` in the thread; False if the loop does not run."""
+        loop = self._loop
+        if loop is None:
+            return False
+        try:
+            # Waking the loop costs a system call; in its own thread it is awake.
+            (loop.call_soon if self.is_current else loop.call_soon_threadsafe)(work)
+        except RuntimeError:  # the loop was closed a moment ago
+            return False
+        return True
+
+    def do(self, work: Callable[[], T]) -> T:
+        """Run `work` in the thread and return its result; in the caller's thread where the loop does not run.
+
+        Raises:
+            LinkLost: The loop ended meanwhile.
+        """
+        done: Future[T] = Future()
+        if self.is_current or not self.post(lambda: _settle(done, work)):
+            return work()
+        try:
+            return done.result(timeout=_PATIENCE)
+        except FutureTimeoutError:
+            raise LinkLost(f"{self._name}: ended meanwhile.") from None
+
+    def _run(self, main: Callable[[Future[None]], Coroutine[Any, Any, None]], ready: Future[None]) -> None:
+        asyncio.run(self._entered(main, ready))
+
+    async def _entered(self, main: Callable[[Future[None]], Coroutine[Any, Any, None]], ready: Future[None]) -> None:
+        self._loop = asyncio.get_running_loop()
+        try:
+            await main(ready)
+        except Exception as error:  # whoever waits for `ready` must hear of it, whatever it is
+            if ready.done():
+                raise
+            ready.set_exception(error)
+        finally:
+            self._loop = None
+
+
+def _settle(done: Future[T], work: Callable[[], T]) -> None:
+    try:
+        done.set_result(work())
+    except Exception as error:  # it is raised where the result is waited for
+        done.set_exception(error)
+
+
+class Workers:
+    """A pool of daemon threads.
+
+    A `ThreadPoolExecutor` joins its threads when the interpreter exits: one handler that hangs would keep the program.
+
+    Args:
+        most: Largest number of threads; each is started when the others are busy.
+        name: Prefix of their names.
+    """
+
+    def __init__(self, most: int, name: str) -> None:
+        self.most, self.name = most, name
+        self._work: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._threads: list[threading.Thread] = []
+        self._idle = threading.Semaphore(0)
+
+    def submit(self, work: Callable[[], None]) -> None:
+        """Run `work`, which must not raise, in one of the threads. From one thread only."""
+        self._work.put(work)
+        if not self._idle.acquire(blocking=False) and len(self._threads) < self.most:
+            name = f"{self.name}-{len(self._threads)}"
+            self._threads.append(threading.Thread(target=self._run, name=name, daemon=True))
+            self._threads[-1].start()
+
+    def close(self, patience: float = 1.0) -> None:
+        """End the threads; one that is busy for longer than `patience` [s] ends by itself later."""
+        deadline = time.monotonic() + patience
+        for _ in self._threads:
+            self._work.put(None)
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(max(0.0, deadline - time.monotonic()))
+
+    def _run(self) -> None:
+        while (work := self._work.get()) is not None:
+            work()
+            self._idle.release()
