@@ -76,7 +76,8 @@ class RosbridgeLink:
         self._declaring = threading.Lock()
         self._up: Connection | None = None
         self._why = "not connected yet: call connect()"
-        self._server, self._seen_ros = ServerClock(), None
+        self._server = ServerClock()
+        self._seen_ros: str | None = None
         self._beat: Heartbeat | None = None
         self._down_callbacks: list[Callable[[LinkLost], None]] = []
         self._status_callbacks: list[Callable[[Mapping[str, Any]], None]] = []
@@ -322,7 +323,8 @@ class RosbridgeLink:
         def run() -> None:
             if done.set_running_or_notify_cancel():
                 try:
-                    done.set_result(work())
+                    work()
+                    done.set_result(None)
                 except BaseException as error:
                     done.set_exception(error)
 

@@ -276,7 +276,7 @@ class Connection:
                 # A server that does not read what waits for it answers no ping either.
                 if self.is_open and not socket.transport.get_write_buffer_size():
                     with contextlib.suppress(ConnectionClosed):
-                        (await socket.ping()).add_done_callback(self._ponged)
+                        asyncio.ensure_future(await socket.ping()).add_done_callback(self._ponged)
             woken = time.monotonic() + pause
             await asyncio.sleep(pause)
             now = time.monotonic()
