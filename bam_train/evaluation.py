@@ -41,8 +41,8 @@ OnProgress = Callable[[int, int], None]
 class BatchPolicy(Protocol):
     """What can be evaluated: a `FrozenPolicy`, or a trainer's model behind an adapter."""
 
-    def reset(self, rows: Any = None) -> None:
-        """Forget the recurrent state of `rows` (indices), or of all rows."""
+    def reset(self, env_ids: Any = None) -> None:
+        """Forget the recurrent state of `env_ids` (indices), or of all environments."""
 
     def act_batch(self, observations: Any) -> Any:
         """Actions for a batch of observations. Shapes: (n, ...) -> (n, ...)."""

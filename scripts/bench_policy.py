@@ -1,4 +1,4 @@
-"""Time one action of a frozen policy against onnxruntime and stable-baselines3, interleaved in one process.
+"""Time one action of a frozen policy against bare onnxruntime and stable-baselines3, interleaved in one process.
 
 Observation array in, action array out, one observation at a time, one thread. The weights are random: only their number
 matters. Compare ratios; the times are this machine's, now.
@@ -37,6 +37,7 @@ def main() -> None:
 def contenders(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
     """Build one policy, three ways to run it."""
     import numpy as np
+    import onnxruntime
     import torch
     from gymnasium import spaces
     from stable_baselines3 import PPO
@@ -44,7 +45,6 @@ def contenders(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
 
     from bam_envs.core.spaces import space_to_json
     from bam_train.policy import FrozenPolicy
-    from bam_train.policy.onnx_session import OnnxSession
     from bam_train.trainers.sb3.freeze import freeze
 
     torch.set_num_threads(1)
@@ -54,14 +54,16 @@ def contenders(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
     model = PPO("MlpPolicy", normaliser or env, policy_kwargs={"net_arch": options.layers}, device="cpu")
     graph = freeze(model, normaliser, observation, action)
     frozen = FrozenPolicy.from_graph(graph, space_to_json(observation), space_to_json(action))
-    session = OnnxSession(graph)
+    session_options = onnxruntime.SessionOptions()
+    session_options.intra_op_num_threads = session_options.inter_op_num_threads = 1
+    session = onnxruntime.InferenceSession(graph, session_options, providers=["CPUExecutionProvider"])
 
     def predict(x: Any) -> Any:
         return model.predict(normaliser.normalize_obs(x) if normaliser else x, deterministic=True)[0]
 
     ways: dict[str, Callable[[Any], Any]] = {
         "FrozenPolicy.act": frozen.act,
-        "onnxruntime": lambda x: session.run({"observation": x[None]})["action"][0],
+        "onnxruntime": lambda x: session.run(["action"], {"observation": x[None]})[0][0],
         "SB3 predict": predict,
     }
     x = observation.sample()

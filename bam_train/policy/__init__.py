@@ -1,4 +1,4 @@
-"""Frozen policies: raw observation in, action out, without torch; NumPy for dense layers, onnxruntime for the rest."""
+"""Frozen policies: raw observation in, action out, with onnxruntime and without torch."""
 
 from bam_train.policy.frozen_policy import FrozenPolicy
 

@@ -1,31 +1,22 @@
-"""A frozen policy: raw observation in, deterministic action out, without torch and without unpickling anything.
-
-A graph of dense layers runs in NumPy; any other is run by onnxruntime, which is imported only then.
-"""
+"""A frozen policy: raw observation in, deterministic action out, without torch and without unpickling anything."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint
 from bam_train.errors import FormatError, PolicyError
-from bam_train.policy import onnx_file
-from bam_train.policy.golden import TOLERANCE, worst_difference
-from bam_train.policy.onnx_mlp import MlpRunner, UnsupportedGraph, require_known
-from bam_train.policy.spaces import Leaf, leaf, leaves
+from bam_train.policy.array_specs import ArraySpec, array_spec, observation_arrays
+from bam_train.policy.golden_check import TOLERANCE, worst_difference
+
+if TYPE_CHECKING:
+    from bam_train.policy.onnx_session import OnnxSession
 
 _STATE = "state."
-
-
-class Runner(Protocol):
-    """Runs a graph for any number of rows."""
-
-    def run(self, inputs: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
-        """Return every output by name, (n, ...), for every input by name, (n, ...)."""
 
 
 class FrozenPolicy:
@@ -34,27 +25,33 @@ class FrozenPolicy:
     Attributes:
         observation_space: JSON form, as in the manifest.
         action_space: JSON form, as in the manifest.
-        recurrent: Whether the action depends on what was seen since `reset`.
+        recurrent: Whether the action depends on the observations since `reset`.
     """
 
     def __init__(
-        self,
-        graph: onnx_file.Graph,
-        runner: Runner,
-        observation_space: Mapping[str, Any],
-        action_space: Mapping[str, Any],
+        self, session: OnnxSession, observation_space: Mapping[str, Any], action_space: Mapping[str, Any]
     ) -> None:
-        """Join a graph and what runs it; use `load` or `from_graph`."""
+        """Join a graph and its spaces; use `load` or `from_graph`.
+
+        Raises:
+            PolicyError: The graph's inputs and outputs do not fit the spaces.
+        """
         self.observation_space, self.action_space = dict(observation_space), dict(action_space)
-        self._leaves, self._action = leaves(observation_space), leaf("action", action_space)
+        self._arrays, self._action = observation_arrays(observation_space), array_spec("action", action_space)
         self._is_dict = observation_space.get("type") == "Dict"
-        self._runner = runner
-        states = [value for value in graph.inputs if value.name.startswith(_STATE)]
-        self._zero_state = {value.name: (tuple(n or 0 for n in value.shape[1:]), value.dtype) for value in states}
+        self._session = session
+        states = {name: tensor for name, tensor in session.inputs.items() if name.startswith(_STATE)}
+        _require_fit(session, self._arrays, states)
+        self._zero_state = {name: np.zeros([n or 1 for n in one.shape], one.dtype) for name, one in states.items()}
         self._state: dict[str, np.ndarray] | None = None
+        self._outputs = ["action", *(f"next_{name}" for name in states)]
         self.recurrent = bool(states)
         self._try_once()
-        self._buffer, self._calls, self._result = self._short_cut()
+        # A plain array of numbers, as most policies take, is copied into an array that is there already.
+        plain = not (self.recurrent or self._is_dict) and self._arrays[0].kind == "Box"
+        self._shape, self._dtype = self._arrays[0].shape, self._arrays[0].dtype
+        self._buffer = np.zeros((1, *self._shape), self._dtype) if plain else None
+        self._inputs: dict[str, Any] = {"observation": self._buffer}
 
     @classmethod
     def load(cls, path: str | Path, *, check_golden: bool = True) -> FrozenPolicy:
@@ -90,28 +87,32 @@ class FrozenPolicy:
         Raises:
             PolicyError: Not ONNX, or its inputs and outputs do not fit the spaces.
         """
+        from bam_train.policy.onnx_graph import require_policy  # these two import onnxruntime and protobuf
+        from bam_train.policy.onnx_session import OnnxSession
+
         try:
-            graph = onnx_file.parse(onnx)
-            require_known(graph)
-            _require_fit(graph, leaves(observation_space))
-            return cls(graph, _runner(graph, onnx), observation_space, action_space)
+            require_policy(onnx)
         except FormatError as error:
             raise PolicyError(f"the policy cannot be read: {error}") from error
+        return cls(OnnxSession(onnx), observation_space, action_space)
 
-    def reset(self, rows: Any = None) -> None:
-        """Forget what was seen, at the start of an episode.
+    def reset(self, env_ids: Any = None) -> None:
+        """Forget what was observed, at the start of an episode.
 
         Args:
-            rows: Indices or a mask of the rows whose episode starts; None for all. Only matters if `recurrent`.
+            env_ids: Indices or a mask of the environments whose episode starts; None for all. Only matters if
+                `recurrent`.
         """
-        if rows is None:
+        if env_ids is None:
             self._state = None
         elif self._state is not None:
             try:
                 for state in self._state.values():
-                    state[rows] = 0
+                    state[env_ids] = 0
             except IndexError as error:
-                raise PolicyError(f"reset: rows {rows!r} do not fit a state of {len(state)} rows") from error
+                raise PolicyError(
+                    f"reset: env_ids {env_ids!r} do not fit a state of {len(state)} environments"
+                ) from error
 
     def act(self, observation: Any) -> Any:
         """Return the action for one observation.
@@ -130,19 +131,17 @@ class FrozenPolicy:
             return self._act({part.name: value[None] for part, value in self._checked(observation, ())})[0]
         if (
             type(observation) is not np.ndarray
-            or observation.dtype != buffer.dtype
-            or observation.shape != buffer.shape
+            or observation.dtype is not self._dtype
+            or observation.shape != self._shape
         ):
-            observation = self._leaves[0].checked(observation, ())
-        buffer[...] = observation
-        for call in self._calls:
-            call()
-        return self._result.copy()[()]  # a number, not an array without axes, of a Discrete
+            observation = self._arrays[0].checked(observation, ())
+        buffer[0] = observation
+        return _int64(self._session.run(self._inputs, self._outputs)[0])[0]
 
     def act_batch(self, observations: Any) -> np.ndarray:
-        """Return the actions for n observations, one a row.
+        """Return the actions for the observations of n environments.
 
-        A recurrent policy keeps a state for each row: give the same rows until `reset`.
+        A recurrent policy keeps a state for each environment: give the same environments until `reset`.
 
         Args:
             observations: (n, ...) each.
@@ -157,13 +156,13 @@ class FrozenPolicy:
         if self._is_dict and isinstance(observations, Mapping) and observations:
             first = next(iter(observations.values()))
         if np.ndim(first) == 0 or len(first) == 0:
-            raise PolicyError(f"observations: expected one or more rows, found shape {np.shape(first)}")
+            raise PolicyError(f"observations: expected one or more, found shape {np.shape(first)}")
         return self._act({part.name: value for part, value in self._checked(observations, (len(first),))})
 
-    def _checked(self, observation: Any, batch: tuple[int, ...]) -> list[tuple[Leaf, np.ndarray]]:
+    def _checked(self, observation: Any, batch: tuple[int, ...]) -> list[tuple[ArraySpec, np.ndarray]]:
         if not self._is_dict:
-            return [(self._leaves[0], self._leaves[0].checked(observation, batch))]
-        expected = {part.name.removeprefix("observation."): part for part in self._leaves}
+            return [(self._arrays[0], self._arrays[0].checked(observation, batch))]
+        expected = {part.name.removeprefix("observation."): part for part in self._arrays}
         found = sorted(observation) if isinstance(observation, Mapping) else type(observation).__name__
         if found != sorted(expected):
             raise PolicyError(f"observation: expected a mapping with the keys {sorted(expected)}, found {found}")
@@ -171,45 +170,34 @@ class FrozenPolicy:
 
     def _act(self, inputs: dict[str, np.ndarray]) -> np.ndarray:
         """Run the graph on checked inputs, (n, ...) each, and keep the state."""
-        inputs = {part.name: inputs[part.name].astype(part.dtype, copy=False) for part in self._leaves}
-        if not self.recurrent:
-            return np.array(self._runner.run(inputs)["action"])
-        n = len(inputs[self._leaves[0].name])
-        outputs = self._runner.run({**inputs, **self._state_of(n)})
-        self._state = {name: outputs[f"next_{name}"].copy() for name in self._zero_state}
-        return np.array(outputs["action"])
+        inputs = {part.name: inputs[part.name].astype(part.dtype, copy=False) for part in self._arrays}
+        if self.recurrent:
+            inputs |= self._state_of(len(inputs[self._arrays[0].name]))
+        action, *state = self._session.run(inputs, self._outputs)
+        if self.recurrent:
+            self._state = dict(zip(self._zero_state, state, strict=True))
+        return _int64(action)
 
     def _state_of(self, n: int) -> dict[str, np.ndarray]:
         if self._state is None:
-            self._state = {name: np.zeros((n, *shape), dtype) for name, (shape, dtype) in self._zero_state.items()}
+            self._state = {name: np.repeat(zero, n, axis=0) for name, zero in self._zero_state.items()}
         found = len(next(iter(self._state.values())))
         if found != n:
-            raise PolicyError(
-                f"observations: expected {found} rows, found {n}; call reset() before changing the number"
-            )
+            raise PolicyError(f"observations: expected {found}, found {n}; call reset() before changing the number")
         return self._state
 
     def _try_once(self) -> None:
-        """Run on zeros: the graph must give what it names, of the action's shape."""
-        zeros = {part.name: np.zeros((2, *part.shape), part.dtype) for part in self._leaves}
+        """Run on zeros: the graph must give an action of the right shape."""
+        zeros = {part.name: np.zeros((2, *part.shape), part.dtype) for part in self._arrays}
         found = self._act(zeros).shape
         self._state = None
         if found != (2, *self._action.shape):
             raise PolicyError(f"action: expected shape {self._action.shape}, the graph gives {found[1:]}")
 
-    def _short_cut(self) -> tuple[np.ndarray | None, list[Any], np.ndarray]:
-        """For one plain array of numbers in a NumPy plan: where it goes, what to call, and where the action is then."""
-        if self.recurrent or self._is_dict or self._leaves[0].kind != "Box" or not isinstance(self._runner, MlpRunner):
-            return None, [], np.empty(0)
-        plan = self._runner.single
-        result = plan.outputs["action"]
-        seen = plan.inputs["observation"][0, ...]  # an array also of one number
-        return seen, plan.calls, result[0] if self._action.shape else result.reshape(())
-
     def _check_golden(self, checkpoint: Checkpoint) -> None:
         """Act on the recorded observations, and compare with what the trainer did."""
         try:
-            worst, row = worst_difference(self, self._leaves, self._action, checkpoint.arrays(GOLDEN))
+            worst, row = worst_difference(self, self._arrays, self._action, checkpoint.arrays(GOLDEN))
         except PolicyError as error:
             raise PolicyError(f"{checkpoint.path}: {GOLDEN} does not fit the policy: {error}") from error
         if not worst <= TOLERANCE:  # NaN too
@@ -219,33 +207,26 @@ class FrozenPolicy:
             )
 
 
-def _runner(graph: onnx_file.Graph, onnx: bytes) -> Runner:
-    """Choose NumPy for dense layers, onnxruntime for everything else."""
-    try:
-        return MlpRunner(graph)
-    except UnsupportedGraph:
-        from bam_train.policy.onnx_session import OnnxSession
-
-        return OnnxSession(onnx)
+def _int64(array: np.ndarray) -> np.ndarray:
+    """Whole numbers as NumPy's int64: those of onnxruntime are of the C type long long, which NumPy keeps apart."""
+    return array.view(np.int64) if array.dtype.char == "q" else array
 
 
-def _require_fit(graph: onnx_file.Graph, parts: list[Leaf]) -> None:
+def _require_fit(session: OnnxSession, arrays: list[ArraySpec], states: Mapping[str, Any]) -> None:
     """Refuse a graph whose inputs are not the observation space's arrays, or that lacks an output."""
-    inputs = {value.name: value for value in graph.inputs if not value.name.startswith(_STATE)}
-    if set(inputs) != {part.name for part in parts}:
+    names = session.inputs.keys() - states.keys()
+    if names != {part.name for part in arrays}:
         raise PolicyError(
-            f"the policy's inputs are {sorted(inputs)}, the observation space has {sorted(p.name for p in parts)}"
+            f"the policy's inputs are {sorted(names)}, the observation space has {sorted(p.name for p in arrays)}"
         )
-    for part in parts:
-        value = inputs[part.name]
-        if value.shape[1:] != part.shape or value.dtype != part.dtype:
-            found = f"{value.shape[1:]} ({value.dtype})"
+    for part in arrays:
+        taken = session.inputs[part.name]
+        if taken.shape[1:] != part.shape or taken.dtype != part.dtype:
+            found = f"{taken.shape[1:]} ({taken.dtype})"
             raise PolicyError(f"{part.name}: the space has {part.shape} ({part.dtype}), the policy takes {found}")
-    states = [value for value in graph.inputs if value.name.startswith(_STATE)]
-    for value in states:
-        if len(value.shape) < 2 or None in value.shape[1:]:
-            raise PolicyError(f"{value.name}: expected a fixed shape after the batch axis, found {value.shape}")
-    names = {value.name for value in graph.outputs}
-    wanted = {"action", *(f"next_{value.name}" for value in states)}
-    if not wanted <= names:
-        raise PolicyError(f"the policy's outputs are {sorted(names)}, expected {sorted(wanted)}")
+    for name, state in states.items():
+        if len(state.shape) < 2 or None in state.shape[1:]:
+            raise PolicyError(f"{name}: expected a fixed shape after the batch axis, found {state.shape}")
+    wanted = {"action", *(f"next_{name}" for name in states)}
+    if not wanted <= set(session.outputs):
+        raise PolicyError(f"the policy's outputs are {sorted(session.outputs)}, expected {sorted(wanted)}")

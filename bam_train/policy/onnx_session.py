@@ -1,15 +1,17 @@
-"""Run an ONNX graph with onnxruntime, on one thread: what a policy with convolutions needs.
+"""Run a policy's ONNX graph with onnxruntime, on one thread.
 
-A graph may come from a stranger, and onnxruntime hears no Ctrl-C. So its memory is bounded, and it is loaded and run a
-first time in a thread that is waited for only so long. A later run takes as long as the first: no operation of a policy
-takes longer for other numbers.
+A graph may come from a stranger, and onnxruntime cannot be interrupted by Ctrl-C. So its memory is bounded, and it is
+loaded and run for the first time in a thread that is waited for only so long. A later run takes as long as the first:
+no operation of a policy takes longer for other numbers.
 """
 
 from __future__ import annotations
 
+import re
 import threading
-from collections.abc import Callable, Mapping
-from typing import TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 import onnxruntime
@@ -18,51 +20,80 @@ from onnxruntime.capi import onnxruntime_pybind11_state as faults
 from bam_train.errors import PolicyError
 
 MOST_SECONDS = 5.0
-"""Time that loading a graph and its first run may take [s]."""
+"""Longest time for loading a graph, and for its first run [s]."""
 MOST_MEMORY = 2**30
 """Bytes that onnxruntime may use for the weights and results of all graphs."""
 
 _FAULTS = (faults.Fail, faults.InvalidArgument, faults.InvalidGraph, faults.InvalidProtobuf, faults.NotImplemented)
+_DTYPES = {"float": "float32", "double": "float64"}
+"""Names of onnxruntime that are not those of NumPy."""
 T = TypeVar("T")
 
 
-class OnnxSession:
-    """A graph in onnxruntime."""
+@dataclass(frozen=True)
+class Tensor:
+    """An input of the graph."""
 
-    def __init__(self, onnx: bytes) -> None:
+    shape: tuple[int | None, ...]
+    """None where the length is free, as the batch axis is."""
+    dtype: str
+    """As NumPy calls it."""
+
+
+class OnnxSession:
+    """A graph in onnxruntime.
+
+    Attributes:
+        inputs: What it takes, by name.
+        outputs: Names of what it returns.
+    """
+
+    def __init__(self, onnx: bytes, most_seconds: float = MOST_SECONDS) -> None:
         """Load the graph.
+
+        Args:
+            onnx: The file, accepted by `require_policy`.
+            most_seconds: Longest time for loading it, and for its first run.
 
         Raises:
             PolicyError: onnxruntime cannot run it.
         """
         try:
-            self._session = _within(MOST_SECONDS, lambda: _load(onnx))
+            self._session = _within(most_seconds, lambda: _load(onnx))
         except _FAULTS as error:
             raise PolicyError(f"onnxruntime {onnxruntime.__version__} cannot run the policy: {error}") from error
-        self._outputs = [output.name for output in self._session.get_outputs()]
+        self.inputs = {one.name: _tensor(one) for one in self._session.get_inputs()}
+        self.outputs = [one.name for one in self._session.get_outputs()]
+        self._most_seconds = most_seconds
         self._options = onnxruntime.RunOptions()
         self._has_run = False
 
-    def run(self, inputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return every output by name, (n, ...), for every input by name, (n, ...)."""
-        given = dict(inputs)
+    def run(self, inputs: Mapping[str, np.ndarray], outputs: Sequence[str]) -> list[np.ndarray]:
+        """Return the named outputs, new arrays (n, ...), for every input by name, (n, ...)."""
         try:
             if self._has_run:
-                results = self._run(given)
-            else:
-                results = _within(MOST_SECONDS, lambda: self._run(given), self._stop)
-                self._has_run = True
+                return self._run(inputs, outputs)
+            results = _within(self._most_seconds, lambda: self._run(inputs, outputs), self._terminate)
         except _FAULTS as error:
             raise PolicyError(f"onnxruntime {onnxruntime.__version__} failed: {error}") from error
-        return dict(zip(self._outputs, results, strict=True))
-
-    def _run(self, inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
-        results: list[np.ndarray] = self._session.run(self._outputs, inputs, self._options)
+        self._has_run = True
         return results
 
-    def _stop(self) -> None:
-        """End a run in progress before its next operation."""
+    def _run(self, inputs: Mapping[str, np.ndarray], outputs: Sequence[str]) -> list[np.ndarray]:
+        # Without options of ours, onnxruntime makes some for each run: 3 us of 13.
+        results: list[np.ndarray] = self._session.run(outputs, inputs, self._options)
+        return results
+
+    def _terminate(self) -> None:
+        """End the first run before its next operation."""
         self._options.terminate = True
+
+
+def _tensor(described: Any) -> Tensor:
+    """Read onnxruntime's description, such as ``tensor(float)`` and ``['n', 3]``."""
+    kind = re.fullmatch(r"tensor\((\w+)\)", described.type)
+    dtype = kind[1] if kind else described.type
+    return Tensor(tuple(n if isinstance(n, int) else None for n in described.shape), _DTYPES.get(dtype, dtype))
 
 
 def _load(onnx: bytes) -> onnxruntime.InferenceSession:
@@ -80,7 +111,7 @@ def _load(onnx: bytes) -> onnxruntime.InferenceSession:
 
 
 def _within(seconds: float, call: Callable[[], T], stop: Callable[[], None] = lambda: None) -> T:
-    """What `call` returns, made in another thread: waiting for a thread, other than for C++, can be interrupted.
+    """Return what `call` returns in another thread: Ctrl-C interrupts waiting for a thread, but not C++.
 
     Raises:
         PolicyError: It takes longer.
@@ -109,7 +140,7 @@ def _within(seconds: float, call: Callable[[], T], stop: Callable[[], None] = la
 
 
 def _bound_memory() -> None:
-    """Bound what sessions that ask for it may allocate together; onnxruntime keeps one such setting a process."""
+    """Bound what sessions that ask for it may allocate together; onnxruntime keeps one such setting per process."""
     info = onnxruntime.OrtMemoryInfo(
         "Cpu", onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, onnxruntime.OrtMemType.DEFAULT
     )

@@ -39,8 +39,8 @@ from bam_train.environments import (
 )
 from bam_train.errors import CheckpointMismatch, PolicyError, SettingsError
 from bam_train.policy import FrozenPolicy
-from bam_train.policy.golden import TOLERANCE, worst_difference
-from bam_train.policy.spaces import leaf, leaves
+from bam_train.policy.array_specs import array_spec, observation_arrays
+from bam_train.policy.golden_check import TOLERANCE, worst_difference
 from bam_train.settings import TrainSettings
 from bam_train.trainers.freezing.golden import pack
 from bam_train.trainers.manifest import origin
@@ -345,7 +345,7 @@ def _reference_actions(parts: PolicyParts, observations: dict[str, Array]) -> tu
 
 def _checked(directory: Directory, policy: FrozenPolicy, golden: bytes, by: str) -> float:
     """Act on the golden observations; the largest difference."""
-    parts, action = leaves(policy.observation_space), leaf("action", policy.action_space)
+    parts, action = observation_arrays(policy.observation_space), array_spec("action", policy.action_space)
     worst, _ = worst_difference(policy, parts, action, safetensors_file.parse(golden))
     if not worst <= TOLERANCE:  # NaN too
         text = f"its frozen policy differs by {worst:.3g} from the actions of {by}"

@@ -6,31 +6,25 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from safetensors import numpy as library
 
 from bam_train.checkpoint.safetensors_file import dump, parse
 from bam_train.errors import FormatError
 
-DTYPES = [
-    "bool",
-    "int8",
-    "uint8",
-    "int16",
-    "uint16",
-    "int32",
-    "uint32",
-    "int64",
-    "uint64",
-    "float16",
-    "float32",
-    "float64",
-]
+INTEGERS = [f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)]
 
 
 def arrays() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
-    made = {f"{name}.{i}": (rng.random((2, 3)) * 100).astype(name) for name in DTYPES for i in range(2)}
-    return {**made, "é": np.array(3.5), "empty": np.zeros((0, 3), np.float32), "transposed": np.eye(3, 2).T}
+    made = {
+        name: (rng.random((2, 3)) * 100).astype(name) for name in ("bool", "float16", "float32", "float64", *INTEGERS)
+    }
+    return {
+        **made,
+        "é": np.array(3.5),
+        "empty": np.zeros((0, 3), np.float32),
+        "transposed": np.eye(3, 2).T,
+        ">": np.ones(2, ">f4"),
+    }
 
 
 def file_of(header: object, body: bytes = b"") -> bytes:
@@ -38,61 +32,55 @@ def file_of(header: object, body: bytes = b"") -> bytes:
     return len(text).to_bytes(8, "little") + text + body
 
 
-def test_writes_the_bytes_that_the_library_writes():
-    contiguous = {name: np.array(array, order="C") for name, array in arrays().items()}
-    assert dump(arrays()) == library.save(contiguous)
-
-
-def test_the_library_reads_ours_and_we_read_the_librarys():
-    for read in (parse(dump(arrays())), library.load(dump(arrays())), parse(library.save(arrays(), {"made": "by"}))):
-        assert set(read) == set(arrays())
-    for name, array in parse(dump(arrays())).items():
-        np.testing.assert_array_equal(array, arrays()[name])
-        assert array.dtype == arrays()[name].dtype
-        assert array.flags.writeable
-
-
-def test_nothing_is_a_file_too():
+def test_arrays_of_every_type_come_back_as_writable_copies():
+    found = parse(dump(arrays()))
+    assert set(found) == set(arrays())
+    for name, array in arrays().items():
+        np.testing.assert_array_equal(found[name], array)
+        assert found[name].dtype == array.dtype.newbyteorder("=")
+        assert found[name].flags.writeable
     assert parse(dump({})) == {}
 
 
-def test_an_object_array_is_refused():
-    with pytest.raises(FormatError, match=r"array 'a': dtype object cannot be stored; expected bool, an integer or a"):
-        dump({"a": np.array([{}])})
+def test_what_cannot_be_stored_is_named():
+    for array in (np.array([{}]), np.ones(2, complex), np.array(["a"])):
+        with pytest.raises(FormatError, match=r"array 'a': dtype .* cannot be stored; expected bool, an integer or a"):
+            dump({"a": array})
+
+
+def entry(dtype: object, shape: object, offsets: list[int], body: bytes = bytes(4)) -> bytes:
+    return file_of({"a": {"dtype": dtype, "shape": shape, "data_offsets": offsets}}, body)
 
 
 @pytest.mark.parametrize(
-    ("data", "text"),
+    "data",
     [
-        (b"", "not a safetensors file: 0 bytes, too short for its header"),
-        (b"\xff" * 20, "not a safetensors file: 20 bytes, too short"),
-        (file_of(b"{nonsense"), "its header is not JSON"),
-        (file_of(b"[" * 100_000), "its header is not JSON"),
-        (file_of([]), "its header is a list, expected an object"),
-        (file_of({"a": 3}), "array 'a': expected dtype, shape and data_offsets, found 3"),
-        (file_of({"a": {"dtype": "F32", "shape": 3, "data_offsets": [0, 4]}}), "array 'a': expected dtype, shape"),
-        (
-            file_of({"a": {"dtype": "BF16", "shape": [2], "data_offsets": [0, 4]}}, bytes(4)),
-            "dtype 'BF16' is not known",
-        ),
-        (file_of({"a": {"dtype": [], "shape": [2], "data_offsets": [0, 4]}}, bytes(4)), r"dtype \[\] is not known"),
-        (file_of({"a": {"dtype": "F32", "shape": [-1], "data_offsets": [0, 4]}}, bytes(4)), "must be whole numbers"),
-        (file_of({"a": {"dtype": "F32", "shape": [1.5], "data_offsets": [0, 4]}}, bytes(4)), "must be whole numbers"),
-        (file_of({"a": {"dtype": "F32", "shape": [2], "data_offsets": [0, 8]}}, bytes(4)), "expected 8 bytes within 4"),
-        (
-            file_of({"a": {"dtype": "F32", "shape": [1], "data_offsets": [4, 8]}}, bytes(8)),
-            "a gap or overlap at byte 0",
-        ),
-        (file_of({}, bytes(4)), "expected 0 bytes of arrays, found 4"),
-        (file_of({"a": {"dtype": "F32", "shape": [2**63, 0], "data_offsets": [0, 0]}}), "array 'a'"),
+        b"",
+        b"\xff" * 20,
+        (2**23 + 8).to_bytes(8, "little") + b" " * (2**23 + 8),
+        file_of(b"{nonsense"),
+        file_of(b"[" * 100_000),
+        file_of([]),
+        file_of({"a": 3}),
+        entry("F32", 3, [0, 4]),
+        entry("BF16", [2], [0, 4]),
+        entry("F4", [2], [0, 1]),
+        entry([], [2], [0, 4]),
+        entry("F32", [-1], [0, 4]),
+        entry("F32", [1.5], [0, 4]),
+        entry("F32", [2], [0, 8]),
+        entry("F32", [1], [4, 8], bytes(8)),
+        file_of({}, bytes(4)),
+        entry("F32", [2**63, 0], [0, 0], b""),
+        entry("F32", [1] * 100, [0, 4]),
     ],
 )
-def test_what_is_not_safetensors_is_refused(data: bytes, text: str):
-    with pytest.raises(FormatError, match=text):
+def test_what_is_not_safetensors_is_refused(data: bytes):
+    with pytest.raises(FormatError, match="not a safetensors file"):
         parse(data)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(st.data())
 def test_any_damage_is_refused_or_harmless(data: st.DataObject):
     whole = bytearray(dump({"a": np.arange(6.0), "b": np.ones((2, 2), np.uint8)}))

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from bam_train.errors import PolicyError
-from bam_train.policy.spaces import Leaf
+from bam_train.policy.array_specs import ArraySpec
 
 TOLERANCE = 1e-5
 """Largest difference from the trainer's own action; a Box wider than 2 is measured in half its range."""
@@ -33,7 +33,7 @@ class Policy(Protocol):
 
 
 def worst_difference(
-    policy: Policy, observation: list[Leaf], action: Leaf, arrays: Mapping[str, np.ndarray]
+    policy: Policy, observation: list[ArraySpec], action: ArraySpec, arrays: Mapping[str, np.ndarray]
 ) -> tuple[float, int]:
     """Act on the recorded observations.
 
@@ -63,7 +63,7 @@ def worst_difference(
     return float(worst[row]), row
 
 
-def _expected(observation: list[Leaf], action: Leaf, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+def _expected(observation: list[ArraySpec], action: ArraySpec, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return the recorded actions if every array is there with as many rows."""
     names = {"action", *(part.name for part in observation)}
     if set(arrays) != names:
@@ -85,7 +85,7 @@ def _rows(parts: Mapping[str, np.ndarray], chosen: Any) -> Any:
     return {key: array[chosen] for key, array in parts.items()}
 
 
-def _unit(action: Leaf, expected: np.ndarray) -> np.ndarray:
+def _unit(action: ArraySpec, expected: np.ndarray) -> np.ndarray:
     """What a difference is measured in: 1, or half the range of a Box if that is more, as float32 rounds."""
     if action.kind != "Box" or action.low is None or action.high is None:
         return np.ones(())

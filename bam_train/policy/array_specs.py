@@ -14,7 +14,7 @@ _KINDS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary")
 
 
 @dataclass(frozen=True)
-class Leaf:
+class ArraySpec:
     """One array of an observation, or the action."""
 
     name: str
@@ -31,7 +31,7 @@ class Leaf:
     """Highest value; None for a MultiBinary."""
 
     def checked(self, value: Any, batch: tuple[int, ...]) -> np.ndarray:
-        """Return the value as an array that can be copied into this leaf's.
+        """Return the value as an array that can be copied into this one.
 
         Args:
             value: (*batch, *shape).
@@ -56,7 +56,7 @@ class Leaf:
         return f"{(*batch, *self.shape)} ({self.dtype})"
 
 
-def leaves(space: Mapping[str, Any]) -> list[Leaf]:
+def observation_arrays(space: Mapping[str, Any]) -> list[ArraySpec]:
     """List the arrays of an observation space; that of a Dict are named observation.<key>.
 
     Args:
@@ -66,11 +66,11 @@ def leaves(space: Mapping[str, Any]) -> list[Leaf]:
         PolicyError: The space is of another kind than a policy takes.
     """
     if space.get("type") != "Dict":
-        return [leaf("observation", space)]
-    return [leaf(f"observation.{key}", inner) for key, inner in dict(space["spaces"]).items()]
+        return [array_spec("observation", space)]
+    return [array_spec(f"observation.{key}", inner) for key, inner in dict(space["spaces"]).items()]
 
 
-def leaf(name: str, space: Mapping[str, Any]) -> Leaf:
+def array_spec(name: str, space: Mapping[str, Any]) -> ArraySpec:
     """Read one space that is a single array."""
     kind = space.get("type")
     if kind not in _KINDS:
@@ -78,22 +78,22 @@ def leaf(name: str, space: Mapping[str, Any]) -> Leaf:
             f"{name}: a space of type {kind!r} cannot be used; expected {', '.join(_KINDS)} or a Dict of them"
         )
     try:
-        return _leaf(name, str(kind), space)
+        return _array_spec(name, str(kind), space)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise PolicyError(f"{name}: its space cannot be read ({type(error).__name__}: {error}): {space}") from error
 
 
-def _leaf(name: str, kind: str, space: Mapping[str, Any]) -> Leaf:
+def _array_spec(name: str, kind: str, space: Mapping[str, Any]) -> ArraySpec:
     if kind == "MultiBinary":
         shape = tuple(np.atleast_1d(space["n"]).tolist())
-        return Leaf(name, kind, shape, np.dtype(np.int8), None, None)
+        return ArraySpec(name, kind, shape, np.dtype(np.int8), None, None)
     dtype = np.dtype(space["dtype"])
     if kind == "Box":
         shape = tuple(space["shape"])
-        return Leaf(name, kind, shape, dtype, _numbers(space["low"], shape), _numbers(space["high"], shape))
+        return ArraySpec(name, kind, shape, dtype, _numbers(space["low"], shape), _numbers(space["high"], shape))
     counts = np.asarray(space["n"] if kind == "Discrete" else space["nvec"], np.int64)
     low = np.broadcast_to(np.asarray(space.get("start", 0), np.int64), counts.shape)
-    return Leaf(name, kind, counts.shape, dtype, low, low + counts - 1)
+    return ArraySpec(name, kind, counts.shape, dtype, low, low + counts - 1)
 
 
 def _numbers(values: Any, shape: tuple[int, ...]) -> np.ndarray:
