@@ -228,7 +228,7 @@ def _signal_rows(signal: SignalSpec) -> list[list[object]]:
     rates = signal.max_rate or (0.0,) * len(signal.labels)
     columns = zip(signal.units, map(float, signal.low), map(float, signal.high), rates, strict=True)
     rows: list[list[object]] = []
-    groups = itertools.groupby(zip(itertools.count(), signal.labels, columns), lambda one: one[2])  # noqa: B905
+    groups = itertools.groupby(zip(itertools.count(), signal.labels, columns), lambda one: one[2])
     for (unit, low, high, rate), members in groups:
         indices, names, _ = zip(*members, strict=True)
         where = f"[{indices[0]}]" if len(indices) == 1 else f"[{indices[0]}:{indices[-1] + 1}]"

@@ -27,7 +27,8 @@ def dump(arrays: Mapping[str, np.ndarray]) -> bytes:
         if np.asarray(array).dtype.kind not in "biuf":
             expected = "expected bool, an integer or a float type"
             raise FormatError(f"array {name!r}: dtype {np.asarray(array).dtype} cannot be stored; {expected}")
-    return safetensors.numpy.save({name: np.asarray(array, order="C") for name, array in arrays.items()})
+    data: bytes = safetensors.numpy.save({name: np.asarray(array, order="C") for name, array in arrays.items()})
+    return data
 
 
 def parse(data: bytes) -> dict[str, np.ndarray]:

@@ -46,25 +46,25 @@ class OnnxSession:
     Attributes:
         inputs: What it takes, by name.
         outputs: Names of what it returns.
+        most_seconds: Longest time for the first run.
     """
 
-    def __init__(self, onnx: bytes, most_seconds: float = MOST_SECONDS) -> None:
+    def __init__(self, onnx: bytes) -> None:
         """Load the graph.
 
         Args:
             onnx: The file, accepted by `require_policy`.
-            most_seconds: Longest time for loading it, and for its first run.
 
         Raises:
             PolicyError: onnxruntime cannot run it.
         """
         try:
-            self._session = _within(most_seconds, lambda: _load(onnx))
+            self._session = _within(MOST_SECONDS, lambda: _load(onnx))
         except _FAULTS as error:
             raise PolicyError(f"onnxruntime {onnxruntime.__version__} cannot run the policy: {error}") from error
         self.inputs = {one.name: _tensor(one) for one in self._session.get_inputs()}
         self.outputs = [one.name for one in self._session.get_outputs()]
-        self._most_seconds = most_seconds
+        self.most_seconds = MOST_SECONDS
         self._options = onnxruntime.RunOptions()
         self._has_run = False
 
@@ -73,7 +73,7 @@ class OnnxSession:
         try:
             if self._has_run:
                 return self._run(inputs, outputs)
-            results = _within(self._most_seconds, lambda: self._run(inputs, outputs), self._terminate)
+            results = _within(self.most_seconds, lambda: self._run(inputs, outputs), self._terminate)
         except _FAULTS as error:
             raise PolicyError(f"onnxruntime {onnxruntime.__version__} failed: {error}") from error
         self._has_run = True
