@@ -10,8 +10,7 @@ from gymnasium import Space
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.registry import resolve_id
-from bam_envs.remote.gymapi.actions import DEFAULT
-from bam_envs.remote.gymapi.codec import EnvCodec
+from bam_envs.remote.gymapi.codec import DEFAULT, EnvCodec
 from bam_envs.remote.gymapi.versions import Version, version_named
 from bam_envs.remote.transport import EnvSpecMessage, Info
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from bam_envs.core.errors import InvalidValue, LinkLost, NoServer
-from bam_envs.remote.gymapi.requests import base_name, service_name
+from bam_envs.remote.gymapi.messages import base_name, service_name
 from bam_envs.remote.ros2_node import RclpyBus
 from bam_envs.remote.rosbridge_transport import RosbridgeTransport
 from bam_envs.ros.messages import write_stamp

@@ -13,21 +13,20 @@ from gymnasium import Space
 
 from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, ProtocolError, RemoteError, UnknownName
 from bam_envs.remote.foreign_rack import ForeignRack, LastKnown
-from bam_envs.remote.gymapi.actions import DEFAULT
-from bam_envs.remote.gymapi.codec import EnvCodec
-from bam_envs.remote.gymapi.requests import (
+from bam_envs.remote.gymapi.codec import DEFAULT, EnvCodec
+from bam_envs.remote.gymapi.messages import (
     KIND,
     GymRequest,
+    GymResponse,
     RequestType,
     base_name,
-    plain_seed,
+    read_response,
     refuse_foreign,
     service_name,
     whole_request,
     write_request,
 )
-from bam_envs.remote.gymapi.responses import GymResponse, read_response
-from bam_envs.remote.transport import EnvSpecMessage, Info, spec_from_json, spec_to_json
+from bam_envs.remote.transport import EnvSpecMessage, Info, plain_seed, spec_from_json, spec_to_json
 from bam_envs.ros.freshness import Tagger
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint

@@ -1,23 +1,248 @@
-"""Actions and results of one environment as GymAPI messages and back: of one, or lists with one for each row."""
+"""Actions and results of one environment as GymAPI messages and back; see `leaves` for what goes where.
+
+What the lists of an action cannot hold exactly (Text, Sequence, images, infinities) is JSON in ``prefix``, marked by
+``bam:``; what the fields of an observation cannot hold is JSON in ``info``, by the name of its leaf. Images go into
+``color_img``, all of them where that is a list and the first one where it is not; a depth image that was asked for goes
+into ``depth_img``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+from gymnasium import Space, spaces
+
 from bam_envs.core.errors import InvalidValue, ProtocolError
-from bam_envs.remote.gymapi.actions import DEFAULT, ActionCodec
-from bam_envs.remote.gymapi.observations import ObservationCodec
-from bam_envs.remote.gymapi.responses import GymResponse, write_feedback
+from bam_envs.remote.gymapi.leaves import (
+    EXACT,
+    GRIPPER_WIDTH,
+    IMAGE,
+    NUMBERS,
+    POSE,
+    Leaf,
+    Lists,
+    Path,
+    is_depth,
+    joined,
+    leaves_of,
+    read_numbers,
+    read_pose,
+)
+from bam_envs.remote.gymapi.messages import PREFIX, GymResponse, write_feedback
 from bam_envs.remote.gymapi.versions import JUNE_22, Version
 from bam_envs.remote.transport import EnvSpecMessage, Info
-from bam_envs.remote.values import exact, pack, shown
+from bam_envs.remote.values import exact, pack, shown, tree_from_json, tree_to_json
+from bam_envs.ros.images import FORMATS, color_message, depth_message, read_color_message, read_depth_message
+from bam_envs.rosbridge.strict_json import dump_json, load_json
 
-Messages = Sequence[Mapping[str, Any]]
+Trees = dict[str, Any]
+Values = dict[Path, Any]
+DEFAULT = 1
+"""The action_type of an action that is none of the rack's own."""
+WAYPOINT = {
+    "kp_scale": 1.0,
+    "kd_scale": 1.0,
+    "max_velocity": 10.0,
+    "max_effort": 1.0,
+    "target_link": "tcp_world",
+    "planner": "ptp",
+    "vel_scale": 1.0,
+    "accel_scale": 1.0,
+    "blend_radius": 0.0,
+    "goal_tol": 0.2,
+    "path_tol": 0.2,
+}
+"""How a rack's own client goes to a pose."""
+
+
+class ActionCodec:
+    """Actions of one space as GymAction messages and back.
+
+    Args:
+        space: Of a single environment.
+        action_type: What a rack does with it: 1 default, 2 pick and lift, 3 pick and place, 4 open, 5 fold.
+    """
+
+    def __init__(self, space: Space[Any], action_type: int = DEFAULT) -> None:
+        self.space, self.action_type = space, action_type
+        self._leaves = leaves_of(space, "action", gripper=True)
+        numbers = [leaf for leaf in self._leaves if leaf.kind == NUMBERS]
+        boxes = tuple(leaf for leaf in numbers if isinstance(leaf.space, spaces.Box))
+        others = tuple(leaf for leaf in numbers if not isinstance(leaf.space, spaces.Box))
+        self._continuous = Lists("continuous_names", "continuous_action", boxes)
+        self._discrete = Lists("discrete_names", "discrete_action", others)
+        poses = tuple(leaf for leaf in self._leaves if leaf.kind == POSE)
+        self._poses = Lists("pose_names", "pose_action", poses)
+
+    def encode(self, action: Any) -> dict[str, Any]:
+        """The message of `action`; fields at their defaults are left out.
+
+        Raises:
+            InvalidValue: It is not one of the space, or NaN is in it.
+        """
+        value = exact(self.space, action, "action")
+        fields: dict[str, Any] = {}
+        if not all(self._write(leaf, leaf.of(value), fields) for leaf in self._leaves):
+            tree = tree_to_json(pack(self.space, value, "action"))
+            fields = {"prefix": PREFIX + dump_json({"action": tree}, "An action")}
+        return {"action_type": self.action_type, **fields}
+
+    def decode(self, message: Mapping[str, Any]) -> Any:
+        """The action in a complete, checked message.
+
+        Raises:
+            ProtocolError: Something is missing, too much, or does not fit.
+            InvalidValue: It is not one of the space.
+        """
+        prefix = message["prefix"]
+        if prefix.startswith(PREFIX):
+            tree = tree_from_json(load_json(prefix.removeprefix(PREFIX), "prefix").get("action"))
+            return exact(self.space, tree, "action")
+        poses = self._poses.read(message)
+        widths = [one[GRIPPER_WIDTH] for one in message["pose_param"]] or [0.0] * len(poses)
+        widths = self._poses.in_order(widths, message["pose_names"], "pose_param")
+        values: Values = {}
+        for (leaf, [pose]), width in zip(poses, widths, strict=True):
+            values[leaf.path] = read_pose(leaf, pose, width)
+        for lists in (self._continuous, self._discrete):
+            values |= {leaf.path: read_numbers(leaf, numbers) for leaf, numbers in lists.read(message)}
+        return joined(self.space, values)
+
+    def _write(self, leaf: Leaf, part: Any, fields: dict[str, Any]) -> bool:
+        if leaf.kind == NUMBERS:
+            lists = self._continuous if isinstance(leaf.space, spaces.Box) else self._discrete
+            return lists.write(leaf, part, fields)
+        if leaf.kind != POSE or not self._poses.write(leaf, part, fields):
+            return False
+        width = float(part[GRIPPER_WIDTH].item()) if GRIPPER_WIDTH in part else 0.0
+        fields.setdefault("pose_param", []).append({**WAYPOINT, GRIPPER_WIDTH: width})
+        return True
+
+
+class ObservationCodec:
+    """Observations of one space as fields of GymFeedback and back.
+
+    Args:
+        space: Of a single environment.
+        image_format: ``"png"``, which keeps every bit, or ``"jpeg"``.
+        depth: Names of the leaves that are depth images [m], to be sent in whole millimetres; one at most.
+
+    Raises:
+        InvalidValue: Another format, or a name that is no leaf that may be a depth image.
+    """
+
+    def __init__(self, space: Space[Any], image_format: str = "png", depth: Sequence[str] = ()) -> None:
+        self.space, self.image_format, self.depth = space, image_format, tuple(depth)
+        self._leaves = leaves_of(space, "observation")
+        self._images = [leaf for leaf in self._leaves if leaf.kind == IMAGE]
+        if image_format not in FORMATS:
+            raise InvalidValue(f"The image format must be png or jpeg, not {image_format!r}.")
+        fitting = [leaf.name for leaf in self._leaves if is_depth(leaf.space)]
+        if not set(self.depth) <= set(fitting) or len(self.depth) > 1:
+            raise InvalidValue(f"depth must name one of the depth images ({', '.join(fitting)}), not {self.depth}.")
+
+    def encode(
+        self, observation: Any, stamp: Mapping[str, int] | None = None, version: Version = JUNE_22
+    ) -> tuple[dict[str, Any], Trees]:
+        """Fields of a message, those at their defaults left out, and the exact trees of what is not in them.
+
+        Raises:
+            InvalidValue: It is not one of the space, or NaN is in it.
+            MissingExtra: There is an image and nothing to encode it with.
+        """
+        value = exact(self.space, observation, "observation")
+        fields: dict[str, Any] = {}
+        trees: Trees = {}
+        images = self._images if version.lists else self._images[:1]
+        for leaf in self._leaves:
+            part = leaf.of(value)
+            if leaf.name in self.depth:
+                image = depth_message(part, leaf.name, stamp)
+                fields["depth_img"] = [image] if version.lists else image
+            elif leaf in images:
+                image = color_message(part, self.image_format, leaf.name, stamp)
+                fields["color_img"] = [*fields.get("color_img", []), image] if version.lists else image
+            elif not (leaf.kind in (NUMBERS, POSE) and _lists(leaf.kind).write(leaf, part, fields)):
+                trees[leaf.name] = tree_to_json(pack(leaf.space, part, leaf.name))
+        return fields, trees
+
+    def decode(self, feedback: Mapping[str, Any], trees: Mapping[str, Any]) -> Any:
+        """The observation in a complete, checked message and its exact trees.
+
+        Raises:
+            ProtocolError: Something is missing or does not fit the space.
+        """
+        try:
+            values: Values = {
+                leaf.path: exact(leaf.space, tree_from_json(trees[leaf.name]), leaf.name)
+                for leaf in self._leaves
+                if leaf.name in trees
+            }
+            self._read_depth(feedback, values)
+            self._read_images(feedback, values)
+            numbers, poses = self._missing(NUMBERS, values), self._missing(POSE, values)
+            if numbers:
+                parts = _lists(NUMBERS, numbers).read(feedback)
+                values |= {leaf.path: read_numbers(leaf, some) for leaf, some in parts}
+            if poses:
+                values |= {leaf.path: read_pose(leaf, *pose) for leaf, pose in _lists(POSE, poses).read(feedback)}
+            if unread := self._missing(EXACT, values):
+                names = ", ".join(leaf.name for leaf in unread)
+                raise ProtocolError(f"The feedback does not hold {names}: only a server of bam-train can send that.")
+            return exact(self.space, joined(self.space, values), "observation")
+        except InvalidValue as error:
+            raise ProtocolError(f"The observation does not fit its space: {error}") from error
+
+    def _missing(self, kind: str, values: Values) -> tuple[Leaf, ...]:
+        return tuple(leaf for leaf in self._leaves if leaf.kind == kind and leaf.path not in values)
+
+    def _read_depth(self, feedback: Mapping[str, Any], values: Values) -> None:
+        """Read the depth images that there are; what is not an image may be in the lists."""
+        names = set(feedback["observation_names"])
+        wanted = [leaf for leaf in self._leaves if is_depth(leaf.space) and leaf.path not in values]
+        wanted = [leaf for leaf in wanted if not names & set(leaf.labels)]
+        images = [read_depth_message(one) for one in _listed(feedback["depth_img"])] if wanted else []
+        for leaf, image in zip(wanted, (one for one in images if one is not None), strict=False):
+            values[leaf.path] = _shaped(leaf, image, "depth_img").astype(leaf.space.dtype)
+
+    def _read_images(self, feedback: Mapping[str, Any], values: Values) -> None:
+        leaves, images = self._missing(IMAGE, values), _listed(feedback["color_img"])
+        names = [one["header"]["frame_id"] for one in images]
+        if all(leaf.name in names for leaf in leaves):
+            images = [images[names.index(leaf.name)] for leaf in leaves]
+        if len(images) < len(leaves):
+            raise ProtocolError(f"color_img must hold {len(leaves)} images, not {len(images)}.")
+        for leaf, message in zip(leaves, images, strict=False):
+            image = read_color_message(message)
+            if image is None:
+                raise ProtocolError(f"color_img must hold {leaf.name}, and is empty.")
+            values[leaf.path] = _shaped(leaf, image, "color_img")
+
+
+def _lists(kind: str, leaves: tuple[Leaf, ...] = ()) -> Lists:
+    """The lists of a feedback; a rack may tell more in them than the space holds."""
+    if kind == NUMBERS:
+        return Lists("observation_names", "observation", leaves, extra=True)
+    return Lists("pose_names", "pose", leaves, extra=True)
+
+
+def _listed(images: Any) -> list[Mapping[str, Any]]:
+    """Racks send one image or a list of them, by their version."""
+    return list(images) if isinstance(images, (list, tuple)) else [images]
+
+
+def _shaped(leaf: Leaf, image: np.ndarray[Any, Any], field: str) -> np.ndarray[Any, Any]:
+    shape = leaf.space.shape or ()
+    # A grey image has no axis for its one channel in a file.
+    if image.shape != shape and (*image.shape, 1) != shape:
+        raise ProtocolError(f"{field} must hold an image of shape {shape} for {leaf.name}, not {image.shape}.")
+    return image.reshape(shape)
 
 
 class EnvCodec:
-    """Both ends of one environment.
+    """Actions and results of one environment, or of a batch of them, as messages: one for each environment.
 
     Args:
         spec: What is served.
@@ -41,26 +266,19 @@ class EnvCodec:
         self._observations = ObservationCodec(spec.observation_space, image_format, depth)
 
     def write_actions(self, action: Any) -> tuple[dict[str, Any], ...]:
-        """The messages of an action, one for each row.
+        """The messages of an action. Raises InvalidValue if it does not fit."""
+        return tuple(self._actions.encode(one) for one in self.spec.each(action))
 
-        Raises:
-            InvalidValue: It does not fit.
-        """
-        if not self.spec.vector:
-            return (self._actions.encode(action),)
-        if not hasattr(action, "__len__") or len(action) != self.spec.num_envs:
-            raise InvalidValue(f"There must be one action for each of {self.spec.num_envs} rows, not {shown(action)}.")
-        return tuple(self._actions.encode(row) for row in action)
-
-    def read_actions(self, messages: Messages) -> Any:
+    def read_actions(self, messages: Sequence[Mapping[str, Any]]) -> Any:
         """The action in complete, checked messages.
 
         Raises:
             InvalidValue: There are too many or too few.
             ProtocolError: One does not fit.
         """
-        if len(messages) != self.spec.num_envs:
-            raise InvalidValue(f"A step must have {self.spec.num_envs} actions, one for each row, not {len(messages)}.")
+        size = self.spec.num_envs
+        if len(messages) != size:
+            raise InvalidValue(f"A step must have {size} actions, one for each environment, not {len(messages)}.")
         actions = [self._actions.decode(one) for one in messages]
         return actions if self.spec.vector else actions[0]
 
@@ -81,14 +299,13 @@ class EnvCodec:
             executed: Whether the action was done.
         """
         observation, *ends, info = result
-        size = self.spec.num_envs
+        columns: Any = (observation, *(ends or (0.0, False, False)), info)
         if self.spec.vector:
-            columns = ends or ([0.0] * size, [False] * size, [False] * size)
-            rows: Iterable[tuple[Any, ...]] = zip(observation, *columns, map(self._packed_final, info), strict=True)
-        else:
-            rows = [(observation, *(ends or (0.0, False, False)), info)]
+            size = self.spec.num_envs
+            ends = ends or [[0.0] * size, [False] * size, [False] * size]
+            columns = zip(observation, *ends, map(self._packed_final, info), strict=True)
         feedback = []
-        for observed, reward, terminated, truncated, told in rows:
+        for observed, reward, terminated, truncated, told in columns if self.spec.vector else [columns]:
             fields, trees = self._observations.encode(observed, stamp, version)
             flags = (reward, terminated, truncated)
             feedback.append(write_feedback(fields, trees, flags, told, version, executed=executed))
@@ -103,30 +320,26 @@ class EnvCodec:
         """(observation, reward, terminated, truncated, info).
 
         Raises:
-            ProtocolError: There are too many or too few rows, or one does not fit.
+            ProtocolError: There is too much or too little feedback, or it does not fit.
         """
-        if len(response.feedback) != self.spec.num_envs:
-            raise ProtocolError(
-                f"The response must have {self.spec.num_envs} feedback, one for each row, not {len(response.feedback)}."
-            )
-        rows = [self._read_row(*row) for row in zip(response.feedback, response.infos, response.exact, strict=True)]
+        size, found = self.spec.num_envs, len(response.feedback)
+        if found != size:
+            raise ProtocolError(f"The response must have {size} feedback, one for each environment, not {found}.")
+        each = [self._read(*one) for one in zip(response.feedback, response.infos, response.exact, strict=True)]
         if not self.spec.vector:
-            return rows[0]
-        return tuple(list(column) for column in zip(*rows, strict=True))  # type: ignore[return-value]
+            return each[0]
+        return tuple(list(column) for column in zip(*each, strict=True))  # type: ignore[return-value]
 
-    def _read_row(self, feedback: Mapping[str, Any], info: Info, exact: Info) -> tuple[Any, float, bool, bool, Info]:
-        trees = exact.get("observation", {})
+    def _read(self, feedback: Mapping[str, Any], info: Info, ours: Info) -> tuple[Any, float, bool, bool, Info]:
+        trees = ours.get("observation", {})
         if not isinstance(trees, dict):
             raise ProtocolError(f"info.bam.observation must be an object, not {shown(trees)}.")
         observation = self._observations.decode(feedback, trees)
         if self.foreign:
             info = {**info, "executed": feedback["executed"]}
         elif self.spec.vector and "final_obs" in info:
-            info = {**info, "final_obs": self._unpacked_final(info["final_obs"])}
+            try:
+                info = {**info, "final_obs": exact(self.spec.observation_space, info["final_obs"], "final_obs")}
+            except InvalidValue as error:
+                raise ProtocolError(str(error)) from error
         return observation, float(feedback["reward"]), feedback["terminated"], feedback["truncated"], info
-
-    def _unpacked_final(self, tree: Any) -> Any:
-        try:
-            return exact(self.spec.observation_space, tree, "final_obs")
-        except InvalidValue as error:
-            raise ProtocolError(str(error)) from error

@@ -56,6 +56,12 @@ class Leaf:
     labels: tuple[str, ...] = ()
     """Names of its numbers."""
 
+    def of(self, value: Any) -> Any:
+        """This part of a checked value."""
+        for key in self.path:
+            value = value[key]
+        return value
+
 
 def leaves_of(space: Space[Any], name: str, *, gripper: bool = False) -> tuple[Leaf, ...]:
     """The leaves of `space`, which is called `name`; with `gripper`, a pose may have a gripper width."""
@@ -64,6 +70,14 @@ def leaves_of(space: Space[Any], name: str, *, gripper: bool = False) -> tuple[L
     taken = [label for leaf in leaves for label in (leaf.labels or (leaf.name,))]
     unique = len({*names}) == len(names) and len({*taken}) == len(taken)
     return leaves if unique else (Leaf(EXACT, name, (), space),)
+
+
+def joined(space: Space[Any], values: Mapping[Path, Any], path: Path = ()) -> Any:
+    """The value of `space` whose leaves are `values`, by path."""
+    if path in values:
+        return values[path]
+    parts = {key: joined(part, values, (*path, key)) for key, part in _parts(space).items()}
+    return tuple(parts.values()) if isinstance(space, spaces.Tuple) else parts
 
 
 def _walk(space: Space[Any], path: Path, name: str, gripper: bool) -> list[Leaf]:
@@ -111,6 +125,11 @@ def _is_image(space: Space[Any]) -> bool:
     return min(space.shape[:2]) >= _SMALLEST_IMAGE and space.shape[2:] in _CHANNELS
 
 
+def is_depth(space: Space[Any]) -> bool:
+    """Whether values of `space` may be depth images: floats, (height, width) or (height, width, 1)."""
+    return _is_float_box(space) and len(space.shape or ()) in (2, 3) and (space.shape or ())[2:] in ((), (1,))
+
+
 def _is_numbers(space: Space[Any]) -> bool:
     if isinstance(space, spaces.Discrete):
         return True
@@ -120,27 +139,72 @@ def _is_numbers(space: Space[Any]) -> bool:
     return 0 < size <= _MOST_NUMBERS and np.dtype(space.dtype).itemsize <= 8
 
 
-def is_depth(space: Space[Any]) -> bool:
-    """Whether values of `space` may be depth images: floats, (height, width) or (height, width, 1)."""
-    return _is_float_box(space) and len(space.shape or ()) in (2, 3) and (space.shape or ())[2:] in ((), (1,))
+@dataclass(frozen=True)
+class Lists:
+    """Leaves of one kind in two lists of a message: their names, and their numbers or poses."""
+
+    names: str
+    """Field with the names."""
+    values: str
+    """Field with the numbers or poses."""
+    leaves: tuple[Leaf, ...]
+    """In this order where the names are none of ours."""
+    extra: bool = False
+    """Whether the lists may hold more than the leaves."""
+
+    def write(self, leaf: Leaf, part: Any, fields: dict[str, Any]) -> bool:
+        """Append a part to the lists in `fields`, if those can hold it exactly; whether they can."""
+        written = _numbers(part) if leaf.kind == NUMBERS else _pose(part)
+        if written is None:
+            return False
+        fields.setdefault(self.names, []).extend(leaf.labels or (leaf.name,))
+        fields.setdefault(self.values, []).extend(written)
+        return True
+
+    def read(self, message: Mapping[str, Any]) -> list[tuple[Leaf, list[Any]]]:
+        """Each leaf with its numbers, or with its one pose, in a complete, checked message.
+
+        Raises:
+            ProtocolError: One is missing, or there is one too many.
+        """
+        ordered, at = self.in_order(message[self.values], message[self.names]), 0
+        parts = []
+        for leaf in self.leaves:
+            size = len(leaf.labels) or 1
+            parts.append((leaf, list(ordered[at : at + size])))
+            at += size
+        return parts
+
+    def in_order(self, values: Sequence[Any], names: Sequence[str], field: str = "") -> Sequence[Any]:
+        """`values` in the order of the leaves: by their `names` if there are any, else as they come.
+
+        Names of somebody else's own, none of which is expected, are no names: then only the number of values counts.
+        Errors call the values `field`, by default the field of the values.
+        """
+        field = field or self.values
+        expected = tuple(label for leaf in self.leaves for label in (leaf.labels or (leaf.name,)))
+        known = set(expected) & set(names)
+        if not known:
+            if len(values) != len(expected):
+                raise ProtocolError(f"{field} must have {len(expected)} values ({_some(expected)}), not {len(values)}.")
+            return values
+        if len(names) != len(values) or len(known) < len(expected) or (len(names) > len(expected) and not self.extra):
+            raise ProtocolError(
+                f"The names of {field} must be {_some(expected)}, one for each value, "
+                f"not {_some(names)} for {len(values)} values."
+            )
+        if tuple(names) == expected:
+            return values
+        table = dict(zip(names, values, strict=True))
+        return [table[name] for name in expected]
 
 
-def part_of(value: Any, path: Path) -> Any:
-    """The part of a checked value to which `path` leads."""
-    for key in path:
-        value = value[key]
-    return value
+def _some(names: Sequence[str], most: int = 8) -> str:
+    text = ", ".join(names[:most])
+    return (f"{text}, … ({len(names)})" if len(names) > most else text) or "none"
 
 
-def joined(space: Space[Any], values: Mapping[Path, Any], path: Path = ()) -> Any:
-    """The value of `space` whose leaves are `values`, by path."""
-    if path in values:
-        return values[path]
-    parts = {key: joined(part, values, (*path, key)) for key, part in _parts(space).items()}
-    return tuple(parts.values()) if isinstance(space, spaces.Tuple) else parts
-
-
-def to_numbers(value: Any) -> list[Any] | None:
+def _numbers(value: Any) -> list[Any] | None:
     """A number or array as a flat list of floats or ints, or None if such a list would not be exactly it."""
     array = np.asarray(value)
     if array.dtype.kind == "f":
@@ -149,8 +213,8 @@ def to_numbers(value: Any) -> list[Any] | None:
     return plain if all(-_WHOLE <= one <= _WHOLE for one in plain) else None
 
 
-def from_numbers(leaf: Leaf, numbers: Sequence[Any]) -> Any:
-    """The value of `leaf` that `to_numbers` was given, from checked finite numbers.
+def read_numbers(leaf: Leaf, numbers: Sequence[Any]) -> Any:
+    """The value of `leaf` that was written as `numbers`, which are checked and finite or NaN.
 
     Raises:
         ProtocolError: One of them does not fit the dtype.
@@ -166,18 +230,16 @@ def from_numbers(leaf: Leaf, numbers: Sequence[Any]) -> Any:
     return array[0] if isinstance(leaf.space, spaces.Discrete) else array.reshape(leaf.space.shape or ())
 
 
-def to_pose(value: Mapping[str, Any]) -> dict[str, Any] | None:
-    """geometry_msgs/PoseStamped of a pose, or None if it is not finite."""
+def _pose(value: Mapping[str, Any]) -> list[dict[str, Any]] | None:
+    """One geometry_msgs/PoseStamped, or None if the pose is not finite."""
     if not all(np.isfinite(part).all() for part in value.values()):
         return None
-    pose = {
-        "position": dict(zip("xyz", value["position"].tolist(), strict=True)),
-        "orientation": dict(zip("xyzw", value["orientation"].tolist(), strict=True)),
-    }
-    return {"pose": pose}
+    position = dict(zip("xyz", value["position"].tolist(), strict=True))
+    orientation = dict(zip("xyzw", value["orientation"].tolist(), strict=True))
+    return [{"pose": {"position": position, "orientation": orientation}}]
 
 
-def from_pose(leaf: Leaf, message: Mapping[str, Any], width: float = 0.0) -> dict[str, Any]:
+def read_pose(leaf: Leaf, message: Mapping[str, Any], width: float = 0.0) -> dict[str, Any]:
     """The pose in a checked PoseStamped, with a gripper `width` [m] if its space has one."""
     pose = message["pose"]
     numbers = {
@@ -187,51 +249,3 @@ def from_pose(leaf: Leaf, message: Mapping[str, Any], width: float = 0.0) -> dic
     }
     parts = leaf.space.spaces.items()  # type: ignore[attr-defined]
     return {key: np.array(numbers[key], part.dtype).reshape(part.shape) for key, part in parts}
-
-
-def in_order(
-    values: Sequence[Any], names: Sequence[str], expected: tuple[str, ...], field: str, *, extra: bool = False
-) -> Sequence[Any]:
-    """`values` in the order of the names `expected`: by their `names` if there are any, else as they come.
-
-    Names of somebody else's own, none of which is expected, are no names: then only the number of values counts.
-
-    Args:
-        values: As they came.
-        names: As they came; perhaps none.
-        expected: What they should be.
-        field: What they are called in the message, for errors.
-        extra: Whether there may be more than expected.
-
-    Raises:
-        ProtocolError: One is missing, or there is one too many.
-    """
-    known = set(expected) & set(names)
-    if not known:
-        if len(values) != len(expected):
-            raise ProtocolError(f"{field} must have {len(expected)} values ({_listed(expected)}), not {len(values)}.")
-        return values
-    if len(names) != len(values) or len(known) < len(expected) or (len(names) > len(expected) and not extra):
-        raise ProtocolError(
-            f"The names of {field} must be {_listed(expected)}, one for each value, "
-            f"not {_listed(names)} for {len(values)} values."
-        )
-    if tuple(names) == expected:
-        return values
-    table = dict(zip(names, values, strict=True))
-    return [table[name] for name in expected]
-
-
-def _listed(names: Sequence[str], most: int = 8) -> str:
-    text = ", ".join(names[:most])
-    return (f"{text}, … ({len(names)})" if len(names) > most else text) or "none"
-
-
-def split(leaves: Sequence[Leaf], values: Sequence[Any]) -> dict[Path, Any]:
-    """The values of numbers leaves, by path, from all their numbers in one list."""
-    parts, at = {}, 0
-    for leaf in leaves:
-        count = len(leaf.labels)
-        parts[leaf.path] = from_numbers(leaf, values[at : at + count])
-        at += count
-    return parts

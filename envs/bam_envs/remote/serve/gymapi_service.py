@@ -14,16 +14,17 @@ from typing import Any
 
 from bam_envs.core.errors import BamEnvsError, RemoteError
 from bam_envs.remote.gymapi.codec import EnvCodec
-from bam_envs.remote.gymapi.info import write_info
-from bam_envs.remote.gymapi.requests import (
+from bam_envs.remote.gymapi.messages import (
     KIND,
     GymRequest,
     RequestType,
     base_name,
     read_request,
     service_name,
+    write_failure,
+    write_info,
+    write_response,
 )
-from bam_envs.remote.gymapi.responses import write_failure, write_response
 from bam_envs.remote.gymapi.versions import JUNE_22, Version, version_named, version_of_bus, version_of_request
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.transport import spec_to_json

@@ -12,8 +12,14 @@ from hypothesis import strategies as st
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.remote.gymapi.codec import EnvCodec
-from bam_envs.remote.gymapi.requests import GymRequest, RequestType, read_request, write_request
-from bam_envs.remote.gymapi.responses import read_response, write_response
+from bam_envs.remote.gymapi.messages import (
+    GymRequest,
+    RequestType,
+    read_request,
+    read_response,
+    write_request,
+    write_response,
+)
 from bam_envs.remote.transport import EnvSpecMessage
 from bam_envs.ros.interfaces import complete
 from bam_envs.testing.transports import assert_same_value
@@ -118,14 +124,14 @@ def test_a_reset_has_no_ends():
 
 def test_as_many_actions_as_rows():
     codec = EnvCodec(ROWS)
-    with pytest.raises(InvalidValue, match=r"There must be one action for each of 3 rows, not \[1, 2\]\."):
+    with pytest.raises(InvalidValue, match=r"There must be one action for each of 3 environments, not \[1, 2\]\."):
         codec.write_actions([1, 2])
-    with pytest.raises(InvalidValue, match=r"A step must have 3 actions, one for each row, not 1\."):
+    with pytest.raises(InvalidValue, match=r"A step must have 3 actions, one for each environment, not 1\."):
         codec.read_actions([complete("bam_msgs/GymAction", {})])
 
 
 def test_as_many_feedback_as_rows():
-    with pytest.raises(ProtocolError, match=r"The response must have 3 feedback, one for each row, not 1\."):
+    with pytest.raises(ProtocolError, match=r"The response must have 3 feedback, one for each environment, not 1\."):
         EnvCodec(ROWS).read_result(read_response({"header": {"error_code": {"value": 1}}, "feedback": [{}]}))
 
 

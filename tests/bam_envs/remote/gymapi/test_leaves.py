@@ -7,7 +7,7 @@ import pytest
 from gymnasium import spaces
 
 from bam_envs.core.errors import ProtocolError
-from bam_envs.remote.gymapi.leaves import in_order, is_depth, joined, leaves_of, part_of, to_numbers
+from bam_envs.remote.gymapi.leaves import NUMBERS, Leaf, Lists, is_depth, joined, leaves_of
 
 POSE = {"position": spaces.Box(-1, 1, (3,)), "orientation": spaces.Box(-1, 1, (4,))}
 WIDTH = spaces.Box(0, 1, ())
@@ -71,23 +71,30 @@ def test_where_two_parts_have_one_name_all_is_one_exact_leaf(other):
 def test_taken_apart_and_put_together():
     space = spaces.Dict(OrderedDict(b=spaces.Tuple([WIDTH, spaces.Discrete(2)]), a=spaces.Text(3)))
     value = {"b": (np.float32(1), 1), "a": "x"}
-    parts = {leaf.path: part_of(value, leaf.path) for leaf in leaves_of(space, "it")}
+    parts = {leaf.path: leaf.of(value) for leaf in leaves_of(space, "it")}
     assert parts == {("b", 0): 1, ("b", 1): 1, ("a",): "x"}
     assert joined(space, parts) == value
     assert list(joined(space, parts)) == ["b", "a"]
 
 
-def test_numbers_that_float64_has_not():
-    assert to_numbers(np.array([2**53, -(2**53)])) == [2**53, -(2**53)]
-    assert to_numbers(np.array([2**53 + 1])) is None
-    assert to_numbers(np.array([np.inf])) is None
-    assert to_numbers(np.array([True, False])) == [1, 0]
+LEAF = Leaf(NUMBERS, "a", ("a",), WIDTH, ("a",))
+
+
+@pytest.mark.parametrize(
+    ("value", "numbers"),
+    [([2**53, -(2**53)], [2**53, -(2**53)]), ([2**53 + 1], None), ([np.inf], None), ([True, False], [1, 0])],
+)
+def test_numbers_that_a_list_of_float64_holds_exactly(value, numbers):
+    fields = {}
+    assert Lists("names", "values", (LEAF,)).write(LEAF, np.array(value), fields) == (numbers is not None)
+    assert fields.get("values") == numbers
 
 
 def test_more_names_than_expected_only_where_that_is_meant():
-    assert list(in_order([1, 2], ["z", "a"], ("a",), "observation", extra=True)) == [2]
-    with pytest.raises(ProtocolError, match="The names of observation must be a, one for each value, not z, a for 2"):
-        in_order([1, 2], ["z", "a"], ("a",), "observation")
+    message = {"names": ["z", "a"], "values": [1, 2]}
+    assert Lists("names", "values", (LEAF,), extra=True).read(message) == [(LEAF, [2])]
+    with pytest.raises(ProtocolError, match="The names of values must be a, one for each value, not z, a for 2"):
+        Lists("names", "values", (LEAF,)).read(message)
 
 
 def test_depth():

@@ -1,0 +1,393 @@
+"""The requests and responses of bam_msgs/GymAPI, the service of a BAM robot rack; pure functions on dicts.
+
+A field that is missing has the default of its type, a field that is unknown is ignored, and one of the wrong kind is
+an error that names it. What the message type has no field for travels where it has text: a `Tag` and the seed 0 in
+``header.frame_id``; options, seeds of several environments and exact actions in ``prefix`` of an action; exact
+observations and infos in ``info``, under ``bam``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+
+from bam_envs.core.errors import BamEnvsError, InvalidValue, NotInCommand, ProtocolError, RemoteError
+from bam_envs.remote.gymapi.versions import JUNE_22, Version, version_of_response
+from bam_envs.remote.transport import Info, Seed
+from bam_envs.remote.values import plain_info, tree_from_json, tree_to_json
+from bam_envs.ros.freshness import Tag, read_tag
+from bam_envs.ros.interfaces import complete, complete_known, request_type, response_type
+from bam_envs.rosbridge.strict_json import dump_json, load_json
+
+KIND = "bam_msgs/GymAPI"
+PREFIX = "bam:"
+"""Begins the text in ``prefix`` of an action that is ours."""
+MAX_SEED = 2**31 - 1
+"""Largest seed that the field holds on every rack."""
+Message = Mapping[str, Any]
+_SEED_ZERO = " seed=0"
+_MOST_READABLE = 64
+"""Longer arrays are only sent exactly."""
+_UNREAD = ("camera_info", "detections", "masks", "segments")
+"""Fields that no space asks for."""
+_NO_OBSERVATION = (
+    "ns",
+    "duplicate_obs_ns",
+    "duplicate_obs",
+    "duplicate_index",
+    "executed",
+    "reward",
+    "terminated",
+    "truncated",
+    "info",
+)
+"""Fields of a feedback that are not its observation."""
+_NOWHERE = {"pose": {"position": dict.fromkeys("xyz", math.nan), "orientation": dict.fromkeys("xyzw", math.nan)}}
+
+
+class RequestType(IntEnum):
+    """What a request asks for."""
+
+    NONE = 0
+    STEP = 1
+    RESET = 2
+    CLOSE = 3
+
+
+class ErrorCode(IntEnum):
+    """How a request went."""
+
+    UNDEFINED = 0
+    SUCCESS = 1
+    FAILURE = 2
+    NO_SENSOR_DATA = 5
+
+
+@dataclass(frozen=True)
+class GymRequest:
+    """One request."""
+
+    type: RequestType
+    """What is asked for."""
+    client_id: str = ""
+    """Who asks, for people."""
+    env_name: str = ""
+    """Which environment; empty for the one that is there."""
+    actions: tuple[Message, ...] = ()
+    """GymAction of each environment."""
+    seed: Seed = None
+    """Of a reset, as Gymnasium's."""
+    options: Info | None = None
+    """Of a reset, as Gymnasium's."""
+    tag: Tag | None = None
+    """When it was sent and until when it counts; None from clients that say nothing."""
+    take: bool = False
+    """Take command from whoever has it."""
+
+
+@dataclass(frozen=True)
+class GymResponse:
+    """One answer."""
+
+    error: RemoteError | None
+    """What went wrong, if anything."""
+    feedback: tuple[Message, ...]
+    """Complete GymFeedback of each environment."""
+    infos: tuple[Info, ...]
+    """What each feedback's info says to people and programs."""
+    exact: tuple[Info, ...]
+    """What it says to us, under ``bam``; empty dicts from everybody else's servers."""
+    version: Version | None = None
+    """The version of the messages that the sender speaks; None if that does not show."""
+
+    @property
+    def ours(self) -> bool:
+        """Whether one of our servers made it, as far as one can see."""
+        return any(self.exact)
+
+
+def base_name(namespace: str = "") -> str:
+    """What the service, and the topics ``request`` and ``reply``, are under."""
+    stripped = namespace.strip("/")
+    return f"/{stripped}/gym_env" if stripped else "/gym_env"
+
+
+def service_name(namespace: str = "") -> str:
+    """Name of the service in `namespace`."""
+    return f"{base_name(namespace)}/gym_api_request"
+
+
+def write_request(request: GymRequest, stamp: Message) -> dict[str, Any]:
+    """The message of `request`, with fields that every version has. `stamp` is as the ROS there spells a time."""
+    in_field = request.seed if isinstance(request.seed, int) and 0 < request.seed <= MAX_SEED else 0
+    zero = _SEED_ZERO if request.seed == 0 and isinstance(request.seed, int) else ""
+    header = {
+        "client_id": request.client_id,
+        "request_type": int(request.type),
+        "force_priority": request.take,
+        "stamp": dict(stamp),
+        "frame_id": (request.tag.to_text() if request.tag else "") + zero,
+        "expected_duration": 0.0,
+        "blocking": True,
+    }
+    actions = [dict(one) for one in request.actions]
+    seed = None if in_field or zero else request.seed
+    if seed is not None or request.options is not None:
+        words = {"seed": tree_to_json(seed), "options": tree_to_json(plain_info(request.options))}
+        actions.append({"prefix": PREFIX + dump_json(words, "The seed and options of a reset")})
+    return {"header": header, "seed": in_field, "env_name": request.env_name, "action": actions}
+
+
+def whole_request(message: Message, version: Version | None) -> dict[str, Any]:
+    """`message` with all fields, for a rack that may look at any: those of `version`, or of all versions."""
+    busy = (version or JUNE_22).busy
+    whole = complete(request_type(KIND), {**message, "header": {**message["header"], busy: False}})
+    if version is not None:
+        return whole
+    return {**whole, "header": {name: value for name, value in whole["header"].items() if name != busy}}
+
+
+def refuse_foreign(seed: Seed, options: Info | None) -> None:
+    """Refuse what only our own servers understand.
+
+    Raises:
+        InvalidValue: A seed or an option for which GymAPI has no field.
+    """
+    if options:
+        raise InvalidValue(f"GymAPI has no field for options of reset, and this rack is not of bam-train: {options}.")
+    if isinstance(seed, list):
+        reason = "a rack has one for all its environments"
+    elif seed is None or 0 < seed <= MAX_SEED:
+        return
+    else:
+        reason = "GymAPI has no room for more" if seed else "0 means no seed to this rack"
+    raise InvalidValue(f"The seed must be a whole number from 1 to {MAX_SEED} or None, not {seed}: {reason}.")
+
+
+def read_request(message: object) -> GymRequest:
+    """The request in `message`, whoever sent it.
+
+    Raises:
+        InvalidValue: A field is of the wrong kind: its name, what was expected, what was found.
+        ProtocolError: The words beside the fields cannot be read.
+    """
+    whole = complete_known(request_type(KIND), message)
+    header = whole["header"]
+    if header["request_type"] not in list(RequestType):
+        known = ", ".join(f"{one.value} {one.name}" for one in RequestType)
+        raise InvalidValue(f"{KIND}: header.request_type must be one of {known}, not {header['request_type']}.")
+    kind = RequestType(header["request_type"])
+    seed, options = _seed_and_options(whole) if kind is RequestType.RESET else (None, None)
+    return GymRequest(
+        type=kind,
+        client_id=header["client_id"],
+        env_name=whole["env_name"],
+        actions=tuple(whole["action"]) if kind is RequestType.STEP else (),
+        seed=seed,
+        options=options,
+        tag=read_tag(header["frame_id"]),
+        take=header["force_priority"],
+    )
+
+
+def _seed_and_options(whole: Message) -> tuple[Seed, Info | None]:
+    in_field = whole["seed"] or (0 if whole["header"]["frame_id"].endswith(_SEED_ZERO) else None)
+    prefix = whole["action"][0]["prefix"] if whole["action"] else ""
+    if not prefix.startswith(PREFIX):
+        return in_field, None
+    words = load_json(prefix.removeprefix(PREFIX), "prefix")
+    beside, options = tree_from_json(words.get("seed")), tree_from_json(words.get("options"))
+    if not (options is None or isinstance(options, dict)):
+        raise ProtocolError(f"The options of a reset must be an object, not {options!r}.")
+    return (in_field if beside is None else beside), options
+
+
+def write_feedback(
+    fields: Message,
+    trees: Mapping[str, Any],
+    ends: tuple[float, bool, bool],
+    info: Mapping[str, Any],
+    version: Version = JUNE_22,
+    *,
+    executed: bool = True,
+) -> dict[str, Any]:
+    """The message of one environment.
+
+    Args:
+        fields: What holds the observation.
+        trees: The parts of it that the fields cannot hold, as JSON.
+        ends: Reward, terminated, truncated.
+        info: Gymnasium's, as a tree.
+        version: Of the messages.
+        executed: Whether the action was done.
+
+    Raises:
+        InvalidValue: The reward is not finite.
+    """
+    reward, terminated, truncated = ends
+    if not math.isfinite(reward):
+        raise InvalidValue(f"The reward must be finite to be sent, not {reward}.")
+    text = write_info(info, {"observation": dict(trees)} if trees else {})
+    flags = {"executed": executed, "reward": reward, "terminated": terminated, "truncated": truncated}
+    return {**version.no_images, **fields, **flags, "info": text}
+
+
+def write_response(
+    feedback: Sequence[Message], duration: float, stamp: Message, version: Version = JUNE_22
+) -> dict[str, Any]:
+    """The message of a success that took `duration` [s] and is sent at `stamp`, in the words of `version`."""
+    code = {"value": int(ErrorCode.SUCCESS)}
+    # How long it travels (transport_duration) only the client can tell.
+    times = {"process_duration": duration, "response_stamp": dict(stamp)} if version.june else {"duration": duration}
+    header = {**times, "error_code": code, "error_msg": "", "calibrated": True}
+    return {"header": header, "feedback": list(feedback)}
+
+
+def write_failure(error: BamEnvsError, duration: float, stamp: Message, version: Version = JUNE_22) -> dict[str, Any]:
+    """The message of a request that was refused or failed; see `write_response`."""
+    feedback = {**version.no_images, "info": dump_json({"bam": {"error": type(error).__name__}}, "info")}
+    message = write_response([feedback], duration, stamp, version)
+    message["header"] |= {"error_code": {"value": int(ErrorCode.FAILURE)}, "error_msg": str(error)}
+    return message
+
+
+def read_response(message: object) -> GymResponse:
+    """The answer in `message`, whoever sent it.
+
+    Raises:
+        ProtocolError: A field is of the wrong kind.
+    """
+    told = message.get("feedback") if isinstance(message, Mapping) else None
+    told = told if isinstance(told, (list, tuple)) else ()
+    given = {**message, "feedback": [_readable(one) for one in told]} if told else message  # type: ignore[dict-item]
+    try:
+        whole = complete_known(response_type(KIND), given)
+    except InvalidValue as error:
+        raise ProtocolError(str(error)) from error
+    feedback = [_with_gaps(*pair) for pair in zip(whole["feedback"], told, strict=True)]
+    read = [read_info(one["info"]) for one in feedback]
+    infos, ours = tuple(info for info, _ in read), tuple(bam for _, bam in read)
+    failure = _error(whole["header"]["error_code"]["value"], whole["header"]["error_msg"], ours[0] if ours else {})
+    filled = tuple(_with_observation(feedback, at) for at in range(len(feedback)))
+    return GymResponse(failure, filled, infos, ours, version_of_response(message))
+
+
+def _readable(feedback: Any) -> Any:
+    """A feedback as it came, with zeros for numbers and poses that are null.
+
+    Every rosbridge writes NaN as null: the joint without a sensor, the cup that was not found, the camera without a
+    calibration. Whether that is a fault depends on what the space needs.
+    """
+    if not isinstance(feedback, Mapping):
+        return feedback
+    kept = {name: value for name, value in feedback.items() if name not in _UNREAD}
+    return {**kept, **_filled_gaps(feedback, feedback, 0.0, {})}
+
+
+def _with_gaps(checked: Message, told: Message) -> Message:
+    """A checked feedback with NaN where null was told; no space takes that."""
+    return {**checked, **_filled_gaps(checked, told, math.nan, _NOWHERE)}
+
+
+def _filled_gaps(values: Message, told: Message, number: float, pose: Message) -> dict[str, Any]:
+    """The lists of `values` with a number or pose in place of each entry that was told as null, or holds one."""
+    filled: dict[str, Any] = {}
+    for field, unknown in (("observation", number), ("pose", pose)):
+        entries = told.get(field)
+        gaps = [_has_null(one) for one in entries] if isinstance(entries, list) else []
+        if any(gaps):
+            filled[field] = [unknown if gap else value for value, gap in zip(values[field], gaps, strict=True)]
+    return filled
+
+
+def _has_null(value: Any, depth: int = 3) -> bool:
+    """Whether it is null, or a pose with one."""
+    if depth and isinstance(value, Mapping):
+        return any(_has_null(one, depth - 1) for one in value.values())
+    return value is None
+
+
+def _error(code: int, text: str, bam: Info) -> RemoteError | None:
+    if code == ErrorCode.SUCCESS:
+        return None
+    name = ErrorCode(code).name if code in list(ErrorCode) else "not in the list"
+    kind = NotInCommand if bam.get("error") == NotInCommand.__name__ else RemoteError
+    return kind(text or f"The rack answered error code {code} ({name}).")
+
+
+def _with_observation(feedback: Sequence[Message], at: int) -> Message:
+    """The feedback at `at`; one that is marked as equal to another one gets the observation of that."""
+    own = {key: feedback[at][key] for key in _NO_OBSERVATION}
+    return {**feedback[_source(feedback, at)], **own}
+
+
+def _source(feedback: Sequence[Message], at: int) -> int:
+    """The place of the observation of the entry at `at`, which names it, or says that it is in its ``ns``."""
+    one, path = feedback[at], [at]
+    while one["duplicate_obs"]:
+        place = one["duplicate_index"]
+        if place in path or not 0 <= place < len(feedback):
+            raise ProtocolError(
+                f"feedback[{path[-1]}].duplicate_index must be the place of another entry, one of {len(feedback)} with "
+                f"an observation of its own, not {place}."
+            )
+        one = feedback[place]
+        path.append(place)
+    if not one["duplicate_obs_ns"]:
+        return path[-1]
+    same = (
+        place
+        for place, other in enumerate(feedback)
+        if other["ns"] == one["ns"] and not (other["duplicate_obs"] or other["duplicate_obs_ns"])
+    )
+    return next(same, path[-1])
+
+
+def write_info(info: Mapping[str, Any], bam: Mapping[str, Any]) -> str:
+    """`info` as JSON: what anybody can read, and under ``bam`` what only comes back exactly from there."""
+    plain: Info = {}
+    precise: Info = {}
+    for key, value in info.items():
+        exact = tree_to_json(value)
+        readable = _for_people(value)
+        if readable is not None or value is None:
+            plain[key] = readable
+        if key == "bam" or exact != readable:
+            precise[key] = exact
+    plain.pop("bam", None)
+    ours = {**bam, **({"info": precise} if precise else {})}
+    return dump_json({**plain, **({"bam": ours} if ours else {})}, "info")
+
+
+def _for_people(value: Any) -> Any:
+    """A tree for people: arrays as lists, None for what is too long or has no word in JSON."""
+    if isinstance(value, (np.generic, np.ndarray)):
+        return _for_people(value.tolist()) if value.size <= _MOST_READABLE else None
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {key: _for_people(one) for key, one in value.items()}
+    return [_for_people(one) for one in value] if isinstance(value, list) else value
+
+
+def read_info(text: str) -> tuple[Info, Info]:
+    """An info and what it holds under ``bam``. Other people's text that is no JSON object is ``{"text": …}``."""
+    try:
+        words = json.loads(text) if text else {}
+    except (ValueError, RecursionError):
+        words = None
+    if not isinstance(words, dict):
+        words = {"text": text}
+    bam = words.pop("bam", None)
+    if not isinstance(bam, dict):
+        return words, {}
+    precise = bam.get("info", {})
+    if not isinstance(precise, dict):
+        raise ProtocolError(f"info.bam.info must be an object, not {precise!r}.")
+    return {**words, **{key: tree_from_json(one) for key, one in precise.items()}}, bam
