@@ -31,14 +31,14 @@ from bam_envs.core.wording import brief, did_you_mean
 T = TypeVar("T")
 _MOST = sys.float_info.max
 
-Finite = Annotated[float, Meta(ge=-_MOST, le=_MOST)]
+Finite = Annotated[float, Meta(ge=-_MOST, le=_MOST, description="a finite number")]
 Positive = Annotated[float, Meta(gt=0, le=_MOST)]
 NonNegative = Annotated[float, Meta(ge=0, le=_MOST)]
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 PositiveInt = Annotated[int, Meta(ge=1)]
 NonNegativeInt = Annotated[int, Meta(ge=0)]
 Port = Annotated[int, Meta(ge=0, le=65535)]
-NonEmpty = Annotated[str, Meta(min_length=1)]
+NonEmpty = Annotated[str, Meta(min_length=1, description="non-empty text")]
 
 
 def check(value: object, kind: Any, name: str, error: type[Exception] = InvalidValue) -> Any:
@@ -126,7 +126,8 @@ def expected(kind: Any) -> str:
     if origin in (Union, types.UnionType):
         return " or ".join(expected(one) for one in arguments if one is not type(None))
     if origin is Literal:
-        return " or ".join(map(repr, arguments))
+        *rest, last = map(repr, arguments)
+        return f"{', '.join(rest)} or {last}" if rest else last
     base = origin or kind
     if base in (list, tuple, Sequence) and arguments:
         if base is not tuple or arguments[-1] is ...:
@@ -151,18 +152,12 @@ _WORDS: dict[Any, str] = {
 
 def _range(meta: Meta) -> str:
     """The range of `meta`, as it follows a noun."""
-    low, high = meta.ge, meta.le
-    if high == _MOST:  # every finite number, on this side
-        high = None
-        if low == -_MOST:
-            return " that is finite"
-    if meta.min_length is not None:
-        return " that is not empty" if meta.min_length == 1 else f" of length {meta.min_length} or more"
+    low, high = meta.ge, None if meta.le == _MOST else meta.le
     if low is not None and high is not None:
         return f" from {_number(low)} to {_number(high)}"
-    limits = (("above", meta.gt), ("of at least", low), ("below", meta.lt), ("of at most", high))
+    limits = (("above", meta.gt), ("at least", low), ("below", meta.lt), ("at most", high))
     said = [f"{word} {_number(limit)}" for word, limit in limits if limit is not None]
-    return f" {' and '.join(said)}" if said else ""
+    return f"{' of' if said[0].startswith('at') else ''} {' and '.join(said)}" if said else ""
 
 
 def _number(limit: float) -> str:

@@ -45,7 +45,7 @@ def live_robot(
     Raises:
         InvalidValue: The address is none of a robot, a file cannot be read, or the robot does not measure, or take,
             what `spec` names.
-        UnknownName: There is no such profile, or no such way of sending commands.
+        UnknownName: There is no such profile, or no such command mode.
     """
     require_robot_address(url)
     endpoint = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file)

@@ -89,7 +89,7 @@ class RosbridgeRobot:
 
     Raises:
         InvalidValue: The address is none, or the robot does not measure, or take, what `spec` names.
-        UnknownName: The profile has no such way of sending commands.
+        UnknownName: The profile has no such command mode.
     """
 
     needs_clearance = True

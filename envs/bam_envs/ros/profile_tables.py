@@ -6,11 +6,24 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, get_args
+
+from msgspec import Meta
 
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot import RobotSpec, SignalSpec
+from bam_envs.core.validation import Finite, NonEmpty, NonNegativeInt, Positive
 
+Topic = Annotated[str, Meta(pattern=r"^(/[A-Za-z]\w*)+\Z", description="an absolute name such as /joint_states")]
+"""Without namespace."""
+MessageType = Annotated[
+    str,
+    Meta(pattern=r"^[A-Za-z]\w*/(msg/)?[A-Za-z]\w*\Z", description="a message type such as sensor_msgs/JointState"),
+]
+"""``pkg/Type``."""
+ImageType = Literal["sensor_msgs/CompressedImage", "sensor_msgs/Image"]
+"""What a camera may send: JPEG or PNG, or raw pixels, which come on a CBOR connection of their own."""
+IMAGE_TYPES = get_args(ImageType)
 _TRAJECTORY = "trajectory_msgs/JointTrajectory"
 _LAGS = {"arm": 0.1, "base": 0.3}
 """How far live robots are behind their commands [s], network and controller together; the limit `lag` changes it."""
@@ -20,40 +33,39 @@ _LAGS = {"arm": 0.1, "base": 0.3}
 class Source:
     """Where the numbers of one signal come from."""
 
-    signal: str
+    signal: NonEmpty
     """Which signal."""
-    topic: str
-    """Absolute name, without namespace."""
-    type: str
+    topic: Topic
+    type: MessageType
     """Message type, ``pkg/Type``. What is stamped (``pkg/TypeStamped``) is read too where `type` is not."""
-    field: str = ""
+    field: NonEmpty = ""
     """Where the list of its numbers is, e.g. ``position``; or `fields`."""
-    fields: tuple[str, ...] = ()
+    fields: tuple[NonEmpty, ...] = ()
     """Where each number is, e.g. ``pose.position.x``; ``yaw(orientation)`` is the angle about z of a quaternion."""
-    names: tuple[str, ...] = ()
+    names: tuple[NonEmpty, ...] = ()
     """Names of the numbers at the robot, in the order of the signal's labels; they are looked up in the message's
     ``name``, whatever their order there. Empty: the numbers come in order, without names."""
-    ignore: tuple[str, ...] = ()
+    ignore: tuple[NonEmpty, ...] = ()
     """Names that may come too, and are not ours."""
     partial: bool = False
     """Whether several publishers share the topic, so that messages without any of `names` are somebody else's."""
-    scale: tuple[float, ...] = (1.0,)
+    scale: tuple[Finite, ...] = (1.0,)
     """SI value = number x scale + offset; one for all, or one for each."""
-    offset: tuple[float, ...] = (0.0,)
+    offset: tuple[Finite, ...] = (0.0,)
     """See `scale`."""
-    skip: tuple[int, int] = (0, 0)
+    skip: tuple[NonNegativeInt, NonNegativeInt] = (0, 0)
     """How many numbers of `field` to leave out at the beginning and at the end."""
-    missing: float | None = None
+    missing: Finite | None = None
     """What null, NaN and infinities in `field` mean; None: they are errors."""
-    within: tuple[float, float] | None = None
+    within: tuple[Finite, Finite] | None = None
     """Least and greatest that its numbers can be, as they travel: what is beyond is cut. None: as they come."""
-    frame: str = ""
+    frame: NonEmpty = ""
     """Frame that ``header.frame_id`` must name, or the message is refused; empty: not looked at."""
-    max_age: float | None = None
+    max_age: Positive | None = None
     """Oldest that is acted on [s]; None: the profile's."""
     optional: bool = False
     """Whether it is measured only when it is asked for."""
-    constants: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    constants: Mapping[str, Finite] = dataclasses.field(default_factory=dict)
     """Further fields of the message, as a simulated robot sends them."""
 
     @cached_property
@@ -66,30 +78,28 @@ class Source:
 class Sink:
     """Where some of the numbers of a command go."""
 
-    topic: str
-    """Absolute name, without namespace."""
-    type: str
-    """Message type, ``pkg/Type``."""
-    labels: tuple[str, ...]
+    topic: Topic
+    type: MessageType
+    labels: tuple[NonEmpty, ...]
     """Which numbers of the command, by label, in the order of the message."""
-    names: tuple[str, ...] = ()
+    names: tuple[NonEmpty, ...] = ()
     """Names of the numbers at the robot, for types that have names; the labels by default."""
-    fields: tuple[str, ...] = ()
+    fields: tuple[NonEmpty, ...] = ()
     """Where each number goes, for types without a list, e.g. ``linear.x``."""
-    scale: tuple[float, ...] = (1.0,)
+    scale: tuple[Finite, ...] = (1.0,)
     """SI value = number x scale + offset; one for all, or one for each."""
-    offset: tuple[float, ...] = (0.0,)
+    offset: tuple[Finite, ...] = (0.0,)
     """See `scale`."""
-    reach: float | None = None
+    reach: Positive | None = None
     """When a trajectory's point is to be reached [s]; None: `reach_periods` after it was sent."""
-    reach_periods: float = 1.0
+    reach_periods: Positive = 1.0
     """The same, in periods of the task; above 1 an arm does not stop where the next command is late."""
     hold: Literal["measured", "last", "zero"] = "measured"
     """What a halt sends: where it is, what was sent last, or zeros."""
     tag: bool = True
     """Whether the message says who sent it when, if its type has room for a text: ``header.frame_id``, or the label of
     an array's first dimension."""
-    controller: str = ""
+    controller: NonEmpty = ""
     """The controller of ros2_control that takes it, which must be active; empty, and where the topic is renamed: it is
     not asked for."""
 
@@ -107,19 +117,17 @@ class Sink:
 class Readiness:
     """A topic on which a robot says whether it can move. A robot that does not have it is driven without."""
 
-    topic: str
-    """Absolute name, without namespace."""
-    type: str
-    """Message type, ``pkg/Type``."""
-    field: tuple[str, ...]
+    topic: Topic
+    type: MessageType
+    field: tuple[NonEmpty, ...]
     """Where the value is, e.g. ``mode``; of several names the first that the message has."""
-    ready: tuple[float | bool | str, ...] = ()
+    ready: tuple[Finite | bool | str, ...] = ()
     """The values with which it can move; or `at_least`."""
-    at_least: float | None = None
+    at_least: Finite | None = None
     """The least number with which it can begin to move."""
     words: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """What other values mean, e.g. ``3 = "protective stop"``."""
-    otherwise: str = ""
+    otherwise: NonEmpty = ""
     """What all further values mean; ``{}`` stands for the value. Empty: the value itself is said."""
 
     def value(self, message: Any) -> Any:
@@ -143,21 +151,16 @@ class Readiness:
         return self.words.get(text) or self.otherwise.replace("{}", text) or f"{self.field[0]} is {text}"
 
 
-IMAGE_TYPES = ("sensor_msgs/CompressedImage", "sensor_msgs/Image")
-"""What a camera may send: JPEG or PNG, or raw pixels, which come on a CBOR connection of their own."""
-
-
 @dataclass(frozen=True)
 class CameraSource:
     """A camera."""
 
-    name: str
+    name: NonEmpty
     """What it is called here."""
-    topic: str
-    """Absolute name, without namespace."""
-    type: str = "sensor_msgs/CompressedImage"
+    topic: Topic
+    type: MessageType = "sensor_msgs/CompressedImage"
     """One of `IMAGE_TYPES`."""
-    max_age: float = 0.5
+    max_age: Positive = 0.5
     """Oldest image that is handed out [s]."""
 
 
@@ -176,7 +179,7 @@ class RobotProfile:
     state: tuple[Source, ...]
     """One source for each of `signals`, in their order."""
     commands: Mapping[str, tuple[Sink, ...]]
-    """Ways of sending a command, by name, the default first. The last sink of a way makes a command complete."""
+    """Modes in which a command is sent, by name, the default first. The last sink of a mode completes a command."""
     period: float
     """Time between two commands [s]."""
     max_age: float
@@ -194,8 +197,8 @@ class RobotProfile:
 
     @cached_property
     def sinks_by_topic(self) -> Mapping[str, Sink]:
-        """What is sent on each topic, in the first way that uses it."""
-        return {sink.topic: sink for way in reversed([*self.commands.values()]) for sink in reversed(way)}
+        """What is sent on each topic, in the first mode that uses it."""
+        return {sink.topic: sink for sinks in reversed([*self.commands.values()]) for sink in reversed(sinks)}
 
     def command_life(self, period: float) -> float:
         """For how long a command means something to who sends one every `period` [s]: two periods at least.
@@ -228,26 +231,26 @@ class RobotProfile:
         return self.max_age if source.max_age is None else source.max_age
 
     def sinks(self, mode: str | None = None) -> tuple[Sink, ...]:
-        """Where the parts of a command go; `mode` None is the default way.
+        """Where the parts of a command go; `mode` None is the default one.
 
         Raises:
-            UnknownName: There is no such way.
+            UnknownName: There is no such mode.
         """
         if mode is None:
             return next(iter(self.commands.values()))
         if mode not in self.commands:
-            raise UnknownName(f"way of sending commands to {self.name}", mode, self.commands)
+            raise UnknownName(f"command mode of {self.name}", mode, self.commands)
         return self.commands[mode]
 
     def narrowed(self, labels: tuple[str, ...], mode: str | None = None) -> RobotProfile:
         """The same robot, for a task that commands only the numbers `labels`, in their order.
 
-        Sinks that take none of them are not in it: nothing is ever sent there. Nor are ways that would cut a message,
-        and that is an error of the way `mode` (None: the default one).
+        Sinks that take none of them are not in it: nothing is ever sent there. Nor are modes that would cut a message,
+        and that is an error for `mode` (None: the default one).
 
         Raises:
             InvalidValue: It does not take one of them, or a sink of `mode` takes some of its numbers only.
-            UnknownName: There is no such way.
+            UnknownName: There is no such mode.
         """
         if labels == self.command.labels:
             return self
@@ -258,8 +261,8 @@ class RobotProfile:
         for sink in wanted:
             self._require_whole(sink, labels)
         commands = {
-            way: tuple(sink for sink in sinks if set(sink.labels) <= set(labels))
-            for way, sinks in self.commands.items()
+            name: tuple(sink for sink in sinks if set(sink.labels) <= set(labels))
+            for name, sinks in self.commands.items()
             if sinks is wanted or not any(_missing(sink, labels) for sink in sinks)
         }
         return dataclasses.replace(self, command=self.command.part(labels), commands=commands)
@@ -270,7 +273,7 @@ class RobotProfile:
             taken, absent, alone = (", ".join(one) for one in (sink.labels, missing, labels))
             raise InvalidValue(
                 f"{sink.topic} takes {taken} in one message, and {absent} is not commanded. "
-                f"Give the profile of {self.name} a way of sending commands with a topic for {alone} alone."
+                f"Give the profile of {self.name} a command mode with a topic for {alone} alone."
             )
 
     def spec(self, wanted: RobotSpec | None = None, mode: str | None = None) -> RobotSpec:

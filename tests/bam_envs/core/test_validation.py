@@ -52,7 +52,7 @@ def test_what_fits_is_converted(value: Any, kind: Any, found: Any) -> None:
         (0, Positive, "it: expected a number above 0, found 0"),
         (math.nan, Positive, "it: expected a number above 0, found nan"),
         (math.inf, Positive, "it: expected a number above 0, found inf"),
-        (-math.inf, Finite, "it: expected a number that is finite, found -inf"),
+        (-math.inf, Finite, "it: expected a finite number, found -inf"),
         (1.5, Fraction | None, "it: expected a number from 0 to 1, found 1.5"),
         (True, PositiveInt, "it: expected a whole number of at least 1, found True"),
         (1.5, PositiveInt, "it: expected a whole number of at least 1, found 1.5"),
@@ -60,7 +60,7 @@ def test_what_fits_is_converted(value: Any, kind: Any, found: Any) -> None:
         ("1e5", int, "it: expected a whole number, found '1e5'"),
         (70_000, Port, "it: expected a whole number from 0 to 65535, found 70000"),
         ("false", bool, "it: expected true or false, found 'false'"),
-        ("", NonEmpty, "it: expected text that is not empty, found ''"),
+        ("", NonEmpty, "it: expected non-empty text, found ''"),
         (1, str, "it: expected text, found 1"),
         ("x", Literal["png", "jpeg"], "it: expected 'png' or 'jpeg', found 'x'"),
         (10**400, float, "it: expected a number, found 1000"),
@@ -96,7 +96,7 @@ def test_the_fields_of_a_dataclass_are_checked_in_their_order() -> None:
     check_fields(Options(1.0, ("a",)))
     with pytest.raises(ValueError, match=r"^--rate-hz: expected a number above 0, found -1$"):
         check_fields(Options(-1, ("",)), as_flag, ValueError)
-    with pytest.raises(InvalidValue, match=r"^names\[1\]: expected text that is not empty, found ''$"):
+    with pytest.raises(InvalidValue, match=r"^names\[1\]: expected non-empty text, found ''$"):
         check_fields(Options(1.0, ("a", "")))
 
 

@@ -162,5 +162,5 @@ def test_a_message_is_never_cut(tmp_path):
     joints = ", ".join(SIX.command.labels)
     assert str(caught.value) == (
         f"/all takes {joints}, gripper_width in one message, and gripper_width is not commanded. "
-        f"Give the profile of one a way of sending commands with a topic for {joints} alone."
+        f"Give the profile of one a command mode with a topic for {joints} alone."
     )

@@ -104,7 +104,7 @@ def test_the_mir100():
     assert sizes == {"base_pose": 3, "base_velocity": 2, "f_scan": 501, "b_scan": 511}
     assert {source.topic for source in profile.state} == {"/odom", "/robot_pose", "/f_scan", "/b_scan"}
     assert profile.sinks()[0].hold == "zero"
-    assert [(way, sinks[0].type) for way, sinks in profile.commands.items()] == [
+    assert [(mode, sinks[0].type) for mode, sinks in profile.commands.items()] == [
         ("velocity", "geometry_msgs/Twist"),
         ("stamped", "geometry_msgs/TwistStamped"),
     ]
@@ -182,11 +182,11 @@ def test_no_message_is_cut_in_two():
         profile_for(spec)
     assert str(caught.value) == (
         "/cmd_vel takes linear_velocity, angular_velocity in one message, and angular_velocity is not commanded. "
-        "Give the profile of mir100 a way of sending commands with a topic for linear_velocity alone."
+        "Give the profile of mir100 a command mode with a topic for linear_velocity alone."
     )
 
 
-def test_a_way_that_would_be_cut_is_left_out_unless_it_is_wanted():
+def test_a_mode_that_would_be_cut_is_left_out_unless_it_is_wanted():
     profile = load_profile("ur5e")
     gripper, arm = profile.sinks()
     whole = replace(arm, topic="/all", labels=profile.command.labels)
@@ -207,7 +207,7 @@ def test_unknown_names():
     assert str(caught.value) == "Unknown robot profile 'ur5'. Did you mean 'ur5e'?"
     with pytest.raises(UnknownName) as caught:
         load_profile("ur5e").sinks("trajectories")
-    assert str(caught.value) == "Unknown way of sending commands to ur5e 'trajectories'. Did you mean 'trajectory'?"
+    assert str(caught.value) == "Unknown command mode of ur5e 'trajectories'. Did you mean 'trajectory'?"
 
 
 def test_a_profile_of_ones_own(write):
@@ -245,14 +245,18 @@ ignore: [finger_joint, elbow_joint]
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('kind = "arm"', 'kind = "leg"', "FILE: kind must be one of arm, base, not 'leg'."),
-        ('name = "lift"\n', "", "FILE: the key 'name' is missing."),
+        ('kind = "arm"', 'kind = "leg"', "FILE: kind: expected 'arm' or 'base', found 'leg'"),
+        ('name = "lift"\n', "", "FILE: the key 'name' is missing"),
         ("period = 0.02", "perod = 0.02", "FILE: unknown key 'perod'. Did you mean 'period'?"),
-        ("period = 0.02", 'period = "fast"', "FILE: period must be a finite number, not 'fast'."),
-        ("period = 0.02", "period = true", "FILE: period must be a finite number, not True."),
-        ("period = 0.02", "period = nan", "FILE: period must be a finite number, not nan."),
-        ("period = 0.02", "period = -1", "FILE: period must be above 0, not -1."),
-        ("period = 0.02", "period = 0.02\ndead_man = 1e9", "FILE: command_timeout may be 1 s at most, not 1e+09."),
+        ("period = 0.02", 'period = "fast"', "FILE: period: expected a number above 0, found 'fast'"),
+        ("period = 0.02", "period = true", "FILE: period: expected a number above 0, found True"),
+        ("period = 0.02", "period = nan", "FILE: period: expected a number above 0, found nan"),
+        ("period = 0.02", "period = -1", "FILE: period: expected a number above 0, found -1"),
+        (
+            "period = 0.02",
+            "period = 0.02\ndead_man = 1e9",
+            "FILE: command_timeout: expected a number above 0 and at most 1, found 1000000000.0",
+        ),
         ("period = 0.02", "", "FILE: give robot (ur5e, mir100), or [command] with max_rate, and period."),
         ("period = 0.02", 'robot = "ur5"', "FILE: Unknown robot 'ur5'. Did you mean 'ur5e'?"),
         ("period = 0.02", "period = 0.02\nstate = 3", "FILE is not TOML: "),
@@ -268,12 +272,12 @@ ignore: [finger_joint, elbow_joint]
         (
             "/lift/joint_states",
             "lift",
-            "FILE: state[0]: topic must be an absolute name such as /joint_states, not 'lift'.",
+            "FILE: state[0]: topic: expected an absolute name such as /joint_states, found 'lift'",
         ),
         (
             "sensor_msgs/msg/JointState",
             "JointState",
-            "FILE: state[0]: type must be such as sensor_msgs/JointState, not 'JointState'.",
+            "FILE: state[0]: type: expected a message type such as sensor_msgs/JointState, found 'JointState'",
         ),
         (
             'field = "position"\n',
@@ -282,24 +286,33 @@ ignore: [finger_joint, elbow_joint]
         ),
         ('names = ["lift_joint"]', "partial = true", "FILE: state[0]: partial and ignore need names."),
         ('["lift_joint"]', '["a", "b"]', "FILE: state[0]: names must name the 1 numbers of field, not 2."),
-        ('["lift_joint"]', '["a", 3]', "FILE: state[0]: names must be a list of texts, not ['a', 3]."),
+        ('["lift_joint"]', '["a", 3]', "FILE: state[0]: names[1]: expected non-empty text, found 3"),
         ("scale = 0.001\n\n[[commands", "scale = 0\n\n[[commands", "FILE: state[0]: scale must not be 0."),
         (
             "scale = 0.001\n\n[[commands",
             "scale = [1, 2]\n\n[[commands",
             "FILE: state[0]: scale must have 1 or 1 values, not 2.",
         ),
-        ("scale = 0.001\n\n[[commands", "skip = 3\n\n[[commands", "FILE: state[0]: skip must be two counts, not 3."),
+        (
+            "scale = 0.001\n\n[[commands",
+            "skip = 3\n\n[[commands",
+            "FILE: state[0]: skip: expected a list [a whole number of at least 0, "
+            "a whole number of at least 0], found 3",
+        ),
         (
             "scale = 0.001\n\n[[commands",
             "within = [2, 1]\n\n[[commands",
-            "FILE: state[0]: within must be two finite numbers, the least first, not [2, 1].",
+            "FILE: state[0]: within must be two numbers, the least first, not [2.0, 1.0].",
         ),
-        ("scale = 0.001\n\n[[commands", "max_age = 0\n\n[[commands", "FILE: state[0]: max_age must be above 0, not 0."),
+        (
+            "scale = 0.001\n\n[[commands",
+            "max_age = 0\n\n[[commands",
+            "FILE: state[0]: max_age: expected a number above 0, found 0",
+        ),
         (
             "scale = 0.001\n\n[[commands",
             "max_age = 9\n\n[[commands",
-            "FILE: state[0]: max_age may be 1 s at most, not 9.",
+            "FILE: state[0]: max_age: expected a number above 0 and at most 1, found 9.0",
         ),
         (
             'fields = ["data"]',
@@ -315,7 +328,7 @@ ignore: [finger_joint, elbow_joint]
         (
             'fields = ["data"]',
             'fields = ["data"]\nhold = "first"',
-            "FILE: commands.position[0]: hold must be one of measured, last, zero, not 'first'.",
+            "FILE: commands.position[0]: hold: expected 'measured', 'last' or 'zero', found 'first'",
         ),
         (
             "[command]",
@@ -335,7 +348,7 @@ ignore: [finger_joint, elbow_joint]
         (
             "[command]",
             "max_age = 1.5\n[command]",
-            "FILE: max_age may be 1 s at most, not 1.5.",
+            "FILE: max_age: expected a number above 0 and at most 1, found 1.5",
         ),
         (
             "[command]",
@@ -345,13 +358,13 @@ ignore: [finger_joint, elbow_joint]
         (
             "[command]",
             '[rename]\n"/lift/command" = "command"\n[command]',
-            "FILE: rename: /lift/command must become an absolute name such as /ur/state, not 'command'.",
+            "FILE: rename./lift/command: expected an absolute name such as /joint_states, found 'command'",
         ),
         (
             "[command]",
             '[[cameras]]\nname = "hand"\ntopic = "/hand/image"\ntype = "sensor_msgs/CameraInfo"\n[command]',
-            "FILE: cameras[0]: type must be one of sensor_msgs/CompressedImage, sensor_msgs/Image, "
-            "not 'sensor_msgs/CameraInfo'.",
+            "FILE: cameras[0]: type: expected 'sensor_msgs/CompressedImage' or 'sensor_msgs/Image', "
+            "found 'sensor_msgs/CameraInfo'",
         ),
     ],
 )
@@ -373,11 +386,9 @@ def test_a_signal_has_one_source(write):
     assert refusal(write(twice)) == "FILE: state[1]: lift_height has a source already."
 
 
-def test_no_way_and_no_state(write):
-    no_way = OWN[: OWN.index("[[commands")]
-    assert refusal(write(no_way)) == (
-        "FILE: at least one way of sending commands is needed, such as [[commands.position]]."
-    )
+def test_no_mode_and_no_state(write):
+    no_mode = OWN[: OWN.index("[[commands")]
+    assert refusal(write(no_mode)) == ("FILE: at least one command mode is needed, such as [[commands.position]].")
     no_state = OWN[: OWN.index("[[state")] + OWN[OWN.index("[[commands") :]
     assert refusal(write(no_state)) == "FILE: at least one [[state]] table is needed."
 
@@ -391,14 +402,14 @@ def test_files(write, tmp_path):
     assert refusal(write("name =")).startswith("FILE is not TOML: ")
     for text in ("a: [", "a: 2020-13-45", "a: !!int b", "[" * 3000):
         assert refusal(write(text, "b.yaml")).startswith("FILE is not YAML: ")
-    assert refusal(write("- 1", "b.yaml")) == "FILE must be a table of named values, not [1]."
+    assert refusal(write("- 1", "b.yaml")) == "FILE: expected a table of named values, found [1]"
     assert (
         refusal(write("state: 3\nname: a\nkind: arm\nrobot: ur5e", "b.yaml"))
-        == "FILE: state must be a list of tables, not 3."
+        == "FILE: state: expected a list of tables of named values, found 3"
     )
     with pytest.raises(UnknownName, match=r"Did you mean 'ur5e'\?"):
         load_profile(write('extends = "ur5"'))
-    assert refusal(write("extends = 3")) == "FILE: extends must be text, not 3."
+    assert refusal(write("extends = 3")) == "FILE: extends: expected non-empty text, found 3"
     assert refusal(write('extends = "b.toml"')) == (
         "FILE: extends must be a shipped profile (mir100, ur5e, ur5e_trajectory), not 'b.toml'."
     )
@@ -446,7 +457,7 @@ def test_frames_that_cannot_be(write, text, message):
 
 
 @pytest.mark.parametrize(
-    ("name", "way", "period", "lag"),
+    ("name", "mode", "period", "lag"),
     [
         ("ur5e", None, 0.05, 0.1),
         ("ur5e", "trajectory", 0.05, 0.1),
@@ -455,9 +466,9 @@ def test_frames_that_cannot_be(write, text, message):
         ("mir100", None, 0.1, 0.3),
     ],
 )
-def test_what_takes_longer_is_farther_behind(name, way, period, lag):
+def test_what_takes_longer_is_farther_behind(name, mode, period, lag):
     profile = load_profile(name)
-    assert profile.spec(replace(profile.spec(), period=period), way).lag == pytest.approx(lag)
+    assert profile.spec(replace(profile.spec(), period=period), mode).lag == pytest.approx(lag)
 
 
 def test_a_renamed_command_is_another_controllers(write):
