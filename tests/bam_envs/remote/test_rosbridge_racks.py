@@ -183,7 +183,7 @@ def test_a_rack_without_that_environment(rack, open_to):
 def test_a_rack_with_more_arms_than_said(rack, open_to):
     rack(arms=2)
     transport = open_to(**PICKING)
-    with pytest.raises(ProtocolError, match="The response must have 1 feedback, one for each row, not 2"):
+    with pytest.raises(ProtocolError, match="The response must have 1 feedback, one for each environment, not 2"):
         transport.reset()
 
 

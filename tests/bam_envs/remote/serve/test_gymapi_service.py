@@ -144,8 +144,8 @@ def test_names_that_are_not(serve, name, request_type):
 @pytest.mark.parametrize(
     ("action", "text"),
     [
-        (None, "A step must have 1 actions, one for each row, not 0."),
-        ([{}, {}], "A step must have 1 actions, one for each row, not 2."),
+        (None, "A step must have 1 actions, one for each environment, not 0."),
+        ([{}, {}], "A step must have 1 actions, one for each environment, not 2."),
         ([{"continuous_action": [1]}], "continuous_action must have 2 values (action[0], action[1]), not 1."),
         ([{"continuous_action": [1, "2"]}], "continuous_action[1]: expected a number, found '2'"),
         ([{"continuous_action": [1, None]}], "continuous_action[1]: expected a number, found null"),
@@ -297,7 +297,7 @@ def test_rows_are_one_request(serve):
     second = ask(STEP, action=actions)["feedback"]
     assert [row["terminated"] for row in second] == [True] * 3
     assert [json.loads(row["info"])["final_obs"] for row in second] == [[0.0], [0.5], [1.0]]
-    assert refusal(ask(STEP, action=actions[:2])) == "A step must have 3 actions, one for each row, not 2."
+    assert refusal(ask(STEP, action=actions[:2])) == "A step must have 3 actions, one for each environment, not 2."
 
 
 def test_pictures_and_stamps(serve, bus):
