@@ -6,7 +6,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 DEMO := build/demo
 WORKERS := -n 2 --no-loadscope-reorder
 
-.PHONY: demo test quick peers lint format docs clean
+.PHONY: demo test quick peers lint format docs site clean
 
 demo: $(VENV)/.run
 	$(BIN)/bam-train --env bam/pick --algo ppo --out $(DEMO)/pick-ppo.zip --runs $(DEMO)/runs --force
@@ -33,8 +33,13 @@ format: $(VENV)/.dev
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+# The generated parts of docs/*.md, from the code.
 docs: $(VENV)/.dev
 	$(BIN)/python scripts/make_docs.py
+
+# All pages and the reference of the code, with search, in build/site: open build/site/index.html.
+site: $(VENV)/.dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
 clean:
 	rm -rf $(VENV) build dist runs .pytest_cache .mypy_cache .ruff_cache .hypothesis
