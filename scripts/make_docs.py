@@ -17,7 +17,7 @@ import re
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from bam_envs.core.registry import ENVIRONMENTS, resolve
 from bam_envs.core.robot import SignalSpec
@@ -277,7 +277,7 @@ def _flag_rows(kind: type) -> list[list[object]]:
         if isinstance(field.default_factory, type) and dataclasses.is_dataclass(field.default_factory):
             rows += _flag_rows(field.default_factory)
         else:
-            rows.append([flag(field), flag_default(field), docs[field.name]])
+            rows.append([flag(kind, field), flag_default(field), docs[field.name]])
     return rows
 
 
@@ -286,9 +286,9 @@ def flag_default(field: dataclasses.Field[Any]) -> str:
     return "" if field.default is False else default_of(field)
 
 
-def flag(field: dataclasses.Field[Any]) -> str:
+def flag(kind: type, field: dataclasses.Field[Any]) -> str:
     """How a field is given on the command line."""
-    if "Positional" in str(field.type):
+    if "Positional" in str(get_type_hints(kind, include_extras=True)[field.name]):
         return f"`{field.name.upper() if field.name != 'env' else 'ID'}`"
     return f"`--{field.name.replace('_', '-')}`"
 

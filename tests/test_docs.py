@@ -186,8 +186,9 @@ def test_flags_in_the_tables_are_those_of_the_programs(program, monkeypatch, cap
         main()
     assert caught.value.code == 0
     there = set(re.findall(r"--[a-z][a-z-]*", capsys.readouterr().out)) - {"--help"}
+    config = f"{program.removeprefix('bam-').capitalize()}Config"
     page = (ROOT / "docs" / FLAGS_OF.get(program, "deploying.md")).read_text()
-    table = re.search(rf"generated: flags {module}(?:_config)?:.*?<!-- /generated -->", page, re.DOTALL)[0]
+    table = re.search(rf"generated: flags \S+:{config} .*?<!-- /generated -->", page, re.DOTALL)[0]
     assert set(re.findall(r"^\| `(--[a-z-]+)`", table, re.MULTILINE)) == there
 
 
@@ -200,7 +201,7 @@ def test_commands_exist(page):
         elif words[0] == "python":
             assert (ROOT / words[1]).exists() or f"`{words[1]}`" in page.read_text()
         else:
-            assert words[0] in {*PROGRAMS, "pip", "pytest", "ray", "ros2"}
+            assert words[0] in {*PROGRAMS, "pip", "pytest", "python3", "ray", "ros2", "source"}
 
 
 TRAINING = [words for page in PAGES for words in commands(page) if words[0] == "bam-train" and "--resume" not in words]

@@ -80,7 +80,6 @@ def test_the_base_install_is_small(metadata):
     assert names == [
         "cbor2",
         "gymnasium",
-        "msgpack",
         "msgspec",
         "numpy",
         "onnxruntime",
@@ -96,7 +95,16 @@ def test_the_base_install_is_small(metadata):
 
 
 def test_extras(metadata):
-    assert sorted(metadata.get_all("Provides-Extra")) == ["all", "dev", "notebook", "rllib", "sim", "train", "video"]
+    assert sorted(metadata.get_all("Provides-Extra")) == [
+        "all",
+        "dev",
+        "docs",
+        "notebook",
+        "rllib",
+        "sim",
+        "train",
+        "video",
+    ]
 
 
 def of_extra(metadata, extra):
