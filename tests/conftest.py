@@ -10,6 +10,11 @@ import signal
 from typing import Any
 
 import pytest
+from hypothesis import settings
+
+settings.register_profile("quick", max_examples=30, deadline=None, derandomize=True)
+settings.register_profile("thorough", max_examples=1000, deadline=None)
+settings.load_profile("quick")  # pytest --hypothesis-profile=thorough for the other
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the shell that started it ignores them
 for name in ("SIGTERM", "SIGHUP"):
