@@ -1,91 +1,98 @@
-"""Connecting a live robot: who it is, and whether its topics are what the profile says.
+"""Connecting a live robot: who it is, whether its topics are what the profile says, and whether it is ready to move.
 
-A rosbridge server says nothing when a topic or type is wrong, so each is looked at by its effect: its type where the
-server can tell it (rosapi), and the first message of every source.
+A rosbridge server does not report a wrong topic or type. So each one is checked by its effect: by its type if the
+server can tell it (rosapi), and by the first message of every source.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from bam_envs.core.errors import InvalidValue, LinkLost, ProtocolError, RemoteError, StaleState
-from bam_envs.live.state import LiveState
+from bam_envs.core.timing import Deadline
+from bam_envs.live.state import LiveState, Mailbox
 from bam_envs.ros.codec import INFO_SERVICE, RobotInfo, read_info
 from bam_envs.ros.command_messages import has_room
 from bam_envs.ros.messages import bare_type, same_type
-from bam_envs.ros.profile_tables import RobotProfile, Sink
+from bam_envs.ros.profile_tables import Readiness, RobotProfile, Sink
+from bam_envs.rosbridge.bus import Listener
 
 if TYPE_CHECKING:
     from bam_envs.rosbridge.client import RosbridgeLink
 
-_ASK_AGAIN = 0.1
 TIMEOUT = 3.0
-"""Longest that a question to the server takes, and that a first message is waited for [s]."""
-_LOOKS = 5
-"""How many states of a topic are to come in a period, or in the time after which one is too old."""
-_QUESTIONS = 3
-"""How often a question is asked in that time."""
+"""Longest wait for the answer of a service, and for a first message [s]."""
+_TRIES, _TRY_AGAIN = 3, 0.1
+"""How often a service is called within `TIMEOUT`, and the time between two looks at a topic [s]."""
+_STATES = 5
+"""How many states of a topic should arrive in a period, and in the time after which one is too old."""
+FIRST_WITHIN = 0.3
+"""Longest wait for the latched topics by which a robot says whether it is ready [s]."""
+_ANSWER_WITHIN = 2.0
+_ACTIVE = ("active", "running")
+"""The states of a controller that takes commands, in ROS 2 and in ROS 1."""
 
 
 def ask_info(link: RosbridgeLink) -> RobotInfo | None:
-    """What the robot says of itself; None if it says nothing, as somebody else's does."""
+    """What the robot says of itself; None if it does not describe itself, like robots that are not served by us."""
     service = link.namespace + INFO_SERVICE
     answer = ask(link, service)
     return None if answer is None else read_info(answer.get("message"), service)
 
 
-def ask(link: RosbridgeLink, service: str, questions: int = _QUESTIONS) -> dict[str, Any] | None:
-    """What `service`, which takes nothing, answers; None if there is no such service. Asked again where all is silent.
+def ask(link: RosbridgeLink, service: str, tries: int = _TRIES) -> dict[str, Any] | None:
+    """The answer of `service`, which takes no arguments; None if there is no such service.
 
-    A ROS 2 bridge makes a client for each call, and the answer is lost where it comes before the two have met.
+    It is called several times: a ROS 2 bridge creates a client for each call, and loses an answer that comes before
+    client and service have discovered each other.
 
     Raises:
         LinkLost: No answer.
     """
     try:
-        return link.call(service, "", {}, TIMEOUT / _QUESTIONS)
+        return link.call(service, "", {}, TIMEOUT / _TRIES)
     except RemoteError:  # there is no such service
         return None
     except LinkLost:
-        if questions == 1 or not link.is_up:
+        if tries == 1 or not link.is_up:
             raise
-        return ask(link, service, questions - 1)
+        return ask(link, service, tries - 1)
 
 
 def info_by_profile(url: str, profile: RobotProfile, unknown: Iterable[str] = ()) -> RobotInfo:
-    """What is known of a robot at `url` that does not describe itself; `unknown` is where it might say more."""
+    """What is known of a robot at `url` that does not describe itself; `unknown` names topics that said nothing."""
     silent = ", ".join(name.rpartition("/")[2] for name in unknown)
     rest = f"; it does not say {silent}" if silent else ""
     known = f"profile {profile.name}: {', '.join(profile.command.labels)}"
     return RobotInfo(profile.name, text=f"the robot at {url}, which does not describe itself ({known}{rest})")
 
 
-def tagged_sinks(profile: RobotProfile, way: str | None, info: RobotInfo) -> tuple[Sink, ...]:
-    """Where to send commands so that they say who sent them when, if there is such a way.
+def tagged_sinks(profile: RobotProfile, mode: str | None, info: RobotInfo) -> tuple[Sink, ...]:
+    """The sinks whose messages have room for a tag, if the profile has such a mode of sending commands.
 
     Raises:
-        InvalidValue: The robot answers each command, and commands sent this `way` cannot be told apart.
+        InvalidValue: The robot answers each command, and commands sent in this mode cannot be told apart.
     """
-    ways = list(profile.commands) if way is None else [way]
-    for one in ways:
+    modes = list(profile.commands) if mode is None else [mode]
+    for one in modes:
         sinks = profile.sinks(one)
         if all(sink.tag and has_room(sink.type) for sink in sinks):
             return sinks
     if info.lockstep:
         raise InvalidValue(
-            f"{info.name} goes on with each command, and its answers cannot be told apart: {ways[0]} of the profile of "
-            f"{profile.name} has no room for a tag. Give it a way that has, such as stamped messages."
+            f"{info.name} goes on with each command, and its answers cannot be told apart: {modes[0]} of the profile "
+            f"of {profile.name} has no room for a tag. Give it a mode that has, such as stamped messages."
         )
-    return profile.sinks(way)
+    return profile.sinks(mode)
 
 
 def require_period(info: RobotInfo, period: float) -> None:
-    """A robot in lockstep goes on by the task's `period` [s].
+    """Check that a robot in lockstep advances by the task's `period` [s].
 
     Raises:
-        InvalidValue: By another one.
+        InvalidValue: It advances by another one.
     """
     if info.lockstep and info.period is not None and info.period != period:
         raise InvalidValue(
@@ -95,7 +102,7 @@ def require_period(info: RobotInfo, period: float) -> None:
 
 
 class TopicTypes:
-    """Asks a server for the types of its topics, as long as it answers such questions.
+    """Asks a server for the types of its topics, if it offers rosapi.
 
     Args:
         link: To the server.
@@ -106,7 +113,7 @@ class TopicTypes:
         self._link, self._profile, self._answers = link, profile, True
 
     def check(self, topic: str, expected: str) -> str:
-        """The type to use for `topic`: the server's, or `expected` where it does not say.
+        """The type to use for `topic`: the server's, or `expected` if the server does not know.
 
         Raises:
             ProtocolError: `topic` has another type there.
@@ -117,7 +124,7 @@ class TopicTypes:
         return found or expected
 
     def may_be(self, topic: str, kind: str) -> bool:
-        """Whether `topic` is of type `kind` there, or the server does not say."""
+        """Whether `topic` is of type `kind` there, or the server does not know."""
         found = self._found(topic)
         return same_type(found, kind) if found else not self._answers
 
@@ -128,32 +135,32 @@ class TopicTypes:
         )
 
     def check_listened(self, topic: str, sink: Sink) -> str:
-        """As `check`, for the `topic` of `sink`, which somebody must listen to; stamped or not must be as expected.
+        """As `check`, for the `topic` of `sink`, which somebody must listen to, with or without stamp as expected.
 
         Raises:
             ProtocolError: `topic` has another type there, or nobody knows it.
         """
-        deadline, expected = time.monotonic() + TIMEOUT, sink.type
+        deadline, expected = Deadline(TIMEOUT), sink.type
         while not self._found(topic) and self._answers:
-            if time.monotonic() > deadline:
+            if deadline.passed:
                 raise ProtocolError(
                     f"Nobody listens to {topic} ({expected}), which takes {', '.join(sink.labels)}. Is the controller "
                     f"active, and is the topic called so? Topics are in the profile of {self._profile.name}; "
                     "this may be another robot than it describes."
                 )
-            time.sleep(_ASK_AGAIN)  # nodes of a ROS graph find each other after a while
+            time.sleep(_TRY_AGAIN)  # nodes of a ROS graph take a while to discover each other
         found = self._found(topic) or expected
-        if bare_type(found) != bare_type(expected):  # what is stamped is read like what is not, and written otherwise
+        if bare_type(found) != bare_type(expected):  # reading ignores a stamp, writing does not
             raise self._misfit(topic, expected, found)
         return found
 
     def _found(self, topic: str) -> str:
-        """The type of `topic` there; empty if the server does not know, or does not say."""
+        """The type of `topic` there; empty if the server does not know."""
         if not self._answers:
             return ""
         try:
             answer = self._link.call("/rosapi/topic_type", "rosapi/TopicType", {"topic": topic}, TIMEOUT)
-        except RemoteError:  # rosapi is a node of its own, and does not run
+        except RemoteError:  # rosapi is a node of its own, which does not run
             self._answers = False
             return ""
         kind = answer.get("type")
@@ -161,23 +168,23 @@ class TopicTypes:
 
 
 def throttle(profile: RobotProfile, topic: str, period: float) -> int:
-    """Least time between two states on `topic` that a bridge is asked for [ms].
+    """Minimum time between two states on `topic` that a bridge is asked for [ms].
 
-    A driver may send 500 a second, and a busy bridge ages each that nobody looks at. A fifth of the `period` [s], or of
-    the oldest that is acted on, costs no freshness that matters. Of several publishers on one topic it could be always
-    the same one's messages that are left out, so such a topic comes whole.
+    A driver may send 500 states a second, and queues of a busy bridge delay every one of them. A fifth of the `period`
+    [s], or of the maximum age, costs no freshness that matters. A topic of several publishers is not throttled: the
+    bridge might always drop the messages of the same one.
     """
     if any(source.partial for source in profile.state if source.topic == topic):
         return 0
-    return int(1000 * min(period, profile.max_age) / _LOOKS)
+    return int(1000 * min(period, profile.max_age) / _STATES)
 
 
 def await_first(link: RosbridgeLink, state: LiveState, profile: RobotProfile) -> None:
-    """Wait until every source sent something.
+    """Wait until every source has sent a message.
 
     Raises:
         LinkLost: The link dropped.
-        StaleState: One is silent; it names its topic, its type, and what the server said.
+        StaleState: A source is silent; names its topic, its type, and the last status of the server.
     """
     wanted = {source.signal for source in state.sources}
     arrived = state.mailbox.wait_for(lambda slots: wanted <= slots.keys() or not link.is_up, TIMEOUT)
@@ -191,3 +198,113 @@ def await_first(link: RosbridgeLink, state: LiveState, profile: RobotProfile) ->
         f"{', '.join(silent)}: no message in {TIMEOUT:g} s. Does it run, and is the topic called so? "
         f"Topics are in the profile of {profile.name}." + (f" The server said: {said[-1]}" if said else "")
     )
+
+
+class LiveReadiness:
+    """What a robot says of being ready to move: the topics in `profile.readiness`, and the controllers of `sinks`.
+
+    All of it is optional: a robot that does not say something is driven without, and `unknown` names it.
+
+    Args:
+        profile: The robot.
+        sinks: Where its commands go.
+        types: Tells which topics the server may have.
+    """
+
+    def __init__(self, profile: RobotProfile, sinks: tuple[Sink, ...], types: TopicTypes) -> None:
+        self._profile, self._types = profile, types
+        self._controllers = tuple(dict.fromkeys(sink.controller for sink in sinks if sink.controller))
+        self._mailbox = Mailbox()
+        self._heard: tuple[Readiness, ...] = ()
+        self._states: Mapping[str, str] | None = None
+        self._answers = bool(self._controllers and profile.controllers)
+
+    def begin(self, link: RosbridgeLink) -> None:
+        """Subscribe to the topics, wait a little for their latched messages, and ask for the controllers."""
+        if not self._heard:  # on a later connection the link subscribes again by itself
+            self._listen(link)
+        topics = {one.topic for one in self._heard}
+        self._mailbox.wait_for(lambda slots: topics <= slots.keys() or not link.is_up, FIRST_WITHIN)
+        self._ask(link)
+
+    def _listen(self, link: RosbridgeLink) -> None:
+        self._heard = tuple(
+            one for one in self._profile.readiness if self._types.may_be(link.namespace + one.topic, one.type)
+        )
+        for one in self._heard:
+            link.subscribe(link.namespace + one.topic, one.type, self._listener(one.topic))
+
+    def _listener(self, topic: str) -> Listener:
+        return lambda message, caller: self._mailbox.put([topic], message)
+
+    def owns(self, status: Mapping[str, Any], namespace: str) -> bool:
+        """Whether a `status` of the server is about these topics: it is no error if the server cannot offer one."""
+        return status.get("id") in {f"subscribe:{namespace}{one.topic}" for one in self._heard}
+
+    def forget(self) -> None:
+        """Drop what was heard: the link is down."""
+        self._mailbox.clear()
+
+    def fault(self, *, moving: bool) -> str | None:
+        """Why the robot is not ready, by the newest messages; None if nothing says so. Any thread.
+
+        Args:
+            moving: Leave out measured numbers (`at_least`), which may dip while the robot moves.
+        """
+        letters = self._mailbox.newest()
+        for one in self._heard:
+            if one.topic in letters and not (moving and one.at_least is not None):
+                trouble = one.trouble(letters[one.topic].message)
+                if trouble is not None:
+                    return f"{trouble} ({one.topic})"
+        return None
+
+    def not_ready(self, link: RosbridgeLink) -> str | None:
+        """As `fault`, including the controllers, which are asked for now."""
+        said = self.fault(moving=False)
+        if said is None:
+            self._ask(link)
+            said = self._controller_fault()
+        return said
+
+    def _ask(self, link: RosbridgeLink) -> None:
+        """Ask for the states of the controllers; a server without that service is not asked again."""
+        if not self._answers:
+            return
+        try:
+            answer = link.call(link.namespace + self._profile.controllers, "", {}, _ANSWER_WITHIN)
+        except (RemoteError, ProtocolError):
+            self._answers = False
+        except LinkLost:  # what was known may have changed
+            self._states = None
+        else:
+            self._states = _states_of(answer)
+
+    def _controller_fault(self) -> str | None:
+        if self._states is None:
+            return None
+        for name in self._controllers:
+            state = self._states.get(name, "not loaded")
+            if state not in _ACTIVE:
+                return f"the controller {name} is {state}: ros2 control switch_controllers --activate {name}"
+        return None
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """Topics, and the service of the controllers, that gave nothing readable."""
+        letters = self._mailbox.newest()
+        topics = (
+            one.topic
+            for one in self._profile.readiness
+            if one.topic not in letters or one.value(letters[one.topic].message) is None
+        )
+        asked = bool(self._controllers and self._profile.controllers)
+        return (*topics, *([self._profile.controllers] if asked and self._states is None else []))
+
+
+def _states_of(answer: Mapping[str, Any]) -> dict[str, str] | None:
+    """State of each controller by its name, from the answer of ``list_controllers``; None if it is malformed."""
+    rows = answer.get("controller")
+    if not isinstance(rows, list) or not all(isinstance(row, Mapping) for row in rows):
+        return None
+    return {str(row.get("name")): str(row.get("state")) for row in rows}

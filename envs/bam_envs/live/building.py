@@ -7,13 +7,12 @@ from pathlib import Path
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import RobotSpec
-from bam_envs.live.rosbridge import RosbridgeRobot
+from bam_envs.live.rosbridge_robot import RosbridgeRobot
 from bam_envs.robots.profiles.profile import load_profile, profile_for
 from bam_envs.ros.profile_tables import RobotProfile
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.safety.gate import SafeRobot
-from bam_envs.safety.guard import ToolPosition
-from bam_envs.safety.guards import Limits
+from bam_envs.safety.guard import Limits, ToolPosition
 
 DEFAULT_PROFILE = "ur5e"
 
@@ -34,23 +33,23 @@ def live_robot(
     Args:
         url: ``ws://host:port`` or ``wss://host:port``, with a namespace behind it if its topics have one.
         spec: What the task needs of it, such as the spec of its simulated robot; None: everything it measures.
-        profile: Its topics; a shipped name or a file. None: the shipped one that takes the commands of `spec`. What
-            takes others only is left alone.
+        profile: Its topics: a shipped name or a file. None: the shipped one that takes the commands of `spec`; topics
+            that take other commands are left alone.
         limits: How far the guards let it go; None: those of the profile.
         tool_position: Forward kinematics of an arm that is no UR5e, (n, k) [rad] to (n, 3) [m].
-        command: Way of sending commands, such as ``"trajectory"``; None: the profile's default.
+        command: Command mode, such as ``"trajectory"``; None: the profile's default.
         ca_file: PEM file of the authorities to trust instead of the system's.
         token_file: File with the server's shared secret.
 
     Raises:
-        InvalidValue: The address is none of a robot, a file cannot be read, or the robot does not measure, or take,
+        InvalidValue: The address is not that of a robot, a file cannot be read, or the robot does not measure, or take,
             what `spec` names.
         UnknownName: There is no such profile, or no such command mode.
     """
     require_robot_address(url)
     endpoint = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file)
     chosen = _profile(profile, spec)
-    robot = RosbridgeRobot(url, chosen, spec=spec, ca_file=endpoint.ca_file, token=endpoint.token, command=command)
+    robot = RosbridgeRobot(endpoint, chosen, spec=spec, command=command)
     return SafeRobot(robot, limits=limits or profile_limits(chosen), tool_position=tool_position)
 
 
@@ -69,7 +68,7 @@ def _profile(profile: RobotProfile | str | Path | None, spec: RobotSpec | None) 
 
 
 def require_robot_address(url: str) -> None:
-    """Refuse what is no address of a live robot, by its form alone.
+    """Check the form of a live robot's address.
 
     Raises:
         InvalidValue: Says what was expected.

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import ProtocolError, ResetNeeded, StaleState
-from bam_envs.live.mailbox import Letter, Mailbox
-from bam_envs.live.state import SourceAge
+from bam_envs.live.state import Letter, Mailbox, SourceAge
 from bam_envs.ros.images import message_bytes, read_color_message, read_depth_message
 from bam_envs.ros.messages import read_stamp, require_message
 from bam_envs.ros.profile_tables import CameraSource
@@ -25,8 +24,8 @@ from bam_envs.rosbridge.endpoint import Endpoint
 
 Pixels = NDArray[Any]
 FIRST_IMAGE = 3.0
-"""Longest that a first image is waited for [s]."""
-_LOOK_AGAIN = 0.01
+"""Longest wait for a first image [s]."""
+_SLOT = "image"
 _COLOURS: dict[str, tuple[int, list[int]]] = {
     "rgb8": (3, [0, 1, 2]),
     "bgr8": (3, [2, 1, 0]),
@@ -36,7 +35,7 @@ _COLOURS: dict[str, tuple[int, list[int]]] = {
     "8UC1": (1, [0]),
     "8UC3": (3, [2, 1, 0]),
 }
-"""Encodings of raw images: bytes a pixel, and their order as RGB."""
+"""Encodings of raw images: bytes per pixel, and their order as RGB."""
 _DEPTHS = ("16UC1", "mono16", "32FC1")
 
 
@@ -47,99 +46,70 @@ class CameraImage:
     pixels: Pixels
     """uint8, (height, width, 3 or 4) RGB or RGBA, (height, width) if grey; depth: float32, (height, width) [m]."""
     stamp: float | None
-    """When it was taken, on the camera's clock [s]; None if it does not say."""
+    """When it was taken, on the camera's clock [s]; None without a stamp."""
     number: int
-    """Counts the images that came."""
-
-
-class _Feed:
-    """The newest image of one topic, on a connection and in a thread of its own."""
-
-    def __init__(self, endpoint: Endpoint, topic: str, kind: str, clock: Callable[[], float]) -> None:
-        mailbox = self._mailbox = Mailbox(clock)
-        self._link = RosbridgeLink(endpoint, name="camera")
-        self._link.subscribe(topic, kind, lambda message, caller: mailbox.put(("",), message), compression="cbor")
-
-    def open(self) -> None:
-        self._link.connect()
-
-    def newest(self) -> Letter | None:
-        return self._mailbox.newest().get("")
-
-    def close(self) -> None:
-        self._link.close()
+    """Counts the images that arrived."""
 
 
 class LiveCamera:
     """One camera behind a rosbridge server.
 
     Args:
-        url: As of the robot: its namespace goes before the camera's topic.
+        endpoint: As of the robot: its namespace goes before the camera's topic.
         source: The camera, as a profile describes it.
-        ca_file: PEM file of the authorities to trust instead of the system's.
-        token: Shared secret of the server.
         clock: Monotonic clock [s].
     """
 
     def __init__(
-        self,
-        url: str,
-        source: CameraSource,
-        *,
-        ca_file: str | None = None,
-        token: str | None = None,
-        clock: Callable[[], float] = time.monotonic,
+        self, endpoint: Endpoint | str, source: CameraSource, *, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self.source, self.url = source, url
-        self._topic = Endpoint(url).address.namespace + source.topic
-        self._ca_file, self._token, self._clock = ca_file, token, clock
-        self._feed: _Feed | None = None
+        self._endpoint = Endpoint(endpoint) if isinstance(endpoint, str) else endpoint
+        self.source, self.url = source, self._endpoint.url
+        self._topic, self._clock = self._endpoint.address.namespace + source.topic, clock
+        self._link: RosbridgeLink | None = None
+        self._forget()
+
+    def _forget(self) -> None:
+        self._mailbox = Mailbox(self._clock)
         self._decoded: CameraImage | None = None
-        self._age, self._judged = SourceAge(0.0), 0  # and the number of the image that was judged last
+        self._age, self._judged = SourceAge(0.0), 0  # and the number of the image whose age was judged last
 
     def connect(self) -> None:
-        """Open a connection for this camera, and wait for its first image. Doing it twice is once.
+        """Open a connection for this camera, and wait for its first image. Idempotent.
 
         Raises:
             NoServer: There is no usable server.
             StaleState: No image came.
         """
-        if self._feed is not None:
+        if self._link is not None:
             return
-        feed, self._decoded = self._new_feed(), None
-        self._age, self._judged = SourceAge(0.0), 0
+        self._forget()
+        link, mailbox = RosbridgeLink(self._endpoint, name="camera"), self._mailbox
+        link.subscribe(
+            self._topic, self.source.type, lambda message, caller: mailbox.put([_SLOT], message), compression="cbor"
+        )
         try:
-            feed.open()
-            self._await_first(feed)
-        except BaseException:
-            feed.close()
-            raise
-        self._feed = feed
-
-    def _new_feed(self) -> _Feed:
-        endpoint = Endpoint(self.url, self._ca_file, self._token)
-        return _Feed(endpoint, self._topic, self.source.type, self._clock)
-
-    def _await_first(self, feed: _Feed) -> None:
-        deadline = time.monotonic() + FIRST_IMAGE
-        while feed.newest() is None:
-            if time.monotonic() > deadline:
+            link.connect()
+            if not mailbox.wait_for(bool, FIRST_IMAGE):
                 raise StaleState(
                     f"{self._topic} ({self.source.type}): no image in {FIRST_IMAGE:g} s. "
                     "Does the camera run, and is the topic called so?"
                 )
-            time.sleep(_LOOK_AGAIN)
+        except BaseException:
+            link.close()
+            raise
+        self._link = link
 
     def latest(self) -> CameraImage:
-        """The newest image; decoded at most once.
+        """The newest image; each is decoded at most once.
 
         Raises:
             ResetNeeded: Not connected.
             StaleState: It is older than the profile allows.
-            ProtocolError: It is no image.
+            ProtocolError: It is not an image.
             MissingExtra: Neither OpenCV nor Pillow is installed.
         """
-        letter = None if self._feed is None else self._feed.newest()
+        letter = None if self._link is None else self._mailbox.newest().get(_SLOT)
         if letter is None:
             raise ResetNeeded(f"The camera {self.source.name} at {self.url} is not connected. Call connect() first.")
         self._judge(letter)
@@ -152,7 +122,7 @@ class LiveCamera:
         return self._decoded
 
     def _judge(self, letter: Letter) -> None:
-        """An image is as old as its stamp says, beside the quickest one: a link that hung delivers old ones anew."""
+        """Judge the age by the stamp, compared with the quickest image: a link that hung delivers old images late."""
         if letter.number != self._judged:
             stamp = read_stamp(require_message(letter.message, self._topic), self._topic)
             self._age.look(letter.arrived, stamp, None)
@@ -163,10 +133,10 @@ class LiveCamera:
         return CameraImage(decode_pixels(message, self._topic), read_stamp(message, self._topic), letter.number)
 
     def close(self) -> None:
-        """Drop the connection. As often as one likes."""
-        feed, self._feed = self._feed, None
-        if feed is not None:
-            feed.close()
+        """Drop the connection. Idempotent."""
+        link, self._link = self._link, None
+        if link is not None:
+            link.close()
 
 
 def decode_pixels(message: Mapping[str, Any], where: str) -> Pixels:

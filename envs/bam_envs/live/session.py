@@ -15,27 +15,27 @@ if TYPE_CHECKING:
     from bam_envs.rosbridge.client import RosbridgeLink
 
 _EVERY = 0.5
-"""Time between two signs of life of who drives [s]; the robot's side waits for several (`CommandLease`)."""
+"""Time between two renewals of the lease [s]; the robot's side waits for several of them (`CommandLease`)."""
 _LIFE = 1.0
-"""For how long each means something [s]."""
+"""How long each of them is valid [s]."""
 
 
 class DrivingSession:
-    """Signs commands, and says in a thread of its own that the driver is there, however long its start takes."""
+    """Signs commands, and renews the lease in a thread of its own: a slow driver must not lose it."""
 
     def __init__(self) -> None:
         self.tagger = Tagger()
-        """Of the session; signs nothing where none was opened, as for a robot of somebody else."""
+        """Signs for the open session; without a session, as for robots that are not served by us, it signs nothing."""
         self._link: RosbridgeLink | None = None  # of the open session
         self._thread: threading.Thread | None = None
         self._left = threading.Event()
 
     def open(self, link: RosbridgeLink) -> None:
-        """Open a new session on `link`, where the robot's side has such; one that was open before is left.
+        """Leave the session that is open, and open a new one on `link` if the robot's side has sessions.
 
         Raises:
             LinkLost: No answer.
-            ProtocolError: The answer is none.
+            ProtocolError: The answer is malformed.
         """
         link.advertise(link.namespace + LEASE_TOPIC, "std_msgs/String")
         self.leave()
@@ -44,14 +44,14 @@ class DrivingSession:
             self.tagger, self._link = read_session(answer, SESSION_SERVICE), link
 
     def drive(self) -> None:
-        """From now on say that the driver is there."""
+        """Renew the lease from now on."""
         if self._link is not None and self._thread is None:
             self._left = threading.Event()
             self._thread = threading.Thread(target=self._renew, args=(self._left,), name="bam-lease", daemon=True)
             self._thread.start()
 
     def leave(self) -> None:
-        """Give command back at once. As often as one likes; never raises."""
+        """Give the lease back at once. Idempotent; never raises."""
         self._left.set()
         if self._thread is not None:
             self._thread.join()
@@ -68,5 +68,5 @@ class DrivingSession:
             return
         tag = self.tagger.next(link.epoch, _LIFE)
         text = f"{word} {self.tagger.sign(tag, LEASE_TOPIC, word.encode())}"
-        with suppress(BamEnvsError):  # a link that is down says so where commands are sent
+        with suppress(BamEnvsError):  # a link that is down is reported by the next command
             link.publish(link.namespace + LEASE_TOPIC, {"data": text})

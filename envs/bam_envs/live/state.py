@@ -1,14 +1,18 @@
-"""The newest messages of a live robot as its state, and how old that is.
+"""The newest messages of a live robot as its state, and how old that state is.
 
-A message's age is judged twice, and the worse counts: since it arrived, and by its stamp. The clock that stamps it need
-not be ours: how far it is off comes from the server's clock where the link knows that, and from the quickest message.
+The network thread does nothing but put messages into a `Mailbox`; the thread that drives the robot decodes them.
+
+The age of a message is judged twice, since its arrival and by its stamp, and the greater age counts. The clock of the
+stamps may differ from ours: the offset comes from the server's clock if the link knows it, and from the message that
+took the least time.
 """
 
 from __future__ import annotations
 
 import math
+import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +21,6 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import StaleState
 from bam_envs.core.robot import RobotSpec
-from bam_envs.live.mailbox import Alarm, Letter, Mailbox
 from bam_envs.ros.codec import decode_source
 from bam_envs.ros.freshness import ClockOffset, read_echo
 from bam_envs.ros.messages import read_stamp, require_message, tag_text
@@ -26,9 +29,63 @@ from bam_envs.rosbridge.bus import Caller, Listener, Message
 
 Array = NDArray[np.float64]
 _SIMULATED_BEFORE = 1e8
-"""A stamp before this [s since 1970] is a simulator's clock, which goes at any speed: only that it goes on counts."""
+"""An earlier stamp [s since 1970] comes from a simulator's clock, of any speed: it only has to go on."""
 _OTHER_CLOCK = 60.0
-"""A stamp farther than this [s] from the server's clock is of a clock that nobody set."""
+"""A stamp farther than this [s] from the server's clock comes from a clock that nobody set."""
+
+
+@dataclass(frozen=True)
+class Letter:
+    """A message that arrived."""
+
+    message: Any
+    """As it arrived, unchecked."""
+    arrived: float
+    """When it arrived [s], our monotonic clock."""
+    number: int
+    """Counts the messages of its slot, from 1."""
+
+
+class Mailbox:
+    """The newest message of each signal, by name, for threads that look or wait.
+
+    Args:
+        clock: Monotonic clock [s].
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock, self._changed = clock, threading.Condition()
+        self._slots: dict[str, Letter] = {}
+
+    def put(self, names: Iterable[str], message: Any) -> None:
+        """Replace what is in the slots `names` by `message`, which arrives now."""
+        with self._changed:
+            arrived = self._clock()
+            for name in names:
+                before = self._slots.get(name)
+                self._slots[name] = Letter(message, arrived, 1 if before is None else before.number + 1)
+            self._changed.notify_all()
+
+    def newest(self) -> dict[str, Letter]:
+        """The filled slots."""
+        with self._changed:
+            return dict(self._slots)
+
+    def clear(self) -> None:
+        """Empty the slots."""
+        with self._changed:
+            self._slots.clear()
+            self._changed.notify_all()
+
+    def wake(self) -> None:
+        """Let whoever waits check its condition again."""
+        with self._changed:
+            self._changed.notify_all()
+
+    def wait_for(self, ready: Callable[[dict[str, Letter]], bool], timeout: float) -> bool:
+        """Wait until `ready` is true of the slots, at most `timeout` [s]; whether it became true."""
+        with self._changed:
+            return self._changed.wait_for(lambda: ready(self._slots), timeout)
 
 
 class SourceAge:
@@ -44,20 +101,20 @@ class SourceAge:
         self._measured = -math.inf
 
     def look(self, arrived: float, stamp: float | None, server_offset: float | None) -> None:
-        """Take note of a message.
+        """Note a message.
 
         Args:
             arrived: When it arrived [s], our monotonic clock.
-            stamp: What it says when it was measured [s]; None if it does not.
-            server_offset: Our wall clock minus the server's [s], if it is known.
+            stamp: When it was measured, as it says [s]; None without a stamp.
+            server_offset: Our wall clock minus the server's [s]; None if it is not known.
         """
         if stamp is None:
             self._measured = arrived
-        elif stamp != self._stamp:  # one that stands still is stale, however many messages repeat it
+        elif stamp != self._stamp:  # a stamp that stands still is stale, however many messages repeat it
             self._stamp, self._measured = stamp, arrived - self._delay(arrived, stamp, server_offset)
 
     def _delay(self, arrived: float, stamp: float, server_offset: float | None) -> float:
-        """How long it took to arrive [s]."""
+        """How long the message took to arrive [s]."""
         if stamp < _SIMULATED_BEFORE:
             return 0.0
         delay = self._quickest.age(stamp, arrived)
@@ -73,7 +130,7 @@ class SourceAge:
 
 @dataclass(frozen=True)
 class _Seen:
-    """What the newest message of a topic says of itself."""
+    """What was read from the newest message of a topic."""
 
     number: int
     stamped: bool
@@ -82,7 +139,9 @@ class _Seen:
 
 
 class LiveState:
-    """Listens to the sources of a robot's signals; decodes in the thread that asks, which is one, but for `signals`.
+    """Listens to the sources of a robot's signals, and decodes in the calling thread.
+
+    One thread may call it; `signals` may be called from any.
 
     Args:
         profile: The robot.
@@ -110,7 +169,6 @@ class LiveState:
         self._extra = self._allowed_extra(profile)
         self._ages: dict[str, SourceAge] = {}
         self._seen: dict[str, _Seen] = {}
-        self._expected, self._answered = "", Alarm()
 
     def _allowed_extra(self, profile: RobotProfile) -> dict[str, float]:
         """How much older than `max_age` the messages of each head may be [s]."""
@@ -127,38 +185,36 @@ class LiveState:
         return {source.topic: source.type for source in self.sources}
 
     def listener(self, topic: str) -> Listener:
-        """What to subscribe `topic` with."""
+        """The listener to subscribe `topic` with."""
         mine = [source for source in self.sources if source.topic == topic]
         always = [source.signal for source in mine if not source.partial]
         shared = [source for source in mine if source.partial]
 
         def listen(message: Message, caller: Caller) -> None:
             self.mailbox.put([*always, *(source.signal for source in shared if _is_ours(source, message))], message)
-            if self._expected and tag_text(message) == self._expected:
-                self._answered.ring()
 
         return listen
 
     def restart(self) -> None:
-        """Forget everything."""
+        """Forget all messages and ages."""
         self.mailbox.clear()
         self.forget_ages()
 
     def forget_ages(self) -> None:
-        """Judge ages anew: clocks may be others behind another connection."""
+        """Forget ages: behind another connection there may be other clocks."""
         self._ages.clear()
         self._seen.clear()
 
     def silent(self) -> list[Source]:
-        """Sources that nothing came from."""
+        """Sources without a message."""
         letters = self.mailbox.newest()
         return [source for source in self.sources if source.signal not in letters]
 
     def read(self) -> tuple[dict[str, Array], float]:
-        """The newest numbers [SI] of each signal, shape (1, k), and the stamp of the first that has one [s].
+        """The newest values [SI] of each signal, shape (1, k), and the stamp of the first source that has one [s].
 
         Raises:
-            StaleState: Nothing came of a signal.
+            StaleState: A signal has no message.
             ProtocolError: A message is not what the profile says.
         """
         letters = self._letters()
@@ -166,14 +222,14 @@ class LiveState:
         return self._decode(letters), self._stamp(letters)
 
     def signals(self) -> dict[str, Array]:
-        """As `read`, without the stamp; from any thread."""
+        """As `read`, without the stamp. Any thread."""
         return self._decode(self._letters())
 
     def age(self) -> float:
-        """Age of the state [s]: of its oldest source, less what the profile allows that more than the others.
+        """Age of the state [s]: of its oldest source, less the extra age that the profile allows that source.
 
         Raises:
-            ProtocolError: A stamp is none.
+            ProtocolError: A stamp cannot be read.
         """
         letters, now = self.mailbox.newest(), self._clock()
         if len(letters) < len(self.sources):
@@ -181,29 +237,18 @@ class LiveState:
         self._look(letters)
         return max(self._ages[head].at(now) - extra for head, extra in self._extra.items())
 
-    def echo(self) -> tuple[str, int] | None:
-        """Session and number of the command that the newest state answers; None if it answers none."""
+    def echo(self) -> tuple[str, int]:
+        """Session and number of the command that the newest state answers; empty and 0 if it answers none."""
         echoes = (read_echo(tag_text(letter.message)) for letter in self.mailbox.newest().values())
-        return next((one for one in echoes if one is not None), None)
+        return next((one for one in echoes if one is not None), ("", 0))
 
-    def expect(self, tag: str) -> None:
-        """From now on look for the answer to the command with the echo `tag`, which is about to be sent."""
-        self._answered.stop()
-        self._expected = tag
+    def await_answer(self, tag: str, stop: Callable[[], bool], timeout: float) -> bool:
+        """Wait until the command with the echo `tag` is answered, and no source is older than the answer.
 
-    def stop_waiting(self) -> None:
-        """Something happened that `stop` of `await_answer` knows."""
-        self._answered.ring()
-
-    def await_answer(self, stop: Callable[[], bool], timeout: float) -> bool:
-        """Wait until the expected answer came, and no source is from before it; whether it did, or `stop` says so.
-
-        One message wakes the caller: each time would cost as much as the message.
+        Returns:
+            Whether that happened within `timeout` [s], or `stop` became true; `Mailbox.wake` has it checked.
         """
-        deadline, tag = time.monotonic() + timeout, self._expected
-        self._answered.wait(timeout)
-        left = max(0.0, deadline - time.monotonic())
-        return self.mailbox.wait_for(lambda slots: stop() or self._is_answer(slots, tag), left)
+        return self.mailbox.wait_for(lambda slots: stop() or self._is_answer(slots, tag), timeout)
 
     def _is_answer(self, letters: Mapping[str, Letter], tag: str) -> bool:
         if len(letters) < len(self.sources):
@@ -226,7 +271,7 @@ class LiveState:
         }
 
     def _look(self, letters: Mapping[str, Letter]) -> None:
-        """Judge the messages that were not judged yet, each once."""
+        """Read stamps and tags of the messages that are new."""
         for source in self._heads.values():
             letter, seen = letters[source.signal], self._seen.get(source.signal)
             if seen is None or seen.number != letter.number:
@@ -241,13 +286,13 @@ class LiveState:
         return self._ages[signal]
 
     def _stamp(self, letters: Mapping[str, Letter]) -> float:
-        """The stamp of the first source that has one; without any, when the newest message came [s]."""
+        """The stamp of the first source that has one, else the arrival of the newest message [s]."""
         heads = (self._heads[source.topic, source.names] for source in self.sources)
         stamps = (self._seen[head.signal] for head in heads)
         return next((seen.stamp for seen in stamps if seen.stamped), max(one.arrived for one in letters.values()))
 
 
 def _is_ours(source: Source, message: Any) -> bool:
-    """Whether a message of a shared topic is of the publisher of `source`; what is malformed is, too."""
+    """Whether a message of a shared topic comes from the publisher of `source`; a malformed one counts as such."""
     names = message.get("name") if isinstance(message, Mapping) else None
     return not isinstance(names, Sequence) or any(name in source.names for name in names)

@@ -9,7 +9,7 @@ from bam_envs.core.on_use import imported_on_use
 if TYPE_CHECKING:
     from bam_envs.core.robot import Initial, Robot, RobotSpec, RobotState, SignalSpec
     from bam_envs.live.building import live_robot
-    from bam_envs.live.rosbridge import RosbridgeRobot
+    from bam_envs.live.rosbridge_robot import RosbridgeRobot
     from bam_envs.robots.fake import FakeRobot
     from bam_envs.robots.physics.mir100 import SimulatedBase
     from bam_envs.robots.profiles.profile import load_profile
@@ -21,7 +21,7 @@ _MODULES = {
     "Robot": "bam_envs.core.robot",
     "RobotSpec": "bam_envs.core.robot",
     "RobotState": "bam_envs.core.robot",
-    "RosbridgeRobot": "bam_envs.live.rosbridge",
+    "RosbridgeRobot": "bam_envs.live.rosbridge_robot",
     "SafeRobot": "bam_envs.safety.gate",
     "SignalSpec": "bam_envs.core.robot",
     "SimulatedBase": "bam_envs.robots.physics.mir100",

@@ -9,7 +9,7 @@ import pytest
 from bam_envs.core.errors import InvalidValue, LinkLost, ProtocolError, UnknownName
 from bam_envs.core.robot import Initial, Robot, RobotState, Rows
 from bam_envs.live.building import live_robot, profile_limits
-from bam_envs.live.rosbridge import RosbridgeRobot
+from bam_envs.live.rosbridge_robot import RosbridgeRobot
 from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.robot_service import RobotService
 from bam_envs.remote.serve.served_robot import ServedRobot
@@ -20,7 +20,7 @@ from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.robots.ur5e import JOINTS, arm_spec
 from bam_envs.rosbridge.server.server import BridgeServer
 from bam_envs.safety.gate import SafeRobot
-from bam_envs.safety.guards import Limits
+from bam_envs.safety.guard import Limits
 from bam_envs.testing import RobotContract
 
 ROW = np.zeros(1, np.int64)

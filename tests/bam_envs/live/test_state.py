@@ -1,14 +1,12 @@
 """The newest messages as a state, and how old that is; clocks are the test's."""
 
 import threading
-import time
 
 import numpy as np
 import pytest
 
 from bam_envs.core.errors import ProtocolError, StaleState
-from bam_envs.live.mailbox import Alarm, Mailbox
-from bam_envs.live.state import LiveState, SourceAge
+from bam_envs.live.state import LiveState, Mailbox, SourceAge
 from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.robots.ur5e import JOINTS, arm_spec
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER
@@ -241,19 +239,17 @@ def test_the_mailbox_keeps_the_newest():
     assert not waiting.is_alive()
 
 
-def test_an_alarm_wakes_once_and_can_be_stopped():
-    alarm, woken = Alarm(), threading.Event()
-    alarm.ring()
-    alarm.ring()
-    alarm.wait(10.0)
-    thread = threading.Thread(target=lambda: (alarm.wait(10.0), woken.set()))
-    thread.start()
-    assert not woken.is_set()
-    alarm.ring()
-    thread.join(10.0)
-    assert woken.is_set()
-    alarm.ring()
-    alarm.stop()
-    began = time.monotonic()
-    alarm.wait(0.05)
-    assert time.monotonic() - began >= 0.05
+def test_a_command_is_answered_when_no_source_is_older(state):
+    def answered(stamp, tag):
+        message = joints(stamp)
+        message["header"]["frame_id"] = tag
+        return message
+
+    hear_all(state, 1.0)
+    assert not state.await_answer("bam1 s=a q=1", lambda: False, 0.01)
+    hear(state, "/joint_states", answered(2.0, "bam1 s=a q=1"))
+    assert not state.await_answer("bam1 s=a q=1", lambda: False, 0.01)  # the gripper's message is older
+    assert state.await_answer("bam1 s=a q=1", lambda: True, 0.0)
+    hear(state, "/gripper/joint_states", gripper(2.0))
+    assert state.await_answer("bam1 s=a q=1", lambda: False, 0.0)
+    assert state.echo() == ("a", 1)

@@ -10,7 +10,7 @@ import pytest
 from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.core.robot import Initial
 from bam_envs.live.building import live_robot
-from bam_envs.live.rosbridge import RosbridgeRobot
+from bam_envs.live.rosbridge_robot import RosbridgeRobot
 from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.robot_service import RobotService
 from bam_envs.remote.serve.served_robot import ServedRobot

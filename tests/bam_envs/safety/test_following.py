@@ -13,7 +13,7 @@ from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.core.robot import Initial, RobotState
 from bam_envs.core.robot_env import RobotEnv
 from bam_envs.safety.gate import SafeRobot
-from bam_envs.safety.guards import Limits
+from bam_envs.safety.guard import Limits
 from bam_envs.testing.drivers import DrivenRobot
 
 CHECKPOINTS = Path(__file__).parents[3] / "checkpoints"

@@ -26,7 +26,7 @@ from bam_envs.robots.physics.mir100 import SimulatedBase
 from bam_envs.robots.ur5e import GEOMETRY
 from bam_envs.safety.arm_guards import JointSpeed
 from bam_envs.safety.gate import ClearedCommand, SafeRobot
-from bam_envs.safety.guards import Guard, Limits
+from bam_envs.safety.guard import Guard, Limits
 from bam_envs.testing import ARM_HOME, RobotContract
 
 FIRST = np.zeros(1, np.int64)

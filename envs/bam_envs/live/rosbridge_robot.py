@@ -1,7 +1,7 @@
 """A live robot behind a rosbridge server, driven over topics at a fixed rate.
 
-Two connections: one carries states and commands; the other one carries nothing but the halt, since a ROS 2 bridge holds
-back everything behind a call that is running. While a connection is down nothing is sent and nothing is kept.
+It has two connections: one carries states and commands, the other one only the halt, because a ROS 2 bridge holds back
+everything behind a service call that is running. While a connection is down, nothing is sent and nothing is kept.
 
 Longer than other modules because it is one object with one lifecycle: connect, reset, step, halt, close.
 """
@@ -32,6 +32,7 @@ from bam_envs.core.errors import (
 from bam_envs.core.robot import Initial, RobotSpec, RobotState, Rows
 from bam_envs.core.timing import Pacer
 from bam_envs.live.bringup import (
+    LiveReadiness,
     TopicTypes,
     ask_info,
     await_first,
@@ -40,15 +41,12 @@ from bam_envs.live.bringup import (
     tagged_sinks,
     throttle,
 )
-from bam_envs.live.mailbox import Letter
-from bam_envs.live.readiness import LiveReadiness
-from bam_envs.live.rest import hold_command, places_of, rest_command
 from bam_envs.live.session import DrivingSession
-from bam_envs.live.state import LiveState
+from bam_envs.live.state import Letter, LiveState
 from bam_envs.ros.codec import HALT_TOPIC, SCENE_TOPIC, RobotInfo, encode_sink
 from bam_envs.ros.command_messages import has_room
 from bam_envs.ros.freshness import Tag
-from bam_envs.ros.profile_tables import RobotProfile
+from bam_envs.ros.profile_tables import RobotProfile, Sink
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.client_connection import bare_reason
 from bam_envs.rosbridge.endpoint import Endpoint
@@ -60,35 +58,33 @@ Array = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
 _HEARTBEAT, _LOST_AFTER = 0.2, 1.0
 ANSWER_TIMEOUT = 5.0
-"""Longest that a robot in lockstep takes for a period [s]."""
+"""Longest time that a robot in lockstep takes for a period [s]."""
 _RESET_TIMEOUT = 3.0
-"""Longest that a fresh state, or a scene, is waited for [s]."""
+"""Longest wait for a fresh state, or for a scene to be set [s]."""
 _HALT_WAITS = 0.05
-"""Longest that a halt waits for a command that is being sent, so as to come after it [s]."""
+"""Longest that a halt waits for a command that is being sent, so that it comes after it [s]."""
 _BY_HAND = "stop it by hand if it moves; a robot with a command timeout stops by itself"
 _HALT_NOT_SENT = f"%s: the halt could not be sent, %s: {_BY_HAND}."
 _AS_SAID = ". Nothing was sent, and nothing is kept"
 _FAR, _CANNOT_BE_FAR = 0.3, 1.0
-"""An arm that was commanded in the last second cannot be farther than this [rad] from its command."""
+"""An arm that was commanded in the last second [s] cannot be farther than this [rad] from its command."""
 _LATE = ("expired", "old message", "old connection")
-"""How the robot's side says that a command came too late: it holds, and the next one counts."""
+"""How the robot's side reports that a command came too late: it holds, and the next command counts."""
 
 
 class RosbridgeRobot:
     """One robot behind a rosbridge server; commands reach it only through a `SafeRobot`, which `live_robot` builds.
 
     Args:
-        url: ``ws://host:port`` or ``wss://host:port``, with a namespace behind it if its topics have one.
+        endpoint: Its rosbridge server, with a namespace behind the URL if its topics have one.
         profile: Its topics.
         spec: What the task needs; only these signals are subscribed, only these commands sent. None: everything that
             is not optional.
-        ca_file: PEM file of the authorities to trust instead of the system's.
-        token: Shared secret of the server.
-        command: Way of sending commands, such as ``"trajectory"``; None: the profile's default.
+        command: Command mode, such as ``"trajectory"``; None: the profile's default.
         clock: Monotonic clock [s].
 
     Raises:
-        InvalidValue: The address is none, or the robot does not measure, or take, what `spec` names.
+        InvalidValue: The address is not valid, or the robot does not measure, or take, what `spec` names.
         UnknownName: The profile has no such command mode.
     """
 
@@ -97,23 +93,20 @@ class RosbridgeRobot:
 
     def __init__(
         self,
-        url: str,
+        endpoint: Endpoint | str,
         profile: RobotProfile,
         *,
         spec: RobotSpec | None = None,
-        ca_file: str | None = None,
-        token: str | None = None,
         command: str | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        self._endpoint = Endpoint(endpoint) if isinstance(endpoint, str) else endpoint
+        self.url, self.namespace = self._endpoint.url, self._endpoint.address.namespace
         self._spec = profile.spec(spec, command)
         self.profile = profile.narrowed(self.spec.command.labels, command)
-        self.url = url
-        self.namespace = Endpoint(url).address.namespace
+        self._mode, self._sinks = command, self.profile.sinks(command)
         self._info = RobotInfo(self.profile.name)
-        self._hears_halts = False
-        self._way, self._sinks = command, self.profile.sinks(command)
-        self._ca_file, self._token = ca_file, token
+        self._describes_itself = False  # and so hears halts, and has sessions
         self._clock, self._state = clock, LiveState(self.profile, self.spec, clock)
         self._readiness: LiveReadiness | None = None  # of a robot that is real
         self._pacer, self._session = Pacer(self.spec.period, now=clock), DrivingSession()
@@ -123,15 +116,15 @@ class RosbridgeRobot:
         self._epoch = 0  # of the connection that was verified; another one needs a reset
         self._cut = threading.Event()
         self._sending, self._halts = threading.Lock(), 0
-        self._halt_failed = False  # and somebody was told
+        self._halt_failed = False  # and that was reported
         self._commanded = False  # since `connect`
         self._drove = False  # since the session was opened
-        self._session_over = False  # by the words of the robot's side
+        self._session_over = False  # as the robot's side said
         self._refusals: list[BamEnvsError] = []
         self._sent: Array | None = None
         self._sent_at = -math.inf
-        self._answers = False  # whether it says which command it has executed, while its time goes on
-        self._owed: dict[int, float] = {}  # number of the command -> when it was sent [s], of those without an answer
+        self._answers = False  # whether it reports which command it has executed, while its time goes on
+        self._owed: dict[int, float] = {}  # number of each command without an answer -> when it was sent [s]
 
     @property
     def spec(self) -> RobotSpec:
@@ -140,13 +133,13 @@ class RosbridgeRobot:
 
     @property
     def info(self) -> RobotInfo:
-        """What it says of itself; known after `connect`."""
+        """What the robot says of itself; known after `connect`."""
         return self._info
 
     def connect(self) -> None:
-        """Open both connections, learn who is there, and see that every topic is what the profile says.
+        """Open both connections, learn who is there, and check that every topic is what the profile says.
 
-        It is closed when Python ends, which halts it.
+        The robot is closed, and so halted, when Python ends.
 
         Raises:
             NoServer: There is no usable server.
@@ -156,7 +149,7 @@ class RosbridgeRobot:
         """
         if self._control is not None:
             return
-        control, halting = self._new_link("control"), self._new_link("halt")
+        control, halting = RosbridgeLink(self._endpoint, name="control"), RosbridgeLink(self._endpoint, name="halt")
         self._state.restart()
         try:
             self._open(control, halting)
@@ -168,9 +161,6 @@ class RosbridgeRobot:
             raise
         close_at_exit(self)
 
-    def _new_link(self, name: str) -> RosbridgeLink:
-        return RosbridgeLink(Endpoint(self.url, self._ca_file, self._token), name=name)
-
     def _open(self, control: RosbridgeLink, halting: RosbridgeLink) -> None:
         control.on_down(self._on_down)
         control.on_status(self._on_status)
@@ -178,9 +168,9 @@ class RosbridgeRobot:
         halting.connect()
         halting.heartbeat(_HEARTBEAT, _LOST_AFTER)
         said = ask_info(control)
-        self._hears_halts, self._info = said is not None, said or info_by_profile(self.url, self.profile)
+        self._describes_itself, self._info = said is not None, said or info_by_profile(self.url, self.profile)
         if said is not None:
-            self._sinks = tagged_sinks(self.profile, self._way, said)
+            self._sinks = tagged_sinks(self.profile, self._mode, said)
             require_period(said, self.spec.period)
             tagged = all(sink.tag and has_room(sink.type) for sink in self._sinks)
             self._answers = tagged and not said.lockstep
@@ -195,8 +185,8 @@ class RosbridgeRobot:
         """Subscribe states and advertise commands, with the types that they have there."""
         for topic, kind in self._state.topics.items():
             name = self.namespace + topic
-            # What describes itself sends no more than is needed; in lockstep every state is the answer to a command.
-            least = 0 if self._hears_halts else throttle(self.profile, topic, self.spec.period)
+            # A robot that describes itself sends no more than is needed; in lockstep each state answers a command.
+            least = 0 if self._describes_itself else throttle(self.profile, topic, self.spec.period)
             listener, kind = self._state.listener(topic), types.check(name, kind)
             control.subscribe(name, kind, listener, throttle_ms=least, queue_length=1 if least else 0)
         for sink in self._sinks:
@@ -207,7 +197,7 @@ class RosbridgeRobot:
         halting.advertise(self.namespace + HALT_TOPIC, "std_msgs/Empty")
 
     def _begin(self, control: RosbridgeLink) -> None:
-        """From now on this connection counts; what came over an older one does not."""
+        """From now on this connection counts; messages of an older one do not."""
         self._cut.clear()
         self._epoch = control.epoch
         self._state.forget_ages()
@@ -221,24 +211,19 @@ class RosbridgeRobot:
         self._sent = None
 
     def _open_session(self, control: RosbridgeLink) -> None:
-        """From now on commands are signed for a new session, where the robot's side has such."""
-        if self._hears_halts:
+        """From now on commands are signed for a new session, if the robot's side has sessions."""
+        if self._describes_itself:
             self._session.open(control)
         self._drove = self._session_over = False
-
-    def _answered_session(self) -> str | None:
-        echo = self._state.echo()
-        return None if echo is None else echo[0]
 
     def _on_down(self, error: LinkLost) -> None:
         self._cut.set()
         self._state.mailbox.clear()
         if self._readiness is not None:
             self._readiness.forget()
-        self._state.stop_waiting()
 
     def _on_status(self, status: Mapping[str, Any]) -> None:
-        """The server, or the robot's side behind it, says that something does not work."""
+        """The server, or the robot's side behind it, reports an error."""
         if self._readiness is not None and self._readiness.owns(status, self.namespace):
             return
         if status.get("level") == "error":
@@ -248,18 +233,14 @@ class RosbridgeRobot:
                 refusal = NotInCommand if " in command" in text else RemoteError
                 error = refusal(f"{self.url}: {text}")
                 self._session_over |= is_over(error)
-                self._on_refusal(error)
-
-    def _on_refusal(self, error: BamEnvsError) -> None:
-        """The command that was sent last is refused, there or here."""
-        if not self._refusals:  # the first one is told, however many a server sends
-            self._refusals.append(error)
-        self._state.stop_waiting()
+                if not self._refusals:  # the first one is raised, however many a server sends
+                    self._refusals.append(error)
+                self._state.mailbox.wake()
 
     def reset(self, rows: Rows, initial: Initial) -> RobotState:
         """A fresh state. Nothing real moves; a simulated robot is at rest, its object where `initial` says.
 
-        After the link dropped and is back, this is what makes the robot usable again.
+        After the link has dropped and is back, this makes the robot usable again.
 
         Raises:
             LinkLost: The link is down.
@@ -271,7 +252,7 @@ class RosbridgeRobot:
         control.wait_up(_RESET_TIMEOUT)
         if control.epoch != self._epoch or self._cut.is_set():
             self._begin(control)
-        elif self._session_over or (self._drove and self._answered_session() != self._session.tagger.session):
+        elif self._session_over or (self._drove and self._state.echo()[0] != self._session.tagger.session):
             self._open_session(control)  # the robot's side began anew, and does not know the old one
         self._refusals.clear()
         self._require_ready(self.not_ready())
@@ -284,19 +265,18 @@ class RosbridgeRobot:
     def _set_scene(self, control: RosbridgeLink, initial: Initial) -> None:
         pose = initial.signals.get("object_pose")
         scene = {"object_pose": None if pose is None else pose.tolist(), "seeds": np.asarray(initial.seeds).tolist()}
+        self._drive()
         rpc = StringRpc(control, self.namespace + SCENE_TOPIC, self._session.tagger)
-        self._drove = True
-        self._session.drive()
         try:
             rpc.call(scene, _RESET_TIMEOUT)
         finally:
             rpc.close()
         before = {name: letter.number for name, letter in self._state.mailbox.newest().items()}
-        # Two more of each: one may have been on its way when the scene was set.
+        # Two more of each: one may have been under way when the scene was set.
         self._await(lambda slots: all(slots[name].number >= number + 2 for name, number in before.items()))
 
     def _await(self, ready: Callable[[Mapping[str, Letter]], bool]) -> None:
-        """Wait until the messages are what `ready` wants, or the link drops."""
+        """Wait until `ready` is true of the messages, or the link drops."""
         if not self._state.mailbox.wait_for(lambda slots: self._cut.is_set() or ready(slots), _RESET_TIMEOUT):
             age, limit = self._state.age(), self.profile.max_age
             raise StaleState(f"{self.url}: no fresh state in {_RESET_TIMEOUT:g} s. Does the robot run?", age, limit)
@@ -305,7 +285,7 @@ class RosbridgeRobot:
     def step(self, command: Array | ClearedCommand) -> RobotState:
         """Send a command that passed the guards (any other is refused), and return the state at the end of the period.
 
-        A simulated robot whose time goes on only with commands is waited for; else the period ends when it ends.
+        A simulated robot in lockstep, whose time advances with commands only, ends the period with its answer.
 
         Raises:
             ResetNeeded: Not connected.
@@ -317,59 +297,46 @@ class RosbridgeRobot:
             StaleState: The robot did not answer in time.
             ProtocolError: The state is not what the profile says.
         """
-        control = self._connected()
+        control, halts = self._connected(), self._halts
         if not isinstance(command, ClearedCommand):
             raise InvalidValue("Commands reach a live robot only through SafeRobot. Build it with live_robot(...).")
         told = command.for_robot(self)[0]
         self._require_link()
         self._require_accepted()
-        # Where no time passes between commands, a late one does no harm before it is given up.
-        tag = self._session.tagger.next(self._epoch, ANSWER_TIMEOUT if self.info.lockstep else self._command_life)
-        if self.info.lockstep:
-            self._ask(control, told, tag)
+        lockstep = self.info.lockstep  # no time passes between commands: a late one does no harm until it is given up
+        tag = self._session.tagger.next(self._epoch, ANSWER_TIMEOUT if lockstep else self._command_life)
+        self._pacer.tick()
+        self._send(control, told, tag, halts)
+        if lockstep:
+            self._await_answer(tag)
         else:
-            self._pacer.tick()
-            self._send(control, told, tag)
             self._cut.wait(max(0.0, self._pacer.slack))
         self._require_link()
         self._require_accepted()
         return self.measure()
 
-    def _send(self, control: RosbridgeLink, command: Array, tag: Tag) -> None:
-        """Every part of `command` (m,); nothing after a halt."""
-        halts, messages = self._halts, self._messages(control, command, tag)
+    def _send(self, control: RosbridgeLink, command: Array, tag: Tag, halts: int) -> None:
+        """Send every part of `command` (m,), unless there were more than `halts` halts: one came after `step` began."""
+        ros1, sign = control.ros == "ros1", self._session.tagger.sign
+        envelopes = [encode_sink(sink, self.spec, command, tag, sign=sign, ros1=ros1) for sink in self._sinks]
         with self._sending:
             if self._halts == halts:
-                self._note_driving()
-                control.publish_all(messages)
+                self._commanded = True
+                self._drive()
+                control.publish_all([(self.namespace + topic, message) for topic, _, message in envelopes])
                 self._sent, self._sent_at = command.copy(), self._clock()
                 if self._answers:
                     self._owed[tag.sequence] = self._sent_at
 
-    def _ask(self, control: RosbridgeLink, command: Array, tag: Tag) -> None:
-        """Send as `_send`, and wait for the answer."""
-        halts, messages = self._halts, self._messages(control, command, tag)
-        self._state.expect(tag.echo)
-        with self._sending:
-            if self._halts == halts:
-                self._note_driving()
-                control.publish_all(messages)
-                self._sent = command.copy()
-        self._await_answer()
-
-    def _note_driving(self) -> None:
-        self._commanded = self._drove = True
+    def _drive(self) -> None:
+        self._drove = True
         self._session.drive()
 
-    def _messages(self, control: RosbridgeLink, command: Array, tag: Tag) -> list[tuple[str, dict[str, Any]]]:
-        """Topics and messages that send `command` (m,)."""
-        ros1 = control.ros == "ros1"
-        sign = self._session.tagger.sign
-        envelopes = [encode_sink(sink, self.spec, command, tag, sign=sign, ros1=ros1) for sink in self._sinks]
-        return [(self.namespace + topic, message) for topic, _, message in envelopes]
+    def _await_answer(self, tag: Tag) -> None:
+        def stopped() -> bool:
+            return self._cut.is_set() or bool(self._refusals)
 
-    def _await_answer(self) -> None:
-        if not self._state.await_answer(lambda: self._cut.is_set() or bool(self._refusals), ANSWER_TIMEOUT):
+        if not self._state.await_answer(tag.echo, stopped, ANSWER_TIMEOUT):
             raise StaleState(
                 f"{self.url}: no state answered the command in {ANSWER_TIMEOUT:g} s. Does the simulation run?",
                 self.age(),
@@ -377,32 +344,32 @@ class RosbridgeRobot:
             )
 
     def measure(self) -> RobotState:
-        """The newest state, and what was sent last.
+        """The newest state, with the command that was sent last.
 
         Raises:
             ResetNeeded: Not connected.
-            StaleState: Nothing came yet.
+            StaleState: No message has arrived yet.
             ProtocolError: A message is not what the profile says.
         """
         self._connected()
         signals, stamp = self._state.read()
-        command = rest_command(self.spec, self._sinks, signals) if self._sent is None else self._sent
+        command = _rest_command(self.spec, self._sinks, signals) if self._sent is None else self._sent
         return RobotState(signals, np.array([stamp]), command[None].copy())
 
     def age(self) -> float:
-        """Age of the state [s]: the oldest of its sources, by stamp or by arrival; infinite if one never came.
+        """Age of the state [s], by its oldest source; infinite without a message of one.
 
-        In lockstep it is 0: between two commands no time passes there.
+        In lockstep it is 0: no time passes between two commands.
         """
         age = self._state.age()
         return 0.0 if self.info.lockstep and math.isfinite(age) else age
 
     def waiting(self) -> float:
-        """For how long the robot has owed the answer to a command [s]; 0 where it owes none, or gives none."""
-        echo = self._state.echo()
-        if echo is not None and echo[0] == self._session.tagger.session:
+        """How long the robot has owed the answer to a command [s]; 0 if it owes none, or never answers."""
+        session, answered = self._state.echo()
+        if session == self._session.tagger.session:
             for number in list(self._owed):
-                if number <= echo[1]:  # executed, or replaced by one that was
+                if number <= answered:  # executed, or replaced by one that was
                     self._owed.pop(number, None)
         owed = list(self._owed.values())  # a halt in another thread clears it
         return self._clock() - owed[0] if owed else 0.0
@@ -411,14 +378,14 @@ class RosbridgeRobot:
         """Stop moving and keep the link, on the connection that does nothing else. From any thread; never raises."""
         self._halts += 1
         halting = self._halting
-        self._owed.clear()  # what has not been executed is not any more
+        self._owed.clear()  # commands that were not executed yet will not be
         if halting is None:
             return
         first = self._sending.acquire(timeout=_HALT_WAITS)
         try:
             self._publish_halt(halting)
             self._halt_failed = False
-        except BamEnvsError as error:  # told once: several threads and `close` try it too
+        except BamEnvsError as error:  # reported once: several threads and `close` try it too
             if not self._halt_failed:
                 _LOG.warning(_HALT_NOT_SENT, self.url, bare_reason(halting.url, error).removesuffix(_AS_SAID))
             self._halt_failed = True
@@ -428,33 +395,33 @@ class RosbridgeRobot:
 
     def _publish_halt(self, halting: RosbridgeLink) -> None:
         halting.publish(self.namespace + HALT_TOPIC, {})
-        if self._hears_halts:
+        if self._describes_itself:
             return
         hold = self._hold()
         tag = self._session.tagger.next(self._epoch, self._command_life)
         for sink in self._sinks:
-            if np.isfinite(hold[places_of(self.spec, sink)]).all():  # what is not known is not commanded
+            if np.isfinite(hold[_places(self.spec, sink)]).all():  # what is unknown is not commanded
                 topic, _, message = encode_sink(sink, self.spec, hold, tag, ros1=halting.ros == "ros1")
                 halting.publish(self.namespace + topic, message)
 
     def _hold(self) -> Array:
         """What a halt sends, NaN for nothing. Shape: (m,)."""
         try:
-            # To go back to where it was some time ago would be a motion.
+            # Going back to where the robot was some time ago would be a motion.
             signals = self._state.signals() if self._state.age() <= self.profile.max_age else {}
-        except BamEnvsError:  # what it measures cannot be read: it holds what it was sent
+        except BamEnvsError:  # the measurement cannot be read: hold what was sent
             signals = {}
-        hold = hold_command(self.spec, self._sinks, signals, self._sent)
+        hold = _hold_command(self.spec, self._sinks, signals, self._sent)
         if self._sent is None or self._clock() - self._sent_at > _CANNOT_BE_FAR:
             return hold
         joints = np.array([unit == "rad" for unit in self.spec.command.units])
-        if (np.abs(hold - self._sent)[joints] > _FAR).any():  # guards let no joint get so far: it is measured wrongly
+        if (np.abs(hold - self._sent)[joints] > _FAR).any():  # no guard lets it get so far: wrongly measured
             hold[joints] = self._sent[joints]
         return hold
 
     def close(self) -> None:
         """Halt what was commanded from here, then drop both connections. As often as one likes."""
-        if self._commanded:  # who only looked moves nothing, and stops nobody else
+        if self._commanded:  # a client that only looked must not stop another one
             self.halt()
         self._session.leave()
         control, halting = self._control, self._halting
@@ -474,7 +441,7 @@ class RosbridgeRobot:
         """Both connections are up, and have been since `connect` or `reset`."""
         control, halting = self._connected(), self._halting
         if not control.is_up:
-            self._halt_failed = self._commanded  # as is said here
+            self._halt_failed = self._commanded  # this error reports it
             advice = f"; {_BY_HAND}" if self._commanded else ""
             raise LinkLost(f"{self.url}: the link is down. Nothing was sent, and nothing is kept{advice}.")
         if self._cut.is_set() or control.epoch != self._epoch:
@@ -483,9 +450,9 @@ class RosbridgeRobot:
             raise LinkLost(f"{self.url}: the connection that halts the robot is down. Nothing is sent without it.")
 
     def not_ready(self) -> str | None:
-        """Why the robot cannot move now, by its own words; None if it does not say so, or is not connected.
+        """Why the robot cannot move now, as it says itself; None if it does not say so, or is not connected.
 
-        Not while commands are sent: it may ask the server, which takes a while.
+        Not to be called while commands are sent: it may ask the server, which takes a while.
         """
         control = self._control
         return None if control is None or self._readiness is None else self._readiness.not_ready(control)
@@ -501,3 +468,46 @@ class RosbridgeRobot:
             refusal = self._refusals[0]
             self._refusals.clear()
             raise refusal
+
+
+def _rest_command(spec: RobotSpec, sinks: tuple[Sink, ...], signals: Mapping[str, Array]) -> Array:
+    """The command of a robot at rest: speeds 0, the rest as measured, NaN where it is not. Shape: (m,).
+
+    A number of the command is measured by the number of a signal with the same label and unit.
+    """
+    measured = {
+        (label, unit): signals[signal.name][0, column]
+        for signal in reversed(spec.signals)
+        if signal.name in signals
+        for column, (label, unit) in enumerate(zip(signal.labels, signal.units, strict=True))
+    }
+    pairs = zip(spec.command.labels, spec.command.units, strict=True)
+    rest = np.array([measured.get(pair, np.nan) for pair in pairs])
+    for sink in sinks:
+        if sink.hold == "zero":
+            rest[_places(spec, sink)] = 0.0
+    return rest
+
+
+def _hold_command(spec: RobotSpec, sinks: tuple[Sink, ...], signals: Mapping[str, Array], sent: Array | None) -> Array:
+    """What a halt sends, NaN for nothing: each sink of the profile says how it holds. Shape: (m,).
+
+    Args:
+        spec: Of the robot.
+        sinks: Where commands go.
+        signals: The newest state; empty if it cannot be read.
+        sent: What was sent last. Shape: (m,). None if nothing was.
+    """
+    hold = _rest_command(spec, sinks, signals)
+    for sink in sinks:
+        places = _places(spec, sink)
+        if sent is None and sink.hold == "last":
+            hold[places] = np.nan
+        elif sent is not None and (sink.hold == "last" or not np.isfinite(hold[places]).all()):
+            hold[places] = sent[places]
+    return hold
+
+
+def _places(spec: RobotSpec, sink: Sink) -> list[int]:
+    """Indices of the numbers of `sink` in a command."""
+    return [spec.command.labels.index(label) for label in sink.labels]
