@@ -8,8 +8,8 @@ from typing import Any
 import gymnasium as gym
 from gymnasium import Space
 
-from bam_envs.core.errors import InvalidValue
 from bam_envs.core.registry import resolve_id
+from bam_envs.core.validation import PositiveInt, check
 from bam_envs.remote.gymapi.codec import DEFAULT, EnvCodec
 from bam_envs.remote.gymapi.versions import Version, version_named
 from bam_envs.remote.transport import EnvSpecMessage, Info
@@ -20,24 +20,22 @@ class ForeignRack:
     """A rack whose server is not of bam-train."""
 
     observation_space: Space[Any] | None = None
-    """Of one row."""
+    """Of a single environment."""
     action_space: Space[Any] | None = None
-    """Of one row."""
+    """Of a single environment."""
     num_envs: int = 1
-    """Rows (arms); they begin their episodes together."""
+    """Environments (arms); they begin their episodes together."""
     period: float | None = None
     """Time between two actions [s]; None if nobody knows."""
     action_type: int = DEFAULT
-    """What it is to do with an action: 1 default, 2 pick and lift, 3 pick and place, 4 open, 5 fold."""
-
+    """What it does with an action: 1 default, 2 pick and lift, 3 pick and place, 4 open, 5 fold."""
     gymapi_version: str | None = None
     """Version of its messages; None to find out by its first answer."""
     autoreset: bool | None = None
     """Whether it begins the next episode in the step that ends one; None: as racks of its version do, from June on."""
 
     def __post_init__(self) -> None:
-        if self.num_envs < 1:
-            raise InvalidValue(f"num_envs must be at least 1, not {self.num_envs}.")
+        check(self.num_envs, PositiveInt, "num_envs")
         self.version  # noqa: B018 - refuses a name that is none
 
     @property
@@ -50,6 +48,10 @@ class ForeignRack:
         """Whether both spaces were given."""
         return self.observation_space is not None and self.action_space is not None
 
+    def begins_next(self, version: Version | None) -> bool:
+        """Whether its observation at the end of an episode is the first one of the next, if it speaks `version`."""
+        return (version is not None and version.june) if self.autoreset is None else self.autoreset
+
     def codec(self, env_id: str) -> EnvCodec:
         """How values travel; spaces that were not given are those of the environment registered here as `env_id`.
 
@@ -58,21 +60,19 @@ class ForeignRack:
         """
         observation_space, action_space = self.observation_space, self.action_space
         if observation_space is None or action_space is None:
-            observation_space, action_space = _registered_spaces(env_id)
-        vector = self.num_envs > 1
-        name = env_id or "rack"
+            env: gym.Env[Any, Any] = gym.make(resolve_id(env_id))
+            observation_space, action_space = env.observation_space, env.action_space
+            env.close()  # type: ignore[no-untyped-call]
         spec = EnvSpecMessage(
-            name, observation_space, action_space, self.num_envs, vector=vector, autoreset=False, period=self.period
+            env_id or "rack",
+            observation_space,
+            action_space,
+            self.num_envs,
+            vector=self.num_envs > 1,
+            autoreset=False,
+            period=self.period,
         )
         return EnvCodec(spec, foreign=True, action_type=self.action_type)
-
-
-def _registered_spaces(env_id: str) -> tuple[Space[Any], Space[Any]]:
-    env: gym.Env[Any, Any] = gym.make(resolve_id(env_id))
-    try:
-        return env.observation_space, env.action_space
-    finally:
-        env.close()  # type: ignore[no-untyped-call]
 
 
 class LastKnown:
@@ -86,7 +86,7 @@ class LastKnown:
         self._observation: Any = None
 
     def begin(self, observation: Any) -> None:
-        """Episodes begin with `observation`, a list of rows of a vector environment."""
+        """Episodes begin with `observation`, or a list of them."""
         self._observation = observation
 
     def instead(self, result: tuple[Any, Any, Any, Any, Any], vector: bool) -> tuple[Any, Any, Any, Any, Any]:
@@ -98,8 +98,8 @@ class LastKnown:
                 observation, info = before, _stale(info)
         else:
             ended = [done or cut for done, cut in zip(terminated, truncated, strict=True)]
-            observation = [before[row] if end else observation[row] for row, end in enumerate(ended)]
-            info = [_stale(info[row]) if end else info[row] for row, end in enumerate(ended)]
+            observation = [before[i] if end else observation[i] for i, end in enumerate(ended)]
+            info = [_stale(info[i]) if end else info[i] for i, end in enumerate(ended)]
         return observation, reward, terminated, truncated, info
 
 

@@ -7,11 +7,12 @@ import socket
 import threading
 import time
 from contextlib import suppress
-from typing import Any
+from typing import Any, Literal
 
 from gymnasium import Space
 
-from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, ProtocolError, RemoteError, UnknownName
+from bam_envs.core.errors import LinkLost, NoServer, ProtocolError, RemoteError, UnknownName
+from bam_envs.core.validation import check
 from bam_envs.remote.foreign_rack import ForeignRack, LastKnown
 from bam_envs.remote.gymapi.codec import DEFAULT, EnvCodec
 from bam_envs.remote.gymapi.messages import (
@@ -26,7 +27,7 @@ from bam_envs.remote.gymapi.messages import (
     whole_request,
     write_request,
 )
-from bam_envs.remote.transport import EnvSpecMessage, Info, plain_seed, spec_from_json, spec_to_json
+from bam_envs.remote.transport import EnvSpecMessage, Info, Seed, plain_seed, spec_from_json, spec_to_json
 from bam_envs.ros.freshness import Tagger
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
@@ -36,7 +37,6 @@ from bam_envs.rosbridge.string_rpc import StringRpc
 _QUESTIONS = 3
 """How often it is asked who it is: a ROS 2 bridge makes a client for each call, and the answer is lost where it comes
 before the two ends have found each other."""
-CHANNELS = ("service", "topics")
 _CLOSE_TIMEOUT = 1.0  # [s]; a server that is gone must not hold up `close`
 
 
@@ -53,7 +53,7 @@ class RosbridgeTransport:
             which is several times faster through a real rosbridge.
         timeout: Longest time for a request [s]; a rack's pick takes seconds.
         connect_timeout: Longest time to connect [s].
-        name: What other clients are told of this one; computer and process by default.
+        name: The name of this client that others are told; computer and process by default.
         ca_file: PEM file of the authorities to trust instead of the system's.
         token: The server's shared secret, if it has one.
         take: Take command from whoever has it.
@@ -69,7 +69,7 @@ class RosbridgeTransport:
         url: str,
         env_id: str = "",
         *,
-        channel: str = "service",
+        channel: Literal["service", "topics"] = "service",
         timeout: float = 30.0,
         connect_timeout: float = 3.0,
         name: str | None = None,
@@ -84,28 +84,23 @@ class RosbridgeTransport:
         gymapi_version: str | None = None,
         autoreset: bool | None = None,
     ) -> None:
-        if channel not in CHANNELS:
-            raise InvalidValue(f"The channel must be service or topics, not {channel!r}.")
-        if timeout <= 0 or connect_timeout <= 0:
-            raise InvalidValue(f"Time-outs must be above 0 s, not {timeout:g} and {connect_timeout:g}.")
-        self.url, self.env_id, self.channel = url, env_id, channel
-        self.timeout, self.connect_timeout, self.take = timeout, connect_timeout, take
+        self.endpoint = Endpoint(url, ca_file, token, connect_timeout, timeout)
+        self.channel = check(channel, Literal["service", "topics"], "channel")
+        self.url, self.env_id, self.timeout, self.take = url, env_id, timeout, take
         self._rack = ForeignRack(
             observation_space, action_space, num_envs, period, action_type, gymapi_version, autoreset
         )
         self._version, self._last_known = self._rack.version, LastKnown()
-        self._name, self._tagger, self._lock = name, Tagger(), threading.Lock()
-        self._ca_file, self._token = ca_file, token
-        self._link = self._make_link()
-        self._rpc = self._make_rpc()
-        self._pid = os.getpid()
+        self._name, self._lock, self._closed = name, threading.Lock(), False
         self._there: EnvCodec | None = None
         self._described_epoch: int | None = None
         self._known_epoch: int | None = None  # of the connection on which the state over there is known
-        self._closed = False
+        self._link = self._make_link()
+        self._base = base_name(self._link.namespace)
+        self._begin_process()
 
     def connect(self) -> EnvSpecMessage:
-        """Open the link and learn what is there; moves nothing.
+        """Open the link and ask what is there; moves nothing.
 
         Raises:
             NoServer: Nobody there, no such environment, or another rack whose spaces were not given.
@@ -113,16 +108,17 @@ class RosbridgeTransport:
         with self._lock:
             return self._connect().spec
 
-    def reset(self, seed: int | list[int | None] | None = None, options: Info | None = None) -> tuple[Any, Any]:
+    def reset(self, seed: Seed = None, options: Info | None = None) -> tuple[Any, Any]:
         """Begin an episode; waits for a link that dropped as long as connecting may take."""
         with self._lock:
             there = self._connect()
             self._known_epoch = None
-            request: dict[str, Any] = {"seed": plain_seed(seed), "options": options, "take": self.take}
+            plain = plain_seed(seed)
             if there.foreign:
-                refuse_foreign(request["seed"], options)
+                refuse_foreign(plain, options)
             epoch = self._link.epoch
-            observation, *_, info = there.read_result(self._ask(RequestType.RESET, **request))
+            response = self._ask(RequestType.RESET, seed=plain, options=options, take=self.take)
+            observation, *_, info = there.read_result(response)
             self._known_epoch = epoch
             self._last_known.begin(observation)
             return observation, info
@@ -138,25 +134,25 @@ class RosbridgeTransport:
             if there is None or self._closed or self._known_epoch != self._link.epoch or os.getpid() != self._pid:
                 raise LinkLost(f"{self.url}: {self._why_unknown()}, and nothing was sent. Call reset() first.")
             result = there.read_result(self._ask(RequestType.STEP, actions=there.write_actions(action)))
-            return self._last_known.instead(result, there.spec.vector) if self._begins_next(there) else result
+            if there.foreign and self._rack.begins_next(self._version):
+                return self._last_known.instead(result, there.spec.vector)
+            return result
 
     def close(self) -> None:
-        """Let go of the environment there and drop the link; a request under way ends with `LinkLost`."""
+        """Release the environment there and drop the link; a request under way ends with `LinkLost`."""
         if os.getpid() != self._pid:
             return  # the link is the parent's
         self._closed = True
         if self._lock.acquire(blocking=False):
             try:
-                self._leave()
+                if self._there is not None and self._link.is_up:
+                    # A server of ours finds out by itself that the link is gone.
+                    with suppress(LinkLost, ProtocolError, RemoteError):
+                        self._ask(RequestType.CLOSE, timeout=min(self.timeout, _CLOSE_TIMEOUT))
             finally:
                 self._lock.release()
         self._rpc.close()
         self._link.close()
-
-    def _begins_next(self, there: EnvCodec) -> bool:
-        """Whether what it observes at the end of an episode is the first observation of the next one."""
-        by_version = self._version is not None and self._version.june
-        return there.foreign and (by_version if self._rack.autoreset is None else self._rack.autoreset)
 
     def _why_unknown(self) -> str:
         if self._closed:
@@ -165,28 +161,23 @@ class RosbridgeTransport:
             return "the link is not open"
         return "the link was lost, so what the environment did since is unknown"
 
-    def _leave(self) -> None:
-        if self._there is not None and self._link.is_up:
-            # A server of ours finds out by itself that the link is gone.
-            with suppress(LinkLost, ProtocolError, RemoteError):
-                self._ask(RequestType.CLOSE, timeout=min(self.timeout, _CLOSE_TIMEOUT))
+    def _make_link(self) -> Any:
+        return RosbridgeLink(self.endpoint, name="gymapi")
 
-    def _make_link(self) -> RosbridgeLink:
-        return RosbridgeLink(Endpoint(self.url, self._ca_file, self._token, self.connect_timeout), name="gymapi")
-
-    def _make_rpc(self) -> StringRpc:
-        return StringRpc(self._link, base_name(self._link.namespace), self._tagger)
+    def _begin_process(self) -> None:
+        self._pid, self._tagger = os.getpid(), Tagger()
+        self._rpc = StringRpc(self._link, self._base, self._tagger)
 
     def _connect(self) -> EnvCodec:
         if self._closed:
             raise LinkLost(f"{self.url}: this transport is closed; make a new one.")
         if os.getpid() != self._pid:  # after a fork the link is the parent's, which must not notice
-            self._link, self._pid, self._tagger = self._make_link(), os.getpid(), Tagger()
-            self._rpc, self._there = self._make_rpc(), None
+            self._link, self._there = self._make_link(), None
+            self._begin_process()
         if self._there is None:
             self._link.connect()
         else:
-            self._link.wait_up(self.connect_timeout)
+            self._link.wait_up(self.endpoint.connect_timeout)
         if self._there is None or self._described_epoch != self._link.epoch:
             self._there = self._described()
             if self.channel == "topics" and not self._there.foreign and not self._tagger.signs:
@@ -194,10 +185,10 @@ class RosbridgeTransport:
         return self._there
 
     def _open_session(self) -> None:
-        """What is asked on topics can be read by everybody, and is signed."""
-        service = f"{base_name(self._link.namespace)}/session"
+        """Everybody can read requests on topics: they are signed."""
+        service = f"{self._base}/session"
         try:
-            answer = self._link.call(service, "std_srvs/Trigger", {}, self.connect_timeout)
+            answer = self._link.call(service, "std_srvs/Trigger", {}, self.endpoint.connect_timeout)
         except RemoteError:  # an older server
             return
         self._sign_with(read_session(answer, service))
@@ -205,7 +196,7 @@ class RosbridgeTransport:
     def _sign_with(self, tagger: Tagger) -> None:
         self._rpc.close()
         self._tagger = tagger
-        self._rpc = self._make_rpc()
+        self._rpc = StringRpc(self._link, self._base, tagger)
 
     def _described(self) -> EnvCodec:
         """What is there on this connection; it must be what was there on the one before."""
@@ -234,7 +225,8 @@ class RosbridgeTransport:
     def _introduction(self, questions: int = _QUESTIONS) -> GymResponse:
         """What it answers when it is asked who it is; asked again while nothing comes, for that moves nothing."""
         try:
-            return self._exchange(RequestType.NONE, None, timeout=max(self.connect_timeout, 1.0) / _QUESTIONS)
+            limit = max(self.endpoint.connect_timeout, 1.0) / _QUESTIONS
+            return self._exchange(RequestType.NONE, None, timeout=limit)
         except RemoteError as error:
             if not is_over(error):
                 raise
@@ -246,24 +238,21 @@ class RosbridgeTransport:
         return self._introduction(questions - 1)
 
     def _foreign(self, reason: str) -> EnvCodec:
+        namespace = f" --namespace {self._link.namespace.strip('/')}" if self._link.namespace else ""
+        remedy = f"Start one: bam-serve --env {self.env_id or 'bam/pick'}{namespace}"
         if "does not exist" in reason:  # the words of every bridge but one, whose text does not say
-            raise NoServer(self.url, f"{reason}. {self._remedy()}")
+            raise NoServer(self.url, f"{reason}. {remedy}")
         try:
             return self._rack.codec(self.env_id)
         except UnknownName as error:
             raise NoServer(
                 self.url,
                 f"{self._where()}: {reason.rstrip('.')}; give observation_space and action_space, or an env_id that is "
-                f"registered here. {self._remedy()}",
+                f"registered here. {remedy}",
             ) from error
 
     def _where(self) -> str:
-        namespace = self._link.namespace
-        return service_name(namespace) if self.channel == "service" else f"{base_name(namespace)}/request"
-
-    def _remedy(self) -> str:
-        namespace = f" --namespace {self._link.namespace.strip('/')}" if self._link.namespace else ""
-        return f"Start one: bam-serve --env {self.env_id or 'bam/pick'}{namespace}"
+        return service_name(self._link.namespace) if self.channel == "service" else f"{self._base}/request"
 
     def _ask(self, kind: RequestType, **fields: Any) -> GymResponse:
         """A success. Whatever else comes but a refusal, the state over there is unknown until the next reset."""

@@ -29,6 +29,7 @@ from bam_envs.remote.tcp_wire import (
 from bam_envs.remote.transport import EnvSpecMessage, Info, Seed, plain_seed, spec_from_json, spec_to_json
 from bam_envs.remote.values import Tree, plain_info
 from bam_envs.ros.freshness import Tagger
+from bam_envs.rosbridge.endpoint import Endpoint
 
 _LEAVE_TIMEOUT = 1.0  # [s]; a server that is gone must not hold up `close`
 
@@ -62,10 +63,10 @@ class TcpTransport:
         name: str | None = None,
         take: bool = False,
     ) -> None:
-        self.url, self.env_id, self.timeout, self.connect_timeout = url, env_id, timeout, connect_timeout
-        self.take = take
+        self.endpoint = Endpoint(url, None, token, connect_timeout, timeout)
+        self.url, self.env_id, self.timeout, self.take = url, env_id, timeout, take
         self._host, self._port = _address(url)
-        self._token, self._name = token or "", name
+        self._name = name
         self._tagger, self._epoch = Tagger(), 0
         self._lock = threading.Lock()
         self._frames: FrameSocket | None = None
@@ -147,38 +148,34 @@ class TcpTransport:
             self._tagger, self._epoch = Tagger(), 0
 
     def _open(self) -> EnvSpecMessage:
-        deadline = time.monotonic() + self.connect_timeout
+        deadline = time.monotonic() + self.endpoint.connect_timeout
+        start = f"bam-serve --env {self.env_id or 'bam/pick'} --tcp"
         try:
             self._frames = FrameSocket(_dial(self._host, self._port, deadline))
         except OSError as error:
-            raise NoServer(self.url, f"{self._unreachable(error)}. {self._remedy()}") from error
+            raise NoServer(self.url, f"{self._unreachable(error)}. Start one: {start} {self._port}") from error
         self._pid, self._epoch = os.getpid(), self._epoch + 1
         name = self._name or f"{socket.gethostname()}:{self._pid}"
-        hello = Hello(self._tagger.session, self._epoch, name, self._token, self.env_id)
+        hello = Hello(self._tagger.session, self._epoch, name, self.endpoint.token or "", self.env_id)
         try:
             self._frames.send(encode(["hello", hello]), deadline)
             return spec_from_json(content_of(self._frames.receive(deadline), 0))
         except (ForeignPeer, RemoteError) as error:
             raise NoServer(self.url, f"{error}") from error
         except (LinkLost, ProtocolError) as error:
-            raise NoServer(self.url, f"not a bam-serve TCP server: {error}. {self._other_port()}") from error
+            remedy = f"If it is rosbridge, use ws://; else start one at a free port: {start} PORT"
+            raise NoServer(self.url, f"not a bam-serve TCP server: {error}. {remedy}") from error
 
     def _unreachable(self, error: OSError) -> str:
         if isinstance(error, ConnectionRefusedError):
             return "nobody listens there (is the port open?)"
         if isinstance(error, TimeoutError):
-            return f"no answer within {self.connect_timeout:g} s (is the address right, and no firewall between?)"
+            return (
+                f"no answer within {self.endpoint.connect_timeout:g} s (is the address right, and no firewall between?)"
+            )
         if isinstance(error, socket.gaierror):
             return f"no computer is known by the name {self._host!r}"
         return error.strerror or str(error)
-
-    def _remedy(self) -> str:
-        return f"Start one: bam-serve --env {self.env_id or 'bam/pick'} --tcp {self._port}"
-
-    def _other_port(self) -> str:
-        """The remedy where something else has the port."""
-        start = f"bam-serve --env {self.env_id or 'bam/pick'} --tcp PORT"
-        return f"If it is rosbridge, use ws://; else start one at a free port: {start}"
 
     def _tag(self, limit: float) -> TagMessage:
         return tag_message(self._tagger.next(self._epoch, limit))

@@ -46,8 +46,9 @@ from msgspec.msgpack import Ext
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NotInCommand, ProtocolError, RemoteError
+from bam_envs.core.wording import brief
 from bam_envs.remote.transport import EnvSpecMessage
-from bam_envs.remote.values import Tree, exact, number_dtype, pack, shown
+from bam_envs.remote.values import Tree, exact, number_dtype, pack
 from bam_envs.ros.freshness import Tag
 
 MARK, VERSION = b"bam", 1
@@ -161,7 +162,7 @@ def content_of(answer: Tree, sequence: int) -> Tree:
     except msgspec.ValidationError:
         number, kind, content = -1, "", None
     if number != sequence:
-        raise ProtocolError(f"Expected the answer to request {sequence}, found {shown(answer)}.")
+        raise ProtocolError(f"Expected the answer to request {sequence}, found {brief(answer)}.")
     if kind == "ok":
         return content
     raise (NotInCommand if kind == "NotInCommand" else RemoteError)(str(content))
@@ -205,7 +206,7 @@ def read_result(spec: EnvSpecMessage, tree: Tree, size: int) -> tuple[Any, ...]:
         ProtocolError: It is something else.
     """
     if not isinstance(tree, list) or len(tree) != size:
-        raise ProtocolError(f"Expected a result of {size} values, found {shown(tree)}.")
+        raise ProtocolError(f"Expected a result of {size} values, found {brief(tree)}.")
     observation, *between, info = tree
     space = spec.observation_space
     try:
@@ -213,9 +214,9 @@ def read_result(spec: EnvSpecMessage, tree: Tree, size: int) -> tuple[Any, ...]:
             return exact(space, observation, "observation"), *between, info
         for column in tree:
             if not isinstance(column, list) and not (isinstance(column, np.ndarray) and column.ndim):
-                raise ProtocolError(f"Expected a list with one value for each environment, found {shown(column)}.")
+                raise ProtocolError(f"Expected a list with one value for each environment, found {brief(column)}.")
             if len(column) != spec.num_envs:
-                raise ProtocolError(f"Expected values of {spec.num_envs} environments, found {shown(column)}.")
+                raise ProtocolError(f"Expected values of {spec.num_envs} environments, found {brief(column)}.")
         each = [exact(space, one, f"observation of environment {i}") for i, one in enumerate(observation)]
         final = [{**one, "final_obs": exact(space, one["final_obs"])} if "final_obs" in one else one for one in info]
     except InvalidValue as error:
@@ -256,7 +257,7 @@ class _Body:
         if isinstance(value, np.generic):
             return Ext(_SCALAR, msgspec.msgpack.encode([value.dtype.str, value.tobytes()]))
         if not isinstance(value, np.ndarray):
-            raise ProtocolError(f"{shown(value)} cannot be sent.")
+            raise ProtocolError(f"{brief(value)} cannot be sent.")
         content = msgspec.msgpack.encode([value.dtype.str, value.shape, self.size])
         if value.size:
             self.parts.append(value.reshape(-1).view(np.uint8).data)

@@ -12,7 +12,8 @@ from gymnasium import Space
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.core.spaces import space_from_json, space_to_json
-from bam_envs.remote.values import plain_info, shown, tree_from_json, tree_to_json
+from bam_envs.core.wording import brief
+from bam_envs.remote.values import plain_info, tree_from_json, tree_to_json
 
 Info = dict[str, Any]
 Seed = int | list[int | None] | None
@@ -56,7 +57,7 @@ class EnvSpecMessage:
             each = []
         if len(each) != self.num_envs:
             raise InvalidValue(
-                f"There must be one action for each of {self.num_envs} environments, not {shown(action)}."
+                f"There must be one action for each of {self.num_envs} environments, not {brief(action)}."
             )
         return each
 
@@ -109,7 +110,7 @@ def spec_from_json(value: Mapping[str, Any]) -> EnvSpecMessage:
             signals=tree_from_json(value["signals"]),
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise ProtocolError(f"Expected the description of an environment, found {shown(value)}: {error}.") from error
+        raise ProtocolError(f"Expected the description of an environment, found {brief(value)}: {error}.") from error
 
 
 @runtime_checkable

@@ -23,7 +23,6 @@ from __future__ import annotations
 import base64
 import math
 import re
-import reprlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -33,6 +32,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, ProtocolError, UnknownName
+from bam_envs.core.wording import brief
 
 Tree = Any
 _INT64 = range(-(2**63), 2**63)
@@ -91,9 +91,9 @@ def _array(space: Space[Any], value: Any, name: str) -> NDArray[Any]:
         try:
             value = np.asarray(value)
         except ValueError as error:  # rows of different lengths
-            raise InvalidValue(f"{name} must be an array, not {shown(value)}.") from error
+            raise InvalidValue(f"{name} must be an array, not {brief(value)}.") from error
         if value.dtype.kind not in "biuf":
-            raise InvalidValue(f"{name} must be numbers, not {shown(value.tolist())}.")
+            raise InvalidValue(f"{name} must be numbers, not {brief(value.tolist())}.")
     if value.shape != space.shape:
         raise InvalidValue(f"{name} must have shape {space.shape}, not {value.shape}.")
     if value.dtype != space.dtype:
@@ -135,7 +135,7 @@ def _first(bad: NDArray[np.bool_], array: NDArray[Any], name: str) -> tuple[str,
 def _pack_integers(space: Space[Any], value: Any, name: str) -> NDArray[Any]:
     array = _array(space, value, name)
     if not space.contains(array):
-        raise InvalidValue(f"{name} must be one of {space}, not {shown(value)}.")
+        raise InvalidValue(f"{name} must be one of {space}, not {brief(value)}.")
     return array
 
 
@@ -143,7 +143,7 @@ def _pack_discrete(space: spaces.Discrete[Any], value: Any, name: str) -> int:
     plain = value.item() if isinstance(value, (np.generic, np.ndarray)) and value.size == 1 else value
     if isinstance(plain, bool) or not isinstance(plain, int) or not 0 <= plain - int(space.start) < int(space.n):
         last = int(space.start) + int(space.n) - 1
-        raise InvalidValue(f"{name} must be a whole number from {space.start} to {last}, not {shown(value)}.")
+        raise InvalidValue(f"{name} must be a whole number from {space.start} to {last}, not {brief(value)}.")
     return plain
 
 
@@ -151,7 +151,7 @@ def _pack_text(space: spaces.Text, value: Any, name: str) -> str:
     if not isinstance(value, str) or not space.contains(value):
         raise InvalidValue(
             f"{name} must be {space.min_length} to {space.max_length} of the characters "
-            f"{shown(''.join(space.character_list))}, not {shown(value)}."
+            f"{brief(''.join(space.character_list))}, not {brief(value)}."
         )
     return str(value)
 
@@ -163,7 +163,7 @@ def _pack_tuple(space: spaces.Tuple, value: Any, name: str) -> list[Tree]:
 
 def _parts(space: spaces.Tuple, value: Any, name: str) -> Any:
     if not isinstance(value, (tuple, list, np.ndarray)) or len(value) != len(space.spaces):
-        raise InvalidValue(f"{name} must be {len(space.spaces)} values, not {shown(value)}.")
+        raise InvalidValue(f"{name} must be {len(space.spaces)} values, not {brief(value)}.")
     return value
 
 
@@ -173,7 +173,7 @@ def _pack_dict(space: spaces.Dict, value: Any, name: str) -> dict[str, Tree]:
 
 
 def _require_keys(space: spaces.Dict, value: Any, name: str) -> None:
-    found = list(value) if isinstance(value, Mapping) else shown(value)
+    found = list(value) if isinstance(value, Mapping) else brief(value)
     if not isinstance(value, Mapping) or value.keys() != space.spaces.keys():
         raise InvalidValue(f"{name} must have the keys {list(space.spaces)}, not {found}.")
 
@@ -183,7 +183,7 @@ def _pack_sequence(space: spaces.Sequence, value: Any, name: str) -> list[Tree]:
     # Gymnasium stacks arrays, dicts and tuples; a list is the list of items of a tree.
     items = _unstacked(feature, value, name) if space.stack and not isinstance(value, list) else value
     if not isinstance(items, (tuple, list)):
-        raise InvalidValue(f"{name} must be a tuple of any length, not {shown(value)}.")
+        raise InvalidValue(f"{name} must be a tuple of any length, not {brief(value)}.")
     return [pack(feature, one, f"{name}[{i}]") for i, one in enumerate(items)]
 
 
@@ -197,7 +197,7 @@ def _unstacked(feature: Space[Any], value: Any, name: str) -> list[Any]:
         parts = _parts(feature, value, name)
         return _zipped([_unstacked(one, part, name) for one, part in zip(feature.spaces, parts, strict=True)], name)
     if not isinstance(value, (np.ndarray, tuple, list)):
-        raise InvalidValue(f"{name} must be an array of any length, not {shown(value)}.")
+        raise InvalidValue(f"{name} must be an array of any length, not {brief(value)}.")
     return list(value)
 
 
@@ -279,7 +279,7 @@ def tree_from_json(value: Any) -> Tree:
             try:
                 return _MARKS[mark](content)
             except (AttributeError, IndexError, TypeError, ValueError) as error:
-                raise ProtocolError(f"Expected the {mark} of a value, found {shown(content)}: {error}.") from error
+                raise ProtocolError(f"Expected the {mark} of a value, found {brief(content)}: {error}.") from error
     return {key: tree_from_json(one) for key, one in value.items()}
 
 
@@ -307,14 +307,5 @@ def number_dtype(text: Any) -> np.dtype[Any]:
         ValueError: It is not.
     """
     if not isinstance(text, str) or not _DTYPE.fullmatch(text):
-        raise ValueError(f"{shown(text)} is no dtype of numbers")
+        raise ValueError(f"{brief(text)} is no dtype of numbers")
     return np.dtype(text)
-
-
-_SHORT = reprlib.Repr()
-_SHORT.maxstring = _SHORT.maxother = 60
-
-
-def shown(value: Any) -> str:
-    """`value` in one short line, for an error."""
-    return " ".join(_SHORT.repr(value).split())

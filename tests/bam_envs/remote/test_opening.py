@@ -70,7 +70,7 @@ def test_how_long_an_answer_is_waited_for(url):
 def test_a_token_file(tmp_path):
     path = tmp_path / "token"
     path.write_text("geheim\n")
-    assert open_transport("tcp://x:1", token_file=str(path))._token == "geheim"
+    assert open_transport("tcp://x:1", token_file=str(path)).endpoint.token == "geheim"
     with pytest.raises(InvalidValue) as caught:
         open_transport("tcp://x:1", token_file=str(tmp_path / "none"))
     assert str(caught.value) == f"The token file {tmp_path / 'none'} cannot be read: No such file or directory."

@@ -181,9 +181,9 @@ def test_closed_is_closed(served, open_to):
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"channel": "pigeon"}, "The channel must be service or topics, not 'pigeon'."),
-        ({"timeout": 0}, "Time-outs must be above 0 s, not 0 and 3."),
-        ({"num_envs": 0}, "num_envs must be at least 1, not 0."),
+        ({"channel": "pigeon"}, "channel: expected 'service' or 'topics', found 'pigeon'"),
+        ({"timeout": 0}, "timeout: expected a time above 0 s, found 0."),
+        ({"num_envs": 0}, "num_envs: expected a whole number of at least 1, found 0"),
     ],
 )
 def test_options_that_are_not_possible(options, text):

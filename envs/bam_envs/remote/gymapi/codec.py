@@ -15,6 +15,7 @@ import numpy as np
 from gymnasium import Space, spaces
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
+from bam_envs.core.wording import brief
 from bam_envs.remote.gymapi.leaves import (
     EXACT,
     GRIPPER_WIDTH,
@@ -33,7 +34,7 @@ from bam_envs.remote.gymapi.leaves import (
 from bam_envs.remote.gymapi.messages import PREFIX, GymResponse, write_feedback
 from bam_envs.remote.gymapi.versions import JUNE_22, Version
 from bam_envs.remote.transport import EnvSpecMessage, Info
-from bam_envs.remote.values import exact, pack, shown, tree_from_json, tree_to_json
+from bam_envs.remote.values import exact, pack, tree_from_json, tree_to_json
 from bam_envs.ros.images import FORMATS, color_message, depth_message, read_color_message, read_depth_message
 from bam_envs.rosbridge.strict_json import dump_json, load_json
 
@@ -333,7 +334,7 @@ class EnvCodec:
     def _read(self, feedback: Mapping[str, Any], info: Info, ours: Info) -> tuple[Any, float, bool, bool, Info]:
         trees = ours.get("observation", {})
         if not isinstance(trees, dict):
-            raise ProtocolError(f"info.bam.observation must be an object, not {shown(trees)}.")
+            raise ProtocolError(f"info.bam.observation must be an object, not {brief(trees)}.")
         observation = self._observations.decode(feedback, trees)
         if self.foreign:
             info = {**info, "executed": feedback["executed"]}

@@ -27,6 +27,7 @@ import numpy as np
 from gymnasium import Space, spaces
 
 from bam_envs.core.errors import ProtocolError
+from bam_envs.core.wording import listed
 
 NUMBERS, POSE, IMAGE, EXACT = "numbers", "pose", "image", "exact"
 GRIPPER_WIDTH = "gripper_width"
@@ -186,22 +187,19 @@ class Lists:
         known = set(expected) & set(names)
         if not known:
             if len(values) != len(expected):
-                raise ProtocolError(f"{field} must have {len(expected)} values ({_some(expected)}), not {len(values)}.")
+                raise ProtocolError(
+                    f"{field} must have {len(expected)} values ({listed(expected)}), not {len(values)}."
+                )
             return values
         if len(names) != len(values) or len(known) < len(expected) or (len(names) > len(expected) and not self.extra):
             raise ProtocolError(
-                f"The names of {field} must be {_some(expected)}, one for each value, "
-                f"not {_some(names)} for {len(values)} values."
+                f"The names of {field} must be {listed(expected)}, one for each value, "
+                f"not {listed(names)} for {len(values)} values."
             )
         if tuple(names) == expected:
             return values
         table = dict(zip(names, values, strict=True))
         return [table[name] for name in expected]
-
-
-def _some(names: Sequence[str], most: int = 8) -> str:
-    text = ", ".join(names[:most])
-    return (f"{text}, … ({len(names)})" if len(names) > most else text) or "none"
 
 
 def _numbers(value: Any) -> list[Any] | None:
