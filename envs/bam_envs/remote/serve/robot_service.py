@@ -14,8 +14,8 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,6 @@ import numpy as np
 from bam_envs.core.errors import LinkLost, ProtocolError, RemoteError, RobotFault
 from bam_envs.core.timing import Ticker
 from bam_envs.remote.serve.command_lease import CommandLease
-from bam_envs.remote.serve.command_slot import CommandSlot, Order
 from bam_envs.remote.serve.served_robot import ServedRobot
 from bam_envs.ros.codec import (
     HALT_TOPIC,
@@ -48,6 +47,42 @@ QUICK = 2e-4
 """A robot whose last period took no longer than this to compute [s] may hold up the thread of the network for it."""
 _ROUNDING = 1e-9
 """How far beyond a limit a number may be that went through text and other units."""
+
+
+@dataclass(frozen=True)
+class Order:
+    """What the messages since the last look command together."""
+
+    values: Mapping[int, float] = field(default_factory=dict)
+    """Place in the command -> number [SI]; places that are not in it stay as they are."""
+    complete: bool = False
+    """Whether the message that makes a command complete is among them."""
+    tag: str = ""
+    """`Tag.echo` of the newest one."""
+    client: str = ""
+    """Who sent them."""
+
+
+class CommandSlot:
+    """The newest command on its way from the network to the robot: one place, overwritten, never a queue."""
+
+    def __init__(self) -> None:
+        self._lock, self._order = threading.Lock(), Order()
+
+    def put(self, client: str, places: Iterable[int], values: Iterable[float], *, complete: bool, tag: str) -> None:
+        """Add a message's numbers [SI] for `places`; what was there for them, or of another client, is forgotten."""
+        new = dict(zip(places, values, strict=True))
+        with self._lock:
+            old = self._order if self._order.client == client else Order()
+            self._order = Order({**old.values, **new}, old.complete or complete, tag or old.tag, client)
+
+    def take(self, *, complete: bool = False) -> Order:
+        """What came, once; an order without values if nothing did, or with `complete` as long as it is not complete."""
+        with self._lock:
+            if complete and not self._order.complete:
+                return Order()
+            order, self._order = self._order, Order()
+        return order
 
 
 class RobotService:
@@ -115,7 +150,7 @@ class RobotService:
         self.clock.start()
 
     def close(self) -> None:
-        """Stop listening, halt, and let time stand still. As often as one likes."""
+        """Stop listening, halt, and let time stand still. Idempotent."""
         while self._unsubscribe:
             self._unsubscribe.pop()()
         self.clock.stop()
@@ -181,7 +216,7 @@ class RobotService:
     def _rest(self) -> Order:
         """What was to be executed next, and is not."""
         with self._moving:
-            order = self._slot.clear()
+            order = self._slot.take()
             self._robot.halt()
             if order.complete and self.info.lockstep:
                 self._answered = order.tag
@@ -210,7 +245,7 @@ class RobotService:
         """Real time: one part of a period."""
         with self._moving:
             order = self._slot.take()
-            if order is not None and order.client == self._lease.holder:  # it may have changed since
+            if order.values and order.client == self._lease.holder:  # it may have changed since
                 self._robot.follow(self._merged(order), at_once=order.complete)
                 self._answered = order.tag
         self._robot.tick()
@@ -233,8 +268,8 @@ class RobotService:
     def _pass_period(self) -> None:
         """A whole period, if a command is there; else the state that has not changed."""
         with self._moving:
-            order = self._slot.take_complete()
-            if order is not None and order.client == self._lease.holder:
+            order = self._slot.take(complete=True)
+            if order.values and order.client == self._lease.holder:
                 self._execute(order)
         self._publish()
 

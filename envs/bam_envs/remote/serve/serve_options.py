@@ -7,23 +7,26 @@ import re
 from dataclasses import dataclass
 
 from bam_envs.core.errors import InvalidValue
+from bam_envs.core.validation import Port, Positive, check_fields
+from bam_envs.core.wording import as_flag
 from bam_envs.remote.gymapi.versions import version_named
 from bam_envs.remote.serve.command_lease import LEASE_SECONDS
 
 _NAMESPACE = re.compile(r"(/[A-Za-z]\w*)*")
+_EXCLUDE = (("realtime", "fast"), ("via", "rclpy"), ("via", "cert"), ("rclpy", "cert"), ("no_token", "token_file"))
 
 
 @dataclass(frozen=True)
 class ServeOptions:
     """Where an environment is served, and how its time passes."""
 
-    port: int = 9090
+    port: Port = 9090
     """Port of the rosbridge server; 0 takes a free one."""
     bind: str = "127.0.0.1"
     """Address to listen on; 127.0.0.1 is this computer alone, 0.0.0.0 every network it is in."""
     namespace: str = ""
     """Name before every topic and service, such as bam_001."""
-    tcp: int | None = None
+    tcp: Port | None = None
     """Serve the environment on this TCP port too, which is faster; 0 takes a free one."""
     via: str | None = None
     """Offer everything through the rosbridge server at this address (ws://10.0.0.5:9090) instead of one here."""
@@ -33,7 +36,7 @@ class ServeOptions:
     """Time passes as on the clock: the default of an environment with a robot."""
     fast: bool = False
     """Time passes only with steps and commands, as fast as they come: the default of other environments."""
-    lease: float = LEASE_SECONDS
+    lease: Positive = LEASE_SECONDS
     """A client that gives no sign of life for so long may lose command to another one [s]."""
     cert: str | None = None
     """Certificate in PEM, for wss:// instead of ws://."""
@@ -53,15 +56,15 @@ class ServeOptions:
     """Version of bam_msgs/GymAPI, where clients do not show theirs: 2025-05-24, 2025-06-17 or 2025-06-22 (default)."""
 
     def require_sane(self) -> None:
-        """Refuse what excludes each other.
+        """Refuse values that are not possible, and flags that exclude each other.
 
         Raises:
             InvalidValue: Names the flags.
         """
-        pairs = (("realtime", "fast"), ("via", "rclpy"), ("via", "cert"), ("rclpy", "cert"))
-        for one, other in pairs:
+        check_fields(self, as_flag)
+        for one, other in _EXCLUDE:
             if getattr(self, one) and getattr(self, other):
-                raise InvalidValue(f"--{one} and --{other} exclude each other; give one of the two.")
+                raise InvalidValue(f"{as_flag(one)} and {as_flag(other)} exclude each other; give one of the two.")
         if self.cert and self.tcp is not None:
             raise InvalidValue(
                 "--tcp carries everything in the clear, and --cert does not change that; leave one of the two out."
@@ -71,32 +74,18 @@ class ServeOptions:
                 raise InvalidValue(f"--{flag} means something only with --{needed}.")
         if self.rclpy and self.token_file and self.tcp is None:
             raise InvalidValue("--token-file protects nothing with --rclpy: ROS 2 has no token. Leave it out.")
-        self._require_guarded()
-        if not self.lease > 0:
-            raise InvalidValue(f"--lease must be above 0 s, not {self.lease:g}.")
-        for flag, port in (("port", self.port), ("tcp", self.tcp)):
-            if port is not None and not 0 <= port <= 65535:
-                raise InvalidValue(f"--{flag} must be 0 to 65535, not {port}.")
-        if self.gymapi_version is not None:
-            version_named(self.gymapi_version)
-        if not _NAMESPACE.fullmatch(self.prefix):
-            raise InvalidValue(f"--namespace must be letters, digits and _, such as bam_001, not {self.namespace!r}.")
-
-    def _require_guarded(self) -> None:
-        """Nobody is let in from a network by oversight.
-
-        Raises:
-            InvalidValue: Names the flags.
-        """
-        if self.no_token and self.token_file:
-            raise InvalidValue("--no-token and --token-file exclude each other; give one of the two.")
         if self.operator_token_file and not self.listens:
             raise InvalidValue("--operator-token-file means something only where clients connect to this program.")
+        # Nobody is let in from a network by oversight.
         if self._is_open and not self.token_file and not self.no_token:
             raise InvalidValue(
                 f"Anybody who reaches {self._place} could command what is served here: give --token-file, or "
                 "--bind 127.0.0.1; or --no-token, if everybody there is to."
             )
+        if self.gymapi_version is not None:
+            version_named(self.gymapi_version)
+        if not _NAMESPACE.fullmatch(self.prefix):
+            raise InvalidValue(f"--namespace must be letters, digits and _, such as bam_001, not {self.namespace!r}.")
 
     @property
     def listens(self) -> bool:

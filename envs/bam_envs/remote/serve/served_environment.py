@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from types import TracebackType
 from typing import Any
@@ -13,7 +14,6 @@ from bam_envs.remote.ros2_node import RclpyBus
 from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.env_server import Env, EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
-from bam_envs.remote.serve.refused import Refusals, refusal_lines
 from bam_envs.remote.serve.robot_service import RobotService
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_robot import ServedRobot
@@ -30,6 +30,8 @@ from bam_envs.safety.gate import SafeRobot
 
 _LOOK = 3.0
 """How long a robot that may be there already may take to answer [s]."""
+_WITHIN, _AGAIN, _ANSWER = 3.0, 0.2, 3.0
+"""Longest that a ROS graph takes to know of what was declared, time between two looks, longest answer [s]."""
 
 
 class ServedEnvironment:
@@ -59,8 +61,10 @@ class ServedEnvironment:
         self._tell, self._stack = tell, ExitStack()
         self._robot_service: RobotService | None = None
         self._refusals: Refusals | None = None
-        self._token = _token(options.token_file, private=options.listens)
-        self._operator_token = _token(options.operator_token_file, private=True)
+        self._token, self._operator_token = (
+            None if path is None else read_token(path, private=private)
+            for path, private in ((options.token_file, options.listens), (options.operator_token_file, True))
+        )
 
     def __enter__(self) -> ServedEnvironment:
         with ExitStack() as started:
@@ -75,7 +79,7 @@ class ServedEnvironment:
         self.close()
 
     def close(self) -> None:
-        """Halt the robot, say goodbye, close the environment. As often as one likes."""
+        """Halt the robot, say goodbye, close the environment. Idempotent."""
         self._stack.close()
 
     def require_running(self) -> None:
@@ -103,28 +107,20 @@ class ServedEnvironment:
             started.callback(self._robot_service.close)
             self._robot_service.start()
         started.callback(server.end)  # while the robot's clock still ticks: a step that runs waits for it
-        service = GymApiService(
-            server,
-            bus,
-            self.prefix,
-            image_format=self.options.image_format,
-            version=self.options.gymapi_version,
-        )
+        options, name, pace = self.options, server.spec().env_id, "real time" if realtime else "fast"
+        version = options.gymapi_version
+        service = GymApiService(server, bus, self.prefix, image_format=options.image_format, version=version)
         started.callback(service.close)
         service.start()
-        name = server.spec().env_id
-        pace = "real time" if realtime else "fast"
-        offered = self._offered(profile, self._refused())
+        offered = self._offered(profile, self._not_offered())
         if offered:
-            self.endpoints.append(f"{name} on {self._where(bus)}, {pace}: {offered}")
-        if self.options.tcp is not None:
-            self.tcp = TcpServer(
-                server,
-                self.options.bind,
-                self.options.tcp,
-                token=self._token,
-                operator_token=self._operator_token,
+            node = (
+                f"the ROS 2 graph as the node {bus.name}" if isinstance(bus, RclpyBus) else getattr(bus, "url", "a bus")
             )
+            self.endpoints.append(f"{name} on {node}, {pace}: {offered}")
+        if options.tcp is not None:
+            tokens = {"token": self._token, "operator_token": self._operator_token}
+            self.tcp = TcpServer(server, options.bind, options.tcp, **tokens)
             started.callback(self.tcp.close)
             self.tcp.start()
             self.endpoints.append(f"{name} on {self.tcp.url}, the environment alone")
@@ -174,7 +170,7 @@ class ServedEnvironment:
             "Give this one names of its own: --namespace NAME."
         )
 
-    def _refused(self) -> frozenset[str]:
+    def _not_offered(self) -> frozenset[str]:
         """Names that the server of ``--via``, or ROS 2 here, does not carry; people are told why."""
         if isinstance(self.bus, RclpyBus):
             for name, reason in self.bus.refused.items():
@@ -205,20 +201,11 @@ class ServedEnvironment:
             raise RemoteError(f"{self.options.via or 'ROS 2 here'} carries nothing of use of what is served here.")
         return " and ".join(offered)
 
-    def _where(self, bus: Bus) -> str:
-        if isinstance(bus, RclpyBus):
-            return f"the ROS 2 graph as the node {bus.name}"
-        return str(getattr(bus, "url", "a bus"))
-
     def _say_command(self, before: str | None, after: str | None) -> None:
         self._tell(f"{before} is no longer in command" if after is None else f"{after} is in command")
 
     def _say_down(self, error: LinkLost) -> None:
         self._tell(f"{error} It is tried again until it is back; the robot rests meanwhile.")
-
-
-def _token(path: str | None, *, private: bool) -> str | None:
-    return None if path is None else read_token(path, private=private)
 
 
 def _profile_of(env: Env) -> RobotProfile | None:
@@ -248,3 +235,75 @@ def _is_usable(profile: RobotProfile, prefix: str, refused: frozenset[str]) -> b
     ways = [{prefix + sink.topic for sink in way} for way in profile.commands.values()]
     states = {prefix + source.topic for source in profile.state}
     return not states & refused and any(not way & refused for way in ways)
+
+
+class Refusals:
+    """Collects what a rosbridge server that is not ours does not carry of what is offered through it.
+
+    One kind of server says so in a `status` message with the id of the declaration. The other kinds say nothing, and
+    what they carry is what rosapi lists.
+
+    Args:
+        link: To the server; not connected yet.
+
+    Attributes:
+        unchecked: Whether the server said nothing, and has no rosapi that could be asked; known after `look`.
+    """
+
+    def __init__(self, link: RosbridgeLink) -> None:
+        self._link, self._said = link, dict[str, str]()
+        self.unchecked = False
+        link.on_status(self._hear)
+
+    def _hear(self, status: Mapping[str, Any]) -> None:
+        if status.get("level") == "error":
+            self._said[str(status.get("id"))] = str(status.get("msg"))
+
+    def look(self) -> dict[str, tuple[str, str]]:
+        """What is not carried: name -> type and reason. Waits until the server has answered.
+
+        Raises:
+            LinkLost: The link dropped.
+        """
+        unlisted = self._unlisted()
+        said = {one: reason for one, reason in self._said.items() if one in self._link.declared}
+        self.unchecked = unlisted is None and not said
+        reasons = {**dict.fromkeys(unlisted or (), "rosapi does not list it"), **said}
+        return {name: (kind, reasons[one]) for one, (name, kind) in self._link.declared.items() if one in reasons}
+
+    def _unlisted(self) -> list[str] | None:
+        """Ids of the declarations that rosapi does not know after a while; None if there is no rosapi."""
+        deadline = time.monotonic() + _WITHIN
+        while True:
+            try:
+                known = {
+                    what: self._link.call(f"/rosapi/{what}", f"rosapi/{what.capitalize()}", {}, _ANSWER).get(what)
+                    for what in ("topics", "services")
+                }
+            except RemoteError:
+                return None
+            names = {name for listed in known.values() if isinstance(listed, list) for name in listed}
+            missing = [one for one, (name, _) in self._link.declared.items() if name not in names]
+            if not missing or time.monotonic() > deadline:
+                return missing
+            time.sleep(_AGAIN)
+
+
+def refusal_lines(url: str, refused: Mapping[str, tuple[str, str]]) -> list[str]:
+    """One line for each package, for people: what is not carried, why, and what helps."""
+    packages: dict[str, list[str]] = {}
+    for name, (kind, _) in refused.items():
+        packages.setdefault(kind.partition("/")[0], []).append(name)
+    lines = []
+    for package, names in packages.items():
+        whole = ", ".join(f"{name} ({refused[name][0]})" for name in names)
+        lines.append(f"{url} does not carry {whole}: {refused[names[0]][1]}. {_remedy(package)}")
+    return lines
+
+
+def _remedy(package: str) -> str:
+    if package == "bam_msgs":
+        how = "Build it beside the bridge from ros/bam_msgs of this project (colcon build --packages-select bam_msgs)"
+    else:
+        how = f"Install {package} beside the bridge (apt install ros-$ROS_DISTRO-{package.replace('_', '-')})"
+    return f"{how}, source it, and start the bridge again."

@@ -78,7 +78,7 @@ class Bridge:
 @pytest.fixture
 def offer(monkeypatch):
     """Serve an environment through a bridge; what was told, or the error."""
-    monkeypatch.setattr("bam_envs.remote.serve.refused._WITHIN", 0.0)
+    monkeypatch.setattr("bam_envs.remote.serve.served_environment._WITHIN", 0.0)
 
     def start(env_id, missing, *, tells=False, rosapi=True, tcp=None):
         bridge, lines = Bridge(missing, tells=tells, rosapi=rosapi), []

@@ -426,23 +426,20 @@ def test_a_command_that_a_halt_overtakes_is_answered_and_moves_nothing(serve, bu
 @pytest.mark.parametrize("realtime", [True, False])
 def test_a_halt_wins_over_a_command_that_is_just_being_taken(serve, bus, realtime):
     service = serve(SimulatedArm(1), realtime=realtime)
-    service.service.clock.stop()
-    slot, halting = service.service._slot, threading.Thread(target=bus.say, args=("/bam/halt", {}, "somebody"))
-    slot.put("a:1", range(7), command(0.5), complete=True, tag="")
-    service.lease.take("a:1")
-    name = "take" if realtime else "take_complete"
-    take = getattr(slot, name)
+    halting, taken = threading.Thread(target=bus.say, args=("/bam/halt", {}, "somebody")), threading.Event()
+    target = service.robot.target
 
-    def take_slowly():
-        order = take()
+    def slow_target():
+        service.robot.target = target
         halting.start()
         halting.join(0.2)  # it must not get through before the command it has to stop
-        return order
+        taken.set()
+        return target()
 
-    setattr(slot, name, take_slowly)
-    (service.service._tick if realtime else service.service._tick_lockstep)()
+    service.robot.target = slow_target
+    service.send(command(0.5))
+    assert taken.wait(10.0)
     halting.join(10.0)
-    assert service.robot._resting
     assert (service.robot.target()[0, :6] < HOME[0] + 0.4).all()
 
 
