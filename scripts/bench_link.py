@@ -79,7 +79,7 @@ def serve_robot() -> None:
     from bam_envs.remote.serve.served_robot import ServedRobot
     from bam_envs.robots.fake import FakeRobot
     from bam_envs.robots.profiles.profile import load_profile
-    from bam_envs.rosbridge.server.server import BridgeServer
+    from bam_envs.rosbridge.server import BridgeServer
 
     robot = ServedRobot(FakeRobot(1), command_timeout=0.1)
     robot.connect()
@@ -103,7 +103,7 @@ def serve_environment(shape: tuple[int, ...]) -> None:
     from bam_envs.remote.serve.env_server import EnvServer
     from bam_envs.remote.serve.gymapi_service import GymApiService
     from bam_envs.remote.serve.tcp_server import TcpServer
-    from bam_envs.rosbridge.server.server import BridgeServer
+    from bam_envs.rosbridge.server import BridgeServer
 
     env = EnvServer(Trivial(shape), env_id="Trivial-v0")
     with BridgeServer(port=0) as server, TcpServer(env) as tcp:
@@ -117,7 +117,7 @@ def serve_environment(shape: tuple[int, ...]) -> None:
 def serve_joint_states() -> None:
     """The embedded server, with joint states at 100 Hz."""
     from bam_envs.robots.ur5e import JOINTS
-    from bam_envs.rosbridge.server.server import BridgeServer
+    from bam_envs.rosbridge.server import BridgeServer
 
     joints = {"name": list(JOINTS), "position": [0.1] * 6, "velocity": [0.0] * 6, "effort": []}
     with BridgeServer(port=0) as server:

@@ -23,7 +23,7 @@ import pytest
 from websockets.sync.client import connect
 
 from bam_envs.core.errors import RemoteError
-from bam_envs.rosbridge.server.server import BridgeServer
+from bam_envs.rosbridge.server import BridgeServer
 
 HERE = Path(__file__).parent
 PEERS = HERE.parents[1] / "build" / "peers"

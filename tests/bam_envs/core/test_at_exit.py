@@ -18,7 +18,7 @@ from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.rosbridge.client import RosbridgeLink
-from bam_envs.rosbridge.server.server import BridgeServer
+from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.testing.transports import MirrorEnv
 
 PROGRAM = """

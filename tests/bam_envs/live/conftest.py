@@ -18,7 +18,7 @@ from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.ros.codec import HALT_TOPIC, INFO_SERVICE, RobotInfo, decode_command, encode_state
 from bam_envs.ros.messages import write_stamp
 from bam_envs.rosbridge.bus import Caller
-from bam_envs.rosbridge.server.server import BridgeServer
+from bam_envs.rosbridge.server import BridgeServer
 
 DEADLINE = 10.0
 HOME = np.array([-0.27, -1.54, 1.89, -1.93, -1.57, -1.84])

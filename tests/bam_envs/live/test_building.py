@@ -18,7 +18,7 @@ from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.physics.mir100 import SimulatedBase
 from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.robots.ur5e import JOINTS, arm_spec
-from bam_envs.rosbridge.server.server import BridgeServer
+from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.safety.guard import Limits
 from bam_envs.testing import RobotContract

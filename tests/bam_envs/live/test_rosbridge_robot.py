@@ -27,7 +27,7 @@ from bam_envs.robots.ur5e import JOINTS
 from bam_envs.ros.codec import HALT_TOPIC, SCENE_TOPIC, RobotInfo
 from bam_envs.ros.freshness import read_tag
 from bam_envs.ros.messages import tag_text, write_stamp
-from bam_envs.rosbridge.server.server import BridgeServer
+from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.rosbridge.string_rpc import StringRpcService
 from bam_envs.safety.gate import _clear
 

@@ -19,7 +19,7 @@ from bam_envs.robots.physics.ur import empty_arm
 from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.robots.ur import START as EMPTY_START
 from bam_envs.robots.ur import ur_model, ur_spec
-from bam_envs.rosbridge.server.server import BridgeServer
+from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.tasks.ur_reach import START
 
 ARM, GRIPPER = "/forward_position_controller/commands", "/gripper/commands"

@@ -5,7 +5,7 @@ import pytest
 from bam_envs.remote.rosbridge_transport import RosbridgeTransport
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
-from bam_envs.rosbridge.server.server import BridgeServer
+from bam_envs.rosbridge.server import BridgeServer
 
 
 @pytest.fixture

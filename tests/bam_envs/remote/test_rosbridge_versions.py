@@ -7,7 +7,7 @@ from gymnasium import spaces
 from bam_envs.core.errors import InvalidValue
 from bam_envs.remote.remote_env import RemoteEnv, RemoteVectorEnv
 from bam_envs.remote.rosbridge_transport import RosbridgeTransport
-from bam_envs.rosbridge.server.server import BridgeServer
+from bam_envs.rosbridge.server import BridgeServer
 from tests import gymapi_versions as theirs
 from tests.gymapi_versions import CLOSE, JUNE_17, JUNE_22, MAY_24, RESET, STEP, VERSIONS, Rack
 

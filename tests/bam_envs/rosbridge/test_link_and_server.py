@@ -8,7 +8,7 @@ import pytest
 from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, NotInCommand, RemoteError
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
-from bam_envs.rosbridge.server.server import BridgeServer
+from bam_envs.rosbridge.server import BridgeServer
 
 STRING = "std_msgs/String"
 

@@ -24,7 +24,7 @@ from bam_envs.ros.profile_tables import RobotProfile
 from bam_envs.rosbridge.bus import Bus
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
-from bam_envs.rosbridge.server.server import BridgeServer
+from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.rosbridge.tokens import read_token
 from bam_envs.safety.gate import SafeRobot
 

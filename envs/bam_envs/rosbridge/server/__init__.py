@@ -1,6 +1,6 @@
-"""The rosbridge server: a core without I/O, and the sockets around it."""
+"""The rosbridge server: a protocol without I/O, and the sockets around it."""
 
-from bam_envs.rosbridge.server.options import ServerOptions
-from bam_envs.rosbridge.server.server import BridgeServer
+from bam_envs.rosbridge.server.bridge_server import BridgeServer
+from bam_envs.rosbridge.server.client_session import ServerOptions
 
 __all__ = ["BridgeServer", "ServerOptions"]

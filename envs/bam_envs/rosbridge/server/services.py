@@ -1,13 +1,13 @@
 """The services of a rosbridge server: who offers them, which calls are unanswered. Every call is answered.
 
-The file is long because each of the ways in which a call can end is in it: that none is missing is to be seen here.
+Each of the ways in which a call can end is in this file: that none is missing is to be seen here.
 """
 
 from __future__ import annotations
 
-import heapq
 import itertools
 import logging
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -24,11 +24,11 @@ from bam_envs.ros.interfaces import (
 )
 from bam_envs.rosbridge.bus import Handler
 from bam_envs.rosbridge.fragments import Id
-from bam_envs.rosbridge.server.packets import Packet, Wire, pack
-from bam_envs.rosbridge.server.session import Event, Invoke, Send, Session
+from bam_envs.rosbridge.server.client_session import Event, Invoke, Send, Session
+from bam_envs.rosbridge.server.outgoing import Packet, Wire, pack
 
 _LENIENT = ("bam_msgs/GymAPI",)
-"""Types that are still growing: what a newer end says beside is ignored, as on every other way to an environment."""
+"""Types that are still growing: fields of a newer version are ignored, as on every other way to an environment."""
 _LONGEST_NUMBER = 20
 """Digits of the number of a call."""
 _logger = logging.getLogger(__name__)
@@ -62,8 +62,6 @@ class Request:
     """As the client gave it."""
     name: str
     """Of the service, as the client spells it."""
-    args: Any
-    """With names, or in the order of the fields; not checked yet."""
     wire: Wire = field(default_factory=Wire)
     """How the answer is packed."""
     timeout: float | None = None
@@ -95,17 +93,15 @@ class Services:
         self._services: dict[str, Service] = {}
         self._calls: dict[int, Call] = {}
         self._numbers = itertools.count(1)
-        self._queue: list[tuple[float, int]] = []
+        self._look = math.inf  # no call runs out of time before; one that was answered may have set it
 
     def __iter__(self) -> Iterator[Service]:
         return iter(self._services.values())
 
     @property
     def deadline(self) -> float | None:
-        """When the next unanswered call runs out of time [s]; None if there is none."""
-        while self._queue and self._queue[0][1] not in self._calls:
-            heapq.heappop(self._queue)
-        return self._queue[0][0] if self._queue else None
+        """When to call `expire` next [s]; None if there is no need."""
+        return None if self._look == math.inf else self._look
 
     def find(self, name: str) -> Service | None:
         """The service `name`, if there is one."""
@@ -120,9 +116,9 @@ class Services:
             ProtocolError: It is offered by this process.
         """
         before = self._services.get(service.name)
-        if before is not None and before.provider is None:
-            raise ProtocolError(f"Service {service.name} is offered by this server already.")
         if before is not None:
+            if before.provider is None:
+                raise ProtocolError(f"Service {service.name} is offered by this server already.")
             self.withdraw(before)
         self._services[service.name] = service
         if service.provider is not None:
@@ -130,12 +126,12 @@ class Services:
         return before if before is not None and before.provider is not service.provider else None
 
     def withdraw(self, service: Service) -> None:
-        """Take a service away; who waits for it is told."""
+        """Remove a service; who waits for it is told."""
         del self._services[service.name]
         if service.provider is not None:
             service.provider.services.discard(service.name)
         for call in [one for one in self._calls.values() if one.service is service]:
-            self.fail(call, f"Service {service.name} is gone: the client that offered it left or withdrew it.")
+            self._fail(call, f"Service {service.name} is gone: the client that offered it left or withdrew it.")
 
     def leave(self, session: Session) -> None:
         """A client left: its calls are forgotten, its services end."""
@@ -152,35 +148,24 @@ class Services:
         Args:
             service: What is asked.
             request: By whom, and how.
-            values: What `checked_args` makes of its arguments.
+            values: Its arguments, complete.
             now: Clock of `Bridge` [s].
 
         Raises:
-            BamEnvsError: There are too many.
+            ProtocolError: The client has too many unanswered calls.
         """
-        session, limits = request.session, request.session.limits
-        if max(len(session.calls), len(session.waiting)) >= limits.calls:
-            raise ProtocolError(f"At most {limits.calls} calls may be unanswered; wait for an answer first.")
-        usual = limits.service_timeout if service.provider is not None else limits.handler_timeout
+        session, options = request.session, request.session.options
+        if max(len(session.calls), len(session.waiting)) >= options.calls:
+            raise ProtocolError(f"At most {options.calls} calls may be unanswered; wait for an answer first.")
+        usual = options.service_timeout if service.provider is not None else options.handler_timeout
         timeout = usual if request.timeout is None else request.timeout
         call = Call(next(self._numbers), service, request, timeout, now + timeout)
         self._calls[call.number] = call
         session.calls.add(call.number)
-        self._queue_up(call)
-        self._start(call, values)
-
-    def _queue_up(self, call: Call) -> None:
-        heapq.heappush(self._queue, (call.deadline, call.number))
-        # Answered calls stay in the heap until their time comes; not more of them than of the others.
-        if len(self._queue) > 2 * len(self._calls) + 64:
-            self._queue = [(one.deadline, one.number) for one in self._calls.values()]
-            heapq.heapify(self._queue)
-
-    def _start(self, call: Call, values: Mapping[str, Any]) -> None:
-        service, session = call.service, call.request.session
+        self._look = min(self._look, call.deadline)
         if service.provider is not None:
             message = {"op": "call_service", "id": str(call.number), "service": service.spelling, "args": values}
-            self._emit(Send(service.provider, pack(message, Wire())))
+            self._emit(Send(service.provider, pack(message)))
         elif service.handler is not None:
             invoke = Invoke(session, call.number, service.handler, values, session.caller)
             if service.inline:
@@ -190,7 +175,7 @@ class Services:
                 self._start_waiting(session)
 
     def _start_waiting(self, session: Session) -> None:
-        while session.waiting and session.running < session.limits.at_once:
+        while session.waiting and session.running < session.options.at_once:
             invoke = session.waiting.popleft()
             if invoke.number in self._calls:
                 session.running += 1
@@ -203,15 +188,16 @@ class Services:
             return None
         try:
             values = invoke.handler(invoke.request, invoke.caller)
-            return self._packed(
-                call, values if call.service.inline else checked_values(call.service.kind, values), True
+            return _packed(
+                call, values if call.service.inline else checked(call.service.kind, response_type, values), True
             )
         except BamEnvsError as error:
-            return self._packed(call, str(error), False)
+            return _packed(call, str(error), False)
         # A caller is always answered, whatever the handler of somebody else does.
         except Exception as error:
             _logger.exception("The handler of %s failed.", call.service.name)
-            return self._packed(call, f"Service {call.service.name} failed: {_line(error)}", False)
+            line = " ".join(f"{type(error).__name__}: {error}".split())
+            return _packed(call, f"Service {call.service.name} failed: {line}", False)
 
     def finish(self, number: int, packet: Packet | None) -> None:
         """Send the packed answer, if the call is still unanswered."""
@@ -224,61 +210,61 @@ class Services:
         session.running -= 1
         self._start_waiting(session)
 
-    def kind_of_call(self, name: object) -> str | None:
-        """Type of the service that the unanswered call with the id `name` is of. From any thread."""
-        call = self._call_named(name)
-        return None if call is None else call.service.kind
-
-    def _call_named(self, name: object) -> Call | None:
+    def call_named(self, name: object) -> Call | None:
+        """The unanswered call with the id `name`. From any thread."""
         known = isinstance(name, str) and len(name) < _LONGEST_NUMBER and name.isascii() and name.isdigit()
         return self._calls.get(int(str(name))) if known else None
 
-    def respond(
-        self, provider: Session, message: Mapping[str, Any], checked: Callable[[str], Any] | None = None
-    ) -> None:
-        """Pass on what a client answers to a call of its service; `checked` gives what was found good in it before.
+    def respond(self, provider: Session, message: Mapping[str, Any], values: Callable[[str], Any]) -> None:
+        """Pass on what a client answers to a call of its service.
+
+        Args:
+            provider: Who answers.
+            message: Its message ``service_response``.
+            values: Gives the content of the message, complete for a type.
 
         Raises:
             ProtocolError: Nobody waits for it, or it does not fit.
         """
-        name = message.get("id")
-        call = self._call_named(name)
+        call = self.call_named(message.get("id"))
         if call is None or call.service.provider is not provider:
-            raise ProtocolError(f"Nobody waits for a response with the id {describe(name)}.")
-        result = message.get("result", True)
-        if result is not True:
-            self.fail(call, _reason(call, message.get("values")))
+            raise ProtocolError(f"Nobody waits for a response with the id {describe(message.get('id'))}.")
+        name = call.service.name
+        if message.get("result", True) is not True:
+            reason = message.get("values")
+            told = reason if isinstance(reason, str) and reason else f"Service {name} failed and gave no reason."
+            self._fail(call, told)
             return
         try:
-            kind = call.service.kind
-            values = checked(kind) if checked is not None else checked_values(kind, message.get("values"))
-            self._answer(call, self._packed(call, values, True))
+            self._answer(call, _packed(call, values(response_type(call.service.kind)), True))
         except BamEnvsError as error:
-            self.fail(call, f"Service {call.service.name} answered wrongly: {error}")
-            raise ProtocolError(f"Response of {call.service.name}: {error}") from None
+            self._fail(call, f"Service {name} answered wrongly: {error}")
+            raise ProtocolError(f"Response of {name}: {error}") from None
 
     def expire(self, now: float) -> None:
         """Answer the calls whose time is over."""
-        while self.deadline is not None and self.deadline <= now:
-            call = self._calls[self._queue[0][1]]
-            self.fail(call, f"Timeout exceeded: service {call.service.name} did not answer in {call.timeout:g} s.")
+        if now < self._look:
+            return
+        for call in [one for one in self._calls.values() if one.deadline <= now]:
+            self._fail(call, f"Timeout exceeded: service {call.service.name} did not answer in {call.timeout:g} s.")
+        self._look = min((one.deadline for one in self._calls.values()), default=math.inf)
 
-    def fail(self, call: Call, reason: str) -> None:
-        """Answer a call with a reason why not."""
-        self._answer(call, self._packed(call, reason, False))
+    def _fail(self, call: Call, reason: str) -> None:
+        self._answer(call, _packed(call, reason, False))
 
     def _answer(self, call: Call, packet: Packet) -> None:
         del self._calls[call.number]
         call.request.session.calls.discard(call.number)
         self._emit(Send(call.request.session, packet))
 
-    def _packed(self, call: Call, values: Any, result: bool) -> Packet:
-        packet = packed_response(call.request, values, result)
-        most = call.request.session.limits.max_message
-        if packet.size <= most:
-            return packet
-        reason = f"The response of {call.service.name} has {packet.size} bytes, and {most} is the most."
-        return packed_response(call.request, reason, False)
+
+def _packed(call: Call, values: Any, result: bool) -> Packet:
+    packet = packed_response(call.request, values, result)
+    most = call.request.session.options.max_message
+    if packet.size <= most:
+        return packet
+    reason = f"The response of {call.service.name} has {packet.size} bytes, and {most} is the most."
+    return packed_response(call.request, reason, False)
 
 
 def packed_response(request: Request, values: Any, result: bool) -> Packet:
@@ -287,44 +273,24 @@ def packed_response(request: Request, values: Any, result: bool) -> Packet:
     return pack(message if request.id is None else {**message, "id": request.id}, request.wire)
 
 
-def _named(kind: str, args: Any) -> Any:
-    """Arguments by name: a list has them in the order of the fields."""
-    if not isinstance(args, list):
-        return {} if args is None else args
-    fields = variants(request_type(kind))
-    if not fields or len(args) > len(fields[0]):
-        raise ProtocolError(f"args: expected an object, found {describe(args)}.")
-    return {one.name: value for one, value in zip(fields[0], args, strict=False)}
+def checked(kind: str, part: Callable[[str], str], values: Any) -> dict[str, Any]:
+    """A request or a response of a service of type `kind`, complete.
 
-
-def checked_args(service: Service, args: Any) -> dict[str, Any]:
-    """The arguments of a call, complete.
+    Args:
+        kind: Normal name of the type.
+        part: `request_type` or `response_type`.
+        values: By name; of a request also a list in the order of the fields.
 
     Raises:
         BamEnvsError: They do not fit.
     """
-    return _check_of(service.kind)(request_type(service.kind), _named(service.kind, args))
-
-
-def checked_values(kind: str, values: Any) -> dict[str, Any]:
-    """The response of a service of type `kind`, complete.
-
-    Raises:
-        InvalidValue: It does not fit.
-    """
-    return _check_of(kind)(response_type(kind), {} if values is None else values)
-
-
-def _check_of(kind: str) -> Callable[[str, object], dict[str, Any]]:
-    return complete_known if kind in _LENIENT else complete
-
-
-def _reason(call: Call, values: Any) -> str:
-    return values if isinstance(values, str) and values else f"Service {call.service.name} failed and gave no reason."
-
-
-def _line(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())
+    name = part(kind)
+    if isinstance(values, list) and part is request_type:
+        fields = variants(name)
+        if not fields or len(values) > len(fields[0]):
+            raise ProtocolError(f"args: expected an object, found {describe(values)}.")
+        values = {one.name: value for one, value in zip(fields[0], values, strict=False)}
+    return (complete_known if kind in _LENIENT else complete)(name, {} if values is None else values)
 
 
 def new_service(name: str, kind: str, spelling: str, **offered: Any) -> Service:

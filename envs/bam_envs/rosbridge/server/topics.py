@@ -1,4 +1,4 @@
-"""The topics of a rosbridge server: who publishes, who listens, how often and how many may wait."""
+"""The topics of a rosbridge server: who publishes, who listens, how often and how many messages may wait."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from bam_envs.ros.interfaces import describe, normal_name
 from bam_envs.rosbridge.bus import Listener
 from bam_envs.rosbridge.encoding import COMPRESSIONS
 from bam_envs.rosbridge.fragments import Id
-from bam_envs.rosbridge.server.packets import Publication, Wire
-from bam_envs.rosbridge.server.session import Send, Session
+from bam_envs.rosbridge.server.client_session import Send, Session
+from bam_envs.rosbridge.server.outgoing import Publication, Wire
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Wish:
     throttle: float = 0.0
     """Least time between two messages [s]."""
     queue_length: int = 0
-    """How many messages may wait; 0 says nothing about it."""
+    """How many messages may wait; 0: no limit of its own."""
     wire: Wire = field(default_factory=Wire)
     """How they are packed."""
 
@@ -40,29 +40,25 @@ class Stream:
     def __init__(self, session: Session, topic: str, name: str) -> None:
         self.session, self.topic, self.name = session, topic, name
         self.wishes: dict[Id, Wish] = {}
+        self.wish = Wish()
+        """All of them together."""
         self._waiting: deque[Publication] = deque(maxlen=1)
         self._next = -math.inf
-        self._merged = Wish()
 
-    def wish(self, name: Id, wish: Wish | None) -> None:
-        """Add a subscription, or take it away with None."""
+    def set_wish(self, name: Id, wish: Wish | None) -> None:
+        """Add a subscription, or remove it with None."""
         if wish is None:
             self.wishes.pop(name, None)
         else:
             self.wishes[name] = wish
         if self.wishes:
-            self._merged = _merge(list(self.wishes.values()))
-            self._waiting = deque(self._waiting, maxlen=max(1, self._merged.queue_length))
-
-    @property
-    def wire(self) -> Wire:
-        """How its messages are packed."""
-        return self._merged.wire
+            self.wish = _merge(list(self.wishes.values()))
+            self._waiting = deque(self._waiting, maxlen=max(1, self.wish.queue_length))
 
     @property
     def is_prompt(self) -> bool:
         """Whether it gets every message as it comes."""
-        return self._merged.throttle == 0.0
+        return self.wish.throttle == 0.0
 
     @property
     def deadline(self) -> float | None:
@@ -70,7 +66,7 @@ class Stream:
         return self._next if self._waiting else None
 
     def offer(self, publication: Publication, now: float) -> Send | None:
-        """A new message: what to send now, if anything. What comes too early waits; the oldest gives way."""
+        """A new message: what to send now, if anything. What comes too early waits; the oldest is dropped."""
         if self.is_prompt:
             return self._send(publication)
         self._waiting.append(publication)
@@ -81,12 +77,12 @@ class Stream:
         if not self._waiting or now < self._next:
             return None
         # On a grid, so that a topic of just this rate does not lose every second message to jitter.
-        on_grid = self._next + self._merged.throttle
-        self._next = on_grid if on_grid > now else now + self._merged.throttle
+        on_grid = self._next + self.wish.throttle
+        self._next = on_grid if on_grid > now else now + self.wish.throttle
         return self._send(self._waiting.popleft())
 
     def _send(self, publication: Publication) -> Send:
-        return Send(self.session, publication.packet(self.name, self._merged.wire), self._merged.queue_length)
+        return Send(self.session, publication.packet(self.name, self.wish.wire), self.wish.queue_length)
 
 
 def _merge(wishes: list[Wish]) -> Wish:
@@ -115,21 +111,21 @@ class Topic:
     latched: tuple[Session | None, Publication] | None = None
     """That message, and whose it is."""
 
+    @property
+    def is_ours(self) -> bool:
+        """Whether this process publishes it: what it says, such as where its robot is, nobody says in its place."""
+        return None in self.publishers
+
     def packed(self, publication: Publication) -> Publication:
-        """`publication`, packed for who gets it at once, which nobody else is to wait for. From any thread."""
+        """`publication`, packed for those who get it at once, so that nobody else waits for that. From any thread."""
         for stream in list(self.streams.values()):
             if stream.is_prompt:
-                publication.packet(stream.name, stream.wire)
+                publication.packet(stream.name, stream.wish.wire)
         return publication
-
-    @property
-    def is_used(self) -> bool:
-        """Whether anyone publishes or listens."""
-        return bool(self.publishers or self.streams or self.listeners)
 
 
 class Topics:
-    """Every topic of a server. A topic has the type of who came first, and ends when nobody uses it.
+    """Every topic of a server. A topic has the type of its first user, and ends with its last one.
 
     Args:
         emit: Takes what is to be sent.
@@ -166,7 +162,7 @@ class Topics:
         """Let a new stream have the messages of `topic`, the latched one at once."""
         topic.streams[stream.session] = stream
         if topic.latched is not None:
-            self._offer(stream, topic.latched[1], now)
+            self._note(stream, stream.offer(topic.latched[1], now))
 
     def unsubscribe(self, stream: Stream) -> None:
         """Let a stream have no more messages."""
@@ -180,7 +176,7 @@ class Topics:
         if publisher in topic.latching:
             topic.latched = (publisher, publication)
         for stream in topic.streams.values():
-            self._offer(stream, publication, now)
+            self._note(stream, stream.offer(publication, now))
 
     @property
     def deadline(self) -> float | None:
@@ -201,8 +197,9 @@ class Topics:
         self.forget(topic)
 
     def forget(self, topic: Topic) -> None:
-        """Let go of a topic that nobody uses."""
-        if not topic.is_used and self._topics.get(topic.name) is topic:
+        """Remove a topic that nobody uses."""
+        used = topic.publishers or topic.streams or topic.listeners
+        if not used and self._topics.get(topic.name) is topic:
             del self._topics[topic.name]
 
     def leave(self, session: Session) -> None:
@@ -211,9 +208,6 @@ class Topics:
             self.retire(self._topics[name], session)
         for stream in session.streams.values():
             self.unsubscribe(stream)
-
-    def _offer(self, stream: Stream, publication: Publication, now: float) -> None:
-        self._note(stream, stream.offer(publication, now))
 
     def _note(self, stream: Stream, event: Send | None) -> None:
         if event is not None:

@@ -13,7 +13,7 @@ from bam_envs.core.errors import InvalidValue, RemoteError
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER
-from bam_envs.rosbridge.server.server import BridgeServer
+from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.testing.transports import MirrorEnv
 from tests import gymapi_versions as theirs
 from tests.bam_envs.remote.serve.conftest import MemoryBus

@@ -15,7 +15,7 @@ from websockets.sync.client import connect
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
 from bam_envs.ros.images import decode_image
-from bam_envs.rosbridge.server.server import BridgeServer
+from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.testing.transports import MirrorEnv
 
 NAME = "/bam_001/gym_env/gym_api_request"

@@ -16,7 +16,7 @@ from bam_envs.robots.ur5e import arm_spec
 from bam_envs.ros.codec import encode_command, read_info
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
-from bam_envs.rosbridge.server.server import BridgeServer
+from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.testing.transports import assert_same_value
 
 UR5E = load_profile("ur5e")

@@ -14,9 +14,9 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from bam_envs.rosbridge.bus import Caller
-from bam_envs.rosbridge.server.core import Bridge
-from bam_envs.rosbridge.server.server import BridgeServer
-from bam_envs.rosbridge.server.session import Send
+from bam_envs.rosbridge.server import BridgeServer
+from bam_envs.rosbridge.server.bridge import Bridge
+from bam_envs.rosbridge.server.client_session import Send
 
 COMMAND, TRIGGER = "std_msgs/Float64MultiArray", "std_srvs/Trigger"
 SEEDS = [

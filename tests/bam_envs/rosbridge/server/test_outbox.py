@@ -1,7 +1,6 @@
 import pytest
 
-from bam_envs.rosbridge.server.outbox import Outbox, OutboxLimits
-from bam_envs.rosbridge.server.packets import Packet
+from bam_envs.rosbridge.server.outgoing import Outbox, Packet
 
 
 def packet(name, stream=None, size=1):
@@ -14,7 +13,7 @@ def drain(outbox):
 
 @pytest.fixture
 def outbox():
-    return Outbox(OutboxLimits(size=10, of_one_stream=3))
+    return Outbox(10, 3)
 
 
 def test_what_waits_stays_in_order(outbox):

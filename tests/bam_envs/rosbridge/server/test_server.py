@@ -12,9 +12,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from bam_envs.core.errors import InvalidValue, LinkLost, NotInCommand
-from bam_envs.rosbridge.server.outbox import OutboxLimits
-from bam_envs.rosbridge.server.server import BridgeServer, ServerOptions
-from bam_envs.rosbridge.server.session import Limits
+from bam_envs.rosbridge.server import BridgeServer, ServerOptions
 
 DEADLINE = 10.0
 TEXT, BYTES, TRIGGER = "std_msgs/String", "std_msgs/UInt8MultiArray", "std_srvs/Trigger"
@@ -299,7 +297,7 @@ def ending(client):
     return caught.value.rcvd.code, caught.value.rcvd.reason
 
 
-def test_a_page_shows_its_token_in_its_first_message(new_server, new_client, monkeypatch):
+def test_a_page_shows_its_token_in_its_first_message(new_server, new_client):
     url, page = new_server(token="secret").url, {"additional_headers": {"Origin": "https://good.example"}}
     good = new_client(url, **page)
     good.send(op="auth", token="secret")
@@ -314,7 +312,7 @@ def test_a_page_shows_its_token_in_its_first_message(new_server, new_client, mon
         bad = new_client(url, **page)
         bad.send(**message)
         assert ending(bad) == (1008, reason)
-    monkeypatch.setattr("bam_envs.rosbridge.server.door._GREETING", 0.05)
+    url = new_server(token="secret", options=ServerOptions(token_timeout=0.05)).url
     assert ending(new_client(url, **page)) == (1008, first.replace("2 s", "0.05 s"))
 
 
@@ -340,14 +338,14 @@ def guess(url, source=None):
 def test_guessing_tokens_is_slow_and_keeps_no_other_address_out(new_server, new_client):
     server = new_server(token="secret")
     place = ("127.0.0.1", server.port)
-    server._door._guesses._clock = lambda: 100.0
+    server._admission._guesses._clock = lambda: 100.0
     assert [guess(place) for _ in range(6)] == [401] * 4 + [429] * 2
     try:
         elsewhere = socket.create_connection(place, source_address=("127.0.0.2", 0))
     except OSError:
         pytest.skip("this system has one loopback address")
     new_client(server.url, sock=elsewhere, additional_headers={"Authorization": "Bearer secret"}).sync()
-    server._door._guesses._clock = lambda: 101.0
+    server._admission._guesses._clock = lambda: 101.0
     new_client(server.url, additional_headers={"Authorization": "Bearer secret"}).sync()
 
 
@@ -419,13 +417,13 @@ def test_a_message_of_a_usual_size_is_done(server, client):
 
 
 def test_an_answer_may_be_larger_than_what_a_client_may_send(new_server, new_client):
-    server = new_server(options=ServerOptions(limits=Limits(max_incoming=1000)))
+    server = new_server(options=ServerOptions(max_incoming=1000))
     server.serve("/big", TRIGGER, lambda request, caller: {"message": "x" * 5000})
     assert new_client(server.url).call("/big")["values"]["message"] == "x" * 5000
 
 
 def test_fragments_may_not_be_larger_together_than_one_message(new_server, new_client):
-    client = new_client(new_server(options=ServerOptions(limits=Limits(max_incoming=1000))).url)
+    client = new_client(new_server(options=ServerOptions(max_incoming=1000)).url)
     client.send(op="fragment", id="a", num=0, total=3, data="x" * 700)
     answer = client.ask(op="fragment", id="a", num=1, total=3, data="x" * 700)
     assert answer["msg"] == "fragment: Fragments: expected at most 1000 bytes, found 1600."
@@ -481,17 +479,16 @@ def test_a_large_message_delays_no_halt(new_server, new_client, bomb):
 
 
 def test_unfinished_frames_of_all_clients_are_bounded(new_server, new_client):
-    server = new_server(options=ServerOptions(limits=Limits(max_incoming=2**20, unfinished=4 * 2**20)))
+    server = new_server(options=ServerOptions(max_incoming=2**20, unfinished=4 * 2**20))
     clients = [new_client(server.url, close_timeout=0.01) for _ in range(8)]
     head = struct.pack("!BBQ4s", 0x81, 0xFF, 1_000_000, bytes(4))
     for client in clients:
         with contextlib.suppress(OSError):
             client.socket.socket.sendall(head + b" " * 900_000)
     deadline = time.monotonic() + DEADLINE
-    while len(server._sockets) > 4:
+    while server.held[0] > 4 * 2**20:
         assert time.monotonic() < deadline
         time.sleep(0.01)
-    assert sum(one.unfinished for one in server._sockets) <= 4 * 2**20
     survivor = new_client(server.url)
     survivor.sync()
 
@@ -519,7 +516,7 @@ def test_what_is_no_websocket_harms_nobody(server, client, data):
 
 
 def test_a_client_that_never_reads_gets_the_newest_when_it_does(new_server, new_client, heard):
-    server = new_server(options=ServerOptions(outbox=OutboxLimits(size=2**20, of_one_stream=2)))
+    server = new_server(options=ServerOptions(outbox_size=2**20, outbox_of_a_topic=2))
     server.advertise("/t", BYTES)
     sleeper, other = new_client(server.url, max_queue=1), new_client(server.url)
     for client in (sleeper, other):
@@ -528,7 +525,7 @@ def test_a_client_that_never_reads_gets_the_newest_when_it_does(new_server, new_
     for number in range(60):
         server.publish("/t", {"data": bytes([number]) * 500_000})
         assert other.receive()["msg"]["data"]
-    most = max(one.outbox.size for one in server._sockets)
+    most = server.held[1]
     assert 0 < most < 2**20 + 700_000
     numbers = [first_byte(sleeper.receive())]
     while numbers[-1] != 59:
@@ -542,7 +539,7 @@ def first_byte(message):
 
 
 def test_a_client_that_does_not_take_its_answers_is_closed(new_server, new_client):
-    server = new_server(options=ServerOptions(outbox=OutboxLimits(size=2**20), close_timeout=5.0))
+    server = new_server(options=ServerOptions(outbox_size=2**20, close_timeout=5.0))
     server.serve("/big", TRIGGER, lambda request, caller: {"message": "x" * 1_000_000})
     sleeper, other = new_client(server.url, max_queue=1), new_client(server.url)
     with contextlib.suppress(ConnectionClosed):
@@ -561,8 +558,7 @@ def read_all(client):
 
 
 def test_pings_that_are_never_read_do_not_pile_up(new_server, new_client, until):
-    limits = Limits(max_message=100_000)
-    server = new_server(options=ServerOptions(limits=limits, outbox=OutboxLimits(size=100_000)))
+    server = new_server(options=ServerOptions(max_message=100_000, outbox_size=100_000))
     sleeper, other = socket.create_connection(("127.0.0.1", server.port), timeout=DEADLINE), new_client(server.url)
     sleeper.sendall(
         b"GET / HTTP/1.1\r\nHost: here\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"

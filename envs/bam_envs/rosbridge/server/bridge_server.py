@@ -1,10 +1,8 @@
-"""The embedded rosbridge server: the protocol of `core` on WebSockets, in a thread of its own.
+"""The embedded rosbridge server: the protocol of `bridge` on WebSockets, in a thread of its own.
 
 The thread of the network runs the protocol and the listeners; handlers of services run in a pool of threads, and what
 is long is read in a thread of its own, so that nobody's halt waits for it. A client that sends nonsense, does not read,
 or opens sockets and says nothing costs a bounded amount of memory and time.
-
-The file is long because the two sides of the server, its bus for this process and its connections, meet in one loop.
 """
 
 from __future__ import annotations
@@ -22,19 +20,17 @@ from typing import Any, TypeVar
 
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
+from websockets.protocol import State
 
 from bam_envs.core.errors import InvalidValue, LinkLost
 from bam_envs.rosbridge.bus import Caller, Handler, Listener, Message
-from bam_envs.rosbridge.server.connection import BridgeConnection
-from bam_envs.rosbridge.server.core import Bridge, Incoming
-from bam_envs.rosbridge.server.door import Door, listening_error, tls_context
-from bam_envs.rosbridge.server.options import ServerOptions
-from bam_envs.rosbridge.server.packets import Publication
-from bam_envs.rosbridge.server.session import Invoke, Send, Session
+from bam_envs.rosbridge.server.admission import Admission, listening_error, tls_context
+from bam_envs.rosbridge.server.bridge import Bridge, Incoming
+from bam_envs.rosbridge.server.client_session import Invoke, Send, ServerOptions, Session
+from bam_envs.rosbridge.server.outgoing import Publication
+from bam_envs.rosbridge.server.server_connection import BridgeConnection
 from bam_envs.rosbridge.threads import LoopThread, Workers
 from bam_envs.rosbridge.tokens import Tokens
-
-__all__ = ["BridgeServer", "ServerOptions"]
 
 T = TypeVar("T")
 
@@ -42,6 +38,7 @@ _HANDLER_THREADS = 32
 _SHORT = 4096
 """A frame up to this is read in the thread of the network [bytes]."""
 _TURN = 4
+"""Frames of one client that are read before the others have their turn."""
 _QUEUE = 2
 """Messages of a client that are taken from its socket before they are done."""
 _logger = logging.getLogger(__name__)
@@ -82,10 +79,10 @@ class BridgeServer:
         self.host, self.port = host, port
         self.options = options or ServerOptions()
         self._cert, self._key = cert, key
-        self._bridge = Bridge(self.options.limits)
+        self._bridge = Bridge(self.options)
         self._connections: dict[Session, BridgeConnection] = {}
         self._sockets: set[BridgeConnection] = set()
-        self._door = Door(Tokens(token, operator_token), self.options.max_clients, lambda: len(self._connections))
+        self._admission = Admission(Tokens(token, operator_token), self.options, lambda: len(self._connections))
         self._numbers = itertools.count(1)
         self._thread = LoopThread("bam-bridge-server")
         self._workers = Workers(_HANDLER_THREADS, "bam-bridge-handler")
@@ -104,6 +101,12 @@ class BridgeServer:
         """How many there are."""
         return len(self._connections)
 
+    @property
+    def held(self) -> tuple[int, int]:
+        """What all sockets hold that is not a message yet, and what waits for clients that read slowly [bytes]."""
+        sockets = list(self._sockets)
+        return sum(one.unfinished for one in sockets), sum(one.outbox.size for one in sockets)
+
     def start(self) -> BridgeServer:
         """Listen; returns when clients can connect.
 
@@ -121,7 +124,7 @@ class BridgeServer:
         return self
 
     def close(self) -> None:
-        """Say goodbye to all clients (1001), and end the threads. As often as one likes."""
+        """Close all connections (1001), and end the threads. Idempotent."""
         if self._stop is not None:
             self._thread.post(self._stop.set)
         self._thread.join()
@@ -136,7 +139,7 @@ class BridgeServer:
     ) -> None:
         self.close()
 
-    # The Bus. See there.
+    # ---- the Bus; see there
 
     def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
         """Say that `topic` of type `kind` will be published; a latched one repeats its last message to newcomers."""
@@ -167,46 +170,33 @@ class BridgeServer:
         """Call `callback` in the thread of the network when a client's connection ends."""
         self._do(lambda: self._bridge.on_leave(callback))
 
-    # The thread of the network.
+    # ---- the thread of the network: connections
 
     async def _main(self, tls: ssl.SSLContext | None, listening: Future[None]) -> None:
-        self._stop = asyncio.Event()
-        server = await self._listen(tls)
-        self.port = server.sockets[0].getsockname()[1]
-        listening.set_result(None)
-        await self._stop.wait()
-        await self._shut(server)
-
-    async def _listen(self, tls: ssl.SSLContext | None) -> Server:
-        options = self.options
+        self._stop, options = asyncio.Event(), self.options
         extra: dict[str, Any] = {"ssl": tls, "ssl_handshake_timeout": options.open_timeout} if tls else {}
-        server: Server = await serve(
+        # What makes a connection: `websockets` calls it, and only says that it is a class.
+        connection: Any = functools.partial(BridgeConnection, sockets=self._sockets, limits=options)
+        server = await serve(
             self._serve,
             self.host,
             self.port,
-            process_request=self._door.check,
+            process_request=self._admission.check,
             compression=None,
             open_timeout=options.open_timeout,
             ping_interval=options.ping_interval,
             ping_timeout=options.ping_timeout,
             close_timeout=options.close_timeout,
-            max_size=options.limits.max_incoming,
+            max_size=options.max_incoming,
             max_queue=_QUEUE,
             logger=_quiet,
-            create_connection=self._connection_type(),
+            create_connection=connection,
             **extra,
         )
-        return server
-
-    def _connection_type(self) -> Any:
-        """What makes a connection; `websockets` calls it, and only says that it is a class."""
-        return functools.partial(
-            BridgeConnection,
-            sockets=self._sockets,
-            most_unfinished=self.options.limits.unfinished,
-            most_unsent=self.options.limits.max_message + self.options.outbox.size,
-            outbox_limits=self.options.outbox,
-        )
+        self.port = server.sockets[0].getsockname()[1]
+        listening.set_result(None)
+        await self._stop.wait()
+        await self._shut(server)
 
     async def _shut(self, server: Server) -> None:
         # asyncio leaks a socket that was accepted just before its server is closed: accept no more, let those become
@@ -214,31 +204,38 @@ class BridgeServer:
         for listener in server.sockets:
             asyncio.get_running_loop().remove_reader(listener.fileno())
         await _turns()
-        self._abort(lambda connection: connection.is_opening)
+        for connection in [
+            one for one in self._sockets if one.state is State.CONNECTING
+        ]:  # in the middle of its handshake
+            connection.transport.abort()
         server.close(reason="the server is closing")
         await _turns()
         # Not for server.wait_closed(): it waits for sockets in the middle of their TLS handshake, too.
         goodbyes = [asyncio.create_task(connection.wait_closed()) for connection in self._sockets]
         if goodbyes:
             await asyncio.wait(goodbyes, timeout=2 * self.options.close_timeout + 1.0)
-        self._abort(lambda connection: True)
-        await _turns()
-
-    def _abort(self, condition: Callable[[BridgeConnection], bool]) -> None:
-        for connection in [one for one in self._sockets if condition(one)]:
+        for connection in list(self._sockets):
             connection.transport.abort()
+        await _turns()
 
     async def _serve(self, connection: ServerConnection) -> None:
         """Read one client's frames until its connection ends."""
         if not isinstance(connection, BridgeConnection):
             raise TypeError(f"Expected a BridgeConnection, found {connection!r}.")
         try:
-            await self._door.greet(connection)
+            await self._admission.greet(connection)
         except ConnectionClosed:
             return
         if connection.role is None:
             return
-        session = self._bridge.open(self._caller(connection))
+        host, port = connection.remote_address[:2]
+        caller = Caller(
+            f"client{next(self._numbers)}",
+            f"{host}:{port}",
+            operator=connection.role == "operator",
+            silence=lambda: time.monotonic() - connection.heard,
+        )
+        session = self._bridge.open(caller)
         self._connections[session] = connection
         try:
             await self._read(connection, session)
@@ -248,15 +245,6 @@ class BridgeServer:
             del self._connections[session]
             self._bridge.lost(session)
             self._flush()
-
-    def _caller(self, connection: BridgeConnection) -> Caller:
-        host, port = connection.remote_address[:2]
-        return Caller(
-            f"client{next(self._numbers)}",
-            f"{host}:{port}",
-            operator=connection.role == "operator",
-            silence=lambda: time.monotonic() - connection.heard,
-        )
 
     async def _read(self, connection: BridgeConnection, session: Session) -> None:
         for number in itertools.count(1):
@@ -271,18 +259,19 @@ class BridgeServer:
                 await asyncio.sleep(0)
 
     async def _incoming(self, text: bytes | str, joined: bool) -> Incoming:
-        """What a frame says; a long one is read elsewhere, and its client's next one waits for it."""
+        """What a frame says; a long one is read in another thread, and its client's next one waits for it."""
         if len(text) <= _SHORT:
             return self._bridge.read(text, joined=joined)
-        loop = asyncio.get_running_loop()
-        done: asyncio.Future[Incoming] = loop.create_future()
+        done: asyncio.Future[Incoming] = asyncio.get_running_loop().create_future()
 
         def read() -> None:
-            incoming = self._bridge.read(text, joined=joined, check=True)
+            incoming = self._bridge.read(text, joined=joined)
             self._thread.post(lambda: None if done.cancelled() else done.set_result(incoming))
 
         self._reader.submit(read)
         return await done
+
+    # ---- the thread of the network: doing what the protocol wants done
 
     def _publish(self, publications: Sequence[Publication]) -> None:
         now = time.monotonic()
@@ -290,7 +279,6 @@ class BridgeServer:
             self._bridge.publish(publication, now)
 
     def _flush(self) -> None:
-        """Do what the protocol wants done."""
         written: dict[BridgeConnection, None] = {}
         for event in self._bridge.events():
             if isinstance(event, Send):
@@ -302,23 +290,21 @@ class BridgeServer:
                 self._workers.submit(functools.partial(self._work, event))
         for connection in written:
             connection.flush()
-        self._arm()
+        self._set_timer()
 
     def _work(self, invoke: Invoke) -> None:
         """In a thread of the pool: answer one call."""
         packet = self._bridge.packed_answer(invoke)
         self._post(lambda: self._bridge.finish(invoke, packet))
 
-    def _arm(self) -> None:
+    def _set_timer(self) -> None:
         deadline = self._bridge.next_deadline
-        if deadline is None:
+        if deadline is None or (self._timer is not None and self._timer.when() <= deadline):
             return
-        if self._timer is not None and self._timer.when() > deadline:
+        if self._timer is not None:
             self._timer.cancel()
-            self._timer = None
-        if self._timer is None:
-            # The loop's clock is the monotonic one.
-            self._timer = asyncio.get_running_loop().call_at(deadline, self._tick)
+        # The loop's clock is the monotonic one.
+        self._timer = asyncio.get_running_loop().call_at(deadline, self._tick)
 
     def _tick(self) -> None:
         self._timer = None

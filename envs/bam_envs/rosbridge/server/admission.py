@@ -1,4 +1,4 @@
-"""Who may come in: the token, the number of clients, the certificate, and clear errors when listening fails."""
+"""Which clients may come in: tokens, the number of clients, the server's certificate; and why it cannot listen."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from websockets.http11 import Request, Response
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.rosbridge.encoding import decode_frame
-from bam_envs.rosbridge.server.connection import BridgeConnection
+from bam_envs.rosbridge.server.client_session import ServerOptions
+from bam_envs.rosbridge.server.server_connection import BridgeConnection
 from bam_envs.rosbridge.tokens import Guesses, Tokens
 
 _NO_TOKEN = (
@@ -29,25 +30,23 @@ _PAGE_REFUSED = (
     'To let it in, start the server with one, and send it as the first message: {"op": "auth", "token": TOKEN}.'
 )
 _FIRST = 'The first message of a page must be its token, within {:g} s: {{"op": "auth", "token": TOKEN}}'
-_GREETING = 2.0
-"""How long a page may take to show its token [s]."""
 _POLICY_VIOLATION = 1008
-"""Close code of who does not show it."""
+"""Close code of who does not show its token."""
 _logger = logging.getLogger(__name__)
 
 
-class Door:
+class Admission:
     """Lets clients in, or says why not.
 
     Args:
         tokens: What they must show.
-        most: Most clients.
+        options: How many there may be, and how long a page has time.
         present: How many there are.
     """
 
-    def __init__(self, tokens: Tokens, most: int, present: Callable[[], int]) -> None:
+    def __init__(self, tokens: Tokens, options: ServerOptions, present: Callable[[], int]) -> None:
         self._tokens, self._guesses = tokens, Guesses()
-        self._most, self._present = most, present
+        self._options, self._present = options, present
 
     def check(self, connection: ServerConnection, request: Request) -> Response | None:
         """The refusal of a request to open a WebSocket, or None; a page may show its token later (`greet`)."""
@@ -55,9 +54,12 @@ class Door:
             raise TypeError(f"Expected a BridgeConnection, found {connection!r}.")
         shown, is_page = _shown(request), "Origin" in request.headers
         if shown and self._tokens.exist:
-            refusal = self._look(connection, shown)
+            # Several different tokens would be several guesses.
+            refusal = self._judge(connection, shown if len(set(shown)) == 1 else [])
+            if refusal == _TOO_OFTEN:
+                return connection.respond(HTTPStatus.TOO_MANY_REQUESTS, _TOO_OFTEN + "\n")
             if refusal is not None:
-                return refusal
+                return _unauthorized(connection)
         elif is_page and not self._tokens.exist:
             # Any page open in a browser on this computer reaches loopback; programs send no Origin.
             _logger.warning(_PAGE_REFUSED, ", ".join(request.headers.get_all("Origin"))[:100])
@@ -66,41 +68,45 @@ class Door:
             return None  # browsers set no headers, and an address with a token is logged: it may be a message, too
         elif self._tokens.needed:
             return _unauthorized(connection)
-        if self._present() >= self._most:
-            text = f"There are {self._most} clients, and no room for more.\n"
-            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, text)
+        if self._is_full:
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, self._no_room + "\n")
         connection.role = connection.role or "client"
         return None
 
-    def _look(self, connection: BridgeConnection, shown: list[str]) -> Response | None:
-        if not self._guesses.may_try(connection.host):
-            return connection.respond(HTTPStatus.TOO_MANY_REQUESTS, _TOO_OFTEN + "\n")
-        connection.role = self._tokens.role(shown) if len(set(shown)) == 1 else None  # several would be several guesses
-        if connection.role is None:
-            self._guesses.wrong(connection.host)
-            return _unauthorized(connection)
-        return None
-
     async def greet(self, connection: BridgeConnection) -> None:
-        """See to it that who came in without a token shows it now, or is out."""
+        """See to it that who came in without a token shows it now, or is closed."""
         if connection.role is not None:
             return
-        reason = _FIRST.format(_GREETING)
+        limit = self._options.token_timeout
         try:
-            token = _read_auth(await asyncio.wait_for(connection.next_frame(), _GREETING))
-        except (TimeoutError, asyncio.TimeoutError):
+            token = _read_auth(await asyncio.wait_for(connection.next_frame(), limit))
+        except asyncio.TimeoutError:
             token = None
-        if token is not None and not self._guesses.may_try(connection.host):
-            reason, token = _TOO_OFTEN, None
+        reason: str | None = _FIRST.format(limit)
         if token is not None:
-            connection.role = self._tokens.role([token])
-            if connection.role is None:
-                self._guesses.wrong(connection.host)
-                reason = "The token is wrong."
-        if connection.role is not None and self._present() >= self._most:
-            connection.role, reason = None, f"There are {self._most} clients, and no room for more."
-        if connection.role is None:
+            reason = self._judge(connection, [token])
+        if reason is None and self._is_full:
+            connection.role, reason = None, self._no_room
+        if reason is not None:
             await connection.close(_POLICY_VIOLATION, reason)
+
+    def _judge(self, connection: BridgeConnection, shown: list[str]) -> str | None:
+        """Set the role of who shows these; why it gets none, or None."""
+        if not self._guesses.may_try(connection.host):
+            return _TOO_OFTEN
+        connection.role = self._tokens.role(shown)
+        if connection.role is None:
+            self._guesses.wrong(connection.host)
+            return "The token is wrong."
+        return None
+
+    @property
+    def _is_full(self) -> bool:
+        return self._present() >= self._options.max_clients
+
+    @property
+    def _no_room(self) -> str:
+        return f"There are {self._options.max_clients} clients, and no room for more."
 
 
 def _shown(request: Request) -> list[str]:
@@ -110,7 +116,7 @@ def _shown(request: Request) -> list[str]:
     return bearers + parse_qs(urlsplit(request.path).query).get("token", [])
 
 
-def _read_auth(frame: str | bytes) -> str | None:
+def _read_auth(frame: bytes) -> str | None:
     try:
         message = decode_frame(frame)
     except ProtocolError:

@@ -1,4 +1,4 @@
-"""One client of the rosbridge server: what it has advertised, subscribed and asked; and how its fields are read."""
+"""One client of the rosbridge server: what it may use, what it has declared and asked, and how its fields are read."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bam_envs.ros.interfaces import describe
 from bam_envs.rosbridge.bus import Caller, Handler, Message
 from bam_envs.rosbridge.encoding import COMPRESSIONS
 from bam_envs.rosbridge.fragments import Fragments, Id
-from bam_envs.rosbridge.server.packets import NEVER_SPLIT, Packet, Wire, pack
+from bam_envs.rosbridge.server.outgoing import NEVER_SPLIT, Packet, Wire, pack
 
 if TYPE_CHECKING:
     from bam_envs.rosbridge.server.topics import Stream
@@ -27,9 +27,11 @@ _LARGEST = 2**53
 
 
 @dataclass(frozen=True)
-class Limits:
-    """What one client may use. Beyond it, it is told so; the others do not notice."""
+class ServerOptions:
+    """What clients of a `BridgeServer` may use: beyond it one is told so, and the others do not notice."""
 
+    max_clients: int = 256
+    """Most clients at the same time; the next one is told 503."""
     service_timeout: float = 30.0
     """A client that offers a service must have answered by then [s], if the caller names no other time."""
     handler_timeout: float = 300.0
@@ -39,18 +41,32 @@ class Limits:
     max_incoming: int = 16 * 2**20
     """Largest message from a client [bytes], and most that its unfinished fragments may hold together."""
     unfinished: int = 64 * 2**20
-    """Most that the unfinished fragments of all clients may hold together, and their unfinished frames [bytes]: who
-    holds most gives way."""
+    """Most that the unfinished fragments of all clients may hold together, and their unfinished frames [bytes]: the
+    client that holds most loses its own."""
     topics: int = 1024
-    """Most subscriptions, and most advertisements."""
+    """Most subscriptions, and most advertisements, of a client."""
     services: int = 256
-    """Most services that it offers."""
+    """Most services that a client offers."""
     calls: int = 256
-    """Most unanswered calls."""
+    """Most unanswered calls of a client."""
     at_once: int = 4
-    """Most of its calls that handlers of this process work on at the same time; the others wait their turn."""
+    """Most calls of a client that handlers of this process work on at the same time; the others wait their turn."""
     fragment_lifetime: float = 10.0
     """A message that comes in fragments must be whole by then [s]."""
+    outbox_size: int = 8 * 2**20
+    """Most bytes that wait for a client that reads slowly."""
+    outbox_of_a_topic: int = 100
+    """Most messages of one topic that wait for it, unless it asked for fewer."""
+    open_timeout: float = 5.0
+    """A socket must have become a WebSocket by then [s]."""
+    token_timeout: float = 2.0
+    """A web page must have shown its token by then [s]."""
+    ping_interval: float = 1.0
+    """How often a client is asked whether it is still there [s]: who drives and does not answer loses command soon."""
+    ping_timeout: float = 20.0
+    """How long its answer may take [s]."""
+    close_timeout: float = 1.0
+    """How long a client may take for the closing handshake [s]."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +98,7 @@ class Session:
     """The state of one connection."""
 
     caller: Caller
-    limits: Limits
+    options: ServerOptions
     level: str = "error"
     """The status messages it wants: this one of LEVELS and those before it."""
     advertised: dict[str, set[Id]] = field(default_factory=dict)
@@ -99,31 +115,31 @@ class Session:
     """Its calls that wait for their turn."""
 
     def __post_init__(self) -> None:
-        self.fragments = Fragments(self.limits.max_incoming, self.limits.fragment_lifetime)
+        self.fragments = Fragments(self.options.max_incoming, self.options.fragment_lifetime)
 
-    def status(self, level: str, text: str, name: Id = None) -> list[Send]:
-        """What tells it `text`: nothing if it does not want to hear of that level."""
-        if LEVELS.index(level) > LEVELS.index(self.level):
+    def status(self, text: str, name: Id = None) -> list[Send]:
+        """What tells it an error: nothing if it does not want to hear of errors."""
+        if self.level == "none":
             return []
-        message = {"op": "status", "level": level, "msg": text}
-        return [Send(self, pack(message if name is None else {**message, "id": name}, Wire(), stream="status"))]
+        message = {"op": "status", "level": "error", "msg": text}
+        return [Send(self, pack(message if name is None else {**message, "id": name}, stream="status"))]
+
+
+@lru_cache(maxsize=1024)
+def canonical(name: str) -> str:
+    """The name of a topic or service with its leading slash.
+
+    Raises:
+        ProtocolError: It is not such a name.
+    """
+    if len(name) > _LONGEST or not _NAME.fullmatch(name):
+        raise ProtocolError(f"Name: expected one such as '/joint_states', found {describe(name)}.")
+    return name if name.startswith("/") else f"/{name}"
 
 
 def read_name(message: Mapping[str, Any], what: str) -> str:
     """The topic or service that a message is about, with a leading slash."""
     return canonical(read_text(message, what))
-
-
-@lru_cache(maxsize=1024)
-def canonical(name: str) -> str:
-    """A name with its leading slash.
-
-    Raises:
-        ProtocolError: It is not the name of a topic or service.
-    """
-    if len(name) > _LONGEST or not _NAME.fullmatch(name):
-        raise ProtocolError(f"Name: expected one such as '/joint_states', found {describe(name)}.")
-    return name if name.startswith("/") else f"/{name}"
 
 
 def read_text(message: Mapping[str, Any], name: str) -> str:
@@ -141,16 +157,6 @@ def read_number(message: Mapping[str, Any], name: str, otherwise: float) -> floa
         return otherwise
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value <= _LARGEST:
         raise ProtocolError(f"{name}: expected a number >= 0, found {describe(value)}.")
-    return value
-
-
-def read_flag(message: Mapping[str, Any], name: str, otherwise: bool) -> bool:
-    """True or false, or `otherwise` if it is left out."""
-    value = message.get(name)
-    if value is None:
-        return otherwise
-    if not isinstance(value, bool):
-        raise ProtocolError(f"{name}: expected true or false, found {describe(value)}.")
     return value
 
 

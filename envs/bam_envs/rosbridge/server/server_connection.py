@@ -11,14 +11,14 @@ from websockets.asyncio.server import ServerConnection
 from websockets.frames import DATA_OPCODES, Frame
 from websockets.protocol import Event, State
 
-from bam_envs.rosbridge.server.outbox import Outbox, OutboxLimits
-from bam_envs.rosbridge.server.packets import Packet
+from bam_envs.rosbridge.server.client_session import ServerOptions
+from bam_envs.rosbridge.server.outgoing import Outbox, Packet
 from bam_envs.rosbridge.tokens import Role
 
 TRY_AGAIN_LATER = 1013
 """Close code of a client that does not read what it must get."""
 _STRANGERS, _STRANGERS_OF_ONE = 128, 32
-"""Sockets that nobody has been let in through yet: of all, and of one address. The oldest gives way."""
+"""Sockets that nobody has been let in through yet: of all, and of one address. The oldest is closed for a new one."""
 _OF_A_STRANGER = 65536
 """What a stranger may say [bytes]."""
 _FRAME = 200
@@ -30,29 +30,20 @@ class BridgeConnection(ServerConnection):
 
     Args:
         *args: Of `websockets`.
-        sockets: Every open socket of the server; this one is added and taken out.
-        most_unfinished: What all of them may hold that is not done yet [bytes]; who holds most gives way.
-        most_unsent: Most bytes that may wait for the socket [bytes]; pings that are never read would pile up.
-        outbox_limits: Of what waits beside.
+        sockets: Every open socket of the server; this one is added and removed.
+        limits: How much may wait, in both directions.
         **options: Of `websockets`.
     """
 
-    def __init__(
-        self,
-        *args: Any,
-        sockets: set[BridgeConnection],
-        most_unfinished: int,
-        most_unsent: int,
-        outbox_limits: OutboxLimits,
-        **options: Any,
-    ) -> None:
+    def __init__(self, *args: Any, sockets: set[BridgeConnection], limits: ServerOptions, **options: Any) -> None:
         super().__init__(*args, **options)
-        self._sockets, self._most_unfinished, self._most_unsent = sockets, most_unfinished, most_unsent
-        self.outbox = Outbox(outbox_limits)
+        self._sockets, self._most_unfinished = sockets, limits.unfinished
+        self._most_unsent = limits.max_message + limits.outbox_size
+        self.outbox = Outbox(limits.outbox_size, limits.outbox_of_a_topic)
         self.role: Role | None = None
-        """What who it is was let in as; None before."""
+        """What the client was let in as; None before."""
         self.host = ""
-        """The IP address there."""
+        """The IP address of the client."""
         self.heard = time.monotonic()
         """When anything came last [s, monotonic]."""
         self.born = self.heard
@@ -62,12 +53,14 @@ class BridgeConnection(ServerConnection):
         self._takes_more = True
         self._closing: asyncio.Task[None] | None = None
 
+    # ---- outgoing
+
     def put(self, packet: Packet, keep: int) -> None:
         """Send `packet` at the next `flush`, or when the socket takes more.
 
         A client that must get it and does not read is closed.
         """
-        if not self.is_open or self.transport.is_closing():
+        if self.state is not State.OPEN or self.transport.is_closing():
             return
         if self._takes_more and not self.outbox:
             self._write(packet)
@@ -78,31 +71,49 @@ class BridgeConnection(ServerConnection):
     def flush(self) -> None:
         """Write what was put, in one piece: a client that waits for several messages wakes up once."""
         parts = self.protocol.data_to_send()
-        whole = parts[0] if len(parts) == 1 else b"".join(parts)
+        whole = b"".join(parts)
         if whole and not self.transport.is_closing():
             self.transport.write(whole)
         if parts and not parts[-1] and self.transport.can_write_eof():  # how the protocol says: half-close
             self.transport.write_eof()
 
-    @property
-    def is_open(self) -> bool:
-        """Whether the opening handshake is over and the closing one has not begun."""
-        return self.state is State.OPEN
+    def pause_writing(self) -> None:
+        """asyncio: the socket takes no more for now."""
+        super().pause_writing()
+        self._takes_more = False
+
+    def resume_writing(self) -> None:
+        """asyncio: the socket takes more."""
+        super().resume_writing()
+        self._takes_more = True
+        while self._takes_more and self.outbox and self.state is State.OPEN:
+            self._write(self.outbox.pop())
+            self.flush()
+
+    def _write(self, packet: Packet) -> None:
+        # Not send(), which waits: how much waits is for the outbox to say.
+        write = self.protocol.send_text if packet.text else self.protocol.send_binary
+        for frame in packet.frames:
+            write(frame)
+
+    # ---- incoming
+
+    async def next_frame(self) -> bytes:
+        """The next message."""
+        message = await self.recv(decode=False)
+        self._waiting -= self._whole.popleft()
+        return message
 
     @property
-    def is_opening(self) -> bool:
-        """Whether the opening handshake is not over yet."""
-        return self.state is State.CONNECTING
+    def unfinished(self) -> int:
+        """What it holds that was not taken yet [bytes]."""
+        return self._waiting + len(self.protocol.reader.buffer)
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """A socket opened."""
+        """asyncio: a socket opened. Sockets that say nothing keep nobody out: the oldest is closed for a new one."""
         super().connection_made(transport)
         self.host = str((self.remote_address or [""])[0])
         self._sockets.add(self)
-        self._make_room()
-
-    def _make_room(self) -> None:
-        """Sockets that say nothing keep nobody out: whoever comes is listened to, and the oldest of them gives way."""
         strangers = sorted((one for one in self._sockets if one.role is None), key=lambda one: one.born)
         mine = [one for one in strangers if one.host == self.host]
         if len(mine) > _STRANGERS_OF_ONE:
@@ -112,18 +123,19 @@ class BridgeConnection(ServerConnection):
             next(one for one in strangers if one.host == host).transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The socket closed."""
+        """asyncio: the socket closed."""
         self._sockets.discard(self)
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Bytes came."""
+        """asyncio: bytes came."""
         self.heard = time.monotonic()
         super().data_received(data)
         if self.role is None and self.unfinished > _OF_A_STRANGER:
             self.transport.abort()
         elif self.unfinished > _OF_A_STRANGER and sum(one.unfinished for one in self._sockets) > self._most_unfinished:
             max(self._sockets, key=lambda one: one.unfinished).transport.abort()
+        # Answers to pings that are never read would pile up.
         if not self._takes_more and self.transport.get_write_buffer_size() > self._most_unsent:
             self.transport.abort()
 
@@ -137,33 +149,3 @@ class BridgeConnection(ServerConnection):
                 self._whole.append(self._message)
                 self._message = 0
         super().process_event(event)
-
-    async def next_frame(self) -> bytes:
-        """The next message."""
-        message = await self.recv(decode=False)
-        self._waiting -= self._whole.popleft()
-        return message if isinstance(message, bytes) else message.encode()
-
-    @property
-    def unfinished(self) -> int:
-        """What it holds that was not taken yet [bytes]."""
-        return self._waiting + len(self.protocol.reader.buffer)
-
-    def pause_writing(self) -> None:
-        """The socket takes no more for now."""
-        super().pause_writing()
-        self._takes_more = False
-
-    def resume_writing(self) -> None:
-        """The socket takes more."""
-        super().resume_writing()
-        self._takes_more = True
-        while self._takes_more and self.outbox and self.is_open:
-            self._write(self.outbox.pop())
-            self.flush()
-
-    def _write(self, packet: Packet) -> None:
-        # Not send(), which waits: how much waits is for the outbox to say.
-        write = self.protocol.send_text if packet.text else self.protocol.send_binary
-        for frame in packet.frames:
-            write(frame)

@@ -1,0 +1,511 @@
+"""The rosbridge v2 protocol of a server without any I/O: frames in, things to do out, the time passed in.
+
+One object, used by one thread. `BridgeServer` gives it sockets and a clock; a test gives it lists. Whatever a client
+sends, it is answered: a request by its response, everything else that does not work by a message ``status``.
+
+Longer than other modules, because every operation of the protocol is in it.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+from bam_envs.core.errors import BamEnvsError, InvalidValue, ProtocolError
+from bam_envs.ros.interfaces import complete, describe, request_type, response_type
+from bam_envs.rosbridge.bus import Caller, Handler, Listener, Message, refusal_of
+from bam_envs.rosbridge.encoding import decode_frame
+from bam_envs.rosbridge.fragments import Id, read_id
+from bam_envs.rosbridge.server.client_session import (
+    LEVELS,
+    Event,
+    Invoke,
+    Send,
+    ServerOptions,
+    Session,
+    canonical,
+    read_name,
+    read_number,
+    read_text,
+    read_wire,
+)
+from bam_envs.rosbridge.server.outgoing import Packet, Publication, pack
+from bam_envs.rosbridge.server.services import Request, Services, checked, new_service, packed_response
+from bam_envs.rosbridge.server.topics import Stream, Topic, Topics, Wish
+
+T = TypeVar("T")
+
+_logger = logging.getLogger(__name__)
+_PROCESS = Caller("this process")
+_LONGEST_QUEUE = 100
+_NO_ACTIONS = "Actions are not supported by this server; use a service, or a pair of topics."
+_NO_AUTH = "The op auth is for the first message of a web page; this client has been let in already."
+
+
+@dataclass(frozen=True)
+class Incoming:
+    """A frame of a client, read; what it carries (a message, arguments, a response) is checked."""
+
+    message: Mapping[str, Any]
+    """What it says."""
+    error: ProtocolError | None = None
+    """Why it says nothing."""
+    kind: str = ""
+    """The type that its content was checked for; empty where there was nothing to check."""
+    content: Any = None
+    """What came of that."""
+    wrong: BamEnvsError | None = None
+    """Why nothing came of that."""
+
+    def content_of(self, kind: str) -> Any:
+        """The content.
+
+        Raises:
+            BamEnvsError: It does not fit, or should be of another type by now.
+        """
+        if self.kind != kind:
+            raise ProtocolError(f"Expected a {kind}, found a {self.kind}: the type was another one a moment ago.")
+        if self.wrong is not None:
+            raise self.wrong
+        return self.content
+
+
+class Bridge:
+    """All clients, topics and services of one server.
+
+    Args:
+        options: What one client may use.
+        clock: Wall clock [s], for ``/rosapi/get_time``.
+    """
+
+    def __init__(self, options: ServerOptions | None = None, clock: Callable[[], float] = time.time) -> None:
+        self.options = options or ServerOptions()
+        self._events: list[Event] = []
+        self.topics = Topics(self._events.append)
+        self.services = Services(self._events.append)
+        self._sessions: set[Session] = set()
+        self._fragmented: set[Session] = set()
+        self._leave: list[Callable[[Caller], None]] = []
+        self._operations: dict[str, Callable[[Session, Incoming, float], None]] = {
+            "advertise": self._advertise,
+            "unadvertise": self._unadvertise,
+            "publish": self._publish,
+            "subscribe": self._subscribe,
+            "unsubscribe": self._unsubscribe,
+            "call_service": self._call_service,
+            "advertise_service": self._advertise_service,
+            "unadvertise_service": self._unadvertise_service,
+            "service_response": self._service_response,
+            "set_level": self._set_level,
+            "send_action_goal": self._send_action_goal,
+        }
+        for name, (kind, handler) in self._rosapi(clock).items():
+            self.services.offer(new_service(name, kind, name, handler=handler, inline=True))
+
+    # ---- clients
+
+    def open(self, caller: Caller) -> Session:
+        """A client connected."""
+        session = Session(caller, self.options)
+        self._sessions.add(session)
+        return session
+
+    def lost(self, session: Session) -> None:
+        """Its connection ended: everything of it ends."""
+        if session not in self._sessions:
+            return
+        self._sessions.discard(session)
+        self._fragmented.discard(session)
+        self.services.leave(session)
+        self.topics.leave(session)
+        for callback in self._leave:
+            _tell(callback, session.caller)
+
+    def receive(self, session: Session, frame: str | bytes, now: float) -> None:
+        """Do what a frame of a client says. Never raises about what the frame holds.
+
+        Args:
+            session: The client.
+            frame: Of text, or binary.
+            now: Any steady clock [s]; the same one everywhere.
+        """
+        text = self.take(session, self.read(frame), now)
+        if text is not None:
+            self.take(session, self.read(text, joined=True), now)
+
+    def read(self, frame: str | bytes, *, joined: bool = False) -> Incoming:
+        """What a frame says, for `take`. It may be long work, and may be done in any thread.
+
+        Args:
+            frame: Of text, or binary.
+            joined: It is the text of fragments.
+        """
+        try:
+            message = decode_frame(frame)
+            if joined and message.get("op") == "fragment":
+                raise ProtocolError("A fragment must not hold fragments.")
+        except ProtocolError as error:
+            return Incoming({}, error)
+        try:
+            found = self._content(message)
+        except ProtocolError:  # it has no such name, as `take` will say
+            found = None
+        if found is None:
+            return Incoming(message)
+        kind, check = found
+        try:
+            return Incoming(message, None, kind, check())
+        except BamEnvsError as error:
+            return Incoming(message, None, kind, wrong=error)
+
+    def _content(self, message: Mapping[str, Any]) -> tuple[str, Callable[[], Any]] | None:
+        """The type of what a message carries, and what checks it; None where nothing is to be checked."""
+        operation = message.get("op")
+        if operation == "publish":
+            topic = self.topics.find(read_name(message, "topic"))
+            if topic is not None and not topic.is_ours:
+                return topic.kind, lambda: _publication(topic, message.get("msg"))
+        elif operation == "call_service":
+            service = self.services.find(read_name(message, "service"))
+            if service is not None:
+                return request_type(service.kind), lambda: checked(service.kind, request_type, message.get("args"))
+        elif operation == "service_response" and message.get("result", True) is True:
+            call = self.services.call_named(message.get("id"))
+            if call is not None:
+                kind = call.service.kind
+                return response_type(kind), lambda: checked(kind, response_type, message.get("values"))
+        return None
+
+    def take(self, session: Session, incoming: Incoming, now: float) -> str | None:
+        """Do what a frame of a client says; the text of a message whose last fragment it was, to be read in turn."""
+        message = incoming.message
+        try:
+            if incoming.error is not None:
+                self._status(session, str(incoming.error))
+            elif message.get("op") == "fragment":
+                return self._add_fragment(session, message, now)
+            else:
+                name = read_text(message, "op")
+                if name not in self._operations:
+                    raise ProtocolError(self._unknown(name))
+                self._operations[name](session, incoming, now)
+        except BamEnvsError as error:
+            self._status(session, f"{_title(message, str(error))}: {error}", _id(message))
+        return None
+
+    def tick(self, now: float) -> None:
+        """Do what `next_deadline` was about."""
+        self.services.expire(now)
+        self.topics.tick(now)
+        for session in list(self._fragmented):
+            for name in session.fragments.expire(now):
+                self._status(session, f"Fragments of {name!r} did not all come in time.")
+            self._note_fragments(session)
+
+    @property
+    def next_deadline(self) -> float | None:
+        """When `tick` is needed next [s], clock of `receive`; None if nothing waits."""
+        times = [self.services.deadline, self.topics.deadline]
+        times += [session.fragments.deadline for session in self._fragmented]
+        return min((one for one in times if one is not None), default=None)
+
+    def events(self) -> list[Event]:
+        """What is to be done, in this order; empties the list."""
+        events = self._events[:]
+        self._events.clear()
+        return events
+
+    def packed_answer(self, invoke: Invoke) -> Packet | None:
+        """Call the handler, which may take its time: from any thread. For `finish`."""
+        return self.services.packed_answer(invoke)
+
+    def finish(self, invoke: Invoke, packet: Packet | None) -> None:
+        """The answer of a handler."""
+        self.services.finish(invoke.number, packet)
+        self.services.ran(invoke.session)
+
+    # ---- this process; names and types as in `Bus`, and a wrong one raises InvalidValue
+
+    def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
+        """This process publishes `topic`."""
+        found = _own(lambda: self.topics.require(canonical(topic), kind))
+        found.publishers.add(None)
+        if latch:
+            found.latching.add(None)
+
+    def publication(self, topic: str, message: Message) -> Publication:
+        """A message of this process, checked; from any thread. For `publish`."""
+        name = _own(lambda: canonical(topic))
+        found = self.topics.find(name)
+        if found is None:
+            raise InvalidValue(f"Topic {name} does not exist; advertise it with its type first.")
+        return _publication(found, message)
+
+    def publish(self, publication: Publication, now: float) -> None:
+        """Send a message of this process to all who want it."""
+        self._spread(publication, None, now)
+
+    def subscribe(self, topic: str, kind: str, listener: Listener) -> Callable[[], None]:
+        """Call `listener` for each message of `topic`, the latched one at once, until what is returned is called."""
+        found = _own(lambda: self.topics.require(canonical(topic), kind))
+        found.listeners.append(listener)
+        if found.latched is not None:
+            publisher, publication = found.latched
+            self._deliver(listener, publication, publisher)
+
+        def unsubscribe() -> None:
+            if listener in found.listeners:
+                found.listeners.remove(listener)
+                self.topics.forget(found)
+
+        return unsubscribe
+
+    def serve(self, service: str, kind: str, handler: Handler) -> None:
+        """Answer `service` with `handler`; the events `Invoke` say when."""
+        _own(lambda: self.services.offer(new_service(canonical(service), kind, service, handler=handler)))
+
+    def on_leave(self, callback: Callable[[Caller], None]) -> None:
+        """Call `callback` when a client's connection ends."""
+        self._leave.append(callback)
+
+    # ---- what clients may say: one function for each op
+
+    def _advertise(self, session: Session, incoming: Incoming, now: float) -> None:
+        message = incoming.message
+        name, kind, number = read_name(message, "topic"), read_text(message, "type"), read_id(message)
+        latch = message.get("latch")
+        if not (latch is None or isinstance(latch, bool)):
+            raise ProtocolError(f"latch: expected true or false, found {describe(latch)}.")
+        _require_room(sum(map(len, session.advertised.values())), session.options.topics, "advertisements")
+        topic = self.topics.require(name, kind)
+        _require_not_ours(topic)
+        topic.publishers.add(session)
+        if latch:
+            topic.latching.add(session)
+        session.advertised.setdefault(name, set()).add(number)
+
+    def _unadvertise(self, session: Session, incoming: Incoming, now: float) -> None:
+        name, number = read_name(incoming.message, "topic"), read_id(incoming.message)
+        ids = session.advertised.get(name)
+        topic = self.topics.find(name)
+        if ids is None or topic is None or (number is not None and number not in ids):
+            raise ProtocolError(f"Topic {name} was not advertised so by this client.")
+        ids.discard(number)
+        if number is None or not ids:
+            del session.advertised[name]
+            self.topics.retire(topic, session)
+
+    def _publish(self, session: Session, incoming: Incoming, now: float) -> None:
+        name = read_name(incoming.message, "topic")
+        topic = self.topics.find(name)
+        if topic is None:
+            raise ProtocolError(f"Topic {name} does not exist; advertise it with its type first.")
+        _require_not_ours(topic)
+        self._spread(incoming.content_of(topic.kind), session, now)
+
+    def _subscribe(self, session: Session, incoming: Incoming, now: float) -> None:
+        message = incoming.message
+        name, number = read_name(message, "topic"), read_id(message)
+        kind = message.get("type")
+        wish = Wish(
+            read_number(message, "throttle_rate", 0) / 1000,
+            int(min(read_number(message, "queue_length", 0), _LONGEST_QUEUE)),
+            read_wire(message),
+        )
+        _require_room(sum(len(one.wishes) for one in session.streams.values()), session.options.topics, "subscriptions")
+        topic = self.topics.require(name, None if kind is None else read_text(message, "type"))
+        stream = session.streams.get(name)
+        if stream is not None:
+            stream.set_wish(number, wish)
+            return
+        stream = session.streams[name] = Stream(session, name, read_text(message, "topic"))
+        stream.set_wish(number, wish)
+        self.topics.subscribe(stream, topic, now)
+
+    def _unsubscribe(self, session: Session, incoming: Incoming, now: float) -> None:
+        name, number = read_name(incoming.message, "topic"), read_id(incoming.message)
+        stream = session.streams.get(name)
+        if stream is None or (number is not None and number not in stream.wishes):
+            raise ProtocolError(f"Topic {name} was not subscribed so by this client.")
+        stream.set_wish(number, None)
+        if number is None or not stream.wishes:
+            self.topics.unsubscribe(session.streams.pop(name))
+
+    def _call_service(self, session: Session, incoming: Incoming, now: float) -> None:
+        message = incoming.message
+        number, spelling = read_id(message), message.get("service")
+        request = Request(session, number, spelling if isinstance(spelling, str) else "")
+        # A call is answered by a response also when it is wrong: who called waits for nothing else.
+        try:
+            name = read_name(message, "service")
+            service = self.services.find(name)
+            if service is None:
+                raise ProtocolError(f"Service {name} does not exist")
+            limit = read_number(message, "timeout", 0) or None
+            values = incoming.content_of(request_type(service.kind))
+            self.services.call(service, replace(request, wire=read_wire(message), timeout=limit), values, now)
+        except BamEnvsError as error:
+            self._events.append(Send(session, packed_response(request, str(error), False)))
+
+    def _advertise_service(self, session: Session, incoming: Incoming, now: float) -> None:
+        message = incoming.message
+        name, kind = read_name(message, "service"), read_text(message, "type")
+        _require_room(len(session.services), session.options.services, "services")
+        before = self.services.offer(new_service(name, kind, read_text(message, "service"), provider=session))
+        if before is not None and before.provider is not None:
+            self._status(before.provider, f"Service {name} is offered by another client now.")
+
+    def _unadvertise_service(self, session: Session, incoming: Incoming, now: float) -> None:
+        name = read_name(incoming.message, "service")
+        service = self.services.find(name)
+        if service is None or service.provider is not session:
+            raise ProtocolError(f"Service {name} is not offered by this client.")
+        self.services.withdraw(service)
+
+    def _service_response(self, session: Session, incoming: Incoming, now: float) -> None:
+        self.services.respond(session, incoming.message, incoming.content_of)
+
+    def _set_level(self, session: Session, incoming: Incoming, now: float) -> None:
+        level = incoming.message.get("level")
+        if level not in LEVELS:
+            raise ProtocolError(f"level: expected one of {', '.join(LEVELS)}, found {level!r:.40}.")
+        session.level = level
+
+    def _send_action_goal(self, session: Session, incoming: Incoming, now: float) -> None:
+        action, aborted = read_text(incoming.message, "action"), 6
+        result = {"op": "action_result", "action": action, "values": _NO_ACTIONS, "status": aborted, "result": False}
+        self._events.append(Send(session, pack({**result, "id": read_id(incoming.message)})))
+
+    def _unknown(self, name: str) -> str:
+        if "action" in name:
+            return _NO_ACTIONS
+        if name == "auth":
+            return _NO_AUTH
+        return f"Unknown op {name!r:.40}; expected one of {', '.join(self._operations)}, fragment."
+
+    # ---- rosapi: what time it is, which topics and services there are
+
+    def _rosapi(self, clock: Callable[[], float]) -> dict[str, tuple[str, Handler]]:
+        """Type and handler of each service, by name."""
+
+        def time_of_day(request: Message, caller: Caller) -> dict[str, Any]:
+            now = clock()
+            seconds = int(now)
+            nanoseconds = int((now - seconds) * 1e9)
+            # Both spellings: clients of ROS 1 read the one, clients of ROS 2 the other.
+            return {"time": {"sec": seconds, "nanosec": nanoseconds, "secs": seconds, "nsecs": nanoseconds}}
+
+        def all_topics(request: Message, caller: Caller) -> dict[str, Any]:
+            return {"topics": [one.name for one in self.topics], "types": [one.kind for one in self.topics]}
+
+        def topic_type(request: Message, caller: Caller) -> dict[str, Any]:
+            topic = self.topics.find(read_name(request, "topic"))
+            return {"type": topic.kind if topic else ""}
+
+        def all_services(request: Message, caller: Caller) -> dict[str, Any]:
+            return {"services": [one.name for one in self.services]}
+
+        def service_type(request: Message, caller: Caller) -> dict[str, Any]:
+            service = self.services.find(read_name(request, "service"))
+            return {"type": service.kind if service else ""}
+
+        return {
+            "/rosapi/get_time": ("rosapi/GetTime", time_of_day),
+            "/rosapi/topics": ("rosapi/Topics", all_topics),
+            "/rosapi/topic_type": ("rosapi/TopicType", topic_type),
+            "/rosapi/services": ("rosapi/Services", all_services),
+            "/rosapi/service_type": ("rosapi/ServiceType", service_type),
+        }
+
+    # ---- inside
+
+    def _add_fragment(self, session: Session, message: Mapping[str, Any], now: float) -> str | None:
+        try:
+            return session.fragments.add(message, now)
+        finally:
+            self._note_fragments(session)
+            while sum(one.fragments.size for one in self._fragmented) > self.options.unfinished:
+                greatest = max(self._fragmented, key=lambda one: one.fragments.size)
+                greatest.fragments.clear()
+                self._note_fragments(greatest)
+                self._status(greatest, f"All unfinished fragments hold more than {self.options.unfinished} bytes.")
+
+    def _note_fragments(self, session: Session) -> None:
+        if session.fragments.deadline is not None:
+            self._fragmented.add(session)
+        else:
+            self._fragmented.discard(session)
+
+    def _spread(self, publication: Publication, publisher: Session | None, now: float) -> None:
+        topic = self.topics.find(publication.topic)
+        if topic is None or topic.kind != publication.kind:
+            return
+        self.topics.publish(publication, topic, publisher, now)
+        for listener in tuple(topic.listeners):
+            self._deliver(listener, publication, publisher)
+
+    def _deliver(self, listener: Listener, publication: Publication, publisher: Session | None) -> None:
+        try:
+            listener(publication.message, publisher.caller if publisher is not None else _PROCESS)
+        except BamEnvsError as error:
+            self._refused(publication, publisher, str(error))
+        # One listener's mistake must not end the connection of the client that published, nor silence other listeners.
+        except Exception:
+            _logger.exception("A listener of %s failed.", publication.topic)
+            self._refused(publication, publisher, "The receiver failed; its log says more.")
+
+    def _refused(self, publication: Publication, publisher: Session | None, reason: str) -> None:
+        if publisher is None:
+            _logger.warning("%s", refusal_of(publication.topic, reason))
+        else:
+            self._status(publisher, refusal_of(publication.topic, reason))
+
+    def _status(self, session: Session, text: str, name: Id = None) -> None:
+        self._events.extend(session.status(text, name))
+
+
+def _publication(topic: Topic, content: Any) -> Publication:
+    message = complete(topic.kind, {} if content is None else content)
+    return topic.packed(Publication(topic.name, topic.kind, message))
+
+
+def _require_not_ours(topic: Topic) -> None:
+    if topic.is_ours:
+        raise ProtocolError(f"Topic {topic.name} is published by this server alone; its clients may subscribe.")
+
+
+def _require_room(used: int, most: int, what: str) -> None:
+    if used >= most:
+        raise ProtocolError(f"A client may have at most {most} {what}.")
+
+
+def _tell(callback: Callable[[Caller], None], caller: Caller) -> None:
+    try:
+        callback(caller)
+    # Callbacks are foreign code, and the others must hear that somebody left.
+    except Exception:
+        _logger.exception("A callback about the end of a connection failed.")
+
+
+def _own(work: Callable[[], T]) -> T:
+    """Do something for this process, whose mistakes are values, not somebody else's protocol."""
+    try:
+        return work()
+    except ProtocolError as error:
+        raise InvalidValue(str(error)) from None
+
+
+def _title(message: Mapping[str, Any], said: str) -> str:
+    """What a message was about, for the status that says what is wrong with it; no name that is `said` there."""
+    names = [name for name in (message.get("topic"), message.get("service")) if f" {name} " not in said]
+    return " ".join(part[:80] for part in (message.get("op"), *names) if isinstance(part, str)) or "message"
+
+
+def _id(message: Mapping[str, Any]) -> Id:
+    try:
+        return read_id(message)
+    except ProtocolError:
+        return None
