@@ -204,10 +204,8 @@ class BridgeServer:
         for listener in server.sockets:
             asyncio.get_running_loop().remove_reader(listener.fileno())
         await _turns()
-        for connection in [
-            one for one in self._sockets if one.state is State.CONNECTING
-        ]:  # in the middle of its handshake
-            connection.transport.abort()
+        for opening in [one for one in self._sockets if one.state is State.CONNECTING]:
+            opening.transport.abort()
         server.close(reason="the server is closing")
         await _turns()
         # Not for server.wait_closed(): it waits for sockets in the middle of their TLS handshake, too.

@@ -1,4 +1,4 @@
-"""What leaves the server: messages packed for those who asked for them, and what waits for a client that reads slowly."""
+"""What leaves the server: messages packed for those who want them, and what waits for a client that reads slowly."""
 
 from __future__ import annotations
 
