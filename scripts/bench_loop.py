@@ -422,8 +422,8 @@ def bench_deployment(options: Options) -> Iterator[Figure]:
 def deploy(length: int, ticks: int) -> tuple[Watch, int, float]:
     """Run a deployment at 20 Hz on a clock of its own: who watched, ticks that left the window, CPU time [s]."""
     from bam_envs.core.timing import Pacer
+    from bam_train.deploy.deployment import Deployment
     from bam_train.deploy.journal import Journal
-    from bam_train.deploy.loop import Deployment
 
     watch, clock, left = Watch(), Clock(), [0]
 

@@ -27,9 +27,8 @@ if TYPE_CHECKING:
     from bam_envs.core.timing import Pacer
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.flags import DeployConfig
-    from bam_train.deploy.agents import Watcher
+    from bam_train.deploy.deployment import Deployment, Watcher
     from bam_train.deploy.journal import Journal
-    from bam_train.deploy.loop import Deployment
     from bam_train.place import Place
 
 
@@ -42,7 +41,7 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     _require_sane(config)
     from bam_envs.core.timing import Pacer
     from bam_train.checkpoint import Checkpoint
-    from bam_train.deploy.loop import Deployment
+    from bam_train.deploy.deployment import Deployment
     from bam_train.environments import environment_of, make_env, require_fit
     from bam_train.policy import FrozenPolicy
 
@@ -80,8 +79,8 @@ def _run(
     journal: Journal,
     signals: SignalMemory,
 ) -> int:
+    from bam_train.deploy.deployment import stop_signals
     from bam_train.deploy.report import DeployReport
-    from bam_train.deploy.signals import stop_signals
 
     with stop_signals() as switch:  # a second Ctrl-C must not lose the report
         switch.waiting += signals.came  # one that was lost: the deployment ends before it begins
@@ -89,7 +88,7 @@ def _run(
         title = f"{checkpoint.path} on {checkpoint.manifest.env}{place and f' at {place}'}"
         with _display(title, env, journal) as watcher:
             journal.startup.mark("display")
-            ending = deployment.run(watcher, seed=config.seed)
+            ending = deployment.run(watcher, seed=config.seed, switch=switch)
         if ending.status:
             say(f"bam-deploy: {ending.reason}")
         guards = guards_of(env)

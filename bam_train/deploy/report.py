@@ -9,8 +9,8 @@ from typing import Any
 
 from bam_envs.core.timing import Lateness, Pacer
 from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.deployment import Ending
 from bam_train.deploy.journal import Journal
-from bam_train.deploy.loop import Ending
 
 MISSED_SHARE = 0.05
 """More missed ticks than this share are worth a warning."""

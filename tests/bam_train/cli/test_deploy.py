@@ -111,7 +111,7 @@ def test_a_signal_still_gives_the_report(corridor_checkpoint, corridor, run, mon
     [
         "tyro.cli",
         "bam_train.environments.require_fit",
-        "bam_train.deploy.loop.Deployment.connect",
+        "bam_train.deploy.deployment.Deployment.connect",
         "bam_train.cli.deploy.require_consent",
         "bam_train.deploy.display.PlainDisplay",
     ],

@@ -3,8 +3,8 @@ import math
 
 from bam_envs.core.timing import Pacer
 from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.deployment import Ending
 from bam_train.deploy.journal import Journal, Startup
-from bam_train.deploy.loop import Ending
 from bam_train.deploy.report import DeployReport, episodes_text, lateness_text, rate_text
 
 

@@ -11,8 +11,8 @@ from bam_envs.core.robot_env import RobotEnv
 from bam_envs.core.timing import Pacer
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.tasks.pick import PickTask
+from bam_train.deploy.deployment import Deployment, Ending
 from bam_train.deploy.journal import KEPT, Journal
-from bam_train.deploy.loop import Deployment, Ending
 from bam_train.errors import WiringError
 from bam_train.loop import Agent, CopyTAgent
 

@@ -15,8 +15,8 @@ from bam_envs.safety.gate import SafeRobot
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.reach import ReachTask
 from bam_envs.testing.drivers import DrivenRobot
+from bam_train.deploy.deployment import Deployment, Ending, fault_text
 from bam_train.deploy.journal import Journal, Startup
-from bam_train.deploy.loop import Deployment, Ending, fault_text
 
 
 class Right:

@@ -1,0 +1,314 @@
+"""The deployment: a chain of agents that moves a robot at absolute deadlines, and what ends it.
+
+Robot, journal and policy are agents of one `TemporalAgent`, which waits for each deadline before the policy acts; your
+own agents join the same chain. What they read and write is checked when the chain is built, before the robot is
+connected. However the deployment ends (all episodes done, Ctrl-C, SIGTERM, a fault), the robot is halted and closed
+before anything is reported.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import gymnasium as gym
+
+from bam_envs.core.errors import BamEnvsError, LinkLost, SafetyStop
+from bam_envs.core.timing import Pacer
+from bam_train.deploy.journal import EpisodeRecord, Journal
+from bam_train.errors import BamTrainError
+from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, Workspace
+from bam_train.loop.robot_agent import SAYS_SUCCESS, SUCCESS
+from bam_train.loop.workspace import Sink
+from bam_train.signals import handled
+
+WINDOW = 1000
+"""Ticks that the workspace of a deployment keeps at least: 50 s at 20 Hz."""
+LINK_LOST, SAFETY_STOP = 4, 3
+"""Exit statuses."""
+_ENDS = ("terminated", "truncated")
+
+
+class Watcher(Protocol):
+    """Shows the loop to a person; called between ticks, so it has to be quick."""
+
+    def ticked(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> None:
+        """A step was taken."""
+
+    def ended(self, record: EpisodeRecord, pacer: Pacer) -> None:
+        """An episode ended."""
+
+
+@dataclass(frozen=True)
+class Ending:
+    """Why the loop stopped."""
+
+    reason: str
+    """``"episodes done"``, ``"interrupted"``, ``"link lost: ..."``, ``"safety stop: ..."`` or ``"fault: ..."``."""
+    status: int
+    """Exit status of the program: 0, 128 + the signal, 4, 3 or 1."""
+
+
+class Deployment:
+    """A frozen policy and a robot in one loop.
+
+    Memory stays flat however long it runs: the workspace keeps the last `window` ticks at least, and gives older ones
+    to `sink` as they leave.
+
+    Args:
+        env: The environment, already checked to fit the policy.
+        policy: Has ``reset()`` and ``act(observation)``.
+        pacer: The deadlines.
+        journal: Filled in tick by tick.
+        agents: Further agents, run after the policy; they declare what they read and write.
+        window: Ticks that the workspace keeps at least.
+        sink: ``sink(first_time, {variable: array (n, 1, ...)})`` gets every tick once, in order, episode by episode.
+            It is called between two ticks, so it has to be quick; if it fails, the deployment ends.
+
+    Raises:
+        WiringError: An agent reads what nobody writes; nothing has been connected.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        policy: Any,
+        pacer: Pacer,
+        journal: Journal,
+        *,
+        agents: Sequence[Agent] = (),
+        window: int = WINDOW,
+        sink: Sink | None = None,
+    ) -> None:
+        self._robot, self._journal = _DeployedRobot(env), journal
+        self._workspace = Workspace(window=window, sink=None if sink is None else _silent_once_broken(sink))
+        self._signals = _SignalAgent()
+        policy_agent = PolicyAgent(policy, self._robot.observation_names, single=True)
+        own = (_JournalAgent(journal, pacer), policy_agent, _StartupAgent(journal))
+        self._loop = TemporalAgent(Agents(self._signals, self._robot, *own, *agents))
+
+    def connect(self) -> None:
+        """Open the link to the robot, if there is one, without moving it: a missing robot shows before the loop."""
+        self._robot.connect()
+
+    def run(self, watcher: Watcher, *, seed: int, switch: StopSwitch | None = None) -> Ending:
+        """Run ``journal.wanted`` episodes; episode k gets ``seed + k``. Never raises for what happens in them.
+
+        Args:
+            watcher: Shows it.
+            seed: Seed of the first episode.
+            switch: Of the `stop_signals` around this call; None: signals are handled during this call.
+        """
+        if switch is None:
+            with stop_signals() as own:
+                return self.run(watcher, seed=seed, switch=own)
+        self._robot.switch = self._signals.switch = switch
+        try:
+            try:
+                switch.arm()
+                self._episodes(watcher, seed)
+            finally:  # inside the outer try: a signal that comes before this line is still caught
+                switch.armed = False
+            ending = Ending("episodes done", 0)
+        except Stopped as stopped:
+            ending = Ending("interrupted", 128 + stopped.signal)
+        except Exception as error:  # whatever went wrong: the robot has to be halted and the report made
+            ending = _ending_of(error)
+        except BaseException:
+            if not self._robot.closing:
+                self._robot.halt()
+            raise
+        ending = _unless_it_fails(ending, "closing", self._robot.close)
+        return _unless_it_fails(ending, "recording", self._workspace.flush)  # of an episode that was cut short
+
+    def _episodes(self, watcher: Watcher, seed: int) -> None:
+        for k in range(self._journal.wanted):
+            self._loop(self._workspace, t=0, stop_variable="env/done", seed=seed + k, watcher=watcher)
+            self._robot.halt()  # a sink may take its time, and so may the next reset
+            self._workspace.flush()
+
+
+def _ending_of(error: Exception) -> Ending:
+    """Tells the operator what to look at first: the network, the robot, or the program."""
+    text = fault_text(error).replace("call resume()", "run it again")  # the program ends here, nobody can resume it
+    if isinstance(error, LinkLost):
+        return Ending(f"link lost: {text}", LINK_LOST)
+    if isinstance(error, SafetyStop):
+        return Ending(f"safety stop: {text}", SAFETY_STOP)
+    return Ending(f"fault: {text}", 1)
+
+
+def _unless_it_fails(ending: Ending, what: str, end: Callable[[], None]) -> Ending:
+    """Call `end`; a failure of it is a fault, unless there was one before."""
+    try:
+        end()
+    except Exception as error:  # of the environment or the sink; the report comes all the same
+        if ending.status == 0:
+            return replace(ending, reason=f"fault: {what} failed: {fault_text(error)}", status=1)
+    return ending
+
+
+def _silent_once_broken(sink: Sink) -> Sink:
+    """The sink, not called any more after it has failed."""
+    broken = False
+
+    def guarded(first_time: int, piece: dict[str, Any]) -> None:
+        nonlocal broken
+        if not broken:
+            broken = True  # while it runs: whatever leaves it
+            sink(first_time, piece)
+            broken = False
+
+    return guarded
+
+
+def fault_text(error: Exception) -> str:
+    """One line; with the exception's type unless it is one of ours, whose text says enough."""
+    text = " ".join(str(error).split())
+    own = isinstance(error, (BamEnvsError, BamTrainError)) and text
+    return text if own else f"{type(error).__name__}: {text}".removesuffix(": ")
+
+
+# ---- the agents beside robot and policy
+
+
+class _SignalAgent(Agent):
+    """Ends the loop for a signal whose exception was lost. Runs before the robot, which is then sent nothing more."""
+
+    reads = ()
+    writes = ()
+    switch: StopSwitch | None = None
+
+    def forward(self, **kwargs: Any) -> None:
+        if self.switch is not None:
+            self.switch.raise_again()
+
+
+class _DeployedRobot(RobotAgent):
+    """The robot; once the loop begins to close it, no signal interrupts that."""
+
+    switch: StopSwitch | None = None
+    closing = False
+
+    def close(self) -> None:
+        self.closing = True
+        if self.switch is not None:
+            self.switch.armed = False
+        super().close()
+
+
+class _JournalAgent(Agent):
+    """Keeps the journal, tells the watcher, then waits for the deadline of the next action."""
+
+    reads = tuple(f"env/{name}" for name in ("reward", "done", *_ENDS, SUCCESS, SAYS_SUCCESS))
+    reads_previous = ("action",)
+    writes = ()
+
+    def __init__(self, journal: Journal, pacer: Pacer) -> None:
+        super().__init__()
+        self._journal, self._pacer = journal, pacer
+        self._record = EpisodeRecord(0)
+
+    def forward(self, t: int, seed: int, watcher: Watcher, **kwargs: Any) -> None:
+        if t == 0:
+            self._record = self._journal.begin(seed)
+            self._pacer.start()
+        else:
+            self._note(t, watcher)
+        if not self.get(("env/done", t))[0]:
+            self._pacer.wait()
+
+    def _note(self, t: int, watcher: Watcher) -> None:
+        """Add the step that led to time t."""
+        record = self._record
+        says = self.get((f"env/{SAYS_SUCCESS}", t))[0]
+        record.add(self.get(("env/reward", t))[0], {"is_success": self.get((f"env/{SUCCESS}", t))[0]} if says else {})
+        record.end = next((end for end in _ENDS if self.get((f"env/{end}", t))[0]), "stopped")
+        watcher.ticked(record, self.get(("action", t - 1))[0], self._pacer)
+        if record.complete:
+            watcher.ended(record, self._pacer)
+
+
+class _StartupAgent(Agent):
+    """Notes the time of the first action. Runs after the policy."""
+
+    reads = ()
+    writes = ()
+
+    def __init__(self, journal: Journal) -> None:
+        super().__init__()
+        self._startup = journal.startup
+
+    def forward(self, **kwargs: Any) -> None:
+        self._startup.finish("reset and first action")
+
+
+# ---- Ctrl-C and SIGTERM while a robot moves
+
+
+class Stopped(BaseException):
+    """A signal asked for the end.
+
+    Attributes:
+        signal: Its number.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.signal = number
+        super().__init__(f"stopped by {signal.Signals(number).name}")
+
+
+class StopSwitch:
+    """What a signal does: it raises `Stopped` while armed; otherwise the first waits, the second interrupts.
+
+    The first one waits because the robot may be being halted; the second raises KeyboardInterrupt, for a halt that
+    hangs.
+    """
+
+    def __init__(self) -> None:
+        self.armed = False
+        """Whether a signal may interrupt what runs now."""
+        self.waiting: list[int] = []
+        """Signals that came while not armed."""
+        self._raised: int | None = None
+
+    def arm(self) -> None:
+        """From now on a signal interrupts.
+
+        Raises:
+            Stopped: One came before.
+        """
+        self.armed = True
+        if self.waiting:
+            self.armed, number = False, self.waiting[0]
+            self.waiting.clear()
+            raise Stopped(number)
+
+    def raise_again(self) -> None:
+        """Called in every tick: Python discards an exception in a callback of its own, such as a ``__del__``.
+
+        Raises:
+            Stopped: One was raised, and nobody caught it.
+        """
+        if self._raised is not None:
+            raise Stopped(self._raised)
+
+    def __call__(self, number: int) -> None:
+        """Handle a signal, in the main thread, between two of its instructions."""
+        if self.armed:
+            self.armed, self._raised = False, number
+            raise Stopped(number)
+        self.waiting.append(number)
+        if len(self.waiting) > 1:
+            raise KeyboardInterrupt
+
+
+@contextmanager
+def stop_signals() -> Iterator[StopSwitch]:
+    """Within this, SIGINT and SIGTERM go to the switch (not armed yet); afterwards to the handlers of before."""
+    switch = StopSwitch()
+    with handled(switch, (signal.SIGINT, signal.SIGTERM), ignored_too=True):
+        yield switch
