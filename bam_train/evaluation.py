@@ -21,8 +21,8 @@ from bam_train.environments import is_batched, make_rows
 from bam_train.errors import SettingsError
 from bam_train.finite import FiniteRows
 from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, VecGymAgent, Workspace
-from bam_train.loop.film_agent import FilmAgent
-from bam_train.loop.gym.observations import names
+from bam_train.loop.gym.gym_observations import names
+from bam_train.loop.video_agent import VideoAgent
 from bam_train.video import Frame
 
 FIRST_SEED = 1_000_000
@@ -202,7 +202,7 @@ def film_episodes(env: gym.Env[Any, Any], policy: Any, add: Callable[[Frame], An
     Returns:
         How many pictures.
     """
-    robot, film = RobotAgent(env), FilmAgent(env, add)
+    robot, film = RobotAgent(env), VideoAgent(env, add)
     loop = TemporalAgent(Agents(robot, film, PolicyAgent(policy, robot.observation_names, single=True)))
     for k in range(episodes):
         loop(Workspace(window=2), t=0, stop_variable="env/done", seed=seed + k)

@@ -4,7 +4,8 @@
 
     from bam_train.loop import Agent, Agents, TemporalAgent, Workspace
 
-The core needs NumPy only. What needs torch is imported when it is asked for.
+The core needs NumPy only. What needs torch is imported when it is asked for, and so is what only programs written for
+BBRL need, which is in `bam_train.compat.bbrl`.
 """
 
 from __future__ import annotations
@@ -12,118 +13,75 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from bam_train.loop.agent import Agent
-from bam_train.loop.agents import Agents, CopyTAgent, EpisodesDone, KWAgentWrapper, PrintAgent
-from bam_train.loop.conventions import (
-    SeedableAgent,
-    SeedableAgentLast,
-    SeedableAgentMean,
-    SeedableAgentSum,
-    SerializableAgent,
-    TimeAgent,
-    load,
-)
-from bam_train.loop.temporal_agent import TemporalAgent
-from bam_train.loop.workspace import Workspace
+from bam_train.loop.agent import Agent as Agent
+from bam_train.loop.agents import Agents as Agents
+from bam_train.loop.agents import CopyTAgent as CopyTAgent
+from bam_train.loop.agents import EpisodesDone as EpisodesDone
+from bam_train.loop.agents import KWAgentWrapper as KWAgentWrapper
+from bam_train.loop.agents import PrintAgent as PrintAgent
+from bam_train.loop.temporal_agent import TemporalAgent as TemporalAgent
+from bam_train.loop.workspace import Workspace as Workspace
 
 if TYPE_CHECKING:
-    from bam_train.loop.gym import (
-        AutoResetGymAgent,
-        GymAgent,
-        NoAutoResetGymAgent,
-        ParallelGymAgent,
-        VecGymAgent,
-        make_env,
-        record_video,
-    )
-    from bam_train.loop.instantiate import get_arguments, get_class, instantiate_class
-    from bam_train.loop.policy_agent import PolicyAgent
-    from bam_train.loop.robot_agent import RobotAgent
-    from bam_train.loop.tensors.asynchronous import AsynchronousAgent
-    from bam_train.loop.tensors.datasets import DataLoaderAgent, ShuffledDatasetAgent
-    from bam_train.loop.tensors.remote import NRemoteAgent, RemoteAgent, RemoteAgentError
-    from bam_train.loop.tensors.replay_buffer import ReplayBuffer
-    from bam_train.loop.tensors.returns import (
-        cumulated_reward,
-        doubleqlearning_temporal_difference,
-        gae,
-        temporal_difference,
-    )
+    from bam_train.loop.gym.gym_agent import GymAgent as GymAgent
+    from bam_train.loop.gym.parallel_gym_agent import ParallelGymAgent as ParallelGymAgent
+    from bam_train.loop.gym.parallel_gym_agent import make_env as make_env
+    from bam_train.loop.gym.vec_gym_agent import VecGymAgent as VecGymAgent
+    from bam_train.loop.policy_agent import PolicyAgent as PolicyAgent
+    from bam_train.loop.robot_agent import RobotAgent as RobotAgent
+    from bam_train.loop.tensors.replay_buffer import ReplayBuffer as ReplayBuffer
+    from bam_train.loop.tensors.returns import gae as gae
+    from bam_train.loop.video_agent import record_video as record_video
 
 _ON_USE = {
-    "AsynchronousAgent": "tensors.asynchronous",
-    "AutoResetGymAgent": "gym",
-    "DataLoaderAgent": "tensors.datasets",
-    "GymAgent": "gym",
-    "NRemoteAgent": "tensors.remote",
-    "NoAutoResetGymAgent": "gym",
-    "ParallelGymAgent": "gym",
-    "PolicyAgent": "policy_agent",
-    "RemoteAgent": "tensors.remote",
-    "RemoteAgentError": "tensors.remote",
-    "ReplayBuffer": "tensors.replay_buffer",
-    "RobotAgent": "robot_agent",
-    "ShuffledDatasetAgent": "tensors.datasets",
-    "VecGymAgent": "gym",
-    "cumulated_reward": "tensors.returns",
-    "doubleqlearning_temporal_difference": "tensors.returns",
-    "gae": "tensors.returns",
-    "get_arguments": "instantiate",
-    "get_class": "instantiate",
-    "instantiate_class": "instantiate",
-    "make_env": "gym",
-    "record_video": "gym",
-    "temporal_difference": "tensors.returns",
+    "loop.gym.gym_agent": ("GymAgent",),
+    "loop.gym.parallel_gym_agent": ("ParallelGymAgent", "make_env"),
+    "loop.gym.vec_gym_agent": ("VecGymAgent",),
+    "loop.policy_agent": ("PolicyAgent",),
+    "loop.robot_agent": ("RobotAgent",),
+    "loop.tensors.replay_buffer": ("ReplayBuffer",),
+    "loop.tensors.returns": (
+        "cumulated_reward",
+        "doubleqlearning_temporal_difference",
+        "gae",
+        "temporal_difference",
+    ),
+    "loop.video_agent": ("record_video",),
+    "compat.bbrl.classname": ("get_arguments", "get_class", "instantiate_class"),
+    "compat.bbrl.conventions": (
+        "SeedableAgent",
+        "SeedableAgentLast",
+        "SeedableAgentMean",
+        "SeedableAgentSum",
+        "SerializableAgent",
+        "TimeAgent",
+        "load",
+    ),
+    "compat.bbrl.dataset_agents": ("DataLoaderAgent", "ShuffledDatasetAgent"),
+    "compat.bbrl.old_gym_agents": ("AutoResetGymAgent", "NoAutoResetGymAgent"),
+    "compat.bbrl.remote_agents": ("AsynchronousAgent", "NRemoteAgent", "RemoteAgent", "RemoteAgentError"),
 }
-"""Name to the module that has it."""
+"""Module of `bam_train` to the names that it has."""
+_MODULES = {name: module for module, names in _ON_USE.items() for name in names}
 
 __all__ = [
     "Agent",
     "Agents",
-    "AsynchronousAgent",
-    "AutoResetGymAgent",
     "CopyTAgent",
-    "DataLoaderAgent",
     "EpisodesDone",
-    "GymAgent",
     "KWAgentWrapper",
-    "NRemoteAgent",
-    "NoAutoResetGymAgent",
-    "ParallelGymAgent",
-    "PolicyAgent",
     "PrintAgent",
-    "RemoteAgent",
-    "RemoteAgentError",
-    "ReplayBuffer",
-    "RobotAgent",
-    "SeedableAgent",
-    "SeedableAgentLast",
-    "SeedableAgentMean",
-    "SeedableAgentSum",
-    "SerializableAgent",
-    "ShuffledDatasetAgent",
     "TemporalAgent",
-    "TimeAgent",
-    "VecGymAgent",
     "Workspace",
-    "cumulated_reward",
-    "doubleqlearning_temporal_difference",
-    "gae",
-    "get_arguments",
-    "get_class",
-    "instantiate_class",
-    "load",
-    "make_env",
-    "record_video",
-    "temporal_difference",
+    *_MODULES,
 ]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _ON_USE:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:
-        value = getattr(importlib.import_module(f"{__name__}.{_ON_USE[name]}"), name)
+        value = getattr(importlib.import_module(f"bam_train.{_MODULES[name]}"), name)
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise

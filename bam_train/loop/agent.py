@@ -1,25 +1,25 @@
 """An agent reads variables of a workspace and writes others.
 
-It is BBRL's `Agent`. Once torch is imported, every agent is an `nn.Module` too, with everything that belongs to one:
-the class of the instance becomes a subclass of its own class and of `nn.Module`. Without torch it is a plain object,
-and agents that work on NumPy arrays need nothing more.
+It is BBRL's `Agent`. An agent that is made after torch was imported is an `nn.Module` too, with everything that belongs
+to one: its class is a subclass of its own class and of `nn.Module`. Without torch it is a plain object, and agents that
+work on NumPy arrays need nothing more.
 
 Differences from BBRL:
 
 - After an exception the agent has let go of its workspace, and can be used again.
-- Two threads in one agent are an error, not a mixture.
+- Two threads in one agent are an error; BBRL mixes their workspaces.
 - `reads`, `reads_previous` and `writes` can be declared, and are then checked before anything runs.
 - `close` is called when an exception leaves the loop.
-- `load_model` and `set_trace_file` work.
+- `load_model` works.
 """
 
 from __future__ import annotations
 
 import copy
 import sys
-import time
 from collections.abc import Iterable
-from typing import IO, TYPE_CHECKING, Any
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 from bam_train.errors import AgentInUse, LoopError
 from bam_train.loop.workspace import Workspace
@@ -56,13 +56,16 @@ class Agent(_Base):  # type: ignore[misc]
     prefix: str = ""
     verbose: bool = False
     _name: str | None = None
-    _trace: IO[str] | None = None
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        """A plain object; once torch is imported, an `nn.Module` too, as a `pathlib.Path` is a `PosixPath`."""
+        kind: Any = cls
+        agent: Self = super().__new__(kind if sys.modules.get("torch") is None else _module_class(kind))
+        return agent
 
     def __init__(self, name: str | None = None, verbose: bool = False) -> None:
-        if sys.modules.get("torch") is not None:
-            from bam_train.loop.tensors.module import become_module
-
-            become_module(self)
+        if is_module(self):
+            sys.modules["torch"].nn.Module.__init__(self)
         self._name = name
         self.verbose = verbose
         self.workspace = None
@@ -78,12 +81,15 @@ class Agent(_Base):  # type: ignore[misc]
         """
         if workspace is None:
             raise LoopError(f"{agent_name(self)} needs a workspace, found None.")
-        # Straight into the instance's dictionary: nn.Module's __setattr__ costs 1.4 µs, this 0.05 µs. No other thread
-        # can come in between in `setdefault`, and every call has a dictionary of keywords of its own.
+        # Straight into the instance's dictionary: nn.Module's __setattr__ costs 1.4 µs, this 0.05 µs. `setdefault` is
+        # atomic, and every call has a dictionary of keywords of its own.
         own = self.__dict__
         try:
             if own.setdefault("_call", kwargs) is not kwargs:
-                raise in_use(self)
+                raise AgentInUse(
+                    f"{agent_name(self)} is running already, in another thread or around this call; "
+                    f"give each its own: agent.clone()."
+                )
             own["workspace"] = workspace
             self.forward(**kwargs)
         finally:  # no calls in here: Ctrl-C would come between them
@@ -118,14 +124,6 @@ class Agent(_Base):  # type: ignore[misc]
         if type(self).forward is owner.forward:
             self.reads = None if reads is None else tuple(reads)
             self.writes, self.reads_previous = tuple(writes), tuple(reads_previous)
-
-    def is_running(self) -> bool:
-        """Whether it is still at work in another process."""
-        return False
-
-    def _asynchronous_call(self, workspace: Workspace, **kwargs: Any) -> None:
-        """The call, without waiting where the agent is in another process."""
-        self(workspace, **kwargs)
 
     # -- the workspace ---------------------------------------------------------------------------------------------
 
@@ -193,8 +191,12 @@ class Agent(_Base):  # type: ignore[misc]
         return copy.deepcopy(self)
 
     def __getstate__(self) -> dict[str, Any]:
-        left_out = ("_call", "_trace", "get", "set")
-        return {**{key: value for key, value in self.__dict__.items() if key not in left_out}, "workspace": None}
+        return {**{key: value for key, value in self.__dict__.items() if key != "_call"}, "workspace": None}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For pickle and copy: by the class that can be imported, since `_module_class` makes the other one."""
+        plain = getattr(type(self), "_plain_class", None)
+        return _new_agent, (plain or type(self), plain is not None), self.__getstate__()
 
     # -- files -----------------------------------------------------------------------------------------------------
 
@@ -206,43 +208,11 @@ class Agent(_Base):  # type: ignore[misc]
         """The agent in a file of `save_model`. It is a pickle and runs what is in it: read only files you trust."""
         return import_torch("Agent.load_model()").load(filename, weights_only=False)
 
-    def set_trace_file(self, filename: Any) -> None:
-        """Write a line to this file for every `get` and `set`, until `close_trace_file`."""
-        self.close_trace_file()
-        file = open(filename, "w", encoding="utf-8", buffering=1)  # noqa: SIM115 - stays open
-
-        def get(index: Any) -> Any:
-            value = type(self).get(self, index)
-            file.write(f"{time.time():.6f} {agent_name(self)} get {index}\n")
-            return value
-
-        def set_(index: Any, value: Any) -> None:
-            type(self).set(self, index, value)
-            file.write(f"{time.time():.6f} {agent_name(self)} set {index} {tuple(value.shape)} {value.dtype}\n")
-
-        # In the instance's dictionary they hide the class's own, which need not ask whether there is a trace.
-        self.__dict__.update(_trace=file, get=get, set=set_)
-
-    def close_trace_file(self) -> None:
-        """Stop tracing."""
-        if self._trace is not None:
-            self._trace.close()
-            for name in ("_trace", "get", "set"):
-                del self.__dict__[name]
-
     def _workspace(self) -> Workspace:
         if self.workspace is None:
             raise LoopError(f"{agent_name(self)} has no workspace outside a call; call it: agent(workspace, t=0).")
         workspace: Workspace = self.workspace
         return workspace
-
-
-def in_use(agent: Agent) -> AgentInUse:
-    """The error for an agent that is called while it runs."""
-    return AgentInUse(
-        f"{agent_name(agent)} is running already, in another thread or around this call; "
-        f"give each its own: agent.clone()."
-    )
 
 
 def import_torch(purpose: str) -> Any:
@@ -269,3 +239,26 @@ def is_module(agent: Agent) -> bool:
     """Whether it has become an `nn.Module`."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(agent, torch.nn.Module)
+
+
+@cache
+def _module_class(cls: Any) -> Any:
+    """The subclass of the class `cls` and of `nn.Module`; one for each class, with the same name."""
+    from torch import nn
+
+    if issubclass(cls, nn.Module):
+        return cls
+    names = {name: getattr(cls, name) for name in ("__module__", "__qualname__", "__doc__")}
+    return type(cls.__name__, (_Quiet, cls, nn.Module), {**names, "_plain_class": cls})
+
+
+class _Quiet:
+    """Keeps ``__init_subclass__`` of a class from being called for its `_module_class`."""
+
+    def __init_subclass__(cls) -> None:
+        """Nothing."""
+
+
+def _new_agent(cls: Any, is_module: bool) -> Any:
+    """An agent whose attributes follow, for pickle and copy."""
+    return object.__new__(_module_class(cls) if is_module else cls)

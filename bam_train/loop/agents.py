@@ -1,11 +1,12 @@
 """Agents that are made of others, and a few small ones: `Agents`, `KWAgentWrapper`, `CopyTAgent`, `PrintAgent`, ...
 
-Differences from BBRL: `KWAgentWrapper` goes round anything that can be called, `Agents` too; `CopyTAgent` detaches
+Differences from BBRL: `KWAgentWrapper` wraps anything that can be called, `Agents` too; `CopyTAgent` detaches
 without t as well; `PrintAgent` without names prints what there is each time.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from typing import Any
@@ -14,7 +15,6 @@ import numpy as np
 
 from bam_train.errors import LoopError
 from bam_train.loop.agent import Agent, agent_name, is_module
-from bam_train.loop.workspace import Workspace
 
 
 class Agents(Agent):
@@ -36,20 +36,18 @@ class Agents(Agent):
         for k, agent in enumerate(agents):
             if not isinstance(agent, Agent):
                 raise LoopError(f"Agents: expected agents, found {type(agent).__name__} at place {k}.")
-        self.agents: Any = _module_list(agents) if is_module(self) else list(agents)
-
-    def __call__(self, workspace: Workspace, **kwargs: Any) -> None:
-        """Run every member on `workspace`."""
-        for agent in self._members():
-            agent(workspace, **kwargs)
+        self.agents: Any = list(agents)
+        if is_module(self):
+            for agent in agents:
+                if not is_module(agent):
+                    raise LoopError(f"{agent_name(agent)} was made before torch was imported; import torch first.")
+            self.agents = sys.modules["torch"].nn.ModuleList(agents)
 
     def forward(self, **kwargs: Any) -> None:
-        """Not used: a container has no step of its own.
-
-        Raises:
-            NotImplementedError: Always.
-        """
-        raise NotImplementedError("Agents has no forward; call it with a workspace.")
+        """Run every member on the workspace."""
+        workspace = self.workspace
+        for agent in self._members():
+            agent(workspace, **kwargs)
 
     def seed(self, seed: int) -> None:
         """Seed every member."""
@@ -80,10 +78,10 @@ class Agents(Agent):
         return tuple(self._members())
 
     def _parts(self) -> tuple[Agent, ...] | None:
-        return self._inner() if type(self).__call__ is Agents.__call__ else None
+        return self._inner() if _only_runs_members(self) else None
 
     def _members(self) -> Iterable[Agent]:
-        # Past nn.Module's __getattr__ and ModuleList's own, which cost as much as a small agent.
+        # Around nn.Module's __getattr__ and ModuleList's own, which cost as much as a small agent.
         own = self.__dict__
         listed: Iterable[Agent] | None = own.get("agents")  # a module list is elsewhere
         return own["_modules"]["agents"]._modules.values() if listed is None else listed
@@ -190,11 +188,16 @@ class EpisodesDone(Agent):
         self.set((self.out_var, t), self.state)
 
 
+def _only_runs_members(agent: Agent) -> bool:
+    kind: Any = type(agent)
+    return kind.forward is Agents.forward and kind.__call__ is Agent.__call__
+
+
 def members(agent: Agent) -> list[Agent]:
     """What to call instead of `agent`: the members of an `Agents`, and of those in it."""
-    if type(agent).__call__ is not Agents.__call__:
+    if not _only_runs_members(agent):
         return [agent]
-    return [one for member in agent for one in members(member)]
+    return [one for member in agent._inner() for one in members(member)]
 
 
 def leaves(agent: Agent) -> list[Agent]:
@@ -213,14 +216,3 @@ def describe(agent: Agent) -> str:
     if isinstance(agent, Agents):
         return f"Agents({', '.join(describe(member) for member in agent)})"
     return agent_name(agent)
-
-
-def _module_list(agents: Iterable[Agent]) -> Any:
-    from torch import nn
-
-    from bam_train.loop.tensors.module import become_module
-
-    for agent in agents:
-        if not is_module(agent):  # made before torch was imported
-            become_module(agent)
-    return nn.ModuleList(agents)

@@ -10,7 +10,7 @@ import numpy as np
 
 from bam_train.errors import LoopError
 from bam_train.loop.agent import Agent
-from bam_train.loop.gym.observations import Entry, entries, names, pack
+from bam_train.loop.gym.gym_observations import Entry, entries, names, pack
 
 FLAGS = ("terminated", "truncated", "done")
 SUCCESS = "info/is_success"

@@ -6,14 +6,14 @@ which time and closes every agent's environment and robot; a progress display.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import nullcontext
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
 from bam_train.errors import LoopError, UnknownVariable, WiringError
-from bam_train.loop.agent import Agent, agent_name, in_use
-from bam_train.loop.agents import describe, is_live, members
-from bam_train.loop.wiring import check_built, check_called
+from bam_train.loop.agent import Agent, agent_name
+from bam_train.loop.agents import describe, is_live, leaves, members
 from bam_train.loop.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -37,7 +37,8 @@ class TemporalAgent(Agent):
         super().__init__(name=name)
         if not isinstance(agent, Agent):
             raise LoopError(f"TemporalAgent: expected an agent, found {type(agent).__name__}.")
-        check_built(agent)
+        if is_live(agent):  # before the robot is connected
+            _check_chain(_declared(agent), frozenset(), None)
         self.agent = agent
         self.progress = progress
 
@@ -56,7 +57,7 @@ class TemporalAgent(Agent):
         Args:
             workspace: What it reads and writes.
             t: The first time.
-            n_steps: How many times; one at least, as in BBRL. None for until the stop variable says.
+            n_steps: The number of times; at least one is run, as in BBRL. None: until the stop variable says.
             stop_variable: Stop after a time at which it is true for the whole batch.
             kwargs: Given to every agent.
 
@@ -68,33 +69,27 @@ class TemporalAgent(Agent):
         """
         if n_steps is None and stop_variable is None:
             raise LoopError("TemporalAgent: when should it stop? Give n_steps, stop_variable or both.")
-        if workspace is None:
-            raise LoopError("TemporalAgent needs a workspace, found None.")
-        _require_steps(n_steps)
-        own, key = self.__dict__, object()
-        begun = False
+        if not (n_steps is None or isinstance(n_steps, (int, float)) or hasattr(n_steps, "__index__")):
+            raise LoopError(f"n_steps: expected a whole number, found {n_steps!r}.")
+        super().__call__(workspace, t=t, n_steps=n_steps, stop_variable=stop_variable, **kwargs)
+
+    def forward(self, t: int, n_steps: int | None, stop_variable: str | None, **kwargs: Any) -> None:
+        """Check the agents and run them; close them when an exception comes."""
+        workspace = self.workspace
         try:
-            if own.setdefault("_call", key) is not key:
-                raise in_use(self)
-            self._check(workspace, stop_variable)
-            begun = True
+            _check_called(self.agent, workspace, stop_variable)
+        except WiringError:
+            if is_live(self.agent):  # a robot that waits for the next call
+                self.agent.close()
+            raise
+        try:
             with self._advance(n_steps, t) as advance:
                 self._run(workspace, t, n_steps, stop_variable, advance, kwargs)
         except BaseException as error:
-            if begun:
-                self._close_after(error)
-            raise
-        finally:
-            if "_call" in own and own["_call"] is key:
-                del own["_call"]
-
-    def _check(self, workspace: Workspace, stop_variable: str | None) -> None:
-        """Check who reads what; a robot that is waiting for the next call is halted when something is wrong."""
-        try:
-            check_called(self.agent, workspace.keys(), stop_variable)
-        except WiringError:
-            if is_live(self.agent):
+            try:
                 self.agent.close()
+            except Exception as failure:  # the first error is the one to be seen
+                _note(error, f"Closing failed too: {type(failure).__name__}: {failure}")
             raise
 
     def _run(
@@ -106,33 +101,15 @@ class TemporalAgent(Agent):
         advance: Callable[[int], None] | None,
         kwargs: dict[str, Any],
     ) -> None:
-        """The loop itself."""
-        # Of each member of an `Agents`: its dictionary, unless it is called in a way of its own, and its forward.
-        plain = Agent.__call__
-        calls = [
-            (one, one.__dict__ if type(one).__call__ is plain else None, one.forward) for one in members(self.agent)
-        ]
-        key = object()
+        agents = members(self.agent)
         end = None if n_steps is None else t + n_steps
         while True:
-            try:
-                for agent, own, forward in calls:
-                    if own is None:
-                        agent(workspace, t=t, **kwargs)
-                        continue
-                    # What Agent.__call__ does, without its frame and a second copy of the keywords: 0.25 µs less each.
-                    try:
-                        if own.setdefault("_call", key) is not key:
-                            raise in_use(agent)
-                        own["workspace"] = workspace
-                        forward(t=t, **kwargs)
-                    finally:
-                        if "_call" in own and own["_call"] is key:
-                            own["workspace"] = None
-                            del own["_call"]
-            except BaseException as error:
-                _note(error, f"In {agent_name(agent)} of {describe(self.agent)} at t={t}.")
-                raise
+            for agent in agents:
+                try:
+                    agent(workspace, t=t, **kwargs)
+                except BaseException as error:  # noqa: PERF203 - free of cost until it happens
+                    _note(error, f"In {agent_name(agent)} of {describe(self.agent)} at t={t}.")
+                    raise
             if advance is not None:
                 advance(1)
             if stop_variable is not None and _is_reached(workspace, stop_variable, t):
@@ -148,13 +125,6 @@ class TemporalAgent(Agent):
 
         return progress_display(self.progress, n_steps, t, self.name or "steps")
 
-    def _close_after(self, error: BaseException) -> None:
-        """Close all agents."""
-        try:
-            self.agent.close()
-        except Exception as failure:  # the first error is the one to be seen
-            _note(error, f"Closing failed too: {type(failure).__name__}: {failure}")
-
     def _inner(self) -> tuple[Agent, ...]:
         return (self.agent,)
 
@@ -164,14 +134,6 @@ class TemporalAgent(Agent):
     def __getstate__(self) -> dict[str, Any]:
         """A display of the caller's stays with the original."""
         return {**super().__getstate__(), "progress": self.progress is True}
-
-    def forward(self, **kwargs: Any) -> None:
-        """Not used.
-
-        Raises:
-            NotImplementedError: Always.
-        """
-        raise NotImplementedError("TemporalAgent has no forward; call it with a workspace.")
 
     def close(self) -> None:
         """Close the agent."""
@@ -186,16 +148,6 @@ class TemporalAgent(Agent):
         return self.agent.get_by_name(n) + super().get_by_name(n)
 
 
-def _require_steps(n_steps: Any) -> None:
-    """Refuse what is no number.
-
-    Raises:
-        LoopError: It is none.
-    """
-    if not (n_steps is None or isinstance(n_steps, (int, float)) or hasattr(n_steps, "__index__")):
-        raise LoopError(f"n_steps: expected a whole number, found {n_steps!r}.")
-
-
 def _is_reached(workspace: Workspace, stop_variable: str, t: int) -> bool:
     """Whether the stop variable is true for the whole batch."""
     try:
@@ -207,3 +159,60 @@ def _is_reached(workspace: Workspace, stop_variable: str, t: int) -> bool:
 def _note(error: BaseException, text: str) -> None:
     if hasattr(error, "add_note"):  # Python 3.11
         error.add_note(text)
+
+
+# -- who reads and who writes what, checked before anything runs -------------------------------------------------------
+#
+# An agent says what it does with `reads` (at t, so an agent before it must write it), `reads_previous` (at t - 1, so
+# any agent may write it) and `writes`. A chain with a robot in it is checked when it is built, and every agent in it
+# has to say. Any other chain is checked when it is called; what the workspace holds counts as written, and as long as
+# one agent does not say what it writes, anything may be.
+
+
+def _check_called(agent: Agent, held: Iterable[str], stop_variable: str | None) -> None:
+    """Check a chain that is about to run on a workspace that holds the variables `held`.
+
+    Raises:
+        WiringError: An agent reads what nobody writes, or nobody writes the stop variable.
+    """
+    chain = _declared(agent) if is_live(agent) else leaves(agent)
+    if not any(one.writes is None for one in chain):
+        _check_chain(chain, frozenset(held), stop_variable)
+
+
+def _declared(agent: Agent) -> list[Agent]:
+    """The agents of a chain, all of which say what they read and write."""
+    chain = leaves(agent)
+    for one in chain:
+        if one.reads is None or one.writes is None:
+            raise WiringError(
+                f"{agent_name(one)} is in a chain with a robot and does not say what it reads and writes; "
+                f'give its class reads = ("name", ...) and writes = ("name", ...).'
+            )
+    return chain
+
+
+def _check_chain(chain: list[Agent], held: frozenset[str], stop_variable: str | None) -> None:
+    everything = held.union(*(one.writes or () for one in chain))
+    before = set(held)
+    for one in chain:
+        for name in one.reads_previous:
+            if name not in everything:
+                raise WiringError(f"{agent_name(one)} reads {name!r}, which nobody writes{_close(name, everything)}")
+        for name in one.reads or ():
+            if name not in before and name in everything:
+                raise WiringError(
+                    f"{agent_name(one)} reads {name!r}, which only an agent after it writes; put it behind that one."
+                )
+            if name not in before:
+                raise WiringError(f"{agent_name(one)} reads {name!r}, which nobody writes{_close(name, before)}")
+        before.update(one.writes or ())
+    if stop_variable is not None and stop_variable not in everything:
+        raise WiringError(f"stop_variable {stop_variable!r} is written by nobody{_close(stop_variable, everything)}")
+
+
+def _close(name: str, known: Iterable[str]) -> str:
+    names = sorted(known)
+    close = get_close_matches(name, names, n=1)
+    question = f", did you mean {close[0]!r}?" if close else "."
+    return f"{question} Written are {', '.join(map(repr, names))}." if names else f"{question} Nothing is written."

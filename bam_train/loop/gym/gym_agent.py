@@ -1,36 +1,48 @@
-"""What the agents of Gymnasium environments have in common: names of variables, spaces, seeds, writing."""
+"""What the agents of Gymnasium environments have in common: names of variables, spaces, seeds, stepping, writing."""
 
 from __future__ import annotations
 
+import sys
 import warnings
-from abc import ABC
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 from gymnasium import Space, spaces
 
-from bam_train.errors import LoopError, SettingsError, ValueMismatch
-from bam_train.loop.agent import agent_name, import_torch
-from bam_train.loop.conventions import SeedableAgent, SerializableAgent, TimeAgent
-from bam_train.loop.gym.infos import InfoRecorder
-from bam_train.loop.gym.observations import names
+from bam_train.errors import LoopError, SettingsError
+from bam_train.loop.agent import Agent, agent_name, import_torch
+from bam_train.loop.gym.gym_actions import ActionReader
+from bam_train.loop.gym.gym_observations import Array, InfoRecorder, names
 
-_ARRAYS = ("torch", "numpy")
-_NUMBERS = {
-    "terminated": bool,
-    "truncated": bool,
-    "done": bool,
-    "reward": float,
-    "cumulated_reward": float,
-    "timestep": np.int64,
-}
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+NUMBERS = ("terminated", "truncated", "done", "reward", "cumulated_reward", "timestep")
 """Variables of one number for each environment, in the order in which they are written."""
-_NOTHING: tuple[Any, ...] = ("", None, None, None)
-_EMPTY: dict[str, Any] = {}
 
 
-class GymAgent(TimeAgent, SeedableAgent, SerializableAgent, ABC):
+class Frame(NamedTuple):
+    """What n environments gave at one time: new arrays (n, ...) by name, without the output prefix."""
+
+    observations: dict[str, Array]
+    numbers: dict[str, Array]
+    """The `NUMBERS`."""
+    infos: dict[str, Array]
+
+
+class Stepper(Protocol):
+    """The environments of one run, with the sums and counts of their episodes."""
+
+    def reset(self, seeds: Any) -> Frame:
+        """Begin an episode in every environment."""
+
+    def step(self, actions: Any) -> Frame:
+        """Step every environment."""
+
+
+class GymAgent(Agent, ABC):
     """Base of `ParallelGymAgent` and `VecGymAgent`.
 
     Args:
@@ -39,12 +51,13 @@ class GymAgent(TimeAgent, SeedableAgent, SerializableAgent, ABC):
         output_string: Put before the names of all variables that it writes.
         reward_at_t: Write the reward and the cumulated reward of action[t] at t, not at t + 1. The reward at the
             newest time is 0 until the next step overwrites it.
-        include_last_state: Whether the row at which an episode ends has its last observation; without it that row has
-            the first observation of the next episode. Without auto-reset it is always True.
+        include_last_state: Whether the time at which an episode ends has its last observation; without it that time
+            has the first observation of the next episode. Without auto-reset it is always True.
         arrays: ``"torch"``: tensors, float32 and int64. ``"numpy"``: arrays, observations of the space's dtype,
             rewards float64; torch is not needed.
         info_keys: Entries k of the environments' infos to write too: ``info/k`` beside the mask ``info/_k``.
-        kwargs: ``seed``, ``name``, ``verbose``.
+        seed: The seed, if it is known already.
+        kwargs: ``name``, ``verbose``.
 
     Attributes:
         ghost_params: An empty parameter; its device is where observations are put. None with NumPy.
@@ -58,6 +71,12 @@ class GymAgent(TimeAgent, SeedableAgent, SerializableAgent, ABC):
     envs: Any
     num_envs: int
 
+    def __new__(cls, *args: Any, arrays: str = "torch", **kwargs: Any) -> Self:
+        """See `Agent`; with tensors it is an `nn.Module` also where nobody has imported torch yet."""
+        if arrays == "torch":
+            import_torch(f'{cls.__name__} (unless arrays="numpy" is given)')
+        return super().__new__(cls)
+
     def __init__(
         self,
         *args: Any,
@@ -67,112 +86,131 @@ class GymAgent(TimeAgent, SeedableAgent, SerializableAgent, ABC):
         include_last_state: bool = True,
         arrays: str = "torch",
         info_keys: Sequence[str] = (),
+        seed: int | None = None,
         **kwargs: Any,
     ) -> None:
-        if arrays not in _ARRAYS:
+        if arrays not in ("torch", "numpy"):
             raise SettingsError(f'arrays: expected "torch" or "numpy", found {arrays!r}.')
         if isinstance(info_keys, str):
             raise SettingsError(f"info_keys: expected several names, found {info_keys!r}; write ({info_keys!r},).")
-        if arrays == "torch":  # before Agent.__init__, which then makes this a module
-            torch = import_torch(f'{type(self).__name__} (unless arrays="numpy" is given)')
         super().__init__(*args, **kwargs)
         self.input, self.output = input_string, output_string
         self.reward_at_t, self.include_last_state = reward_at_t, include_last_state
         self.arrays, self.info_keys = arrays, tuple(info_keys)
-        self.ghost_params = torch.nn.Parameter(torch.Tensor()) if arrays == "torch" else None
         self.observation_space: Space[Any] | None = None
         self.action_space: Space[Any] | None = None
-        self._nb_reset = 1
-        floats = np.float32 if arrays == "torch" else np.float64
-        self._dtypes = {name: np.dtype(floats if kind is float else kind) for name, kind in _NUMBERS.items()}
-        self._deferring: dict[str, tuple[Any, ...]] = {}
-        self._to_array: Callable[[Any], Any] = torch.from_numpy if arrays == "torch" else _same
-        self._infos: InfoRecorder | None = None
+        self._seed, self._nb_reset = seed, 1
+        self._stepper: Stepper | None = None
+        self._floats = np.dtype(np.float32 if arrays == "torch" else np.float64)
+        self.ghost_params: Any = None
+        if arrays == "torch":
+            torch = sys.modules["torch"]
+            self.ghost_params = torch.nn.Parameter(torch.empty(0))
 
     # -- running ---------------------------------------------------------------------------------------------------
 
-    def forward(self, t: int, *args: Any, **kwargs: Any) -> None:
-        """Take the default seed if there is none, and count the resets; subclasses do the rest."""
-        if self._seed is None and kwargs.get("seed") is None:
-            self.seed(self.default_seed)
+    @abstractmethod
+    def _open(self) -> None:
+        """Make the environments `envs`, and call `_opened`."""
+
+    @abstractmethod
+    def _make_stepper(self, infos: InfoRecorder) -> Stepper:
+        """A stepper for a new run of the environments."""
+
+    @abstractmethod
+    def _read_actions(self, actions: ActionReader, t: int) -> Any:
+        """The actions of time t as the stepper wants them."""
+
+    def _opened(self, observation_space: Space[Any], action_space: Space[Any]) -> None:
+        """Take the spaces of one environment, and declare what is written."""
+        self.observation_space, self.action_space = observation_space, action_space
+        self._actions = ActionReader(self.input, action_space, self.num_envs)
+        self._declare(GymAgent, reads=None, writes=self._written())
+
+    def forward(self, t: int = 0, **kwargs: Any) -> None:
+        """One step of every environment with the action of t - 1; at t = 0 all are reset.
+
+        Args:
+            t: The time.
+            kwargs: ``seed``: at t = 0, what environment k is reset with: a number s for s + k, or one number for
+                each. Without it BBRL's rule holds: num_envs * r * seed + k + 1, r counting the resets from 2. Other
+                keywords are not looked at.
+
+        Raises:
+            LoopError: t > 0 and the environments were never reset, or closed since.
+            UnknownVariable: t > 0 and nobody wrote an action.
+            ValueMismatch: The action does not fit the action space.
+        """
         if t == 0:
+            seed = kwargs.get("seed")
+            if self._seed is None and seed is None:
+                self.seed(self.default_seed)
             self._nb_reset += 1
+            if self.envs is None:
+                self._open()
+            self._stepper = self._make_stepper(InfoRecorder(self.info_keys, self.num_envs, self.arrays == "torch"))
+            frame = self._stepper.reset(self._reset_seeds(seed))
+        elif self._stepper is None:
+            raise LoopError(f"{agent_name(self)} has no episode running; its environments are (re)started at t=0.")
+        else:
+            frame = self._stepper.step(self._read_actions(self._actions, t - 1))
+        self._write(frame, t)
 
-    def set_obs(self, observations: Mapping[str, Any], t: int) -> None:
-        """Write tensors or arrays (B x ...) at t, moved to the device of `ghost_params`.
-
-        Args:
-            observations: By name without the output prefix.
-            t: The time.
-        """
-        device = self._device()
-        if device is not None:
-            observations = {key: value.to(device) for key, value in observations.items()}
-        write = self.workspace.set if self._trace is None else self._traced_set
+    def _write(self, frame: Frame, t: int) -> None:
+        numbers = self._numbers(frame)
+        self._put(frame.observations, t)
         if self.reward_at_t:
-            observations = self._rewards_at_t(observations, t, write)
-        prefix = self.output
-        for key, value in observations.items():
-            write(prefix + key, t, value)
+            shifted = {key: numbers[key] for key in ("reward", "cumulated_reward")}
+            if t > 0:
+                self._put(shifted, t - 1)
+            numbers = {
+                **numbers,  # new arrays: no two times share memory
+                "reward": np.zeros_like(shifted["reward"]),
+                "cumulated_reward": shifted["cumulated_reward"].copy(),
+            }
+        self._put(numbers, t)
+        self._put(frame.infos, t)
 
-    def set_numbers(self, numbers: Mapping[str, Any], t: int) -> None:
-        """Write one number for each environment (B,) at t, for several variables.
+    def _numbers(self, frame: Frame) -> dict[str, Array]:
+        """The numbers that are written."""
+        return frame.numbers
 
-        With tensors most are written as they are, and become tensors when somebody reads them.
-
-        Args:
-            numbers: By name without the output prefix; sequences that nobody changes any more.
-            t: The time.
-        """
-        rest = numbers
-        if self.arrays == "torch" and self._trace is None and not self.reward_at_t and self._device() is None:
-            rest = self._defer(numbers, t)
-        if rest:
-            self.set_obs({key: self._to_array(_numbers(key, values, self._dtypes)) for key, values in rest.items()}, t)
-            self._remember(rest)
-
-    def _defer(self, numbers: Mapping[str, Any], t: int) -> dict[str, Any]:
-        """Write numbers without making tensors, where the variable is the one that was written before; the others."""
-        held, known, rest = self.workspace.variables, self._deferring, {}
-        for key, values in numbers.items():
-            name, variable, shape, dtype = known.get(key, _NOTHING)
-            same = variable is not None and held.get(name) is variable and variable._shape is shape
-            if not same or not variable.defer(t, values, dtype):
-                rest[key] = values
-        return rest
-
-    def _remember(self, keys: Iterable[str]) -> None:
-        """The variables that have just been written, so that the next times of them may be deferred."""
-        for key in keys:
-            variable = self.workspace.variables[self.output + key]
-            if hasattr(variable, "defer"):
-                self._deferring[key] = (self.output + key, variable, variable._shape, self._dtypes[key])
-
-    def _device(self) -> Any:
-        """Where tensors have to go; None if they are there already."""
-        # Past nn.Module's __getattr__, which costs as much as storing a tensor.
-        ghost = self.__dict__.get("_parameters", _EMPTY).get("ghost_params")
-        return None if ghost is None or ghost.is_cpu else ghost.device
-
-    def _rewards_at_t(self, observations: Mapping[str, Any], t: int, write: Any) -> dict[str, Any]:
-        """Write the rewards of action[t - 1] at t - 1; what is left to write at t."""
-        left = dict(observations)
-        for key in ("reward", "cumulated_reward"):
-            if key in left:
-                if t > 0:
-                    write(self.output + key, t - 1, left[key])
-                left[key] = left[key] * 0 if key == "reward" else left[key] + 0  # new: no two times share memory
-        return left
-
-    def _traced_set(self, name: str, t: int, value: Any) -> None:
-        self.set((name, t), value)
+    def _put(self, arrays: dict[str, Array], t: int) -> None:
+        """Write arrays (B x ...) at t, by name without the output prefix, on the device of `ghost_params`."""
+        workspace, prefix = self.workspace, self.output
+        if self.arrays == "numpy":
+            for name, array in arrays.items():
+                workspace.set(prefix + name, t, array)
+            return
+        ghost = self.__dict__["_parameters"]["ghost_params"]  # around nn.Module's __getattr__, which costs much
+        for name, array in arrays.items():
+            if ghost.is_cpu:
+                workspace.set_deferred(prefix + name, t, array)
+            else:
+                workspace.set(prefix + name, t, sys.modules["torch"].from_numpy(array).to(ghost.device))
 
     def _written(self) -> tuple[str, ...]:
         """The names of all variables that it writes."""
         infos = [name for key in self.info_keys for name in (f"info/{key}", f"info/_{key}")]
-        return tuple(self.output + name for name in (*names(self.get_observation_space()), *_NUMBERS, *infos))
+        return tuple(self.output + name for name in (*names(self.get_observation_space()), *NUMBERS, *infos))
 
-    def _row_seeds(self, seed: Any) -> int | list[int | None]:
+    # -- seeds -----------------------------------------------------------------------------------------------------
+
+    def seed(self, seed: int) -> Any:
+        """Take the seed; the agent itself is returned.
+
+        Raises:
+            LoopError: It has one already.
+        """
+        if self._seed is not None:
+            raise LoopError(
+                f"{type(self).__name__} is seeded with {self._seed} already and cannot be seeded with {seed}; "
+                f"give a run another seed with agent(workspace, t=0, seed={seed})."
+            )
+        self._seed = seed
+        return self
+
+    def _reset_seeds(self, seed: Any) -> int | list[int | None]:
         """What the environments are reset with at t = 0: one seed to count from, or one for each.
 
         Args:
@@ -182,7 +220,7 @@ class GymAgent(TimeAgent, SeedableAgent, SerializableAgent, ABC):
             SettingsError: Neither a whole number nor as many as there are environments.
         """
         if seed is None:
-            # Row k gets num_envs * (number of the reset, from 2) * seed + k + 1, as BBRL's ParallelGymAgent does.
+            # Environment k gets num_envs * (number of the reset, from 2) * seed + k + 1, as BBRL's ParallelGymAgent.
             return self.num_envs * self._nb_reset * int(self._seed or 0) + 1
         if isinstance(seed, (int, np.integer)):
             return int(seed)
@@ -193,13 +231,6 @@ class GymAgent(TimeAgent, SeedableAgent, SerializableAgent, ABC):
         if len(seeds) != self.num_envs:
             raise SettingsError(f"seed: expected a number or {self.num_envs} of them, found {len(seeds)}.")
         return seeds
-
-    def _not_open(self) -> LoopError:
-        return LoopError(f"{agent_name(self)} has no episode running; its environments are (re)started at t=0.")
-
-    def __getstate__(self) -> dict[str, Any]:
-        """A copy writes into another workspace."""
-        return {**super().__getstate__(), "_deferring": {}}
 
     # -- spaces ----------------------------------------------------------------------------------------------------
 
@@ -246,18 +277,6 @@ class GymAgent(TimeAgent, SeedableAgent, SerializableAgent, ABC):
     def is_discrete_state(self) -> bool:
         """Whether the observation space is Discrete."""
         return isinstance(self.observation_space, spaces.Discrete)
-
-
-def _numbers(name: str, values: Any, dtypes: Mapping[str, np.dtype[Any]]) -> Any:
-    """One number from each environment as an array (B,)."""
-    array = np.array(values, dtypes[name])
-    if array.ndim != 1:
-        raise ValueMismatch(f"{name!r}: expected one number from each environment, found {values[0]!r}.")
-    return array
-
-
-def _same(array: Any) -> Any:
-    return array
 
 
 def _size(space: Space[Any]) -> Any:

@@ -1,4 +1,4 @@
-"""One agent: what a call does, names, seeds, traces, threads."""
+"""One agent: what a call does, names, seeds, threads."""
 
 import threading
 
@@ -126,7 +126,6 @@ def test_attributes_of_every_agent():
     assert agent.prefix == ""
     assert agent.with_prefix("left/") is agent
     assert agent.prefix == "left/"
-    assert agent.is_running() is False
     assert agent.seed(3) is None
 
 
@@ -195,31 +194,6 @@ def test_a_copy_made_during_a_call_is_free(kind):
     thread.start()
     thread.join(30)
     kind.check(ws["y"], [[1.0]])
-
-
-def test_a_trace(ws, tmp_path, capsys):
-    path = tmp_path / "trace.txt"
-    agent = Times(name="double")
-    agent.set_trace_file(path)
-    agent(ws, t=1)
-    agent.close_trace_file()
-    agent(ws, t=2)
-    lines = [line.split(" ", 1)[1] for line in path.read_text().splitlines()]
-    assert [line.split(" (2,)")[0] for line in lines] == [
-        "Times 'double' get ('x', 1)",
-        "Times 'double' set ('y', 1)",
-    ]
-    assert capsys.readouterr() == ("", "")
-
-
-def test_a_copy_of_a_traced_agent_is_not_traced(ws, tmp_path):
-    agent = Times()
-    agent.set_trace_file(tmp_path / "trace.txt")
-    copy = agent.clone()
-    copy(ws, t=1)
-    agent.close_trace_file()
-    assert (tmp_path / "trace.txt").read_text() == ""
-    assert ws["y"].tolist() == [[0.0, 0.0], [20.0, 22.0]]
 
 
 def test_an_agent_in_two_workspaces_one_after_the_other(ws, kind):

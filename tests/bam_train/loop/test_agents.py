@@ -72,11 +72,6 @@ def test_everything_has_to_be_an_agent():
     assert str(error.value) == "Agents: expected agents, found builtin_function_or_method at place 1."
 
 
-def test_forward_of_a_container_is_not_for_use():
-    with pytest.raises(NotImplementedError):
-        Agents().forward()
-
-
 def test_seed_and_close_reach_every_member():
     one, two = Add(1), Add(2)
     loop = TemporalAgent(Agents(one, Agents(KWAgentWrapper(two, sign=1))))

@@ -115,11 +115,6 @@ def test_not_an_agent():
     assert str(error.value) == "TemporalAgent: expected an agent, found builtin_function_or_method."
 
 
-def test_forward_is_not_for_use(kind):
-    with pytest.raises(NotImplementedError):
-        TemporalAgent(Clock(kind)).forward()
-
-
 def test_keywords_go_to_every_agent():
     class Noting(Agent):
         def forward(self, t, **kwargs):

@@ -185,11 +185,15 @@ def test_a_missing_part_of_the_action(toys):
             torch.tensor([0.0, 1]),
             "'action' at t=0: Discrete(2) takes whole numbers, found float32.",
         ),
-        (spaces.Discrete(2), torch.tensor([0, 2]), "'action' at t=0: Discrete(2) takes 0 to 1, found 2 in row 1."),
+        (
+            spaces.Discrete(2),
+            torch.tensor([0, 2]),
+            "'action' at t=0: Discrete(2) takes 0 to 1, found 2 for environment 1.",
+        ),
         (
             spaces.Discrete(2, start=-1),
             torch.tensor([-2, 0]),
-            "'action' at t=0: Discrete(2, start=-1) takes -1 to 0, found -2 in row 0.",
+            "'action' at t=0: Discrete(2, start=-1) takes -1 to 0, found -2 for environment 0.",
         ),
         (
             spaces.Dict(go=spaces.Discrete(2)),

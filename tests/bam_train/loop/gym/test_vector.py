@@ -315,8 +315,9 @@ def refused(text):
 
 def test_next_step_cannot_leave_the_last_state_out(toys):
     with refused(
-        "include_last_state=False: SyncVectorEnv(num_envs=3) resets ended rows in the next step "
-        "(AutoresetMode.NEXT_STEP), so their last observation cannot be left out; make it with AutoresetMode.SAME_STEP."
+        "include_last_state=False: SyncVectorEnv(num_envs=3) resets ended environments in the next "
+        "step (AutoresetMode.NEXT_STEP), so their last observation cannot be left out; "
+        "make it with AutoresetMode.SAME_STEP."
     ):
         VecGymAgent(vector_of(toys, AutoresetMode.NEXT_STEP), include_last_state=False)
 
@@ -341,7 +342,7 @@ def test_an_environment_that_resets_other_rows_too(toys):
 
     make = lambda: Careless([lambda k=k: toys.Counting(k) for k in (2, 5)], autoreset_mode=AutoresetMode.SAME_STEP)  # noqa: E731
     with pytest.raises(
-        LoopError, match=r'does not obey reset\(options=\{"reset_mask": \.\.\.\}\): it changed other rows'
+        LoopError, match=r'does not obey reset\(options=\{"reset_mask": \.\.\.\}\): it changed other environments'
     ):
         toys.run(VecGymAgent(make), 6)
 
@@ -374,7 +375,7 @@ def test_actions_that_do_not_fit(toys):
     ws = Workspace()
     for action, text in [
         (torch.tensor([1, 2]), "'action' at t=0: expected shape (3,), found (2,)."),
-        (torch.tensor([1, 100, 2]), "'action' at t=0: Discrete(100) takes 0 to 99, found 100 in row 1."),
+        (torch.tensor([1, 100, 2]), "'action' at t=0: Discrete(100) takes 0 to 99, found 100 for environment 1."),
         (torch.tensor([1.0, 2, 3]), "'action' at t=0: Discrete(100) takes whole numbers, found float32."),
     ]:
         ws.clear()

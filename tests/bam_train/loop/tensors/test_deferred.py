@@ -6,20 +6,17 @@ import numpy as np
 import pytest
 import torch
 
+from bam_train.errors import ValueMismatch
 from bam_train.loop import Workspace
-
-FLOAT = np.dtype(np.float32)
 
 
 @pytest.fixture
 def workspace():
-    """x: 0 set as a tensor; 1, 2 and 3 deferred, as a list, a tuple and an array of another dtype."""
+    """x: 0 set as a tensor; 1, 2 and 3 deferred."""
     workspace = Workspace()
     workspace.set("x", 0, torch.tensor([0.0, 0.5]))
-    variable = workspace.variables["x"]
-    assert variable.defer(1, [1.0, 1.5], FLOAT)
-    assert variable.defer(2, (2, 2.5), FLOAT)
-    assert variable.defer(3, np.array([3.0, 3.1]), FLOAT)
+    for t, values in enumerate(([1.0, 1.5], [2.0, 2.5], [3.0, 3.1]), start=1):
+        workspace.set_deferred("x", t, np.array(values, np.float32))
     return workspace
 
 
@@ -87,20 +84,38 @@ def test_a_gradient_among_them(workspace):
     assert workspace["x"][:, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 10.0]
 
 
-def test_only_the_next_time_of_a_list_can_be_deferred(workspace):
-    variable = workspace.variables["x"]
-    assert not variable.defer(5, [0.0, 0.0], FLOAT)
-    assert not variable.defer(3, [0.0, 0.0], FLOAT)
-    workspace.set_full("y", torch.zeros(4, 2))
-    assert not workspace.variables["y"].defer(4, [0.0, 0.0], FLOAT)
+def test_what_does_not_fit_is_refused_at_once(workspace):
+    with pytest.raises(ValueMismatch, match=r"^'x' at t=4: expected shape \(2,\), found \(3,\)\.$"):
+        workspace.set_deferred("x", 4, np.zeros(3, np.float32))
+    with pytest.raises(ValueMismatch, match=r"^'x' at t=4: expected dtype torch.float32, found torch.int64\.$"):
+        workspace.set_deferred("x", 4, np.zeros(2, np.int64))
+    workspace.set("array", 0, np.zeros(2))
+    with pytest.raises(ValueMismatch, match=r"^'array' at t=1: expected a numpy.ndarray, found a torch.Tensor\.$"):
+        workspace.set_deferred("array", 1, np.zeros(2))
+    assert workspace.variables["x"].time_size() == 4
+
+
+def test_any_time_and_one_tensor(workspace):
+    workspace.set_full("y", torch.zeros(2, 2))
+    workspace.set_deferred("y", 3, np.ones(2, np.float32))
+    workspace.set_deferred("y", 0, np.full(2, 5, np.float32))
+    assert workspace["y"][:, 1].tolist() == [5, 0, 0, 1]
+
+
+def test_read_in_inference_mode_then_outside(workspace):
+    weight = torch.ones(2, requires_grad=True)
+    with torch.inference_mode():
+        assert workspace.get("x", 1).is_inference()
+        assert workspace["x"].is_inference()
+    (workspace.get("x", 1) * weight).sum().backward()
+    (workspace["x"] * weight).sum().backward()
+    assert weight.grad.tolist() == pytest.approx([7.0, 9.1])
 
 
 def test_a_window_gives_them_to_the_sink():
     pieces = []
     workspace = Workspace(window=2, sink=lambda first, piece: pieces.append((first, piece["x"])))
-    workspace.set("x", 0, torch.zeros(1))
-    for t in range(1, 200):
-        if not workspace.variables["x"].defer(t, [t], FLOAT):
-            workspace.set("x", t, torch.tensor([float(t)]))
+    for t in range(200):
+        workspace.set_deferred("x", t, np.array([t], np.float32))
     workspace.flush()
     assert torch.cat([piece for _, piece in pieces]).ravel().tolist() == list(range(200))

@@ -5,6 +5,7 @@ import torch
 from torch.utils.data import DataLoader, TensorDataset
 
 import bam_train.loop as ours
+from bam_train.compat.bbrl.shared_workspace import shared_workspace
 from bam_train.loop.tensors import returns
 
 theirs = pytest.importorskip("bbrl.workspace")
@@ -134,7 +135,8 @@ def test_configurations():
 def test_shared_workspaces():
     for time_size in (None, 5):
         workspace, expected = (
-            rows(kind, 3, 2, 0)._convert_to_shared_workspace(n_repeat=2, time_size=time_size) for kind in (ours, theirs)
+            share(rows(kind, 3, 2, 0), n_repeat=2, time_size=time_size)
+            for kind, share in ((ours, shared_workspace), (theirs, theirs.Workspace._convert_to_shared_workspace))
         )
         assert workspace.is_shared == expected.is_shared
         assert (workspace.time_size(), workspace.batch_size()) == (expected.time_size(), expected.batch_size())

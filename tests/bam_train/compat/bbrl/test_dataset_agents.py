@@ -5,9 +5,9 @@ import pytest
 import torch
 from torch.utils.data import DataLoader, TensorDataset
 
+from bam_train.compat.bbrl.dataset_agents import DataLoaderAgent, ShuffledDatasetAgent
 from bam_train.errors import WorkspaceError
 from bam_train.loop import Workspace
-from bam_train.loop.tensors.datasets import DataLoaderAgent, ShuffledDatasetAgent
 
 DATA = TensorDataset(torch.arange(10.0).reshape(5, 2), torch.arange(5))
 

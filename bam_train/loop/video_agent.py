@@ -1,47 +1,51 @@
-"""`make_env`, and films of a policy at work."""
+"""Videos of an environment at work, one picture at every time of the loop."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from gymnasium.wrappers import Autoreset
 
 from bam_train.loop.agent import Agent
 from bam_train.loop.agents import Agents, KWAgentWrapper
-from bam_train.loop.film_agent import FilmAgent
-from bam_train.loop.gym.parallel import ParallelGymAgent
 from bam_train.loop.temporal_agent import TemporalAgent
 from bam_train.loop.workspace import Workspace
-from bam_train.video import open_video, require_video_path
-
-Env = gym.Env[Any, Any]
+from bam_train.video import Frame, open_video, picture, require_video_path
 
 
-def make_env(
-    env_name: str, autoreset: bool = False, wrappers: Iterable[Callable[[Env], Env]] = (), **kwargs: Any
-) -> Env:
-    """A Gymnasium environment in its wrappers.
-
-    Gymnasium's checker, which looks at every step and changes nothing, is off; ``disable_env_checker=False`` has it.
+class VideoAgent(Agent):
+    """Adds what an environment shows to a video. Stands behind the environment's agent.
 
     Args:
-        env_name: Its id.
-        autoreset: Put Gymnasium's `Autoreset` outermost.
-        wrappers: Applied in this order: with [A, B] the environment is B(A(env)).
-        kwargs: For `gymnasium.make`.
+        env: Made with ``render_mode="rgb_array"``.
+        add: Takes a picture, such as what `bam_train.video.open_video` gives.
+
+    Attributes:
+        count: The number of pictures taken.
     """
-    env: Env = gym.make(env_name, **{"disable_env_checker": True, **kwargs})
-    for wrapper in wrappers:
-        env = wrapper(env)
-    return Autoreset(env) if autoreset else env
+
+    reads = ()
+    writes = ()
+
+    def __init__(self, env: gym.Env[Any, Any], add: Callable[[Frame], Any]) -> None:
+        super().__init__()
+        self.env, self.add, self.count = env, add, 0
+
+    def forward(self, t: int, **kwargs: Any) -> None:
+        """Take the picture at time t.
+
+        Raises:
+            SettingsError: The environment gives none.
+        """
+        self.add(picture(self.env))
+        self.count += 1
 
 
-def record_video(env: Env, policy: Agent, path: str | Path, *, arrays: str = "torch") -> Path:
-    """Film one episode; the environment is closed at the end.
+def record_video(env: gym.Env[Any, Any], policy: Agent, path: str | Path, *, arrays: str = "torch") -> Path:
+    """Record one episode; the environment is closed at the end.
 
     BBRL writes ``<path without suffix>/rl-video-episode-0.mp4``; this writes `path` itself.
 
@@ -58,8 +62,10 @@ def record_video(env: Env, policy: Agent, path: str | Path, *, arrays: str = "to
     Raises:
         SettingsError: Another suffix, or the environment gives no picture.
         OutputError: The file cannot be written.
-        MissingExtra: The package that writes this kind of film is not installed.
+        MissingExtra: The package that writes this kind of video is not installed.
     """
+    from bam_train.loop.gym.parallel_gym_agent import ParallelGymAgent
+
     path = Path(path).expanduser().resolve()
     path = path if path.suffix else path.with_suffix(".mp4")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -69,7 +75,7 @@ def record_video(env: Env, policy: Agent, path: str | Path, *, arrays: str = "to
         with _no_grad(arrays), open_video(path, env.metadata.get("render_fps", 30)) as add:
             # Not seeded: as the environment is. The policy gets no keyword but t.
             stepper = KWAgentWrapper(ParallelGymAgent(lambda: env, 1, arrays=arrays), seed=[None])
-            loop = TemporalAgent(Agents(stepper, FilmAgent(env, add), agent))
+            loop = TemporalAgent(Agents(stepper, VideoAgent(env, add), agent))
             loop(Workspace(), t=0, stop_variable="env/done")
     finally:
         env.close()  # type: ignore[no-untyped-call]

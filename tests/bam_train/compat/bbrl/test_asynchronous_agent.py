@@ -3,12 +3,11 @@ import multiprocessing
 import numpy as np
 import pytest
 import torch
-from remote_agents import Trouble, Walker
+from remote_test_agents import Trouble, Walker
 
+from bam_train.compat.bbrl.remote_agents import AsynchronousAgent, RemoteAgentError
 from bam_train.errors import LoopError
 from bam_train.loop import Agent, Agents, TemporalAgent, Workspace
-from bam_train.loop.tensors.asynchronous import AsynchronousAgent
-from bam_train.loop.tensors.remote import RemoteAgentError
 
 pytestmark = [
     pytest.mark.usefixtures("no_process_left"),

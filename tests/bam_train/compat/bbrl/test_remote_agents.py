@@ -12,13 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from remote_agents import Trouble, Walker
+from remote_test_agents import Trouble, Walker
 
+from bam_train.compat.bbrl.remote_agents import NRemoteAgent, RemoteAgent, RemoteAgentError
+from bam_train.compat.bbrl.shared_workspace import shared_workspace
 from bam_train.errors import LoopError, WorkspaceError
-from bam_train.loop import Agent, Agents, SeedableAgent, TemporalAgent, Workspace
-from bam_train.loop.gym import ParallelGymAgent, make_env
-from bam_train.loop.tensors.remote import NRemoteAgent, RemoteAgent, RemoteAgentError
-from bam_train.loop.tensors.shared import shared_workspace
+from bam_train.loop import Agent, Agents, ParallelGymAgent, SeedableAgent, TemporalAgent, Workspace, make_env
 
 pytestmark = [
     pytest.mark.usefixtures("no_process_left"),
@@ -183,7 +182,7 @@ def test_weights_are_shared(created):
 
 def test_one_call_at_a_time(started):
     remote, workspace = started(loop(Trouble()))
-    remote._asynchronous_call(workspace, **STEPS, at=0, what="hang")
+    remote.start(workspace, **STEPS, at=0, what="hang")
     with pytest.raises(LoopError, match=r"^RemoteAgent is still running; wait until is_running\(\) is False\.$"):
         remote(workspace, **STEPS)
     assert remote.is_running()
@@ -213,7 +212,7 @@ def test_numpy_variables(created):
 def test_several_without_waiting(created):
     remote, workspace = created(loop(Walker()))
     assert not remote.is_running()
-    remote._asynchronous_call(workspace, **STEPS)
+    remote.start(workspace, **STEPS)
     while remote.is_running():
         pass
     assert workspace["x"][:, 3, 1].tolist() == [1, 2, 3]
@@ -274,16 +273,13 @@ def test_workspaces_that_do_not_fit(created, started):
     assert multiprocessing.active_children() == []
 
 
-def test_names_and_forward(created):
+def test_names(created):
     remote, _ = created(Walker(name="walker"), t=0)
     remote.agents[0].set_name("first")
     remote.set_name("all")
     assert remote.get_by_name("all") == [remote]
     assert remote.get_by_name("first") == [remote.agents[0]]
     assert remote.get_by_name("walker") == [agent.agent for agent in remote.agents]
-    for agent in (remote, remote.agents[0]):
-        with pytest.raises(NotImplementedError, match="has no forward; call it"):
-            agent.forward()
 
 
 # -- failures ----------------------------------------------------------------------------------------------------------
@@ -376,7 +372,7 @@ def test_agents_that_cannot_be_sent(started):
 
 def test_agents_of_modules_that_only_this_process_has(started, monkeypatch):
     notebook = types.ModuleType("notebook")
-    exec("from remote_agents import Walker\nclass Own(Walker):\n    pass", notebook.__dict__)
+    exec("from remote_test_agents import Walker\nclass Own(Walker):\n    pass", notebook.__dict__)
     monkeypatch.setitem(sys.modules, "notebook", notebook)
     remote, workspace = started(Agents(notebook.Own()), start_method="spawn")
     with pytest.raises(RemoteAgentError) as caught:
@@ -390,7 +386,7 @@ def test_agents_of_modules_that_only_this_process_has(started, monkeypatch):
 
 def test_an_interrupt_ends_a_busy_process(started, monkeypatch):
     remote, workspace = started(loop(Trouble()))
-    remote._asynchronous_call(workspace, **STEPS, at=0, what="hang")
+    remote.start(workspace, **STEPS, at=0, what="hang")
     monkeypatch.setattr(remote._worker._connection, "poll", _interrupted)
     with pytest.raises(KeyboardInterrupt):
         remote._worker.wait()
@@ -442,14 +438,14 @@ def test_the_last_reference_ends_the_process():
 
 SCRIPT = """
 import os, signal
-from remote_agents import Trouble
+from remote_test_agents import Trouble
 from bam_train.loop import NRemoteAgent
 
 if __name__ == "__main__":
     idle, workspace = NRemoteAgent.create(Trouble(), 1, start_method="fork", t=0)
     idle(workspace, t=0)
     busy, workspace = NRemoteAgent.create(Trouble(), 1, start_method="fork", t=0)
-    busy._asynchronous_call(workspace, t=0, at=0, what="hang")
+    busy.start(workspace, t=0, at=0, what="hang")
     print(busy.is_running(), flush=True)
     if {killed}:
         os.kill(os.getpid(), signal.SIGKILL)
@@ -472,7 +468,7 @@ def test_processes_end_with_their_parent(killed, code):
 
 HANDLER = """
 import functools, os, signal
-from remote_agents import Walker
+from remote_test_agents import Walker
 from bam_train.loop import AsynchronousAgent
 
 def handler(number, frame):  # such as the one that ray.init installs
@@ -506,7 +502,7 @@ def test_a_process_that_is_closed_while_it_forks_does_not_run_the_program_again(
 def test_a_script_without_main_guard(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
-        "from remote_agents import Walker\n"
+        "from remote_test_agents import Walker\n"
         "from bam_train.loop import NRemoteAgent\n"
         "agent, workspace = NRemoteAgent.create(Walker(), 1, t=0)\n"
         "agent(workspace, t=0)\n"

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from bam_train.compat.bbrl.shared_workspace import SharedWorkspace, shared_workspace
 from bam_train.errors import TimeNotWritten, UnknownVariable, ValueMismatch, WorkspaceError
 from bam_train.loop import Workspace
-from bam_train.loop.tensors.shared import SharedWorkspace, _SplitSharedWorkspace, shared_workspace
 
 KINDS = {"tensor": torch.tensor, "numpy": np.array}
 
@@ -27,7 +27,7 @@ def written(array, times=3):
 
 def test_a_copy_of_the_same_values(array):
     workspace = written(array)
-    shared = workspace._convert_to_shared_workspace()
+    shared = shared_workspace(workspace)
     assert (shared.is_shared, workspace.is_shared) == (True, False)
     assert isinstance(shared, SharedWorkspace)
     assert [type(shared[name]) for name in ("x", "done")] == [type(array([1]))] * 2
@@ -84,7 +84,7 @@ def test_times_are_copied_in_place(array):
 
 def test_a_split_is_a_part_of_the_memory(array):
     shared = shared_workspace(written(array), n_repeat=3)
-    part = _SplitSharedWorkspace(shared, (2, 4))
+    part = shared.columns(2, 4)
     assert part.is_shared
     assert (part.batch_size(), part.time_size(), list(part.keys())) == (2, 3, ["x", "done"])
     part.set("x", 1, shared.get("x", 0)[:2] * 0 - 1)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-sys.path.append(str(Path(__file__).parent))  # remote_agents, which started processes import, too
+sys.path.append(str(Path(__file__).parent))  # remote_test_agents, which started processes import, too
 
 LIMIT = 120  # seconds; then the whole run is ended, with all tracebacks
 

@@ -15,35 +15,39 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from bam_train.errors import WorkspaceError
-from bam_train.loop.arrays import NumpyVariable, mismatch, not_written, require_full
-from bam_train.loop.tensors.arrays import TensorVariable
+from bam_train.loop.tensors.tensor_variable import TensorVariable
+from bam_train.loop.variables import NumpyVariable, Variable, mismatch
 from bam_train.loop.workspace import Workspace
 
 
-class SharedTensorVariable(TensorVariable):
-    """One tensor variable, T x B x ..., in shared memory.
+class _SharedVariable(Variable):
+    """One variable, T x B x ..., in shared memory.
 
     Args:
         name: For error messages.
-        tensor: The memory.
+        memory: The shared tensor.
     """
 
-    def __init__(self, name: str, tensor: torch.Tensor) -> None:
+    def __init__(self, name: str, memory: torch.Tensor) -> None:
         super().__init__(name)
-        super().set_full(tensor)
+        self.memory = memory
+        super().set_full(memory.numpy() if self.ARRAY is np.ndarray else memory)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return SharedTensorVariable, (self.name, self._tensor)
+        return type(self), (self.name, self.memory)
 
-    @property
-    def memory(self) -> torch.Tensor:
-        """The shared tensor."""
-        return self._tensor
+    def _own(self, value: Any) -> Any:
+        return value  # `_store` and `set_full` copy it
 
-    def set(self, t: int, value: torch.Tensor) -> None:
+    def _store(self, t: int, value: Any) -> None:
+        if t < -len(self.memory):
+            raise self._not_written(t)
+        self._require_length(t)
+        self._whole[t] = value
+
+    def set(self, t: int, value: Any) -> None:
         """Copy `value` (B x ...) to time t, from any device.
 
         Raises:
@@ -51,54 +55,43 @@ class SharedTensorVariable(TensorVariable):
             WorkspaceError: t is beyond the end.
             TimeNotWritten: t is negative beyond the first.
         """
-        self._check(value.to(self.device) if isinstance(value, torch.Tensor) else value, f"t={t}")
-        self._tensor[_index(self.name, t, len(self._tensor))] = value.detach()
+        super().set(t, value.detach().to(self.device) if isinstance(value, torch.Tensor) else value)
 
-    def set_full(self, value: torch.Tensor) -> None:
+    def set_full(self, value: Any) -> None:
         """Copy T x B x ... onto the first T times; later ones stay.
 
         Raises:
             ValueMismatch: Another shape, dtype or kind.
             WorkspaceError: It is longer than the variable.
         """
-        require_full(self.name, value, torch.Tensor, self.KIND)
-        _require_alike(self.name, self._tensor, value)
-        self._tensor[: len(value)] = value.detach()
+        self._check_full(value)
+        for what, ours, theirs in (
+            ("shape of one time", tuple(self.shape), tuple(value.shape[1:])),
+            ("dtype", self.dtype, value.dtype),
+        ):
+            if ours != theirs:
+                raise mismatch(self.name, "all times", what, ours, theirs)
+        self._require_length(len(value) - 1)
+        self._whole[: len(value)] = value.detach() if isinstance(value, torch.Tensor) else value
 
     def detach(self) -> None:
         """Nothing: shared memory keeps no graph."""
 
+    def _require_length(self, t: int) -> None:
+        if t >= len(self.memory):
+            raise WorkspaceError(
+                f"{self.name!r} at t={t}: a shared workspace has a fixed length, and this one has {len(self.memory)} "
+                f"times; make it as long as the run: NRemoteAgent.create(..., time_size=...), {t + 1} at least."
+            )
 
-class SharedNumpyVariable(NumpyVariable):
-    """One NumPy variable, T x B x ..., in the shared memory of a tensor.
 
-    Args:
-        name: For error messages.
-        tensor: The memory.
-    """
+class _SharedTensorVariable(_SharedVariable, TensorVariable):
+    def set_deferred(self, t: int, array: np.ndarray) -> None:
+        self.set(t, torch.from_numpy(array))
 
-    def __init__(self, name: str, tensor: torch.Tensor) -> None:
-        super().__init__(name)
-        self.memory = tensor
-        self._buffer = tensor.numpy()
-        self._count, self._shape, self._sliced = len(tensor), tuple(tensor.shape[1:]), False
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return SharedNumpyVariable, (self.name, self.memory)
-
-    def set_full(self, value: NDArray[Any]) -> None:
-        """Copy T x B x ... onto the first T times; later ones stay.
-
-        Raises:
-            ValueMismatch: Another shape, dtype or kind.
-            WorkspaceError: It is longer than the variable.
-        """
-        require_full(self.name, value, np.ndarray, self.KIND)
-        _require_alike(self.name, self._buffer, value)
-        self._buffer[: len(value)] = value
-
-    def _append(self, t: int, index: int) -> int:
-        return _index(self.name, t, self._count)
+class _SharedNumpyVariable(_SharedVariable, NumpyVariable):
+    pass
 
 
 class SharedWorkspace(Workspace):
@@ -116,6 +109,11 @@ class SharedWorkspace(Workspace):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return SharedWorkspace, (self.variables,)
+
+    def columns(self, begin: int, end: int) -> SharedWorkspace:
+        """The batch columns [begin, end), in the same memory."""
+        variables: Mapping[str, Any] = self.variables
+        return SharedWorkspace({name: type(one)(name, one.memory[:, begin:end]) for name, one in variables.items()})
 
     def remove_variable(self, name: str) -> None:
         """Refused: other processes use it.
@@ -139,29 +137,14 @@ class SharedWorkspace(Workspace):
         )
 
 
-class _SplitSharedWorkspace(SharedWorkspace):
-    """Some batch columns of a shared workspace, in the same memory.
-
-    Args:
-        workspace: The whole.
-        batch_dims: First column, and one after the last.
-    """
-
-    def __init__(self, workspace: SharedWorkspace, batch_dims: tuple[int, int]) -> None:
-        begin, end = batch_dims
-        super().__init__(
-            {name: type(one)(name, one.memory[:, begin:end]) for name, one in workspace.variables.items()}  # type: ignore[union-attr]
-        )
-        self.batch_dims = batch_dims
-
-
 def shared_workspace(workspace: Workspace, n_repeat: int = 1, time_size: int | None = None) -> SharedWorkspace:
     """A copy of a workspace in shared memory, without graph.
 
     Args:
         workspace: What to copy.
         n_repeat: How often to repeat it over the batch.
-        time_size: Times of the copy, which then holds zeros; None for the times and values of `workspace`.
+        time_size: The number of times of the copy, which then holds zeros; None for the times and values of
+            `workspace`.
 
     Raises:
         WorkspaceError: `workspace` is empty, has arrays that torch does not know, or a number is less than 1.
@@ -176,7 +159,7 @@ def shared_workspace(workspace: Workspace, n_repeat: int = 1, time_size: int | N
     )
 
 
-def _shared(name: str, value: Any, n_repeat: int, time_size: int | None) -> SharedTensorVariable | SharedNumpyVariable:
+def _shared(name: str, value: Any, n_repeat: int, time_size: int | None) -> _SharedVariable:
     """One variable of the copy."""
     try:
         tensor = torch.as_tensor(value).detach()
@@ -186,28 +169,4 @@ def _shared(name: str, value: Any, n_repeat: int, time_size: int | None) -> Shar
     memory = tensor.new_zeros((time_size or times, n_repeat * columns, *tensor.shape[2:])).share_memory_()
     if time_size is None:
         memory.copy_(torch.cat([tensor] * n_repeat, dim=1))
-    return SharedNumpyVariable(name, memory) if isinstance(value, np.ndarray) else SharedTensorVariable(name, memory)
-
-
-def _index(name: str, t: int, times: int) -> int:
-    """Time t as an index from 0."""
-    if t >= times:
-        raise WorkspaceError(
-            f"{name!r} at t={t}: a shared workspace has a fixed length, and this one has {times} times; "
-            f"make it as long as the run: NRemoteAgent.create(..., time_size=...), {t + 1} at least."
-        )
-    if t < -times:
-        raise not_written(name, t, 0, times)
-    return t % times
-
-
-def _require_alike(name: str, memory: Any, value: Any) -> None:
-    """Refuse all times of another shape, dtype or more times."""
-    for what, ours, theirs in (
-        ("shape of one time", tuple(memory.shape[1:]), tuple(value.shape[1:])),
-        ("dtype", memory.dtype, value.dtype),
-    ):
-        if ours != theirs:
-            raise mismatch(name, "all times", what, ours, theirs)
-    if len(value) > len(memory):
-        _index(name, len(value) - 1, len(memory))
+    return (_SharedNumpyVariable if isinstance(value, np.ndarray) else _SharedTensorVariable)(name, memory)

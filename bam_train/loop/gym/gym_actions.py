@@ -13,7 +13,7 @@ from gymnasium import Space, spaces
 from numpy.typing import NDArray
 
 from bam_train.errors import UnknownVariable, ValueMismatch
-from bam_train.loop.arrays import mismatch
+from bam_train.loop.variables import mismatch
 
 _SHAPED = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 _WHOLE = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
@@ -28,14 +28,14 @@ class ActionReader:
         name: The variable, or the first part of the variables' names.
         space: Of one environment. Spaces of other kinds than Box, Discrete, MultiDiscrete, MultiBinary and Dict are
             not checked.
-        rows: n.
+        num_envs: n.
     """
 
-    def __init__(self, name: str, space: Space[Any], rows: int) -> None:
-        self._name, self._space, self._rows = name, space, rows
-        self._parts = {name: _Part(name, space, rows)}
+    def __init__(self, name: str, space: Space[Any], num_envs: int) -> None:
+        self._name, self._space, self._num_envs = name, space, num_envs
+        self._parts = {name: _Part(name, space, num_envs)}
 
-    def rows(self, workspace: Any, t: int) -> Sequence[Any]:
+    def each(self, workspace: Any, t: int) -> Sequence[Any]:
         """One action for each environment: an int, an array (float64 or int64), or a nested dict of these.
 
         Raises:
@@ -44,8 +44,8 @@ class ActionReader:
             ValueMismatch: It does not fit the action space, or is not for n environments.
         """
         if self._name in workspace.variables:
-            return self._parts[self._name].rows(workspace.get(self._name, t), t)
-        return _transpose(self._tree(workspace, t, _Part.rows), self._rows)
+            return self._parts[self._name].each(workspace.get(self._name, t), t)
+        return _transpose(self._tree(workspace, t, _Part.each), self._num_envs)
 
     def batch(self, workspace: Any, t: int) -> Any:
         """The actions of all environments together: a new array of the space's dtype, or a nested dict of these.
@@ -66,10 +66,10 @@ class ActionReader:
         for variable in list(workspace.variables):
             if variable.startswith(prefix):
                 *above, last = variable[len(prefix) :].split("/")
-                place = tree
+                branch = tree
                 for key in above:
-                    place = place.setdefault(key, {})
-                place[last] = convert(self._part(variable, (*above, last)), workspace.get(variable, t), t)
+                    branch = branch.setdefault(key, {})
+                branch[last] = convert(self._part(variable, (*above, last)), workspace.get(variable, t), t)
         if not tree:
             raise UnknownVariable(self._name, workspace.variables)
         _require_keys(self._name, self._space, tree, workspace)
@@ -80,23 +80,23 @@ class ActionReader:
             space: Any = self._space
             for key in keys:
                 space = space.spaces.get(key) if isinstance(space, spaces.Dict) else None
-            self._parts[variable] = _Part(variable, space, self._rows)
+            self._parts[variable] = _Part(variable, space, self._num_envs)
         return self._parts[variable]
 
 
 class _Part:
     """One variable of the action, and what is known of it."""
 
-    def __init__(self, name: str, space: Space[Any] | None, rows: int) -> None:
-        self._name, self._space, self._rows = name, space, rows
-        self._shape = (rows, *(space.shape or ())) if isinstance(space, _SHAPED) else None
+    def __init__(self, name: str, space: Space[Any] | None, num_envs: int) -> None:
+        self._name, self._space, self._num_envs = name, space, num_envs
+        self._shape = (num_envs, *(space.shape or ())) if isinstance(space, _SHAPED) else None
         self._whole = isinstance(space, _WHOLE)
         self._dtype = None if space is None or space.dtype is None else np.dtype(space.dtype)
         self._range = None
         if isinstance(space, spaces.Discrete):
             self._range = int(space.start), int(space.start + space.n - 1)
 
-    def rows(self, value: Any, t: int) -> Sequence[Any]:
+    def each(self, value: Any, t: int) -> Sequence[Any]:
         array = self._checked(value, t)
         kind = array.dtype.kind
         if array.ndim > 1:
@@ -117,7 +117,7 @@ class _Part:
         return cast
 
     def _checked(self, value: Any, t: int) -> NDArray[Any]:
-        array = as_array(value)
+        array = _as_array(value)
         if self._shape is None:
             self._check_unshaped(array, t)
         elif array.shape != self._shape:
@@ -127,8 +127,8 @@ class _Part:
         return array
 
     def _check_unshaped(self, array: NDArray[Any], t: int) -> None:
-        if len(array) != self._rows:
-            raise mismatch(self._name, f"t={t}", "batch size", self._rows, len(array))
+        if len(array) != self._num_envs:
+            raise mismatch(self._name, f"t={t}", "batch size", self._num_envs, len(array))
         if isinstance(self._space, spaces.Dict):
             wanted = ", ".join(repr(f"{self._name}/{key}") for key in self._space.spaces)
             raise ValueMismatch(
@@ -138,13 +138,13 @@ class _Part:
     def _check_range(self, actions: Any, least: int, most: int, t: int) -> None:
         first, last = self._range or (0, 0)
         if least < first or most > last:
-            row, found = next((k, int(one)) for k, one in enumerate(actions) if not first <= one <= last)
+            k, found = next((k, int(one)) for k, one in enumerate(actions) if not first <= one <= last)
             raise ValueMismatch(
-                f"{self._name!r} at t={t}: {self._space} takes {first} to {last}, found {found} in row {row}."
+                f"{self._name!r} at t={t}: {self._space} takes {first} to {last}, found {found} for environment {k}."
             )
 
 
-def as_array(value: Any) -> NDArray[Any]:
+def _as_array(value: Any) -> NDArray[Any]:
     """A tensor or array as an array; shares its memory where it can."""
     if isinstance(value, np.ndarray):
         return value
@@ -165,7 +165,7 @@ def _require_keys(name: str, space: Any, tree: Any, workspace: Any) -> None:
         _require_keys(f"{name}/{key}", part, tree[key], workspace)
 
 
-def _transpose(tree: Mapping[str, Any], rows: int) -> list[dict[str, Any]]:
+def _transpose(tree: Mapping[str, Any], num_envs: int) -> list[dict[str, Any]]:
     """A nested dict of n values each as n nested dicts."""
-    parts = {key: _transpose(one, rows) if isinstance(one, dict) else one for key, one in tree.items()}
-    return [{key: one[k] for key, one in parts.items()} for k in range(rows)]
+    parts = {key: _transpose(one, num_envs) if isinstance(one, dict) else one for key, one in tree.items()}
+    return [{key: one[k] for key, one in parts.items()} for k in range(num_envs)]

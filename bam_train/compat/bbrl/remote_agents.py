@@ -1,13 +1,15 @@
-"""Agents in other processes, which write into one shared workspace.
+"""Agents that run in other processes: `RemoteAgent`, `NRemoteAgent` and `AsynchronousAgent`.
 
-Differences from BBRL, whose processes die as they start while the parent waits for ever:
+Differences from BBRL, where the processes of the first two die as they start while the parent waits for ever, and a
+failure in an `AsynchronousAgent` seems to run for ever:
 
 - They work, with every start method. "spawn" is the default, because torch's threads and CUDA do not survive a fork; in
   a notebook, or with agents that cannot be pickled, give ``start_method="fork"``.
 - A failure there is a `RemoteAgentError` here. The processes are closed then; the next call starts new ones.
-- Weights are in shared memory: ``load_state_dict`` on what `get_by_name` finds is seen in the process at once.
+- Weights are in shared memory: ``load_state_dict`` on what `get_by_name` finds is seen in the process at once. For a
+  run on weights that stay as they are, give the agent a clone.
 - `seed` seeds the process's global generators as well, so that the noise of two processes differs; it works after the
-  start, too. Nobody needs to seed: process k has seed k, or, of a lone `RemoteAgent`, its generators one from torch's.
+  start, too. Nobody needs to seed: process k has seed k, or, of a lone agent, its generators one from torch's.
 - `NRemoteAgent.create` leaves the agent it is given as it was. With no processes, what it returns is not seeded.
 - `close` can be called at any time; processes also end with the agent's last reference and with the parent.
 - A process is a daemon: the agent in it cannot start processes of its own. It has one torch thread.
@@ -16,24 +18,23 @@ Differences from BBRL, whose processes die as they start while the parent waits 
 from __future__ import annotations
 
 import copy
+import pickle
+import weakref
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from bam_train.compat.bbrl.shared_workspace import SharedWorkspace, shared_workspace
+from bam_train.compat.bbrl.worker import Worker, wait_for_any
 from bam_train.errors import LoopError, RemoteAgentError, WorkspaceError
 from bam_train.loop.agent import Agent, agent_name
-from bam_train.loop.tensors.process_agent import ProcessAgent
-from bam_train.loop.tensors.shared import SharedWorkspace, _SplitSharedWorkspace, shared_workspace
-from bam_train.loop.tensors.worker import wait_for_any
 from bam_train.loop.workspace import Workspace
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["NRemoteAgent", "RemoteAgent", "RemoteAgentError"]
 
-
-class RemoteAgent(ProcessAgent):
-    """Runs an agent in another process, on a shared workspace, without gradients.
+class _ProcessAgent(Agent):
+    """An agent that runs another one in a process, which starts at the first call.
 
     Args:
         agent: What to run there; its weights move into shared memory.
@@ -45,8 +46,92 @@ class RemoteAgent(ProcessAgent):
     def __init__(
         self, agent: Agent, name: str | None = None, verbose: bool = False, *, start_method: str = "spawn"
     ) -> None:
-        super().__init__(agent, name, verbose, start_method=start_method)
-        self._sent: Workspace | None = None
+        super().__init__(name=name, verbose=verbose)
+        self.agent = agent
+        self.start_method = start_method
+        self._seed: int | None = None
+        self._worker: Worker | None = None
+
+    def get_by_name(self, n: str) -> list[Agent]:
+        """The agents of that name: this one, then those in the agent it runs, whose weights are shared."""
+        return super().get_by_name(n) + self.agent.get_by_name(n)
+
+    def seed(self, seed: int) -> Self:
+        """Seed the agent, and the process's global generators (torch, NumPy, random); itself is returned.
+
+        Before the start it is kept for the start.
+
+        Raises:
+            RemoteAgentError: The agent refuses, for instance because it is seeded already.
+        """
+        self._seed = seed
+        self._tell("seed", seed)
+        return self
+
+    def train(self, mode: bool = True) -> Self:
+        """Set the mode, here and in the process; `eval` is ``train(False)``."""
+        super().train(mode)
+        self._tell("train", mode)
+        return self
+
+    def is_running(self) -> bool:
+        """Whether a call is still under way.
+
+        Raises:
+            RemoteAgentError: It failed; the process is closed.
+        """
+        try:
+            return self._worker is not None and self._worker.poll()
+        except RemoteAgentError:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """End the process; at any time, and idempotent. The next call starts a new one."""
+        if self._worker is not None:
+            self._worker.close()
+            self._worker = None
+
+    def _running_worker(self) -> Worker:
+        """The process, started if there is none.
+
+        Raises:
+            LoopError: It is busy.
+        """
+        if self._worker is not None and self._worker.closed:
+            self._worker = None
+        if self._worker is None:
+            self._worker = Worker(self.agent, self.start_method, self._seed)
+            weakref.finalize(self, self._worker.close)
+        elif self._worker.poll():
+            raise _still_running(self)
+        return self._worker
+
+    def _tell(self, command: str, argument: Any) -> None:
+        """Give a command to the process if there is one, and wait for its end unless it is busy."""
+        worker = self.__dict__.get("_worker")
+        if worker is None or worker.closed:
+            return
+        busy = worker.poll()
+        worker.send(command, argument)
+        if not busy:
+            worker.wait()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_worker": None}
+
+
+class RemoteAgent(_ProcessAgent):
+    """Runs an agent in another process, on a shared workspace, without gradients.
+
+    Args:
+        agent: What to run there; its weights move into shared memory.
+        name: What `get_by_name` finds.
+        verbose: Kept as an attribute.
+        start_method: "spawn", "forkserver" or "fork".
+    """
+
+    _sent: Workspace | None = None
 
     def __call__(self, workspace: Workspace, **kwargs: Any) -> None:
         """Run the agent on `workspace` with these keywords, and wait for it.
@@ -56,16 +141,16 @@ class RemoteAgent(ProcessAgent):
             RemoteAgentError: The agent failed, or its process ended.
             LoopError: It is running already.
         """
-        self._asynchronous_call(workspace, **kwargs)
+        self.start(workspace, **kwargs)
         if self._worker is not None:
             self._worker.wait()
 
-    def _asynchronous_call(self, workspace: Workspace, **kwargs: Any) -> None:
+    def start(self, workspace: Workspace, **kwargs: Any) -> None:
         """The call without waiting; `is_running` says when it has ended."""
         if not getattr(workspace, "is_shared", False):
             raise WorkspaceError(
                 f"{agent_name(self)} needs a shared workspace; NRemoteAgent.create makes one, or "
-                f"bam_train.loop.tensors.shared.shared_workspace(workspace)."
+                f"bam_train.compat.bbrl.shared_workspace.shared_workspace(workspace)."
             )
         before = self._worker
         worker = self._running_worker()
@@ -81,10 +166,6 @@ class NRemoteAgent(Agent):
     """Runs copies of an agent in several processes, each on its own batch columns; see `create`.
 
     Args:
-        agents: One for each process.
-        batch_dims: First column of each, and one after its last.
-
-    Attributes:
         agents: One for each process.
         batch_dims: First column of each, and one after its last.
     """
@@ -150,7 +231,7 @@ class NRemoteAgent(Agent):
             RemoteAgentError: A copy failed, or its process ended. All are closed then.
             LoopError: It is running already.
         """
-        self._asynchronous_call(workspace, **kwargs)
+        self.start(workspace, **kwargs)
         try:
             while running := [agent for agent in self.agents if agent.is_running()]:
                 wait_for_any([agent._worker for agent in running if agent._worker is not None])
@@ -158,25 +239,17 @@ class NRemoteAgent(Agent):
             self.close()
             raise
 
-    def _asynchronous_call(self, workspace: Workspace, **kwargs: Any) -> None:
+    def start(self, workspace: Workspace, **kwargs: Any) -> None:
         """The call without waiting; `is_running` says when it has ended."""
         if self.is_running():
-            raise LoopError(f"{agent_name(self)} is still running; wait until is_running() is False.")
+            raise _still_running(self)
         parts = self._columns(workspace)
         try:
             for agent, columns in zip(self.agents, parts, strict=True):
-                agent._asynchronous_call(columns, **kwargs)
+                agent.start(columns, **kwargs)
         except BaseException:
             self.close()
             raise
-
-    def forward(self, **kwargs: Any) -> None:
-        """Not used.
-
-        Raises:
-            NotImplementedError: Always.
-        """
-        raise NotImplementedError("NRemoteAgent has no forward; call it.")
 
     def is_running(self) -> bool:
         """Whether a call that did not wait is still under way in a process.
@@ -208,9 +281,10 @@ class NRemoteAgent(Agent):
         return self
 
     def close(self) -> None:
-        """End all processes; at any time, as often as one likes. The next call starts new ones."""
+        """End all processes; at any time, and idempotent. The next call starts new ones."""
         for agent in self.agents:
-            agent.ask_to_end()
+            if agent._worker is not None:
+                agent._worker.ask_to_end()  # so that they end at the same time
         for agent in self.agents:
             agent.close()
 
@@ -222,8 +296,73 @@ class NRemoteAgent(Agent):
             width = self.batch_dims[-1][1]
             if workspace.batch_size() != width:
                 raise WorkspaceError(f"Expected a shared workspace of {width} columns, found {workspace.batch_size()}.")
-            self._split = (workspace, [_SplitSharedWorkspace(workspace, columns) for columns in self.batch_dims])
+            self._split = (workspace, [workspace.columns(*columns) for columns in self.batch_dims])
         return self._split[1]
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_split": None}
+
+
+class AsynchronousAgent(_ProcessAgent):
+    """Starts an agent in another process, without gradients, and gives its workspace when it has ended.
+
+    ::
+
+        agent(t=0, n_steps=100)
+        while agent.is_running():
+            ...
+        workspace = agent.get_workspace()
+
+    Args:
+        agent: What to run there; its weights move into shared memory.
+        verbose: Kept as an attribute.
+        start_method: "spawn", "forkserver" or "fork".
+    """
+
+    def __init__(self, agent: Agent, verbose: bool = False, *, start_method: str = "spawn") -> None:
+        super().__init__(agent, verbose=verbose, start_method=start_method)
+        self._last: Workspace | None = None
+        self._expected = False
+
+    def __call__(self, **kwargs: Any) -> None:  # type: ignore[override]  # it has its own workspace
+        """Start the agent on a new workspace with these keywords; does not wait.
+
+        Raises:
+            LoopError: The last call has not ended.
+            RemoteAgentError: The keywords or the agent cannot be sent to the process, or the last call failed.
+        """
+        if self.is_running():
+            raise _still_running(self)
+        self._running_worker().send("run_alone", kwargs)
+        self._last, self._expected = None, True
+
+    def is_running(self) -> bool:
+        """Whether the last call is still under way.
+
+        Raises:
+            RemoteAgentError: It failed.
+        """
+        if super().is_running():
+            return True
+        if self._expected and self._worker is not None:
+            self._expected, self._last = False, Workspace()
+            for name, value in pickle.loads(self._worker.result).items():
+                self._last.set_full(name, value)
+        return False
+
+    def get_workspace(self) -> Workspace | None:
+        """The workspace of the last call; None while it is under way, and before the first.
+
+        Raises:
+            RemoteAgentError: The call failed.
+        """
+        return None if self.is_running() else self._last
+
+    def close(self) -> None:
+        """End the process; at any time, and idempotent. The last workspace stays."""
+        super().close()
+        self._expected = False
+
+
+def _still_running(agent: Agent) -> LoopError:
+    return LoopError(f"{agent_name(agent)} is still running; wait until is_running() is False.")

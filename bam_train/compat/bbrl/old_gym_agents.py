@@ -14,21 +14,20 @@ import numpy as np
 from gymnasium.wrappers import Autoreset
 
 from bam_train.errors import SettingsError
-from bam_train.loop.gym.env_rows import Rows, has_autoreset
-from bam_train.loop.gym.parallel import ParallelGymAgent
-from bam_train.loop.gym.peeling import Env
+from bam_train.loop.gym.gym_agent import Frame
+from bam_train.loop.gym.parallel_gym_agent import Env, ParallelGymAgent, has_autoreset
 
 
-class _LegacyGymAgent(ParallelGymAgent):
+class _OldGymAgent(ParallelGymAgent):
     """What both have in common; `_autoreset` is all that differs.
 
-    Rows are those of `ParallelGymAgent`, in the variables env_obs, done, truncated, reward, timestep and
+    It writes what `ParallelGymAgent` does, in the variables env_obs, done, truncated, reward, timestep and
     cumulated_reward. Environment k is seeded with ``seed + k`` when it is made; no reset seeds it again.
 
     Args:
         make_env_fn: Called `n_envs` times with `make_env_args`.
         make_env_args: Its keywords.
-        n_envs: How many environments.
+        n_envs: The number of environments.
         seed: Of the first environment; required.
         action_string: The variable with the action.
         output: Put before the names of all variables.
@@ -64,11 +63,11 @@ class _LegacyGymAgent(ParallelGymAgent):
             output_string=output,
             arrays=arrays,
         )
-        self._declare(_LegacyGymAgent, reads=None, writes=self._written())
+        self._declare(_OldGymAgent, reads=None, writes=self._written())
 
     @property
     def n_envs(self) -> int:
-        """How many environments."""
+        """The number of environments."""
         return self.num_envs
 
     def seed(self, seed: int) -> None:
@@ -88,9 +87,9 @@ class _LegacyGymAgent(ParallelGymAgent):
         env = super()._make()
         return Autoreset(env) if self._autoreset and not has_autoreset(env) else env
 
-    def _row_seeds(self, seed: Any) -> int | list[int | None]:
+    def _reset_seeds(self, seed: Any) -> int | list[int | None]:
         if seed is not None:
-            return super()._row_seeds(seed)
+            return super()._reset_seeds(seed)
         return [None if self._seeded else int(self._seed or 0) + k for k in range(self.num_envs)]
 
     def forward(self, t: int = 0, save_render: bool = False, render: bool = False, **kwargs: Any) -> None:
@@ -103,30 +102,27 @@ class _LegacyGymAgent(ParallelGymAgent):
             kwargs: ``seed``, see `ParallelGymAgent`.
         """
         super().forward(t, **kwargs)
-        if t == 0:
-            self._seeded = True
+        self._seeded = True
         if save_render or render:
             pictures: list[Any] = [env.render() for env in self.envs]
             if save_render:
-                self.set_obs({"rendering": self._to_array(np.array(pictures))}, t)
+                self._put({"rendering": np.array(pictures)}, t)
 
-    def _numbers(self, rows: Rows) -> dict[str, Any]:
-        numbers = super()._numbers(rows)
-        flags = zip(numbers["truncated"], numbers["terminated"], strict=True)
-        numbers["truncated"] = [truncated and not terminated for truncated, terminated in flags]
+    def _numbers(self, frame: Frame) -> dict[str, Any]:
+        numbers = {**frame.numbers, "truncated": frame.numbers["truncated"] & ~frame.numbers["terminated"]}
         return {name: numbers[name] for name in ("done", "truncated", "reward", "timestep", "cumulated_reward")}
 
     def _written(self) -> tuple[str, ...]:
         return tuple(name for name in super()._written() if name != f"{self.output}terminated")
 
 
-class AutoResetGymAgent(_LegacyGymAgent):
-    """Environments that begin the next episode after one has ended, in the row after its last."""
+class AutoResetGymAgent(_OldGymAgent):
+    """Environments that begin the next episode after one has ended, at the time after its last."""
 
     _autoreset = True
 
 
-class NoAutoResetGymAgent(_LegacyGymAgent):
+class NoAutoResetGymAgent(_OldGymAgent):
     """Environments whose last frame is repeated, with reward 0, once an episode has ended."""
 
     _autoreset = False

@@ -1,10 +1,10 @@
 """A process that runs one agent for another process, and never outlives it.
 
-The two ends talk through one pipe: a command there, an answer back. Waiting looks at whether the process is still
-alive, so that it ends when the process does. What goes wrong there is raised here, with the traceback.
+The two ends talk through one pipe: a command there, an answer back. Whoever waits looks at whether the process is still
+alive, so that the wait ends when the process does. What goes wrong there is raised here, with the traceback.
 
-Weights (parameters and buffers) are in shared memory: what is written into them here, by `load_state_dict` or an
-optimiser, is seen there. Everything else of an agent is a copy.
+Weights (parameters and buffers) are in shared memory: what `load_state_dict` or an optimiser writes into them here is
+seen there. Everything else of an agent is a copy.
 """
 
 from __future__ import annotations
@@ -12,19 +12,24 @@ from __future__ import annotations
 import multiprocessing
 import os
 import pickle
+import random
 import signal
-from collections.abc import Iterator, Sequence
+import threading
+import traceback
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
+import numpy as np
 import torch
 import torch.multiprocessing  # teaches pickle to share tensors
 
-from bam_train.errors import RemoteAgentError
+from bam_train.errors import LoopError, RemoteAgentError
 from bam_train.loop.agent import Agent, agent_name
-from bam_train.loop.tensors.serve import serve
+from bam_train.loop.workspace import Workspace
+from bam_train.signals import drop_handlers
 
 PATIENCE = 5.0
 """Seconds that an idle process has to end by itself."""
@@ -47,17 +52,20 @@ class Worker:
         start_method: "spawn", "forkserver" or "fork".
         seed: For the agent and for the global generators; None seeds the generators only, from torch's here.
 
+    Attributes:
+        closed: Whether the process has been ended.
+        result: What the last command that had a result gave.
+
     Raises:
         RemoteAgentError: The agent cannot be sent to the process.
     """
 
     def __init__(self, agent: Agent, start_method: str, seed: int | None) -> None:
         self.name = agent_name(agent)
-        self._owner = os.getpid()
-        self._pending = 0
-        self._started = self._asked = False
-        self._result: Any = None
         self.closed = False
+        self.result: Any = None
+        self._owner = os.getpid()
+        self._started = self._asked = False
         if isinstance(agent, torch.nn.Module):
             agent.share_memory()
         # A forked process has the agent already, and need not be able to pickle it.
@@ -65,17 +73,11 @@ class Worker:
         noise = int(torch.randint(2**31, ())) if seed is None else seed
         context: Any = multiprocessing.get_context(start_method)
         self._connection, there = context.Pipe()
-        self._process = context.Process(target=serve, args=(there, payload, seed, noise), daemon=True)
+        self._process = context.Process(target=_serve, args=(there, payload, seed, noise), daemon=True)
         with _signals_blocked(start_method == "fork"):
             self._process.start()
         there.close()
         self._pending = 1  # it says when it is ready
-
-    @property
-    def connection(self) -> Connection:
-        """To wait for together with others."""
-        connection: Connection = self._connection
-        return connection
 
     def send(self, command: str, *arguments: Any) -> None:
         """Begin a command; `wait` or `poll` for its end.
@@ -88,18 +90,17 @@ class Worker:
             self._connection.send_bytes(data)
         self._pending += 1
 
-    def wait(self) -> Any:
-        """Wait for the end of all commands; the newest result.
+    def wait(self) -> None:
+        """Wait for the end of all commands.
 
         Raises:
             RemoteAgentError: One failed, or the process ended; it is closed then.
         """
         while self._pending:
             self._take_if_ready(_LOOK_AGAIN)
-        return self._result
 
     def poll(self) -> bool:
-        """Whether a command is still under way, its start aside; does not wait.
+        """Whether a command other than the start is still under way; does not wait.
 
         Raises:
             RemoteAgentError: One failed, or the process ended; it is closed then.
@@ -107,10 +108,6 @@ class Worker:
         while self._pending and self._take_if_ready(0):
             pass
         return self._pending > (0 if self._started else 1)
-
-    def result(self) -> Any:
-        """The result of the last command that had one."""
-        return self._result
 
     def ask_to_end(self) -> None:
         """Ask an idle process to close its agent and end, without waiting; only `close` may follow."""
@@ -120,7 +117,7 @@ class Worker:
                 self._connection.send_bytes(self._pickled(("exit",)))
 
     def close(self) -> None:
-        """End the process, at once if it is busy; from any state, as often as one likes."""
+        """End the process, at once if it is busy; in any state, and idempotent."""
         if self.closed or not self._is_mine():
             return
         self.ask_to_end()
@@ -156,7 +153,7 @@ class Worker:
             self.close()
             raise
         self._started = True
-        self._result = self._result if answer is None else answer
+        self.result = self.result if answer is None else answer
         return True
 
     def _ended(self) -> RemoteAgentError:
@@ -184,13 +181,18 @@ class Worker:
             ) from error
 
 
+def wait_for_any(workers: Sequence[Worker]) -> None:
+    """Wait until one of them answers or ends, or a second has passed."""
+    wait([worker._connection for worker in workers], _LOOK_AGAIN)
+
+
 @contextmanager
 def _signals_blocked(blocked: bool) -> Iterator[None]:
     """Keep signals from a forked process until it has handlers of its own.
 
     It begins inside ``os.fork()`` with this process's handlers. One that raises, such as Ray's for SIGTERM or the one
     for Ctrl-C, would leave ``os.fork()`` there and go on with this process's own code a second time. The forked process
-    inherits the mask; `serve` takes the handlers away and then unblocks.
+    inherits the mask; `drop_handlers` takes the handlers away and then unblocks.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals() if blocked else ())
     try:
@@ -199,6 +201,101 @@ def _signals_blocked(blocked: bool) -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def wait_for_any(workers: Sequence[Worker]) -> None:
-    """Wait until one of them answers or ends, or a second has passed."""
-    wait([worker.connection for worker in workers], _LOOK_AGAIN)
+# -- the other end: what runs in the process ---------------------------------------------------------------------------
+
+
+def _serve(connection: Connection, payload: Any, seed: int | None, noise: int) -> None:
+    """Answer commands until told to exit, or until the parent is gone."""
+    drop_handlers()
+    threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
+    torch.set_num_threads(1)  # as many processes as cores; and OpenMP's threads do not survive a fork
+    server = _Server()
+    _answer(connection, lambda: server.start(payload, seed, noise))
+    while not server.finished:
+        try:
+            data = connection.recv_bytes()
+        except (EOFError, OSError):
+            return
+        _answer(connection, lambda data=data: server.obey(*pickle.loads(data)))  # type: ignore[misc]
+
+
+def _answer(connection: Connection, work: Callable[[], Any]) -> None:
+    """Do it, and send (False, result) or (True, (error, traceback))."""
+    try:
+        answer: tuple[bool, Any] = (False, work())
+    except Exception as error:  # whatever the agent raises is the parent's to handle
+        answer = (True, (f"{type(error).__name__}: {error}", traceback.format_exc()))
+    with suppress(OSError):
+        connection.send(answer)
+
+
+class _Server:
+    """The agent in its process; a method for each command."""
+
+    def __init__(self) -> None:
+        self.agent: Any = None
+        self.workspace: Any = None
+        self.finished = False
+
+    def start(self, payload: Any, seed: int | None, noise: int) -> None:
+        """Take the agent, and seed it."""
+        self.agent = _unpickled(payload) if isinstance(payload, bytes) else payload
+        _seed_generators(noise)
+        if seed is not None:
+            self.agent.seed(seed)
+
+    def obey(self, command: str, *arguments: Any) -> Any:
+        """Do one of the commands below."""
+        return getattr(self, command)(*arguments)
+
+    def run(self, workspace: Any, kwargs: dict[str, Any]) -> None:
+        """Run the agent on a shared workspace; None is the one of the last time."""
+        self.workspace = self.workspace if workspace is None else workspace
+        with torch.no_grad():
+            self.agent(self.workspace, **kwargs)
+
+    def run_alone(self, kwargs: dict[str, Any]) -> bytes:
+        """Run the agent on a new workspace; its variables, in memory that is not shared."""
+        workspace = Workspace()
+        with torch.no_grad():
+            self.agent(workspace, **kwargs)
+        return pickle.dumps({name: one.full() for name, one in workspace.to("cpu").variables.items()})
+
+    def seed(self, seed: int) -> None:
+        """Seed the agent and the global generators."""
+        _seed_generators(seed)
+        self.agent.seed(seed)
+
+    def train(self, mode: bool) -> None:
+        """Set the mode."""
+        if isinstance(self.agent, torch.nn.Module):
+            self.agent.train(mode)
+
+    def exit(self) -> None:
+        """Close the agent, and end."""
+        self.finished = True
+        if self.agent is not None:
+            self.agent.close()
+
+
+def _seed_generators(seed: int) -> None:
+    torch.manual_seed(seed)
+    np.random.seed(seed % 2**32)
+    random.seed(seed)
+
+
+def _unpickled(payload: bytes) -> Any:
+    try:
+        return pickle.loads(payload)
+    except (AttributeError, ImportError) as error:  # its class is not where this process can import it
+        raise LoopError(
+            f'{error}; define what the agent is made of in a module that can be imported, or give start_method="fork"'
+        ) from error
+
+
+def _end_with_parent(parent: int) -> None:
+    """End this process, whatever it is doing, when its parent is gone."""
+    source = multiprocessing.parent_process()
+    while source is not None and os.getppid() == parent and not wait([source.sentinel], _LOOK_AGAIN):
+        pass
+    os._exit(1)

@@ -1,0 +1,242 @@
+"""Single Gymnasium environments as one agent: BBRL's `ParallelGymAgent`, bit for bit, several times as fast.
+
+Differences from bbrl 1.0.1:
+
+- A missing action, one for another number of environments, of another shape than the action space or out of a Discrete
+  space's range, and an observation that is no array, number or dict of them, are exceptions that name the variable.
+- What environments give is written in the dtype of the table below, whatever its Python type: NumPy integers as int64
+  (BBRL: float32), float16 as float32 (BBRL: int64), flags as bool (BBRL: int64 where an environment gives 0 and 1).
+- `seed` in the call, `info_keys`, `arrays="numpy"`, `close`.
+- With `reward_at_t` the cumulated reward at two times is two tensors, not one.
+
+Kept though odd: with ``include_last_state=False`` timestep is one short from the second episode on; the seeds of the
+environments depend on the number of resets; rewards that are NumPy float32 are summed in float32.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from functools import partial
+from operator import add
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.wrappers import Autoreset
+
+from bam_envs.safety.gate import SafeRobot
+from bam_train.errors import SettingsError, ValueMismatch
+from bam_train.loop.gym.gym_actions import ActionReader
+from bam_train.loop.gym.gym_agent import Frame, GymAgent
+from bam_train.loop.gym.gym_observations import Entry, InfoRecorder, entries, pack
+
+Env = gym.Env[Any, Any]
+
+
+def make_env(
+    env_name: str, autoreset: bool = False, wrappers: Iterable[Callable[[Env], Env]] = (), **kwargs: Any
+) -> Env:
+    """A Gymnasium environment in its wrappers.
+
+    Gymnasium's checker, which looks at every step and changes nothing, is off; ``disable_env_checker=False`` has it.
+
+    Args:
+        env_name: Its id.
+        autoreset: Put Gymnasium's `Autoreset` outermost.
+        wrappers: Applied in this order: with [A, B] the environment is B(A(env)).
+        kwargs: For `gymnasium.make`.
+    """
+    env: Env = gym.make(env_name, **{"disable_env_checker": True, **kwargs})
+    for wrapper in wrappers:
+        env = wrapper(env)
+    return Autoreset(env) if autoreset else env
+
+
+def has_autoreset(env: Env) -> bool:
+    """Whether a Gymnasium `Autoreset` is anywhere in the chain of wrappers."""
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, Autoreset):
+            return True
+        env = env.env
+    return False
+
+
+class ParallelGymAgent(GymAgent):
+    """Resets n environments at t = 0, and at t > 0 steps each with its action of t - 1.
+
+    It is auto-resetting if a Gymnasium `Autoreset` wrapper is in the first environment's chain. Then the time after the
+    one at which an episode ends is the first of the next episode, with reward 0; the action at the end is not used.
+    Otherwise the last frame of an ended environment is repeated with reward 0 until the caller stops.
+
+    ========================  ===============================  ======================================================
+    variable                  dtype and shape (B = num_envs)   value
+    ========================  ===============================  ======================================================
+    env/env_obs               float32 or int64, B x ...        the observation after the step
+    env/env_obs/<key>/<key>   float32 or int64, B x ...        instead of it, for dict observations
+    env/terminated            bool, B                          the task's end
+    env/truncated             bool, B                          the time limit's
+    env/done                  bool, B                          either
+    env/reward                float32, B                       of action[t - 1]; 0 at a reset
+    env/cumulated_reward      float32, B                       sum of the episode's rewards, this one included
+    env/timestep              int64, B                         steps since the reset
+    ========================  ===============================  ======================================================
+
+    Args:
+        make_env_fn: Called `num_envs` times with `make_env_args`.
+        num_envs: The number of environments.
+        make_env_args: Keywords of `make_env_fn`.
+        args: For classes that are inherited beside this one.
+        kwargs: See `GymAgent`.
+
+    Raises:
+        SettingsError: `num_envs` is not at least 1, or `make_env_fn` does not make new single environments.
+    """
+
+    def __init__(
+        self,
+        make_env_fn: Callable[..., Env],
+        num_envs: int,
+        make_env_args: Mapping[str, Any] | None = None,
+        *args: Any,
+        **kwargs: Any,
+    ) -> None:
+        if "autoreset" in kwargs or "auto_reset" in kwargs:
+            raise SettingsError(
+                "ParallelGymAgent begins new episodes where the environment has Gymnasium's Autoreset wrapper: "
+                "give autoreset=True to make_env, not to it."
+            )
+        super().__init__(*args, **kwargs)
+        if isinstance(num_envs, bool) or not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
+            raise SettingsError(f"num_envs: expected a whole number of at least 1, found {num_envs!r}.")
+        self.num_envs = int(num_envs)
+        self.make_env_fn, self._make_env_args = make_env_fn, dict(make_env_args or {})
+        self._open()
+
+    def _open(self) -> None:
+        self.envs = [self._make() for _ in range(self.num_envs)]
+        _require_envs(self.envs)
+        self._is_autoreset = has_autoreset(self.envs[0])
+        self.include_last_state = self.include_last_state or not self._is_autoreset
+        self._opened(self.envs[0].observation_space, self.envs[0].action_space)
+
+    def _make(self) -> Env:
+        if not callable(self.make_env_fn):
+            raise SettingsError(
+                f"make_env_fn: expected a function that makes an environment, found {self.make_env_fn!r}; "
+                f'write partial(make_env, "CartPole-v1") or a lambda.'
+            )
+        return self.make_env_fn(**self._make_env_args)
+
+    def _make_stepper(self, infos: InfoRecorder) -> _SingleEnvs:
+        return _SingleEnvs(self.envs, self._is_autoreset, self.include_last_state, infos, self._floats)
+
+    def _read_actions(self, actions: ActionReader, t: int) -> Sequence[Any]:
+        return actions.each(self.workspace, t)
+
+    def close(self) -> None:
+        """Close the environments; they are made anew at the next t = 0."""
+        envs, self.envs, self._stepper = self.envs or (), None, None
+        with ExitStack() as stack:  # all of them, also when one fails
+            for env in envs:
+                stack.callback(env.close)
+
+    @staticmethod
+    def _format_frame(frame: Any) -> dict[str, Any]:
+        """One observation as tensors with a batch dimension of 1, by the names of its variables without prefix."""
+        import torch
+
+        found = entries(frame, None, for_torch=True)
+        return {entry.name: torch.from_numpy(pack(entry, [frame])) for entry in found}
+
+
+class _SingleEnvs:
+    """n environments, stepped one after the other.
+
+    Args:
+        envs: With an `Autoreset` in the chain of each where `autoreset` is True.
+        autoreset: Whether an ended episode is followed by a new one; else its last frame is repeated with reward 0.
+        include_last_state: Whether the time at which an episode ends has its last observation. If not it has the
+            first of the next episode, and no time is spent on the reset.
+        infos: Takes entries of the infos.
+        floats: The dtype of rewards. With float32 observations have the dtypes that torch learns on.
+    """
+
+    def __init__(
+        self, envs: Sequence[Env], autoreset: bool, include_last_state: bool, infos: InfoRecorder, floats: np.dtype[Any]
+    ) -> None:
+        self._envs, self._autoreset, self._include_last = envs, autoreset, include_last_state
+        self._infos, self._floats = infos, floats
+        self._entries: list[Entry] = []
+        self._steps: list[Callable[[Any], Any]] = [env.step for env in envs]
+        self._cumulated: list[float] = [0.0] * len(envs)  # Python's sums, as BBRL's
+        self._timestep = np.zeros(len(envs), dtype=np.int64)
+        self._advance = np.ones(len(envs), dtype=np.int64)
+
+    def reset(self, seeds: int | Sequence[int | None]) -> Frame:
+        """Begin an episode in every environment."""
+        each = [seeds + k for k in range(len(self._envs))] if isinstance(seeds, int) else seeds
+        pairs = [env.reset(seed=seed) for env, seed in zip(self._envs, each, strict=True)]
+        observations, infos = zip(*pairs, strict=True)
+        self._entries = entries(observations[0], self._envs[0].observation_space, self._floats == np.float32)
+        zeros, no = [0.0] * len(pairs), [False] * len(pairs)
+        return self._frame(observations, zeros, np.array(no), np.array(no), infos)
+
+    def step(self, actions: Sequence[Any]) -> Frame:
+        """Step every environment that has not ended for good."""
+        results = [step(action) for step, action in zip(self._steps, actions, strict=True)]
+        observations, rewards, terminated, truncated, infos = zip(*results, strict=True)
+        self._cumulated = list(map(add, self._cumulated, rewards))
+        self._timestep = self._timestep + self._advance
+        terminations, truncations = np.array(terminated, dtype=bool), np.array(truncated, dtype=bool)
+        ended = np.flatnonzero(terminations | truncations).tolist() if any(terminated) or any(truncated) else ()
+        if ended and self._autoreset and not self._include_last:
+            firsts = {k: self._steps[k](None)[0] for k in ended}
+            observations = tuple(firsts.get(k, one) for k, one in enumerate(observations))
+        frame = self._frame(observations, rewards, terminations, truncations, infos)
+        for k in ended:
+            if self._autoreset:
+                self._cumulated[k] = 0.0
+                self._timestep[k] = -1  # so that the reset is step 0
+            else:
+                observation, _, *rest = results[k]
+                self._steps[k], self._advance[k] = partial(_repeat, (observation, 0.0, *rest)), 0
+        return frame
+
+    def _frame(self, observations: Any, rewards: Any, terminated: Any, truncated: Any, infos: Any) -> Frame:
+        reward = np.array(rewards, dtype=self._floats)
+        if reward.ndim != 1:
+            raise ValueMismatch(f"'reward': expected one number from each environment, found {rewards[0]!r}.")
+        numbers = {
+            "terminated": terminated,
+            "truncated": truncated,
+            "done": terminated | truncated,
+            "reward": reward,
+            "cumulated_reward": np.array(self._cumulated, dtype=self._floats),
+            "timestep": self._timestep.copy(),
+        }
+        packed = {entry.name: pack(entry, observations) for entry in self._entries}
+        return Frame(packed, numbers, self._infos.of_each(infos))
+
+
+def _repeat(result: tuple[Any, ...], action: Any) -> tuple[Any, ...]:
+    """The step of an environment that has ended for good."""
+    return result
+
+
+def _require_envs(envs: Sequence[Any]) -> None:
+    """Refuse what cannot be stepped one by one.
+
+    Raises:
+        SettingsError: Not an environment, a vector environment, one environment several times, or a live robot, whose
+            chain has to be checked before it moves.
+    """
+    for env in envs:
+        if isinstance(env, gym.vector.VectorEnv):
+            raise SettingsError("make_env_fn: expected single environments, found a vector one: use VecGymAgent.")
+        if not all(hasattr(env, name) for name in ("reset", "step", "observation_space", "action_space")):
+            raise SettingsError(f"make_env_fn: expected it to return a gymnasium.Env, found {type(env).__name__}.")
+        if isinstance(getattr(getattr(env, "unwrapped", env), "robot", None), SafeRobot):
+            raise SettingsError("make_env_fn: expected a simulation, found a live robot: use RobotAgent.")
+    if len({id(env) for env in envs}) < len(envs):
+        raise SettingsError("make_env_fn: expected a new environment at every call, found the same one again.")

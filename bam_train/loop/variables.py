@@ -1,0 +1,348 @@
+"""One variable of a workspace: a list with one array for each time, or one array of all times.
+
+A variable that `set` writes is a list. One that `set_full` writes is one array, until the next `set`. The joined form
+of a list is kept until the next write through the workspace, so that a second full read costs only a copy. A stored
+value that is changed in place after a full read does not show in the next full read.
+
+`NumpyVariable` copies values in. `bam_train.loop.tensors.tensor_variable.TensorVariable` keeps the tensor objects
+themselves, with their graph: what was written at t and read at t + 1 can still be differentiated through, as in BBRL.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from bam_train.errors import TimeNotWritten, ValueMismatch, WorkspaceError
+
+UNLIMITED = 2**62
+"""More times than any workspace holds."""
+
+
+class Variable:
+    """One variable, T x B x ...; B x ... at one time.
+
+    Args:
+        name: For error messages.
+        first: The first time kept; only a windowed workspace starts later than 0.
+        limit: The most times that are kept.
+        make_room: Called with a time that does not fit; it must call `drop`.
+
+    Attributes:
+        shape: The shape of one time; None before the first write.
+        dtype: The dtype of the values; None before the first write.
+    """
+
+    ARRAY: type
+    """The class of its values."""
+    KIND: str
+    """The same, for error messages."""
+
+    def __init__(
+        self, name: str, first: int = 0, limit: int = UNLIMITED, make_room: Callable[[int], None] | None = None
+    ) -> None:
+        self.name, self.first, self._limit, self._make_room = name, first, limit, make_room
+        self.shape: Any = None
+        self.dtype: Any = None
+        self._values: list[Any] | None = []
+        self._whole: Any = None  # all times, when `_values` is None
+        self._joined: Any = None  # the list as one array, until the next write
+
+    # -- sizes -----------------------------------------------------------------------------------------------------
+
+    @property
+    def size(self) -> Any:
+        """The shape of one time of a list, of all times of one array, as in BBRL."""
+        return self._whole.shape if self._values is None else self.shape or ()
+
+    @property
+    def device(self) -> Any:
+        """Where the values are."""
+        return "cpu"
+
+    @property
+    def stop(self) -> int:
+        """One after the last time written."""
+        return self.first + len(self._whole if self._values is None else self._values)
+
+    def time_size(self) -> int:
+        """One after the last time written."""
+        return self.stop
+
+    def batch_size(self) -> int:
+        """B.
+
+        Raises:
+            WorkspaceError: There is no batch axis: `set_full` takes shape (T,) too.
+        """
+        if not self.shape:
+            raise WorkspaceError(f"{self.name!r} has no batch axis; write it as T x B x ....")
+        return int(self.shape[0])
+
+    # -- one time --------------------------------------------------------------------------------------------------
+
+    def set(self, t: int, value: Any) -> None:
+        """Write `value` (B x ...) at time t; missing earlier times become zeros.
+
+        Raises:
+            ValueMismatch: Another shape, dtype, device or kind than before.
+            TimeNotWritten: A negative time before the first, or one that has left the window.
+        """
+        if not self._fits(value):
+            self._check(value, f"t={t}")
+        self._store(t, self._own(value))
+
+    def get(self, t: int) -> Any:
+        """The value at time t, B x ...; -1 is the last.
+
+        Raises:
+            TimeNotWritten: Nobody wrote it.
+        """
+        values = self._whole if self._values is None else self._values  # both take an index
+        index = t - self.first if t >= 0 else len(values) + t
+        if 0 <= index < len(values):
+            return values[index]
+        raise self._not_written(t)
+
+    # -- all times -------------------------------------------------------------------------------------------------
+
+    def set_full(self, value: Any) -> None:
+        """Write T x B x .... Over a list it overwrites the first T times and leaves the rest, as in BBRL."""
+        self._check_full(value)
+        if self._values:
+            for k in range(len(value)):
+                self.set(self.first + k, value[k, ...])
+            return
+        self._values, self._whole, self._joined = None, self._own(value), None
+        self._be_like(value.shape[1:], value)
+
+    def full(self) -> Any:
+        """All times kept, T x B x ...: one array itself, of a list a copy."""
+        return self._whole if self._values is None else self.copied(self.view())
+
+    def view(self) -> Any:
+        """All times kept, T x B x ..., to be read at once and not to be changed."""
+        if self._values is None:
+            return self._whole
+        if self._joined is None:
+            self._joined = self._join(self._values)
+        return self._joined
+
+    def truncated(self, begin: int, end: int) -> Any:
+        """Times [begin, end), cut off at the end: a view of one array, a copy of a list."""
+        times = slice(max(0, begin - self.first), max(0, end - self.first))
+        if self._values is None:
+            return self._whole[times]
+        values = self._values[times]
+        return self._join(values) if values else self._join([self._zeros()])[:0]
+
+    def drop(self, first: int) -> None:
+        """Forget the times before `first`."""
+        del self._listed()[: first - self.first]
+        self.first, self._joined = first, None
+
+    def copy_time(self, begin: int, to: int, count: int) -> None:
+        """Copy times [begin, begin + count) onto [to, to + count): the objects of a list, memory of one array."""
+        if self._values is not None:
+            for k in range(count):
+                self.set(to + k, self.get(begin + k))
+        elif count:
+            for t in (begin, begin + count - 1, to, to + count - 1):
+                self.get(t)  # refuses times that are not there
+            self._whole[to : to + count] = self.copied(self._whole[begin : begin + count])
+
+    def detach(self) -> None:
+        """Cut every value off its graph."""
+
+    # -- what a kind of array does its own way ---------------------------------------------------------------------
+
+    def _fits(self, value: Any) -> bool:
+        """Whether the value is like those before; quick."""
+        raise NotImplementedError
+
+    def _own(self, value: Any) -> Any:
+        """The value as it is kept."""
+        return value
+
+    def _join(self, values: Sequence[Any]) -> Any:
+        """T values B x ..., at least one, as one new array T x B x ...."""
+        raise NotImplementedError
+
+    def _zeros(self) -> Any:
+        """A time that nobody wrote."""
+        raise NotImplementedError
+
+    @staticmethod
+    def stack(arrays: Sequence[Any]) -> Any:
+        """Arrays of one shape along a new first axis."""
+        raise NotImplementedError
+
+    @staticmethod
+    def concatenate(arrays: Sequence[Any], axis: int) -> Any:
+        """Arrays one after the other along `axis`."""
+        raise NotImplementedError
+
+    @staticmethod
+    def index(index: Any, like: Any) -> Any:
+        """`index` (integers or booleans) as an array that indexes `like`."""
+        raise NotImplementedError
+
+    @staticmethod
+    def copied(array: Any) -> Any:
+        """A copy that shares no memory, and keeps the graph."""
+        raise NotImplementedError
+
+    @staticmethod
+    def on_device(array: Any, device: Any) -> Any:
+        """The array on `device`; itself if it is there."""
+        raise NotImplementedError
+
+    # -- inside ----------------------------------------------------------------------------------------------------
+
+    def _store(self, t: int, value: Any) -> None:
+        """Put a value that fits at time t."""
+        self._joined = None
+        values = self._listed() if self._values is None else self._values
+        count = len(values)
+        index = t - self.first if t >= 0 else count + t
+        if index >= self._limit and self._make_room is not None:
+            self._make_room(t)
+            index, count = t - self.first, len(values)
+        if index == count:
+            values.append(value)
+        elif index > count:
+            values.extend(self._zeros() for _ in range(index - count))
+            values.append(value)
+        elif index >= 0:
+            values[index] = value
+        else:
+            raise self._not_written(t)
+
+    def _listed(self) -> list[Any]:
+        """The list; one array becomes a list of views of it."""
+        if self._values is None:
+            self._values, self._whole = [self._whole[k, ...] for k in range(len(self._whole))], None
+        return self._values
+
+    def _be_like(self, shape: Any, value: Any) -> None:
+        self.shape, self.dtype = shape, value.dtype
+
+    def _check(self, value: Any, where: str) -> None:
+        """Take the shape and dtype of the first value; say what differs in any other."""
+        if not isinstance(value, self.ARRAY):
+            raise kind_mismatch(self.name, where, self.KIND, value)
+        if self.shape is None:
+            if value.ndim == 0:  # type: ignore[attr-defined]
+                raise no_batch(self.name, where)
+            self._be_like(value.shape, value)  # type: ignore[attr-defined]
+        for what in ("shape", "dtype", "device"):
+            ours, theirs = getattr(self, what), getattr(value, what, "cpu")  # arrays of NumPy 1 have no device
+            if ours != theirs:
+                raise mismatch(self.name, where, what, ours, theirs)
+
+    def _check_full(self, value: Any) -> None:
+        """Refuse what is not an array with a time axis."""
+        if not isinstance(value, self.ARRAY):
+            raise kind_mismatch(self.name, "all times", self.KIND, value)
+        if value.ndim == 0:  # type: ignore[attr-defined]
+            raise ValueMismatch(
+                f"{self.name!r} at all times: expected time and batch first (T x B x ...), found a single number."
+            )
+
+    def _not_written(self, t: int) -> TimeNotWritten:
+        return TimeNotWritten(f"{self.name!r} is not written at t={t}; {self.kept_times()}.")
+
+    def kept_times(self) -> str:
+        """Which times there are, for an error message."""
+        if self.stop <= self.first:
+            return "it has none"
+        several = self.stop - self.first > 1
+        text = f"it has times {self.first} to {self.stop - 1}" if several else f"it has time {self.first} only"
+        return f"{text}; earlier ones have left the window" if self.first else text
+
+
+class NumpyVariable(Variable):
+    """One variable of NumPy arrays."""
+
+    ARRAY = np.ndarray
+    KIND = "a numpy.ndarray"
+
+    def _fits(self, value: Any) -> bool:
+        return type(value) is np.ndarray and value.shape == self.shape and value.dtype == self.dtype
+
+    def _own(self, value: Any) -> Any:
+        return np.array(value)
+
+    def _join(self, values: Sequence[Any]) -> Any:
+        if not self.shape:
+            return np.stack(values)
+        return np.concatenate(values).reshape(len(values), *self.shape)  # several times as quick as `stack`
+
+    def _zeros(self) -> Any:
+        return np.zeros(self.shape, self.dtype)
+
+    def full(self) -> Any:
+        """A copy of all times kept, T x B x ...."""
+        return np.array(self.view())
+
+    def truncated(self, begin: int, end: int) -> Any:
+        """A copy of times [begin, end), cut off at the end."""
+        return np.array(super().truncated(begin, end))
+
+    @staticmethod
+    def stack(arrays: Sequence[Any]) -> Any:
+        """Arrays of one shape along a new first axis."""
+        return np.stack(arrays)
+
+    @staticmethod
+    def concatenate(arrays: Sequence[Any], axis: int) -> Any:
+        """Arrays one after the other along `axis`."""
+        return np.concatenate(arrays, axis=axis)
+
+    @staticmethod
+    def index(index: Any, like: Any) -> Any:
+        """`index` (integers or booleans) as an array."""
+        array = np.asarray(index)
+        empty = array.dtype.kind == "f" and not array.size  # what an empty list becomes
+        return np.empty(0, dtype=np.int64) if empty else array
+
+    @staticmethod
+    def copied(array: Any) -> Any:
+        """A copy that shares no memory."""
+        return np.array(array)
+
+    @staticmethod
+    def on_device(array: Any, device: Any) -> Any:
+        """The array itself: NumPy's are on the CPU."""
+        if str(device).partition(":")[0] != "cpu":
+            raise WorkspaceError(f"A NumPy array cannot be moved to {device}; only tensors can.")
+        return array
+
+
+def kind_name(value: Any) -> str:
+    """Module and class, such as ``numpy.ndarray``; builtins without module."""
+    kind = type(value)
+    return kind.__name__ if kind.__module__ == "builtins" else f"{kind.__module__}.{kind.__name__}"
+
+
+def mismatch(name: str, where: str, what: str, expected: Any, found: Any) -> ValueMismatch:
+    """The error for a value that differs from those before."""
+    shown = [str(tuple(one)) if isinstance(one, tuple) else str(one) for one in (expected, found)]
+    return ValueMismatch(f"{name!r} at {where}: expected {what} {shown[0]}, found {shown[1]}.")
+
+
+def no_batch(name: str, where: str) -> ValueMismatch:
+    """The error for a value without axes."""
+    return ValueMismatch(
+        f"{name!r} at {where}: expected a batch axis first (B x ...), found a single number; give it shape (1,)."
+    )
+
+
+def kind_mismatch(name: str, where: str, expected: str, found: Any) -> ValueMismatch:
+    """The error for a value that is no array of the expected kind."""
+    kind = kind_name(found)
+    return ValueMismatch(
+        f"{name!r} at {where}: expected {expected}, found {'an' if kind[0] in 'aeiou' else 'a'} {kind}."
+    )
