@@ -86,11 +86,15 @@ class TemporalAgent(Agent):
             with self._advance(n_steps, t) as advance:
                 self._run(workspace, t, n_steps, stop_variable, advance, kwargs)
         except BaseException as error:
-            try:
-                self.agent.close()
-            except Exception as failure:  # the first error is the one to be seen
-                _note(error, f"Closing failed too: {type(failure).__name__}: {failure}")
+            self._close_after(error)
             raise
+
+    def _close_after(self, error: BaseException) -> None:
+        """Close all agents; the first error is the one to be seen."""
+        try:
+            self.agent.close()
+        except Exception as failure:
+            _note(error, f"Closing failed too: {type(failure).__name__}: {failure}")
 
     def _run(
         self,
