@@ -1,57 +1,60 @@
 """Messages are checked against their types before anything else sees them: fields, types, ranges, finite numbers.
 
-A message of a known type (`definitions`) comes out complete: what it leaves out is filled with the type's default. Of
-an unknown type only plain values are taken. Nothing that is not finite, and no null, gets through either way.
+A message of a known type (`definitions`) comes out complete: what it leaves out gets the type's default. Of an unknown
+type only plain values are taken. Nothing that is not finite, and no null, gets through either way.
 """
 
 from __future__ import annotations
 
+import base64
+import binascii
+import math
 import re
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 from bam_envs.core.errors import InvalidValue
-from bam_envs.ros.checks import (
-    BYTES,
-    FLOATS,
-    INTEGERS,
-    MISSING,
-    Check,
-    Misfit,
-    any_check,
-    array_check,
-    bool_check,
-    byte_array_check,
-    describe,
-    float_check,
-    integer_check,
-    number_array_check,
-    require_object,
-    require_plain,
-    string_array_check,
-    string_check,
-    zeros,
-)
+from bam_envs.core.wording import brief
 from bam_envs.ros.definitions import DEFINITIONS
 
-__all__ = [
-    "Field",
-    "complete",
-    "complete_known",
-    "default",
-    "describe",
-    "is_known",
-    "normal_name",
-    "request_type",
-    "require_plain",
-    "response_type",
-    "variants",
-]
-
+MAX_DEPTH = 32
+"""How deep lists and objects may be nested in one another."""
+INTEGERS = {
+    **{f"int{bits}": (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) for bits in (8, 16, 32, 64)},
+    **{f"uint{bits}": (0, 2**bits - 1) for bits in (8, 16, 32, 64)},
+    "byte": (0, 255),
+    "char": (0, 255),
+}
+"""Least and largest value of each integer type."""
+FLOATS = {"float32": 3.4028234663852886e38, "float64": sys.float_info.max}
+"""Largest value of each floating-point type."""
+_BYTES = ("uint8", "byte", "char")  # the types whose arrays are `bytes`
+_OBJECT = (dict, Mapping)  # dict first: asking whether something is a Mapping takes ten times as long
+_MISSING: Any = object()  # stands for a field that a message leaves out
 _SHORT = {"time": "builtin_interfaces/Time", "duration": "builtin_interfaces/Duration"}
 _PLAIN_NAME = re.compile(r"[A-Za-z]\w*/(?:msg/|srv/)?[A-Za-z]\w*", re.ASCII)
+
+Check = Callable[[Any, int], Any]
+"""Takes a value and how deep it is nested, returns it in its normal form or raises _Misfit."""
+
+
+class _Misfit(Exception):  # noqa: N818 - becomes an InvalidValue
+    """A value that does not fit, or what is `said` of it; collects the path to it on the way out."""
+
+    def __init__(self, expected: str, found: object, said: str = "") -> None:
+        self.expected, self.found, self.path = expected, said or brief(found), ""
+
+    def under(self, step: str) -> _Misfit:
+        """The same, seen from one level further out."""
+        self.path = step + self.path
+        return self
+
+    def error(self, place: str) -> InvalidValue:
+        """What the user is told, of a value that is called `place`."""
+        return InvalidValue(f"{place}{self.path}: expected {self.expected}, found {self.found}.")
 
 
 @dataclass(frozen=True)
@@ -75,13 +78,8 @@ def normal_name(kind: str) -> str:
         InvalidValue: It is not the name of a type.
     """
     if not isinstance(kind, str) or len(kind) > 256 or not _PLAIN_NAME.fullmatch(kind):
-        raise InvalidValue(f"Type: expected a name such as 'std_msgs/String', found {describe(kind)}.")
+        raise InvalidValue(f"Type: expected a name such as 'std_msgs/String', found {brief(kind)}.")
     return kind.replace("/msg/", "/").replace("/srv/", "/")
-
-
-def is_known(kind: str) -> bool:
-    """Whether messages or services of the type `kind` are checked field by field."""
-    return normal_name(kind) in _table() or request_type(kind) in _table()
 
 
 def request_type(kind: str) -> str:
@@ -112,11 +110,10 @@ def complete(kind: str, message: object) -> dict[str, Any]:
     name = kind if isinstance(kind, str) and kind in _table() else normal_name(kind)
     try:
         # Unknown types are not kept: a client could name any number of them.
-        check = _checker(name, None) if name in _table() else any_check
-        checked: dict[str, Any] = check(require_object(message), 0)
-    except Misfit as misfit:
-        place = f"{name}.{misfit.path.removeprefix('.')}" if misfit.path else name
-        raise InvalidValue(f"{place}: expected {misfit.expected}, found {misfit.found}.") from None
+        check = _check(name, None) if name in _table() else _any
+        checked: dict[str, Any] = check(_object(message), 0)
+    except _Misfit as misfit:
+        raise misfit.error(name) from None
     return checked
 
 
@@ -143,9 +140,20 @@ def _known_fields(kind: str, value: Any) -> Any:
     return {field.name: _known_fields(field.type, value[field.name]) for field in fields if field.name in value}
 
 
-def default(kind: str) -> dict[str, Any]:
-    """A message of a known type with every field at its default. Read it, do not change it."""
-    return complete(kind, {})
+def require_plain(value: object, place: str = "value") -> None:
+    """Refuse what JSON cannot carry unharmed.
+
+    Raises:
+        InvalidValue: There is a NaN, an infinity, a huge integer, a broken text, or too deep a nesting in it; null is
+            allowed here.
+    """
+    try:
+        _plain(value, 0, null=True)
+    except _Misfit as misfit:
+        raise misfit.error(place) from None
+
+
+# ---- the table of types
 
 
 @cache
@@ -156,14 +164,12 @@ def _table() -> dict[str, tuple[tuple[Field, ...], ...]]:
         package = name.split("/")[0]
         request, arrow, response = body.partition("->")
         parts = {name + "Request": request, name + "Response": response} if arrow else {name: body}
-        table.update({part: _variants(text, package) for part, text in parts.items()})
+        for part, text in parts.items():
+            table[part] = tuple(
+                tuple(_field(one, package) for one in spelling.split(";") if one.strip())
+                for spelling in text.split("|")
+            )
     return table
-
-
-def _variants(text: str, package: str) -> tuple[tuple[Field, ...], ...]:
-    return tuple(
-        tuple(_field(part, package) for part in spelling.split(";") if part.strip()) for spelling in text.split("|")
-    )
 
 
 def _field(text: str, package: str) -> Field:
@@ -176,48 +182,39 @@ def _field(text: str, package: str) -> Field:
     return Field(name, full, size.removesuffix("]") if bracket else None, float(value or 0))
 
 
+# ---- the check of each type, made once
+
+
 @cache
-def _checker(kind: str, array: str | None, first: float = 0) -> Check:
+def _check(kind: str, array: str | None, first: float = 0) -> Check:
+    """The check of a value of type `kind`, or of an array of it; `first` is the default of a number."""
+    others: dict[str, Check] = {"bool": _bool, "string": _string, "any": _any}
+    numeric = kind in FLOATS or kind in INTEGERS
+    one = _number(kind, first) if numeric else others.get(kind) or _message(kind)
     if array is None:
-        return _single(kind, first)
-    one = _single(kind, first)
+        return one
     if array == "?":
-        many = _checker(kind, "")
+        many = _check(kind, "")
         return lambda value, depth: (many if isinstance(value, (list, tuple)) else one)(value, depth)
     size = int(array) if array else None
-    if kind in BYTES:
-        return lambda value, depth: byte_array_check(value, size)
-    if kind == "string":
-        return string_array_check(size)
-    if kind in FLOATS or kind in INTEGERS:
-        return number_array_check(kind, one, size)
-    return lambda value, depth: array_check(zeros(value, size), depth, one, size)
+    return (lambda value, depth: _byte_array(value, size)) if kind in _BYTES else _array(kind, one, size)
 
 
-def _single(kind: str, first: float) -> Check:
-    if kind in FLOATS:
-        return float_check(FLOATS[kind], float(first))
-    if kind in INTEGERS:
-        return integer_check(kind, *INTEGERS[kind])
-    others: dict[str, Check] = {"bool": bool_check, "string": string_check, "any": any_check}
-    return others.get(kind) or _message_check(kind)
-
-
-def _message_check(kind: str) -> Check:
-    plans = [{one.name: _checker(one.type, one.array, one.default) for one in fields} for fields in _table()[kind]]
+def _message(kind: str) -> Check:
+    plans = [{one.name: _check(one.type, one.array, one.default) for one in fields} for fields in _table()[kind]]
     usual = plans[0]
-    left_out = {name: one(MISSING, 0) for name, one in plans[0].items()}
+    left_out = {name: one(_MISSING, 0) for name, one in usual.items()}
 
     def check(value: Any, depth: int) -> dict[str, Any]:
-        if value is MISSING:
+        if value is _MISSING:
             return left_out
-        given = require_object(value)
+        given = _object(value)
         plan = usual if given.keys() <= usual.keys() else _fitting(plans, given)
         checked, name = {}, ""
         try:  # one for all fields, and no function for each: this runs for every part of every message
             for name, one in plan.items():
-                checked[name] = one(given.get(name, MISSING), depth + 1)
-        except Misfit as misfit:
+                checked[name] = one(given.get(name, _MISSING), depth + 1)
+        except _Misfit as misfit:
             raise misfit.under(f".{name}") from None
         return checked
 
@@ -229,9 +226,178 @@ def _fitting(plans: Sequence[Mapping[str, Check]], given: Mapping[str, Any]) -> 
     for plan in plans:
         if given.keys() <= plan.keys():
             return plan
-    raise _unknown_field(given, plans[0])
+    extra = next(name for name in given if name not in plans[0])
+    raise _Misfit(f"only the fields {', '.join(plans[0])}" if plans[0] else "no fields", extra)
 
 
-def _unknown_field(given: Mapping[str, Any], plan: Mapping[str, Check]) -> Misfit:
-    extra = next(name for name in given if name not in plan)
-    return Misfit(f"only the fields {', '.join(plan)}" if plan else "no fields", f"{extra}")
+def _number(kind: str, first: float) -> Check:
+    whole = kind in INTEGERS
+    make, kinds = (int, int) if whole else (float, (int, float))
+    low, high = INTEGERS[kind] if whole else (-FLOATS[kind], FLOATS[kind])
+    expected = f"an integer ({kind})" if whole else "a number"
+    inside = f"an integer in [{low}, {high}]" if whole else "a finite number"
+    inside += " of 32 bits" if kind == "float32" else ""
+    first = make(first)
+
+    def check(value: Any, depth: int) -> float:
+        if type(value) is make and low <= value <= high:  # what it is nearly always
+            return value
+        if value is _MISSING:
+            return first
+        if isinstance(value, bool) or not isinstance(value, kinds):
+            raise _Misfit(expected, value)
+        if not low <= value <= high:
+            raise _Misfit(inside, value)
+        return make(value)
+
+    return check
+
+
+def _array(kind: str, one: Check, size: int | None) -> Check:
+    """The check of a list; `one` checks an item, `size` is the length if it is fixed."""
+    usual: Callable[[str, Sequence[Any]], list[Any] | None] | None = {
+        **dict.fromkeys(INTEGERS, _all_integers),
+        **dict.fromkeys(FLOATS, _all_floats),
+        "string": _all_ascii,
+    }.get(kind)
+
+    def check(value: Any, depth: int) -> list[Any]:
+        values = [_MISSING] * (size or 0) if value is _MISSING else value
+        if not isinstance(values, (list, tuple)):
+            raise _Misfit("a list", values)
+        if size is not None and len(values) != size:
+            raise _Misfit(f"a list of {size}", values, f"a list of {len(values)}")
+        # A few passes in C instead of one in Python, which would hold up everybody for the time of a large list.
+        if usual is not None and (found := usual(kind, values)):
+            return found
+        checked: list[Any] = []
+        try:
+            checked.extend(one(item, depth + 1) for item in values)
+        except _Misfit as misfit:
+            raise misfit.under(f"[{len(checked)}]") from None
+        return checked
+
+    return check
+
+
+def _all_integers(kind: str, values: Sequence[Any]) -> list[int] | None:
+    """A copy of `values` if all of them are integers of the type `kind`."""
+    low, high = INTEGERS[kind]
+    fits = set(map(type, values)) == {int} and low <= min(values) and max(values) <= high
+    return list(values) if fits else None
+
+
+def _all_floats(kind: str, values: Sequence[Any]) -> list[float] | None:
+    """`values` as floats if all of them are finite numbers of the type `kind`."""
+    kinds = set(map(type, values))
+    if not kinds or not kinds <= {float, int}:
+        return None
+    try:
+        floats = list(values) if int not in kinds else list(map(float, values))
+    except OverflowError:
+        return None
+    finite = math.isfinite(sum(floats))  # a finite sum has finite terms
+    return floats if finite and (kind == "float64" or max(map(abs, floats)) <= FLOATS[kind]) else None
+
+
+def _all_ascii(kind: str, values: Sequence[Any]) -> list[str] | None:
+    """A copy of `values` if all of them are texts in ASCII."""
+    return list(values) if set(map(type, values)) == {str} and "".join(values).isascii() else None
+
+
+def _bool(value: Any, depth: int) -> bool:
+    if value is _MISSING:
+        return False
+    if not isinstance(value, bool):
+        raise _Misfit("true or false", value)
+    return value
+
+
+def _string(value: Any, depth: int) -> str:
+    if value is _MISSING:
+        return ""
+    if not isinstance(value, str):
+        raise _Misfit("a text", value)
+    if not value.isascii():
+        try:
+            value.encode()
+        except UnicodeEncodeError:
+            raise _Misfit("a text of whole characters", value) from None
+    return value
+
+
+def _byte_array(value: Any, size: int | None) -> bytes:
+    """Bytes as they are, as base64, or as a list of integers; zeros where they are left out."""
+    if value is _MISSING:
+        return bytes(size or 0)
+    data = _bytes(value)
+    if size is not None and len(data) != size:
+        raise _Misfit(f"{size} bytes", data, f"{len(data)} bytes")
+    return data
+
+
+def _bytes(value: Any) -> bytes:
+    if isinstance(value, (bytes, bytearray, memoryview)):
+        return bytes(value)
+    try:
+        if isinstance(value, str):
+            return base64.b64decode(value, validate=True)
+        if isinstance(value, (list, tuple)) and set(map(type, value)) <= {int}:
+            return bytes(value)
+    except (binascii.Error, ValueError):
+        pass
+    raise _Misfit("bytes as base64 or a list of integers in [0, 255]", value)
+
+
+# ---- plain values of any type
+
+
+def _object(value: Any) -> Mapping[str, Any]:
+    if not isinstance(value, _OBJECT):
+        raise _Misfit("an object", value)
+    return value
+
+
+def _any(value: Any, depth: int) -> Any:
+    if value is _MISSING:
+        return {}
+    _plain(value, depth, null=False)
+    return value
+
+
+def _plain(value: Any, depth: int, *, null: bool) -> None:
+    if depth > MAX_DEPTH:
+        raise _Misfit(f"at most {MAX_DEPTH} lists and objects in one another", value)
+    kind = type(value)
+    if kind is dict:
+        for name, item in value.items():
+            if not isinstance(name, str):
+                raise _Misfit("texts as names", name)
+            _plain_item(f".{_string(name, 0)}", item, depth, null=null)
+    elif kind is list or kind is tuple:
+        if not _all_plain_numbers(value):
+            for place, item in enumerate(value):
+                _plain_item(f"[{place}]", item, depth, null=null)
+    elif isinstance(value, str):
+        _string(value, depth)
+    elif not isinstance(value, (bool, bytes)) and not (null and value is None):
+        if not isinstance(value, (int, float)):
+            raise _Misfit("a plain value", value)
+        if isinstance(value, int) and not -(2**63) <= value < 2**64:
+            raise _Misfit("a number of 64 bits", value)
+        if isinstance(value, float) and not math.isfinite(value):
+            raise _Misfit("a finite number", value)
+
+
+def _all_plain_numbers(values: Sequence[Any]) -> bool:
+    kinds = set(map(type, values))
+    if kinds == {int}:
+        return min(values) >= -(2**63) and max(values) < 2**64
+    return kinds <= {float} and math.isfinite(sum(values))
+
+
+def _plain_item(step: str, item: Any, depth: int, *, null: bool) -> None:
+    try:
+        _plain(item, depth + 1, null=null)
+    except _Misfit as misfit:
+        raise misfit.under(step) from None

@@ -21,7 +21,8 @@ from functools import partial
 from typing import Any
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NoServer, ProtocolError, RemoteError
-from bam_envs.ros.interfaces import describe, normal_name
+from bam_envs.core.wording import brief
+from bam_envs.ros.interfaces import normal_name
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller, Handler, Listener, Message
 from bam_envs.rosbridge.client_connection import Connection, Heartbeat, ServerClock, bare_reason, tell_all
 from bam_envs.rosbridge.declarations import Declarations
@@ -476,7 +477,7 @@ class RosbridgeLink:
         if operation == "publish":
             topic, content = message.get("topic"), message.get("msg")
             if not isinstance(topic, str) or not isinstance(content, Mapping):
-                raise ProtocolError(f"a published message has topic {topic!r} and msg {describe(content)}")
+                raise ProtocolError(f"a published message has topic {topic!r} and msg {brief(content)}")
             if self.ros is None:
                 self._seen_ros = _ros_of(content)
             self._declarations.deliver(topic, content)

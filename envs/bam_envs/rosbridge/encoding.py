@@ -16,8 +16,8 @@ import cbor2
 import numpy as np
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
-from bam_envs.ros.checks import MAX_DEPTH
-from bam_envs.ros.interfaces import Field, describe, normal_name, require_plain, variants
+from bam_envs.core.wording import brief
+from bam_envs.ros.interfaces import MAX_DEPTH, Field, normal_name, require_plain, variants
 
 COMPRESSIONS = ("none", "png", "cbor")
 """How a message may be packed for a subscriber."""
@@ -116,7 +116,7 @@ def _object(data: str | bytes, most_items: int, decoder: json.JSONDecoder) -> di
             raise ProtocolError("Message: expected one in a frame, found more behind it.") from None
         raise ProtocolError(f"Message: expected JSON: {error}.") from None
     if not isinstance(value, dict):
-        raise ProtocolError(f"Message: expected an object, found {describe(value)}.")
+        raise ProtocolError(f"Message: expected an object, found {brief(value)}.")
     return value
 
 
@@ -217,7 +217,7 @@ def _typed_field(one: Field, value: Any) -> Any:
 
 def _base64(value: object) -> str:
     if not isinstance(value, bytes):
-        raise InvalidValue(f"Message: expected plain values, found {describe(value)}.")
+        raise InvalidValue(f"Message: expected plain values, found {brief(value)}.")
     return base64.b64encode(value).decode("ascii")
 
 

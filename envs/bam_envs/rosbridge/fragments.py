@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bam_envs.core.errors import ProtocolError
-from bam_envs.ros.interfaces import describe
+from bam_envs.core.wording import brief
 from bam_envs.rosbridge.encoding import encode_json
 
 LONGEST_ID = 256
@@ -44,11 +44,11 @@ def read_id(message: Mapping[str, Any], where: str = "id") -> Id:
     """
     value = message.get("id")
     if isinstance(value, bool) or not (value is None or isinstance(value, (str, int))):
-        raise ProtocolError(f"{where}: expected a text or an integer, found {describe(value)}.")
+        raise ProtocolError(f"{where}: expected a text or an integer, found {brief(value)}.")
     if isinstance(value, str) and len(value) > LONGEST_ID:
         raise ProtocolError(f"{where}: expected at most {LONGEST_ID} characters, found {len(value)}.")
     if isinstance(value, int) and abs(value) > LARGEST_ID:
-        raise ProtocolError(f"{where}: expected an integer of 53 bits, found {describe(value)}.")
+        raise ProtocolError(f"{where}: expected an integer of 53 bits, found {brief(value)}.")
     return value
 
 
@@ -96,7 +96,7 @@ class Fragments:
         """
         name = read_id(message, "fragment.id")
         if name is None:
-            raise ProtocolError("fragment.id: expected a text, found null.")
+            raise ProtocolError("fragment.id: expected a text or an integer, found None.")
         try:
             return self._add(name, message, now)
         except ProtocolError:
@@ -114,7 +114,7 @@ class Fragments:
         num, total = _count(message, "num"), _count(message, "total")
         data = message.get("data")
         if not isinstance(data, str):
-            raise ProtocolError(f"fragment.data: expected a text, found {describe(data)}.")
+            raise ProtocolError(f"fragment.data: expected a text, found {brief(data)}.")
         if name not in self._unfinished and len(self._unfinished) >= self.max_messages:
             raise ProtocolError(f"Fragments of {self.max_messages} messages are unfinished; send one to its end first.")
         parts = self._unfinished.setdefault(name, _Parts(total, now + self.lifetime))
@@ -136,5 +136,5 @@ def _count(message: Mapping[str, Any], name: str) -> int:
     value = message.get(name)
     # The Python servers send the total as a float with a fraction: 8.52 for 8 fragments.
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < 2**31:
-        raise ProtocolError(f"fragment.{name}: expected a number >= 0, found {describe(value)}.")
+        raise ProtocolError(f"fragment.{name}: expected a number >= 0, found {brief(value)}.")
     return int(value)

@@ -62,7 +62,7 @@ def test_a_handler_that_fails_is_an_answer(scripted, link, caplog, error, text):
 @pytest.mark.parametrize(
     ("values", "text"),
     [
-        ({"x": float("nan")}, "message.values.x: expected a finite number, found NaN."),
+        ({"x": float("nan")}, "message.values.x: expected a finite number, found nan."),
         (3, "TypeError: 'int' object is not iterable"),
     ],
 )

@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, ProtocolError
-from bam_envs.ros.interfaces import complete, describe, request_type, response_type
+from bam_envs.core.wording import brief
+from bam_envs.ros.interfaces import complete, request_type, response_type
 from bam_envs.rosbridge.bus import Caller, Handler, Listener, Message, refusal_of
 from bam_envs.rosbridge.encoding import decode_frame
 from bam_envs.rosbridge.fragments import Id, read_id
@@ -278,7 +279,7 @@ class Bridge:
         name, kind, number = read_name(message, "topic"), read_text(message, "type"), read_id(message)
         latch = message.get("latch")
         if not (latch is None or isinstance(latch, bool)):
-            raise ProtocolError(f"latch: expected true or false, found {describe(latch)}.")
+            raise ProtocolError(f"latch: expected true or false, found {brief(latch)}.")
         _require_room(sum(map(len, session.advertised.values())), session.options.topics, "advertisements")
         topic = self.topics.require(name, kind)
         _require_not_ours(topic)

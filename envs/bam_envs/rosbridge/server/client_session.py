@@ -10,7 +10,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from bam_envs.core.errors import ProtocolError
-from bam_envs.ros.interfaces import describe
+from bam_envs.core.wording import brief
 from bam_envs.rosbridge.bus import Caller, Handler, Message
 from bam_envs.rosbridge.encoding import COMPRESSIONS
 from bam_envs.rosbridge.fragments import Fragments, Id
@@ -133,7 +133,7 @@ def canonical(name: str) -> str:
         ProtocolError: It is not such a name.
     """
     if len(name) > _LONGEST or not _NAME.fullmatch(name):
-        raise ProtocolError(f"Name: expected one such as '/joint_states', found {describe(name)}.")
+        raise ProtocolError(f"Name: expected one such as '/joint_states', found {brief(name)}.")
     return name if name.startswith("/") else f"/{name}"
 
 
@@ -146,7 +146,7 @@ def read_text(message: Mapping[str, Any], name: str) -> str:
     """A field that must be there."""
     value = message.get(name)
     if not isinstance(value, str) or not value:
-        raise ProtocolError(f"{name}: expected a text, found {describe(value)}.")
+        raise ProtocolError(f"{name}: expected a text, found {brief(value)}.")
     return value
 
 
@@ -156,7 +156,7 @@ def read_number(message: Mapping[str, Any], name: str, otherwise: float) -> floa
     if value is None:
         return otherwise
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value <= _LARGEST:
-        raise ProtocolError(f"{name}: expected a number >= 0, found {describe(value)}.")
+        raise ProtocolError(f"{name}: expected a number >= 0, found {brief(value)}.")
     return value
 
 
@@ -165,8 +165,8 @@ def read_wire(message: Mapping[str, Any]) -> Wire:
     compression = message.get("compression") or "none"
     if compression not in COMPRESSIONS:
         expected = ", ".join(COMPRESSIONS)
-        raise ProtocolError(f"compression: expected one of {expected}, found {describe(compression)}.")
+        raise ProtocolError(f"compression: expected one of {expected}, found {brief(compression)}.")
     size = read_number(message, "fragment_size", NEVER_SPLIT)
     if size < 1:
-        raise ProtocolError(f"fragment_size: expected an integer >= 1, found {describe(size)}.")
+        raise ProtocolError(f"fragment_size: expected an integer >= 1, found {brief(size)}.")
     return Wire(compression, min(int(size), NEVER_SPLIT))

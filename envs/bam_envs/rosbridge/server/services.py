@@ -13,15 +13,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bam_envs.core.errors import BamEnvsError, ProtocolError
-from bam_envs.ros.interfaces import (
-    complete,
-    complete_known,
-    describe,
-    normal_name,
-    request_type,
-    response_type,
-    variants,
-)
+from bam_envs.core.wording import brief
+from bam_envs.ros.interfaces import complete, complete_known, normal_name, request_type, response_type, variants
 from bam_envs.rosbridge.bus import Handler
 from bam_envs.rosbridge.fragments import Id
 from bam_envs.rosbridge.server.client_session import Event, Invoke, Send, Session
@@ -228,7 +221,7 @@ class Services:
         """
         call = self.call_named(message.get("id"))
         if call is None or call.service.provider is not provider:
-            raise ProtocolError(f"Nobody waits for a response with the id {describe(message.get('id'))}.")
+            raise ProtocolError(f"Nobody waits for a response with the id {brief(message.get('id'))}.")
         name = call.service.name
         if message.get("result", True) is not True:
             reason = message.get("values")
@@ -288,7 +281,7 @@ def checked(kind: str, part: Callable[[str], str], values: Any) -> dict[str, Any
     if isinstance(values, list) and part is request_type:
         fields = variants(name)
         if not fields or len(values) > len(fields[0]):
-            raise ProtocolError(f"args: expected an object, found {describe(values)}.")
+            raise ProtocolError(f"args: expected an object, found {brief(values)}.")
         values = {one.name: value for one, value in zip(fields[0], values, strict=False)}
     return (complete_known if kind in _LENIENT else complete)(name, {} if values is None else values)
 

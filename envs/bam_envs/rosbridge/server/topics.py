@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from bam_envs.core.errors import ProtocolError
-from bam_envs.ros.interfaces import describe, normal_name
+from bam_envs.core.wording import brief
+from bam_envs.ros.interfaces import normal_name
 from bam_envs.rosbridge.bus import Listener
 from bam_envs.rosbridge.encoding import COMPRESSIONS
 from bam_envs.rosbridge.fragments import Id
@@ -155,7 +156,7 @@ class Topics:
         if topic is None:
             topic = self._topics[name] = Topic(name, normal_name(kind or ""))
         if kind is not None and normal_name(kind) != topic.kind:
-            raise ProtocolError(f"Topic {name} is of type {topic.kind}, found {describe(kind)}.")
+            raise ProtocolError(f"Topic {name} is of type {topic.kind}, found {brief(kind)}.")
         return topic
 
     def subscribe(self, stream: Stream, topic: Topic, now: float) -> None:

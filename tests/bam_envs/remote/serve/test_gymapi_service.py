@@ -148,7 +148,7 @@ def test_names_that_are_not(serve, name, request_type):
         ([{}, {}], "A step must have 1 actions, one for each environment, not 2."),
         ([{"continuous_action": [1]}], "continuous_action must have 2 values (action[0], action[1]), not 1."),
         ([{"continuous_action": [1, "2"]}], "continuous_action[1]: expected a number, found '2'"),
-        ([{"continuous_action": [1, None]}], "continuous_action[1]: expected a number, found null"),
+        ([{"continuous_action": [1, None]}], "continuous_action[1]: expected a number, found None"),
         ([{"discrete_action": [1]}], "continuous_action must have 2 values (action[0], action[1]), not 0."),
         ("go", "action: expected a list, found 'go'"),
     ],

@@ -98,10 +98,10 @@ def text(value):
     ("frame", "told"),
     [
         ("{", "Message: expected JSON: Expecting property name enclosed in double quotes: line 1 column 2 (char 1)."),
-        ("{}", "message: op: expected a text, found null."),
+        ("{}", "message: op: expected a text, found None."),
         ('{"op": 3}', "message: op: expected a text, found 3."),
         ('{"op": "dance", "id": 4}', None),
-        ("[]", "Message: expected an object, found a list of 0."),
+        ("[]", "Message: expected an object, found []."),
         (b"\xa1\x00\x01", "Message: expected text in UTF-8: invalid start byte at byte 0."),
         (
             '{"op": "set_level", "level": "loud"}',
@@ -134,11 +134,11 @@ def text(value):
         ),
         (
             '{"op": "subscribe", "topic": "/t", "id": {}}',
-            "subscribe /t: id: expected a text or an integer, found an object.",
+            "subscribe /t: id: expected a text or an integer, found {}.",
         ),
         (
             '{"op": "subscribe", "topic": "/t", "id": 1e400}',
-            "subscribe /t: id: expected a text or an integer, found Infinity.",
+            "subscribe /t: id: expected a text or an integer, found inf.",
         ),
         (
             '{"op": "subscribe", "topic": "/t", "id": 9999999999999999999}',
@@ -146,14 +146,14 @@ def text(value):
         ),
         (
             '{"op": "subscribe", "topic": "/t", "throttle_rate": 1e400}',
-            "subscribe /t: throttle_rate: expected a number >= 0, found Infinity.",
+            "subscribe /t: throttle_rate: expected a number >= 0, found inf.",
         ),
         ('{"op": "unsubscribe", "topic": "/t"}', "unsubscribe: Topic /t was not subscribed so by this client."),
         (
             '{"op": "advertise", "topic": "/t", "type": "std_msgs/Bool"}',
             "advertise: Topic /t is of type std_msgs/String, found 'std_msgs/Bool'.",
         ),
-        ('{"op": "advertise", "topic": "/u"}', "advertise /u: type: expected a text, found null."),
+        ('{"op": "advertise", "topic": "/u"}', "advertise /u: type: expected a text, found None."),
         (
             '{"op": "advertise", "topic": "/u", "type": "Bool"}',
             "advertise /u: Type: expected a name such as 'std_msgs/String', found 'Bool'.",
@@ -173,23 +173,23 @@ def text(value):
         ),
         (
             '{"op": "publish", "topic": "/f", "msg": {"data": [NaN]}}',
-            "publish /f: std_msgs/Float64MultiArray.data[0]: expected a finite number, found NaN.",
+            "publish /f: std_msgs/Float64MultiArray.data[0]: expected a finite number, found nan.",
         ),
         (
             '{"op": "publish", "topic": "/f", "msg": {"data": [Infinity]}}',
-            "publish /f: std_msgs/Float64MultiArray.data[0]: expected a finite number, found Infinity.",
+            "publish /f: std_msgs/Float64MultiArray.data[0]: expected a finite number, found inf.",
         ),
         (
             '{"op": "publish", "topic": "/f", "msg": {"data": [1e400]}}',
-            "publish /f: std_msgs/Float64MultiArray.data[0]: expected a finite number, found Infinity.",
+            "publish /f: std_msgs/Float64MultiArray.data[0]: expected a finite number, found inf.",
         ),
         (
             '{"op": "publish", "topic": "/f", "msg": {"data": [null]}}',
-            "publish /f: std_msgs/Float64MultiArray.data[0]: expected a number, found null.",
+            "publish /f: std_msgs/Float64MultiArray.data[0]: expected a number, found None.",
         ),
         (
             '{"op": "publish", "topic": "/f", "msg": {"data": [true]}}',
-            "publish /f: std_msgs/Float64MultiArray.data[0]: expected a number, found true.",
+            "publish /f: std_msgs/Float64MultiArray.data[0]: expected a number, found True.",
         ),
         (
             '{"op": "unadvertise_service", "service": "/s"}',
@@ -487,7 +487,7 @@ def test_arguments_may_have_no_names(peers):
     peers.run()
     assert peers.take(client) == response({"success": True, "message": ""}, True)
     assert peers.say(client, op="call_service", service="/s", args=[True, 1]) == response(
-        "args: expected an object, found a list of 2.", False
+        "args: expected an object, found [True, 1].", False
     )
 
 
@@ -496,8 +496,8 @@ def test_arguments_may_have_no_names(peers):
     [
         ({"args": {"datum": 1}}, "std_srvs/SetBoolRequest: expected only the fields data, found 'datum'."),
         ({"args": {"data": "yes"}}, "std_srvs/SetBoolRequest.data: expected true or false, found 'yes'."),
-        ({"args": {"data": math.nan}}, "std_srvs/SetBoolRequest.data: expected true or false, found NaN."),
-        ({"timeout": math.inf}, "timeout: expected a number >= 0, found Infinity."),
+        ({"args": {"data": math.nan}}, "std_srvs/SetBoolRequest.data: expected true or false, found nan."),
+        ({"timeout": math.inf}, "timeout: expected a number >= 0, found inf."),
         ({"compression": "zip"}, "compression: expected one of none, png, cbor, found 'zip'."),
         ({"timeout": "soon"}, "timeout: expected a number >= 0, found 'soon'."),
         ({"service": "/s s"}, "Name: expected one such as '/joint_states', found '/s s'."),
