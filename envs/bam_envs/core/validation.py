@@ -126,7 +126,7 @@ def expected(kind: Any) -> str:
     if origin in (Union, types.UnionType):
         return " or ".join(expected(one) for one in arguments if one is not type(None))
     if origin is Literal:
-        *rest, last = map(repr, arguments)
+        *rest, last = [repr(one) for one in arguments]
         return f"{', '.join(rest)} or {last}" if rest else last
     base = origin or kind
     if base in (list, tuple, Sequence) and arguments:

@@ -184,7 +184,7 @@ def test_bad_actions_are_refused(make_rows):
     envs = make_rows("bam/pick-v0", 3)
     with pytest.raises(ResetNeeded) as caught:
         envs.step(np.zeros((3, 5), np.float32))
-    assert str(caught.value) == "No episode is running. Call reset() first."
+    assert str(caught.value) == "No episode is running: it ended, or never began. Call reset() first."
     envs.reset(seed=0)
     with pytest.raises(InvalidValue) as caught:
         envs.step(np.zeros((5,), np.float32))
@@ -193,7 +193,7 @@ def test_bad_actions_are_refused(make_rows):
     actions[1, 2], actions[2, 0] = np.nan, np.inf
     with pytest.raises(InvalidValue) as caught:
         envs.step(actions)
-    assert str(caught.value) == "The actions must be finite; rows [1, 2] are not."
+    assert str(caught.value) == "The actions must be finite; those of environments [1, 2] are not."
 
 
 def without_physics(rows):

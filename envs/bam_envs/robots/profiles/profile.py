@@ -128,7 +128,8 @@ def _read_file(name: str) -> tuple[str, Table]:
         text = (_folder() / path.name).read_text(encoding="utf-8")
     else:
         text = _text_of(path)
-    table, base = _parsed(str(path), text), {}
+    table: Table = _parsed(str(path), text)
+    base: Table = {}
     if "extends" in table:
         extends = check(table["extends"], NonEmpty, f"{path}: extends")
         if Path(extends).suffix in _SUFFIXES:
@@ -179,7 +180,8 @@ def _profile(where: str, table: Table) -> RobotProfile:
     cameras = tuple(_camera(row, at) for row, at in _rows(f"{where}: cameras", file.cameras))
     readiness = tuple(_readiness(row, at) for row, at in _rows(f"{where}: readiness", file.readiness))
     sinks = [sink for mode in commands.values() for sink in mode]
-    _require_known(f"{where}: rename", "topic", file.rename, [e.topic for e in (*state, *cameras, *readiness, *sinks)])
+    entries: list[Source | Sink | CameraSource | Readiness] = [*state, *cameras, *readiness, *sinks]
+    _require_known(f"{where}: rename", "topic", file.rename, [entry.topic for entry in entries])
 
     def renamed(entry: Topical) -> Topical:
         if entry.topic not in file.rename:
