@@ -194,9 +194,9 @@ def make_rows(
         SettingsError: It cannot be made.
     """
     if place.transport:
-        from bam_envs.remote.remote_env import make_remote_rows
+        from bam_envs.remote.remote_env import make_remote_vector_env
 
-        return make_remote_rows(env_id, place.transport, **place.link_options)
+        return make_remote_vector_env(env_id, place.transport, **place.link_options)
     if is_batched(env_id):
         return _made(env_id, lambda: gym.make_vec(env_id, num_envs=num_envs, **(env_kwargs or {})))
     arguments = {"disable_env_checker": True, **(env_kwargs or {})}

@@ -370,11 +370,13 @@ def make_vector_env(
         raise InvalidValue("A live robot is one environment, which nothing may reset unasked; use gymnasium.make.")
     _require_answers(transport, timeout)
     if transport is not None:
-        from bam_envs.remote.remote_env import make_remote_rows
+        from bam_envs.remote.remote_env import make_remote_vector_env
 
         _require_one_place(None, str(transport), None, task_options)
         _require_simulation(transport, render_mode, randomize)
-        return make_remote_rows(env_id, transport, num_envs, ca_file=ca_file, token_file=token_file, timeout=timeout)
+        return make_remote_vector_env(
+            env_id, transport, num_envs, ca_file=ca_file, token_file=token_file, timeout=timeout
+        )
     from bam_envs.core.robot_env import RobotVectorEnv
 
     entry = ENVIRONMENTS[env_id]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from bam_envs.core.on_use import imported_on_use
 
 if TYPE_CHECKING:
-    from bam_envs.remote.remote_env import RemoteEnv, make_remote_env, make_remote_rows, open_transport
+    from bam_envs.remote.remote_env import RemoteEnv, make_remote_env, make_remote_vector_env, open_transport
     from bam_envs.remote.remote_vector_env import RemoteVectorEnv
     from bam_envs.remote.ros2_transport import RclpyTransport
     from bam_envs.remote.rosbridge_transport import RosbridgeTransport
@@ -34,7 +34,7 @@ _MODULES = {
     "TcpTransport": "bam_envs.remote.tcp_transport",
     "Transport": "bam_envs.remote.transport",
     "make_remote_env": "bam_envs.remote.remote_env",
-    "make_remote_rows": "bam_envs.remote.remote_env",
+    "make_remote_vector_env": "bam_envs.remote.remote_env",
     "open_transport": "bam_envs.remote.remote_env",
 }
 
@@ -53,7 +53,7 @@ __all__ = [
     "TcpTransport",
     "Transport",
     "make_remote_env",
-    "make_remote_rows",
+    "make_remote_vector_env",
     "open_transport",
 ]
 

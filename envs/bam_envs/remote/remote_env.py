@@ -12,11 +12,11 @@ from gymnasium import Space
 
 from bam_envs.core.at_exit import close_at_exit
 from bam_envs.core.errors import InvalidValue, ResetNeeded, UnknownName
-from bam_envs.remote.remote_vector_env import RemoteVectorEnv
+from bam_envs.remote.remote_vector_env import Described, RemoteVectorEnv
 from bam_envs.remote.transport import EnvSpecMessage, Info, Transport
 from bam_envs.rosbridge.endpoint import Endpoint
 
-__all__ = ["RemoteEnv", "RemoteVectorEnv", "make_remote_env", "make_remote_rows", "open_transport"]
+__all__ = ["RemoteEnv", "RemoteVectorEnv", "make_remote_env", "make_remote_vector_env", "open_transport"]
 
 Where = str | Transport
 """A URL of `open_transport`, or a transport."""
@@ -29,7 +29,7 @@ _CLASSES = {
 """By the scheme of the URL; imported on use."""
 
 
-class RemoteEnv(gym.Env[Any, Any]):
+class RemoteEnv(Described, gym.Env[Any, Any]):
     """One environment behind a transport. Spaces, period and labels are those of the other end.
 
     It connects when something of the other end is first needed. `LinkLost` and the other faults of the transport go
@@ -42,62 +42,47 @@ class RemoteEnv(gym.Env[Any, Any]):
     def __init__(self, transport: Transport) -> None:
         self.transport = transport
         self.metadata = {"render_modes": []}
-        self._there: EnvSpecMessage | None = None
+        self._spec: EnvSpecMessage | None = None
         self._running = False
-        self._steps, self._told = 0, False
+        self._steps, self._warned = 0, False
         close_at_exit(self)
 
     def connect(self) -> EnvSpecMessage:
-        """What is there.
+        """Return the description of the environment there.
 
         Raises:
             NoServer: Nobody, or nobody who has this environment.
-            InvalidValue: An environment of rows, which `RemoteVectorEnv` is for.
+            InvalidValue: Several environments, which `RemoteVectorEnv` is for.
         """
-        if self._there is None:
+        if self._spec is None:
             there = self.transport.connect()
             if there.vector:
                 raise InvalidValue(
-                    f"{there.env_id} has {there.num_envs} rows there, and one is wanted. Make it with "
+                    f"{there.env_id} has {there.num_envs} environments there, and one is wanted. Make it with "
                     f"num_envs={there.num_envs}, or serve one (bam-serve without --num-envs)."
                 )
-            self._there = there
-        return self._there
+            self._spec = there
+        return self._spec
+
+    @property
+    def _there(self) -> EnvSpecMessage:
+        return self.connect()
 
     @property
     def observation_space(self) -> Space[Any]:  # type: ignore[override]
-        """What observations are."""
-        return self.connect().observation_space
+        """The observation space there."""
+        return self._there.observation_space
 
     @property
     def action_space(self) -> Space[Any]:  # type: ignore[override]
-        """What actions are."""
-        return self.connect().action_space
-
-    @property
-    def env_id(self) -> str:
-        """The Gymnasium id there."""
-        return self.connect().env_id
-
-    @property
-    def period(self) -> float | None:
-        """Time between two actions [s]; None if the other end does not say."""
-        return self.connect().period
-
-    @property
-    def max_episode_steps(self) -> int | None:
-        """Steps after which the other end truncates an episode."""
-        return self.connect().max_episode_steps
-
-    def describe(self) -> dict[str, Any]:
-        """What every number of observation, action, state and command means; empty if the other end does not say."""
-        return dict(self.connect().signals)
+        """The action space there."""
+        return self._there.action_space
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Begin an episode; seed and options are for the other end."""
         super().reset(seed=seed)
         self.connect()
-        self._tell_if_cut()
+        self._warn_if_truncated()
         self._running, self._steps = False, 0
         observation, info = self.transport.reset(seed, options)
         self._running = True
@@ -111,26 +96,26 @@ class RemoteEnv(gym.Env[Any, Any]):
         self._running, self._steps = not (terminated or truncated), self._steps + 1
         return observation, reward, terminated, truncated, info
 
-    def _tell_if_cut(self) -> None:
+    def _warn_if_truncated(self) -> None:
         """Warn once when the limit of the id here, which `gymnasium.make` puts around this, ended an episode early.
 
         It is seen only then: whether there is that wrapper, and with which limit, is not known in here.
         """
         entry = gym.registry.get(self.spec.id) if self.spec is not None else None
-        if entry is None or self._told or not self._running or self._steps != entry.max_episode_steps:
+        if entry is None or self._warned or not self._running or self._steps != entry.max_episode_steps:
             return
         if self._steps < (self.max_episode_steps or 0):
-            self._told = True
+            self._warned = True
             gym.logger.warn(
                 f"Episodes of {entry.id} are cut after {self._steps} steps here, and last {self.max_episode_steps} "
                 f"there; for those: gymnasium.make(..., max_episode_steps=-1)."
             )
 
     def render(self) -> None:
-        """Pictures are not carried; observations that are images are."""
+        """Rendered frames are not carried; observations that are images are."""
 
     def close(self) -> None:
-        """Let go of the environment there and drop the link."""
+        """Release the environment there and drop the link."""
         self._running = False
         self.transport.close()
 
@@ -149,15 +134,15 @@ def make_remote_env(env_id: str, transport: Where, **options: Any) -> RemoteEnv:
     return RemoteEnv(_opened(env_id, transport, options))
 
 
-def make_remote_rows(
+def make_remote_vector_env(
     env_id: str, transport: Where | Sequence[Where], num_envs: int | None = None, **options: Any
 ) -> RemoteVectorEnv:
-    """The environments `env_id` that run at `transport`, as rows stepped together; connects on first use.
+    """The environments `env_id` that run at `transport`, stepped together; connects on first use.
 
     Args:
         env_id: As for `make_remote_env`.
         transport: One, or several, which are stepped at the same time.
-        num_envs: Rows in all, if they must be so many; one transport may have many.
+        num_envs: Environments in all, if they must be so many; one transport may have many.
         options: As for `make_remote_env`.
 
     Raises:
@@ -206,7 +191,8 @@ def open_transport(
     if not separator or (not rest.strip("/") and scheme != "ros2"):
         raise InvalidValue(f"A transport is a URL such as tcp://10.0.0.5:5555 or ws://10.0.0.5:9090, not {url!r}.")
     if scheme not in _CLASSES:
-        raise InvalidValue(f"{url}: {UnknownName('transport', scheme, _CLASSES)} It must be one of {_schemes()}.")
+        schemes = ", ".join(f"{one}://" for one in _CLASSES)
+        raise InvalidValue(f"{url}: {UnknownName('transport', scheme, _CLASSES)} It must be one of {schemes}.")
     endpoint = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file)
     for name, value in (("ca_file", ca_file), ("timeout", timeout)):
         if value is not None:
@@ -221,7 +207,7 @@ def open_transport(
 
 
 def _require_options(url: str, make: type[Transport], options: Mapping[str, Any]) -> None:
-    """Each option is one of the transport's."""
+    """Refuse an option that the transport's class does not take."""
     # A class that hands options on to its parent takes those of the parent.
     signatures = [inspect.signature(kind) for kind in make.__mro__ if "__init__" in vars(kind) and kind is not object]
     names = dict.fromkeys(name for signature in signatures for name in signature.parameters)
@@ -229,7 +215,3 @@ def _require_options(url: str, make: type[Transport], options: Mapping[str, Any]
     for name in options:
         if name not in known:
             raise InvalidValue(f"{url} takes no {name}; its options are {', '.join(known)}.")
-
-
-def _schemes() -> str:
-    return ", ".join(f"{scheme}://" for scheme in _CLASSES)

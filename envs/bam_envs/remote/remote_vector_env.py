@@ -1,4 +1,4 @@
-"""RemoteVectorEnv: environments that run somewhere else, as rows of one `gymnasium.vector.VectorEnv`."""
+"""RemoteVectorEnv: environments that run somewhere else, as one `gymnasium.vector.VectorEnv`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bam_envs.core.at_exit import close_at_exit
 from bam_envs.core.errors import InvalidValue, ResetNeeded
 from bam_envs.core.spaces import space_to_json
 from bam_envs.remote.batches import join_final, join_infos, join_observations
-from bam_envs.remote.transport import EnvSpecMessage, Info, Transport
+from bam_envs.remote.transport import EnvSpecMessage, Info, Seed, Transport
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -29,53 +29,44 @@ Seeds = list[int | None]
 
 @dataclass(frozen=True)
 class Stepped:
-    """One step of the rows of a rack."""
+    """One step of the environments of a rack; each list has one entry for each."""
 
     observations: list[Any]
-    """Of rows whose episode ended, the first of the next one."""
+    """Where an episode ended, the first one of the next."""
     rewards: list[float]
-    """One a row."""
     terminated: list[bool]
-    """One a row."""
     truncated: list[bool]
-    """One a row."""
     infos: list[Info]
-    """Those of the next episode, with ``final_obs`` and ``final_info``, where one ended."""
-
-
-@dataclass(frozen=True)
-class ResetOrder:
-    """What a reset says of the rows of all racks."""
-
-    seeds: Seeds
-    """One a row."""
-    mask: NDArray[np.bool_]
-    """The rows that begin anew."""
-    options: Info | None
-    """For the other ends."""
-    before: list[Any]
-    """The last observation of each row."""
+    """Where an episode ended, the info of the next one, with ``final_obs`` and ``final_info``."""
 
 
 class Rack:
-    """The rows of one transport, with automatic resets in the same step whatever is at the other end.
+    """The environments of one transport, reset in the step that ends an episode whatever is at the other end.
 
     Args:
         transport: What carries them.
         spec: What it connected to.
-        first: The number of its first row.
+        first: The number of its first environment.
     """
 
     def __init__(self, transport: Transport, spec: EnvSpecMessage, first: int) -> None:
         self.transport, self.spec = transport, spec
-        self.rows = slice(first, first + spec.num_envs)
-        """Its rows among those of all racks."""
+        self.part = slice(first, first + spec.num_envs)
+        """Its environments among those of all racks."""
 
-    def reset(self, order: ResetOrder) -> tuple[list[Any], list[Info]]:
-        """Begin episodes on the rows of the mask; (observations, infos) of all."""
-        seeds, mask, options = order.seeds[self.rows], order.mask[self.rows], order.options
+    def reset(
+        self, seeds: Seeds, mask: NDArray[np.bool_], options: Info | None, before: list[Any]
+    ) -> tuple[list[Any], list[Info]]:
+        """Begin episodes in the environments of the mask; (observations, infos) of all of this rack.
+
+        Args:
+            seeds: One for each environment of this rack.
+            mask: Which of them begin an episode. Shape: (n,).
+            options: For the other end.
+            before: The last observation of each.
+        """
         if not mask.any():
-            return order.before[self.rows], [{}] * len(mask)
+            return before, [{}] * len(mask)
         if not self.spec.vector or not self.spec.autoreset:
             return self._begin(self._one_seed(seeds, mask), options)
         if not mask.all():
@@ -85,14 +76,14 @@ class Rack:
         return observations, infos
 
     def step(self, actions: list[Any]) -> Stepped:
-        """Step every row; rows whose episode ended begin the next one."""
+        """Step every environment; those whose episode ended are reset."""
         if not self.spec.vector:
             return self._restarted(Stepped(*([one] for one in self.transport.step(actions[0]))))
         stepped = Stepped(*self.transport.step(actions))
         return stepped if self.spec.autoreset else self._restarted(stepped)
 
     def _restarted(self, last: Stepped) -> Stepped:
-        """All rows begin anew once one has ended, for there is one reset for all of them."""
+        """All episodes of this rack end once one has ended, for there is one reset for all of them."""
         if not any(last.terminated) and not any(last.truncated):
             return last
         first, infos = self._begin(None, None)
@@ -100,102 +91,30 @@ class Rack:
             {**begun, "final_obs": observation, "final_info": info}
             for begun, observation, info in zip(infos, last.observations, last.infos, strict=True)
         ]
-        # To a row that was not at its end, the end of another one is a time limit.
+        # For an episode that was not at its end, the end of another one is a time limit.
         cut = [not ended or late for ended, late in zip(last.terminated, last.truncated, strict=True)]
         return Stepped(first, last.rewards, last.terminated, cut, infos)
 
     def _begin(self, seed: int | None, options: Info | None) -> tuple[list[Any], list[Info]]:
-        """Begin the episodes of all rows together."""
         observation, info = self.transport.reset(seed, options)
         return (observation, info) if self.spec.vector else ([observation], [info])
 
     def _one_seed(self, seeds: Seeds, mask: NDArray[np.bool_]) -> int | None:
-        """The seed for all rows: that of the first, from which those of the others go on."""
-        first, rows = seeds[0], f"The {len(seeds)} rows of {self.spec.env_id} begin together"
+        """The seed for all environments: that of the first, from which those of the others go on."""
+        first, those = seeds[0], f"The {len(seeds)} environments of {self.spec.env_id} begin together"
         if not mask.all():
-            raise InvalidValue(f"{rows}; reset_mask must hold all of them or none.")
-        if seeds != [None if first is None else first + row for row in range(len(seeds))]:
-            raise InvalidValue(f"{rows}, from one seed s that stands for s, s + 1, …; not from {seeds}.")
+            raise InvalidValue(f"{those}; reset_mask must hold all of them or none.")
+        if seeds != [None if first is None else first + number for number in range(len(seeds))]:
+            raise InvalidValue(f"{those}, from one seed s that stands for s, s + 1, …; not from {seeds}.")
         return first
 
 
-class RemoteVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
-    """The rows of one or several transports, stepped at the same time.
-
-    n rows of one transport are one request. A row whose episode ends starts the next one in the same step
-    (`AutoresetMode.SAME_STEP`), as in `RobotVectorEnv`. The arms of a rack that is not ours have one reset: when an
-    episode of one ends, those of its others are truncated. It connects when something of the other end is first
-    needed. Faults go through, once every transport has answered; a `reset` is needed then. It is closed when Python
-    ends.
-
-    Args:
-        transports: One, or several with the same spaces.
-        num_envs: Rows in all, if they must be so many.
-    """
-
-    def __init__(self, transports: Transport | Sequence[Transport], num_envs: int | None = None) -> None:
-        self.transports = [transports] if isinstance(transports, Transport) else list(transports)
-        self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
-        self._wanted, self._racks = num_envs, list[Rack]()
-        self._threads: ThreadPoolExecutor | None = None
-        self._process = 0
-        self._rows: list[Any] | None = None
-        """The last observation of each row; None while a reset is needed."""
-        self._batched: tuple[Space[Any], Space[Any]] | None = None
-        if not self.transports:
-            raise InvalidValue("There must be at least one transport.")
-        close_at_exit(self)
-
-    def connect(self) -> list[EnvSpecMessage]:
-        """What is there, for each transport.
-
-        Raises:
-            NoServer: Nobody, or nobody who has this environment.
-            InvalidValue: The spaces differ, or the number of rows is not `num_envs`.
-        """
-        if not self._racks:
-            specs = self._at_once(lambda transport: transport.connect(), self.transports)
-            _require_alike(specs)
-            firsts = [0, *accumulate(spec.num_envs for spec in specs)]
-            if self._wanted not in (None, firsts[-1]):
-                raise InvalidValue(f"num_envs must be {firsts[-1]}, as many rows as there are, not {self._wanted}.")
-            self._racks = [Rack(*one) for one in zip(self.transports, specs, firsts, strict=False)]
-        return [rack.spec for rack in self._racks]
+class Described:
+    """What a remote environment tells of the other end, from the description that comes when it connects."""
 
     @property
     def _there(self) -> EnvSpecMessage:
-        return self.connect()[0]
-
-    @property
-    def num_envs(self) -> int:  # type: ignore[override]
-        """Rows in all."""
-        return sum(spec.num_envs for spec in self.connect())
-
-    @property
-    def single_observation_space(self) -> Space[Any]:  # type: ignore[override]
-        """What observations of one row are."""
-        return self._there.observation_space
-
-    @property
-    def single_action_space(self) -> Space[Any]:  # type: ignore[override]
-        """What actions of one row are."""
-        return self._there.action_space
-
-    @property
-    def observation_space(self) -> Space[Any]:  # type: ignore[override]
-        """What observations are."""
-        return self._spaces()[0]
-
-    @property
-    def action_space(self) -> Space[Any]:  # type: ignore[override]
-        """What actions are."""
-        return self._spaces()[1]
-
-    def _spaces(self) -> tuple[Space[Any], Space[Any]]:
-        if self._batched is None:
-            there, rows = self._there, self.num_envs
-            self._batched = batch_space(there.observation_space, rows), batch_space(there.action_space, rows)
-        return self._batched
+        raise NotImplementedError
 
     @property
     def env_id(self) -> str:
@@ -216,70 +135,148 @@ class RemoteVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         """What every number of observation, action, state and command means; empty if the other end does not say."""
         return dict(self._there.signals)
 
-    def reset(
-        self, *, seed: int | list[int | None] | None = None, options: Info | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode on every row, or on those of ``options["reset_mask"]`` (n,) bool.
+
+class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
+    """The environments of one or several transports, stepped at the same time.
+
+    All environments of one transport are one request. One whose episode ends is reset in the same step
+    (`AutoresetMode.SAME_STEP`), as in `RobotVectorEnv`. The arms of a rack that is not ours have one reset: when an
+    episode of one ends, those of its others are truncated. It connects when something of the other end is first
+    needed. Faults go through, once every transport has answered; a `reset` is needed then. It is closed when Python
+    ends.
+
+    Args:
+        transports: One, or several with the same spaces.
+        num_envs: Environments in all, if they must be so many.
+    """
+
+    def __init__(self, transports: Transport | Sequence[Transport], num_envs: int | None = None) -> None:
+        self.transports = [transports] if isinstance(transports, Transport) else list(transports)
+        self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+        self._wanted, self._racks = num_envs, list[Rack]()
+        self._threads: ThreadPoolExecutor | None = None
+        self._process = 0
+        self._observations: list[Any] | None = None
+        """The last observation of each environment; None while a reset is needed."""
+        self._batched: tuple[Space[Any], Space[Any]] | None = None
+        if not self.transports:
+            raise InvalidValue("There must be at least one transport.")
+        close_at_exit(self)
+
+    def connect(self) -> list[EnvSpecMessage]:
+        """Return the description of each transport's environments.
+
+        Raises:
+            NoServer: Nobody, or nobody who has this environment.
+            InvalidValue: The spaces differ, or there are not `num_envs` environments.
+        """
+        if not self._racks:
+            specs = self._at_once(lambda transport: transport.connect(), self.transports)
+            _require_alike(specs)
+            firsts = [0, *accumulate(spec.num_envs for spec in specs)]
+            if self._wanted not in (None, firsts[-1]):
+                raise InvalidValue(f"num_envs must be {firsts[-1]}, as many as there are, not {self._wanted}.")
+            self._racks = [Rack(*one) for one in zip(self.transports, specs, firsts, strict=False)]
+        return [rack.spec for rack in self._racks]
+
+    @property
+    def _there(self) -> EnvSpecMessage:
+        return self.connect()[0]
+
+    @property
+    def num_envs(self) -> int:  # type: ignore[override]
+        """Environments in all."""
+        return sum(spec.num_envs for spec in self.connect())
+
+    @property
+    def single_observation_space(self) -> Space[Any]:  # type: ignore[override]
+        """The observation space of one environment."""
+        return self._there.observation_space
+
+    @property
+    def single_action_space(self) -> Space[Any]:  # type: ignore[override]
+        """The action space of one environment."""
+        return self._there.action_space
+
+    @property
+    def observation_space(self) -> Space[Any]:  # type: ignore[override]
+        """The observation space of all environments."""
+        return self._spaces()[0]
+
+    @property
+    def action_space(self) -> Space[Any]:  # type: ignore[override]
+        """The action space of all environments."""
+        return self._spaces()[1]
+
+    def _spaces(self) -> tuple[Space[Any], Space[Any]]:
+        if self._batched is None:
+            there, size = self._there, self.num_envs
+            self._batched = batch_space(there.observation_space, size), batch_space(there.action_space, size)
+        return self._batched
+
+    def reset(self, *, seed: Seed = None, options: Info | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode in every environment, or in those of ``options["reset_mask"]`` (n,) bool.
 
         Args:
-            seed: Row i is seeded with ``seed + i``, or with ``seed[i]``; a rack that is not ours is told that of its
-                first arm.
+            seed: Environment i is seeded with ``seed + i``, or with ``seed[i]``; a rack that is not ours is told that
+                of its first arm.
             options: ``reset_mask``, and what the other ends take.
         """
-        seeds = self._row_seeds(seed)
-        rest = {key: value for key, value in (options or {}).items() if key != "reset_mask"}
+        seeds = self._seeds(seed)
+        rest = {key: value for key, value in (options or {}).items() if key != "reset_mask"} or None
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)), dtype=bool)
         if mask.shape != (self.num_envs,):
             raise InvalidValue(f"reset_mask must have shape ({self.num_envs},), not {mask.shape}.")
-        if self._rows is None and not mask.all():
-            raise ResetNeeded("No episode is running. Call reset() without a reset_mask first.")
-        before, self._rows = self._rows or [None] * self.num_envs, None
-        order = ResetOrder(seeds, mask, rest or None, before)
-        parts = self._at_once(lambda rack: rack.reset(order), self._racks)
-        self._rows = [row for observations, _ in parts for row in observations]
-        return self._joined(self._rows), join_infos([info for _, infos in parts for info in infos])
+        if self._observations is None and not mask.all():
+            raise ResetNeeded("No episode is running. Call reset() first, without a reset_mask.")
+        before, self._observations = self._observations or [None] * self.num_envs, None
+        parts = self._at_once(
+            lambda rack: rack.reset(seeds[rack.part], mask[rack.part], rest, before[rack.part]), self._racks
+        )
+        self._observations = [one for observations, _ in parts for one in observations]
+        return self._joined(self._observations), join_infos([info for _, infos in parts for info in infos])
 
-    def _row_seeds(self, seed: int | list[int | None] | None) -> Seeds:
+    def _seeds(self, seed: Seed) -> Seeds:
         if seed is None:
             return [None] * self.num_envs
-        rows = range(self.num_envs)
-        seeds: Seeds = [int(seed) + row for row in rows] if isinstance(seed, (int, np.integer)) else list(seed)
-        if len(seeds) != self.num_envs:
-            raise InvalidValue(f"seed must be one number or {self.num_envs} of them, not {len(seeds)}.")
-        return seeds
+        if isinstance(seed, (int, np.integer)):
+            return [int(seed) + number for number in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise InvalidValue(f"seed must be one number or {self.num_envs} of them, not {len(seed)}.")
+        return list(seed)
 
     def step(
         self, actions: Any
     ) -> tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Step every row; rows whose episode ended begin the next one."""
-        if self._rows is None:
+        """Step every environment; those whose episode ended are reset."""
+        if self._observations is None:
             raise ResetNeeded("No episode is running. Call reset() first.")
-        rows = self._row_actions(actions)
-        self._rows = None  # until it went well
-        steps = self._at_once(lambda rack: rack.step(rows[rack.rows]), self._racks)
-        self._rows = [row for one in steps for row in one.observations]
-        infos = [info for one in steps for info in one.infos]
+        each = self._each_action(actions)
+        self._observations = None  # until it went well
+        steps = self._at_once(lambda rack: rack.step(each[rack.part]), self._racks)
+        self._observations = [one for step in steps for one in step.observations]
+        infos = [info for step in steps for info in step.infos]
         joined = join_infos(infos)
         if "final_obs" in joined:
-            joined["final_obs"] = join_final(self.single_observation_space, self._rows, infos)
-        rewards = np.array([reward for one in steps for reward in one.rewards], np.float64)
-        terminated = np.array([flag for one in steps for flag in one.terminated], np.bool_)
-        truncated = np.array([flag for one in steps for flag in one.truncated], np.bool_)
-        return self._joined(self._rows), rewards, terminated, truncated, joined
+            joined["final_obs"] = join_final(self.single_observation_space, self._observations, infos)
+        rewards = np.array([reward for step in steps for reward in step.rewards], np.float64)
+        terminated = np.array([flag for step in steps for flag in step.terminated], np.bool_)
+        truncated = np.array([flag for step in steps for flag in step.truncated], np.bool_)
+        return self._joined(self._observations), rewards, terminated, truncated, joined
 
-    def _row_actions(self, actions: Any) -> list[Any]:
+    def _each_action(self, actions: Any) -> list[Any]:
         if isinstance(self.action_space, gym.spaces.Box):
             array = np.asarray(actions)
             if array.shape != self.action_space.shape:
                 raise InvalidValue(f"The actions must have shape {self.action_space.shape}, not {array.shape}.")
             return list(array)
-        rows = list(iterate(self.action_space, actions))
-        if len(rows) != self.num_envs:
-            raise InvalidValue(f"There must be one action for each of {self.num_envs} rows, not {len(rows)}.")
-        return rows
+        each, size = list(iterate(self.action_space, actions)), self.num_envs
+        if len(each) != size:
+            raise InvalidValue(f"There must be one action for each of {size} environments, not {len(each)}.")
+        return each
 
-    def _joined(self, rows: list[Any]) -> Any:
-        return join_observations(self.single_observation_space, rows)
+    def _joined(self, each: list[Any]) -> Any:
+        return join_observations(self.single_observation_space, each)
 
     def _at_once(self, call: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
         """`call` of every item at the same time; the first fault, once all have ended."""
@@ -293,8 +290,8 @@ class RemoteVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         return [future.result() for future in futures]
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Let go of the environments there and drop the links."""
-        self._rows = None
+        """Release the environments there and drop the links."""
+        self._observations = None
         for transport in self.transports:
             transport.close()
         threads, self._threads = self._threads, None
@@ -303,12 +300,12 @@ class RemoteVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
 
 
 def _require_alike(specs: Sequence[EnvSpecMessage]) -> None:
-    """Prove that all racks take and give the same."""
+    """Refuse racks that take or give different things."""
     for name in ("observation_space", "action_space"):
         first = getattr(specs[0], name)
         for number, spec in enumerate(specs[1:], start=2):
             if space_to_json(getattr(spec, name)) != space_to_json(first):
                 raise InvalidValue(
                     f"The {name} of transport {number} is {getattr(spec, name)}, and that of the first {first}; "
-                    f"rows must be alike."
+                    f"environments of one batch must be alike."
                 )

@@ -23,9 +23,9 @@ from bam_envs.testing.transports import MirrorEnv
 
 PROGRAM = """
 import sys, time
-from bam_envs.remote.remote_env import make_remote_env, make_remote_rows
+from bam_envs.remote.remote_env import make_remote_env, make_remote_vector_env
 ws, tcp, rows_ws, rows_tcp = sys.argv[1:]
-envs = [make_remote_env("", ws), make_remote_env("", tcp), make_remote_rows("", [rows_ws, rows_tcp])]
+envs = [make_remote_env("", ws), make_remote_env("", tcp), make_remote_vector_env("", [rows_ws, rows_tcp])]
 for env in envs:
     env.reset(seed=1)
     env.step(env.action_space.sample())

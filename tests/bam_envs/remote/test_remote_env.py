@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env
 
 from bam_envs.core.errors import InvalidValue, LinkLost, ResetNeeded
 from bam_envs.core.registry import ENVIRONMENTS
-from bam_envs.remote.remote_env import RemoteEnv, RemoteVectorEnv, make_remote_env, make_remote_rows
+from bam_envs.remote.remote_env import RemoteEnv, RemoteVectorEnv, make_remote_env, make_remote_vector_env
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.local_transport import FakeEnv, FakeTransport, LocalTransport
 from bam_envs.remote.serve.tcp_server import TcpServer
@@ -107,7 +107,7 @@ def test_rows_are_for_the_other_class(make_rows):
     with pytest.raises(InvalidValue) as caught:
         env.reset()
     assert str(caught.value) == (
-        "bam/reach-v0 has 3 rows there, and one is wanted. Make it with num_envs=3, or serve one "
+        "bam/reach-v0 has 3 environments there, and one is wanted. Make it with num_envs=3, or serve one "
         "(bam-serve without --num-envs)."
     )
 
@@ -176,10 +176,10 @@ def test_making_it_of_a_url(make):
 
 def test_making_rows_of_urls_and_transports(make):
     with TcpServer(EnvServer(make("bam/reach-v0"))) as server:
-        rows = make_remote_rows("bam/reach-v0", [server.url, LocalTransport(make("bam/reach-v0"))], 2)
+        rows = make_remote_vector_env("bam/reach-v0", [server.url, LocalTransport(make("bam/reach-v0"))], 2)
         assert type(rows) is RemoteVectorEnv
         assert rows.reset(seed=0)[0].shape[0] == 2
         rows.close()
-        alone = make_remote_rows("bam/reach-v0", server.url)
+        alone = make_remote_vector_env("bam/reach-v0", server.url)
         assert alone.num_envs == 1
         alone.close()

@@ -160,7 +160,7 @@ def test_a_mask_needs_episodes_of_the_other_rows():
     envs = RemoteVectorEnv([FakeTransport(), FakeTransport()])
     with pytest.raises(ResetNeeded) as caught:
         envs.reset(options={"reset_mask": [True, False]})
-    assert str(caught.value) == "No episode is running. Call reset() without a reset_mask first."
+    assert str(caught.value) == "No episode is running. Call reset() first, without a reset_mask."
     envs.close()
 
 
@@ -204,7 +204,7 @@ def test_a_fault_of_one_rack_goes_through_when_all_have_answered():
 def test_the_number_of_rows_must_be_right():
     with pytest.raises(InvalidValue) as caught:
         RemoteVectorEnv([FakeTransport(rows(2)), FakeTransport()], 4).reset()
-    assert str(caught.value) == "num_envs must be 3, as many rows as there are, not 4."
+    assert str(caught.value) == "num_envs must be 3, as many as there are, not 4."
     with pytest.raises(InvalidValue) as caught:
         RemoteVectorEnv([])
     assert str(caught.value) == "There must be at least one transport."
@@ -216,8 +216,8 @@ def test_racks_must_be_alike():
     with pytest.raises(InvalidValue) as caught:
         envs.reset()
     assert str(caught.value) == (
-        "The action_space of transport 2 is Discrete(2), and that of the first Box(-1.0, 1.0, (2,), float32); rows "
-        "must be alike."
+        "The action_space of transport 2 is Discrete(2), and that of the first Box(-1.0, 1.0, (2,), float32); "
+        "environments of one batch must be alike."
     )
     envs.close()
 
@@ -263,7 +263,7 @@ def test_discrete_actions():
     assert [one.calls[-1] for one in transports] == [("step", 2), ("step", 0)]
     with pytest.raises(InvalidValue) as caught:
         envs.step(np.array([2, 0, 1]))
-    assert str(caught.value) == "There must be one action for each of 2 rows, not 3."
+    assert str(caught.value) == "There must be one action for each of 2 environments, not 3."
     envs.close()
 
 

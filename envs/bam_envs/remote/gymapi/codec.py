@@ -103,9 +103,9 @@ class ActionCodec:
             return exact(self.space, tree, "action")
         poses = self._poses.read(message)
         widths = [one[GRIPPER_WIDTH] for one in message["pose_param"]] or [0.0] * len(poses)
-        widths = self._poses.in_order(widths, message["pose_names"], "pose_param")
         values: Values = {}
-        for (leaf, [pose]), width in zip(poses, widths, strict=True):
+        ordered = self._poses.in_order(widths, message["pose_names"], "pose_param")
+        for (leaf, [pose]), width in zip(poses, ordered, strict=True):
             values[leaf.path] = read_pose(leaf, pose, width)
         for lists in (self._continuous, self._discrete):
             values |= {leaf.path: read_numbers(leaf, numbers) for leaf, numbers in lists.read(message)}

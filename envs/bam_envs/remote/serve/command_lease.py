@@ -12,8 +12,6 @@ from bam_envs.core.errors import NotInCommand
 
 Change = Callable[[str | None, str | None], None]
 """Called with who was in command and who is, as others are told; None is nobody."""
-
-
 LEASE_SECONDS = 2.0
 """Usual time without a sign of life after which another client may take command [s]."""
 
@@ -25,7 +23,7 @@ def _unknown() -> float:
 class CommandLease:
     """Command of one robot or environment. The first to ask has it, until it leaves or another one may take it.
 
-    Who gives no sign of life for longer than `seconds` keeps command until another one asks. A sign of life is a
+    A client without a sign of life for longer than `seconds` keeps command until another one asks. A sign of life is a
     request, a word that says so (`renew`), or what the connection shows by itself. Safe to call from any thread.
 
     Args:
@@ -71,31 +69,34 @@ class CommandLease:
             NotInCommand: Another client has it, and gave a sign of life within `seconds`.
         """
         with self._lock:
-            if self._holder not in (None, client) and not force and not self._lapsed():
-                raise NotInCommand(self._refusal(shown or client))
+            if self._holder not in (None, client) and not force:
+                silent = min(self._clock() - self._heard, self._silence())
+                if self._running or silent <= self.seconds:
+                    raise NotInCommand(self._refusal(shown or client))
             self._heard, self._silence = self._clock(), silence
             if self._holder == client:
                 return False
             before, self._shown = self._shown, shown or client
             self._holder, self._running = client, 0
-        return self._told(before, shown or client)
+        self._notify(before, shown or client)
+        return True
 
     def renew(self, client: str) -> None:
-        """Take note that `client` was heard of, if it is in command."""
+        """Record a sign of life of `client`, if it is in command."""
         with self._lock:
             if self._holder == client:
                 self._heard = self._clock()
 
     def require(self, client: str) -> None:
-        """Take note that `client` was heard of.
+        """Record a sign of life of `client`.
 
         Raises:
             NotInCommand: It is not in command: another client is, or nobody.
         """
         with self._lock:
-            self._hear(client)
+            self._require(client)
 
-    def _hear(self, client: str) -> None:
+    def _require(self, client: str) -> None:
         if self._holder != client:
             raise NotInCommand(self._refusal(client))
         self._heard = self._clock()
@@ -104,7 +105,7 @@ class CommandLease:
     def busy(self, client: str) -> Iterator[None]:
         """While a request of `client` runs, however long it takes, it does not count as silent."""
         with self._lock:
-            self._hear(client)
+            self._require(client)
             self._running += 1
         try:
             yield
@@ -120,11 +121,8 @@ class CommandLease:
                 return False
             before, self._shown = self._shown, None
             self._holder, self._running = None, 0
-        return self._told(before, None)
-
-    def _lapsed(self) -> bool:
-        silence = min(self._clock() - self._heard, self._silence())
-        return not self._running and silence > self.seconds
+        self._notify(before, None)
+        return True
 
     def _refusal(self, client: str) -> str:
         if self._holder is None:
@@ -134,7 +132,6 @@ class CommandLease:
             f"{self.seconds:g} s."
         )
 
-    def _told(self, before: str | None, after: str | None) -> bool:
+    def _notify(self, before: str | None, after: str | None) -> None:
         for listener in self._listeners:
             listener(before, after)
-        return True

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NoAnswer  # not the builtin before Python 3.11
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 from bam_envs.core.errors import BamEnvsError, RemoteError
@@ -29,6 +30,7 @@ from bam_envs.remote.gymapi.versions import JUNE_22, Version, version_named, ver
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.transport import spec_to_json
 from bam_envs.ros.freshness import FreshnessCheck
+from bam_envs.ros.messages import write_stamp
 from bam_envs.rosbridge.bus import Bus, Caller, Message
 from bam_envs.rosbridge.sessions import Sessions
 from bam_envs.rosbridge.string_rpc import RecentAnswers, StringRpcService
@@ -88,7 +90,9 @@ class GymApiService:
         self._connections: OrderedDict[str, str] = OrderedDict()
         self._leaving = ThreadPoolExecutor(1, "bam-gymapi-leaving")
         self._sessions = Sessions()
-        self._topics = StringRpcService(bus, base_name(namespace), self._handle_published, self._sessions)
+        # Everybody can read what is published: the tag in it proves nothing.
+        published = partial(self.handle, published=True)
+        self._topics = StringRpcService(bus, base_name(namespace), published, self._sessions)
 
     def start(self) -> GymApiService:
         """Offer the service and the topics; itself."""
@@ -104,10 +108,6 @@ class GymApiService:
         """Answer on the topics no more. The service ends with its bus."""
         self._topics.close()
         self._leaving.shutdown()
-
-    def _handle_published(self, message: Message, caller: Caller) -> dict[str, Any]:
-        """As `handle`, for what everybody could read: the tag in it proves nothing."""
-        return self.handle(message, caller, published=True)
 
     def handle(self, message: Message, caller: Caller, *, published: bool = False) -> dict[str, Any]:
         """The response to a request; never raises: what goes wrong is the text of a failure."""
@@ -148,7 +148,7 @@ class GymApiService:
         client = self._client(request, caller, published)
         if request.type is RequestType.STEP:
             action = self._codec.read_actions(request.actions)
-            if request.tag is None and self.env.has_ended(client):
+            if request.tag is None and self.env.has_ended(client):  # clients of racks do not call reset themselves
                 begun = self.env.reset(client, caller=caller, shown=_shown(request, caller))
                 return self._codec.write_result(begun, self._stamp(), version, executed=False)
             stepped = self.env.step(client, action, deadline=deadline)
@@ -171,7 +171,7 @@ class GymApiService:
         return [{**version.no_images, "info": write_info({}, {"spec": spec_to_json(self._spec)})}]
 
     def _stamp(self) -> dict[str, int]:
-        stamp: Callable[[float], dict[str, int]] = getattr(self.bus, "stamp", _ros2_stamp)
+        stamp: Callable[[float], dict[str, int]] = getattr(self.bus, "stamp", write_stamp)
         return stamp(self._clock())
 
     def _client(self, request: GymRequest, caller: Caller, published: bool) -> str:
@@ -215,8 +215,3 @@ def _name(request: GymRequest) -> str:
 def _shown(request: GymRequest, caller: Caller) -> str:
     """What others are told of who asks."""
     return f"{_name(request)} ({caller.address})" if caller.address else _name(request)
-
-
-def _ros2_stamp(now: float) -> dict[str, int]:
-    seconds, nanoseconds = divmod(round(now * 1e9), 1_000_000_000)
-    return {"sec": seconds, "nanosec": nanoseconds}

@@ -37,11 +37,13 @@ class LocalTransport:
 
     def reset(self, seed: Seed = None, options: Info | None = None) -> tuple[Any, Any]:
         """Begin an episode; (observation, info)."""
-        return self._asked(lambda: self.server.reset(self.client, seed, options))
+        begun: tuple[Any, Any] = self._asked(lambda: self.server.reset(self.client, seed, options))
+        return begun
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
         """(observation, reward, terminated, truncated, info)."""
-        return self._asked(lambda: self.server.step(self.client, action))
+        stepped: tuple[Any, Any, Any, Any, Any] = self._asked(lambda: self.server.step(self.client, action))
+        return stepped
 
     def close(self) -> None:
         """Release the environment; one that no server shares is closed."""

@@ -119,8 +119,8 @@ class ServedEnvironment:
             )
             self.endpoints.append(f"{name} on {node}, {pace}: {offered}")
         if options.tcp is not None:
-            tokens = {"token": self._token, "operator_token": self._operator_token}
-            self.tcp = TcpServer(server, options.bind, options.tcp, **tokens)
+            token, operator = self._token, self._operator_token
+            self.tcp = TcpServer(server, options.bind, options.tcp, token=token, operator_token=operator)
             started.callback(self.tcp.close)
             self.tcp.start()
             self.endpoints.append(f"{name} on {self.tcp.url}, the environment alone")
