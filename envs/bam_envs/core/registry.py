@@ -167,6 +167,8 @@ _ENTRIES = (
     ),
 )
 ENVIRONMENTS: dict[str, EnvEntry] = {entry.id: entry for entry in _ENTRIES}
+OTHER_NAMES: dict[str, str] = {theirs.id: theirs.variant or theirs.env_id for theirs in ROBO_GYM.values()}
+"""What a plug-in calls our environments, such as robo-gym: to each name our id, or one name for a variant of ours."""
 
 
 def register() -> None:

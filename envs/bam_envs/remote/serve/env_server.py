@@ -20,13 +20,13 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import iterate
 
 from bam_envs.core.errors import InvalidValue, NotInCommand, RemoteError, ResetNeeded
+from bam_envs.core.registry import OTHER_NAMES
 from bam_envs.core.spaces import space_to_json
 from bam_envs.core.timing import Pacer
 from bam_envs.remote.batches import join_observations, split_infos
 from bam_envs.remote.serve.command_lease import LEASE_SECONDS, CommandLease
 from bam_envs.remote.transport import EnvSpecMessage, Info, Seed
 from bam_envs.remote.values import exact, plain_info
-from bam_envs.robo_gym.table import ROBO_GYM
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
 
 Env = gym.Env[Any, Any] | VectorEnv[Any, Any, Any]
@@ -88,17 +88,14 @@ def same_name(one: str, other: str) -> bool:
 
 
 def _bare(name: str) -> str:
+    others = {_spelt(other): _spelt(ours) for other, ours in OTHER_NAMES.items()}
     spelt = _spelt(name)
-    return _ROBO_GYM.get(spelt, spelt)
+    return others.get(spelt, spelt)
 
 
 def _spelt(name: str) -> str:
     last = re.split("[/:]", name)[-1]
     return re.sub("[^a-z0-9]", "", re.sub(r"-v\d+$", "", last).lower())
-
-
-_ROBO_GYM = {_spelt(theirs.id): _spelt(theirs.variant or theirs.env_id) for theirs in ROBO_GYM.values()}
-"""robo-gym's names -> ours of the same environment, or one name of what is a variant of it."""
 
 
 class EnvServer:
