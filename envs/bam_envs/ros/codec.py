@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.core.robot import RobotSpec, RobotState
+from bam_envs.core.validation import Positive, read_table
+from bam_envs.core.wording import brief
 from bam_envs.ros.command_messages import read_command, write_command
 from bam_envs.ros.freshness import Tag, read_tag
 from bam_envs.ros.messages import (
@@ -28,7 +30,6 @@ from bam_envs.ros.messages import (
     require_frame,
     require_message,
     require_names,
-    shown,
     tag_text,
     usual_numbers,
     value_at,
@@ -59,7 +60,7 @@ class RobotInfo:
     """Whether nothing real moves."""
     lockstep: bool = False
     """Whether its time goes on only with commands, one period each."""
-    period: float | None = None
+    period: Positive | None = None
     """Time between two commands [s], if it says."""
     text: str = ""
     """One line for people."""
@@ -70,36 +71,19 @@ class RobotInfo:
 
 
 def read_info(text: object, where: str) -> RobotInfo:
-    """The `RobotInfo` that `text` is.
+    """The `RobotInfo` that `text` is; keys of a newer version are left out.
 
     Raises:
-        ProtocolError: It is something else.
+        ProtocolError: It is something else. Any text is true in Python, and what is simulated may be moved unasked.
     """
     try:
         data = json.loads(text) if isinstance(text, str) else None
     except ValueError:
         data = None
     if not isinstance(data, dict) or not isinstance(data.get("name"), str):
-        raise ProtocolError(f"{where}: it must say what robot it is, and says {shown(text)}.")
+        raise ProtocolError(f"{where}: it must say what robot it is, and says {brief(text)}.")
     known = {key: data[key] for key in RobotInfo.__dataclass_fields__ if key in data}
-    if known.get("period") is not None:
-        known["period"] = _period(known["period"], f"{where}: period")
-    # Any text is true in Python, and what is simulated may be moved unasked.
-    for key, kind, expected in (
-        ("simulated", bool, "true or false"),
-        ("lockstep", bool, "true or false"),
-        ("text", str, "a text"),
-    ):
-        if not isinstance(known.get(key, kind()), kind):
-            raise ProtocolError(f"{where}: {key} must be {expected}, not {shown(known[key])}.")
-    return RobotInfo(**known)
-
-
-def _period(value: object, where: str) -> float:
-    period = number(value, where)
-    if not period > 0:
-        raise ProtocolError(f"{where} must be above 0 s, not {period:g}.")
-    return period
+    return read_table(RobotInfo, known, where, ProtocolError)
 
 
 def decode_state(profile: RobotProfile, messages: Mapping[str, object]) -> dict[str, Array]:
@@ -155,7 +139,7 @@ def _by_name(source: Source, message: Message, where: str) -> Array:
     if isinstance(values, (list, tuple)) and not values:
         raise ProtocolError(f"{where}: {source.field} is empty, and {source.signal} is read from it.")
     if not isinstance(values, (list, tuple, np.ndarray)) or len(values) != len(found):
-        length = f"{len(values)} numbers" if isinstance(values, (list, tuple, np.ndarray)) else shown(values)
+        length = f"{len(values)} numbers" if isinstance(values, (list, tuple, np.ndarray)) else brief(values)
         raise ProtocolError(f"{where}: {source.field} must have {len(found)} numbers, one for each name, not {length}.")
     place = {name: values[index] for index, name in enumerate(found)}
     return np.array(

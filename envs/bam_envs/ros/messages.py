@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import ProtocolError
+from bam_envs.core.wording import brief
 from bam_envs.ros.interfaces import variants
 
 Array = NDArray[np.float64]
@@ -44,7 +45,7 @@ def bare_type(kind: str) -> str:
 def require_message(message: object, where: str) -> Message:
     """`message`, which must be an object with fields."""
     if not isinstance(message, _OBJECT):
-        raise ProtocolError(f"{where}: a message must be an object with fields, not {shown(message)}.")
+        raise ProtocolError(f"{where}: a message must be an object with fields, not {brief(message)}.")
     return message
 
 
@@ -54,7 +55,7 @@ def value_at(message: Message, path: str, where: str) -> Any:
     value: Any = _body(message, steps[0])
     for name in steps:
         if not isinstance(value, _OBJECT) or name not in value:
-            found = ", ".join(map(str, value)) if isinstance(value, _OBJECT) else shown(value)
+            found = ", ".join(map(str, value)) if isinstance(value, _OBJECT) else brief(value)
             raise ProtocolError(f"{where}: the field {path} is missing; found: {found}.")
         value = value[name]
     return value
@@ -100,15 +101,7 @@ def number(value: object, where: str) -> float:
             found = math.inf
         if math.isfinite(found):
             return found
-    raise ProtocolError(f"{where} must be a finite number, not {shown(value)}.")
-
-
-def shown(value: object) -> str:
-    """`value` as a message writes it, shortened."""
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    raise ProtocolError(f"{where} must be a finite number, not {brief(value)}.")
 
 
 def usual_numbers(value: object) -> Array | None:
@@ -129,7 +122,7 @@ def numbers(value: object, where: str, *, missing: float | None = None) -> Array
     if isinstance(value, np.ndarray) and value.ndim == 1:
         value = value.tolist()
     if not isinstance(value, Sequence) or isinstance(value, (str, bytes, bytearray)):
-        raise ProtocolError(f"{where} must be a list of numbers, not {shown(value)}.")
+        raise ProtocolError(f"{where} must be a list of numbers, not {brief(value)}.")
     if missing is not None:
         value = [missing if _is_missing(one) else one for one in value]
     if not set(map(type, value)) <= {int, float}:
@@ -152,7 +145,7 @@ def names_of(message: Message, field: str, where: str) -> list[str]:
     """The list of names in `field`, each once."""
     names = value_at(message, field, where)
     if not isinstance(names, Sequence) or isinstance(names, str) or not all(isinstance(name, str) for name in names):
-        raise ProtocolError(f"{where}: {field} must be a list of names, not {shown(names)}.")
+        raise ProtocolError(f"{where}: {field} must be a list of names, not {brief(names)}.")
     for name in names if len(set(names)) < len(names) else ():
         if names.count(name) > 1:
             raise ProtocolError(f"{where}: {name} comes twice in {field}.")
@@ -183,7 +176,7 @@ def require_frame(frame: str, message: Message, where: str) -> None:
     if found == frame or (isinstance(found, str) and found.lstrip("/") == frame):
         return
     raise ProtocolError(
-        f"{where}: header.frame_id must be {frame!r}, not {shown(found)}: a pose in another frame is another place "
+        f"{where}: header.frame_id must be {frame!r}, not {brief(found)}: a pose in another frame is another place "
         f"(a UR's base is its base_link turned by 180 degrees about z). Publish it in {frame}; if that frame has "
         f"another name there, give the name under [frames] of the profile."
     )
@@ -215,7 +208,7 @@ def read_stamp(message: Message, where: str) -> float | None:
         require_message(stamp, f"{where}: header.stamp")
     seconds, nano = _either(stamp, "sec", "secs", where), _either(stamp, "nanosec", "nsecs", where)
     if seconds < 0 or not 0 <= nano < _NANO:
-        raise ProtocolError(f"{where}: header.stamp must be seconds and nanoseconds, not {shown(stamp)}.")
+        raise ProtocolError(f"{where}: header.stamp must be seconds and nanoseconds, not {brief(stamp)}.")
     return seconds + nano / _NANO or None
 
 

@@ -458,11 +458,11 @@ BAD_STATES = [
     ({"name": [*JOINTS, "finger"], "position": [0.0] * 7}, "/joint_states: finger not expected; expected: "),
     (
         {"position": [None] + [0.0] * 5},
-        "/joint_states: position of shoulder_pan_joint must be a finite number, not null.",
+        "/joint_states: position of shoulder_pan_joint must be a finite number, not None.",
     ),
     (
         {"velocity": [0.0] * 5 + [float("nan")]},
-        "/joint_states: velocity of wrist_3_joint must be a finite number, not null.",
+        "/joint_states: velocity of wrist_3_joint must be a finite number, not None.",
     ),
     ({"position": ["0"] * 6}, "/joint_states: position of shoulder_pan_joint must be a finite number, not '0'."),
     ({"header": {"stamp": {"sec": "now", "nanosec": 0}}}, "/joint_states: header.stamp.sec must be a finite number"),
@@ -476,7 +476,7 @@ def test_what_a_robot_must_not_say(lax, robot_on, connect, changes, message):
     _, gate = connect(server.url)
     scripted.mangle = lambda topic, good: {**good, **changes} if topic == "/joint_states" else good
     text = raised(ProtocolError, lambda: [gate.step(gate.state.command) for _ in range(10)])
-    assert text.replace("not nan.", "not null.").startswith(message)
+    assert text.replace("not nan.", "not None.").startswith(message)
 
 
 def test_a_robot_that_never_made_sense(lax, robot_on):

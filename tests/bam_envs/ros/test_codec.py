@@ -131,13 +131,13 @@ def test_missing_and_extra_joints():
 @pytest.mark.parametrize(
     ("bad", "found"),
     [
-        (None, "null"),
+        (None, "None"),
         (math.nan, "nan"),
         (-math.inf, "-inf"),
         ("1.0", "'1.0'"),
-        (True, "true"),
+        (True, "True"),
         ([1.0], "[1.0]"),
-        (10**400, f"{10**400!r}"[:57] + "..."),
+        (10**400, "100000000000000000...0000000000000000000"),
     ],
 )
 def test_what_is_not_a_finite_number(bad, found):
@@ -152,7 +152,7 @@ def test_what_is_not_a_finite_number(bad, found):
     [
         ({"position": [0.0] * 5}, "position must have 6 numbers, one for each name, not 5 numbers."),
         ({"position": []}, "position is empty, and joint_position is read from it."),
-        ({"position": None}, "position must have 6 numbers, one for each name, not null."),
+        ({"position": None}, "position must have 6 numbers, one for each name, not None."),
         ({"position": "123456"}, "position must have 6 numbers, one for each name, not '123456'."),
         ({"name": "abc"}, "name must be a list of names, not 'abc'."),
         ({"name": [1]}, "name must be a list of names, not [1]."),
@@ -321,14 +321,13 @@ def refused_command(topic, message):
     ("message", "text"),
     [
         ({"data": [0.0] * 5}, f"data must have 6 ({', '.join(JOINTS)}) numbers, not 5."),
-        ({"data": [0.0, None, 0, 0, 0, 0]}, "data[1] must be a finite number, not null."),
+        ({"data": [0.0, None, 0, 0, 0, 0]}, "data[1] must be a finite number, not None."),
         ({"data": [0.0, 0, 0, 0, 0, math.nan]}, "data[5] must be a finite number, not nan."),
         ({"data": ["0.0", 0, 0, 0, 0, 0]}, "data[0] must be a finite number, not '0.0'."),
-        ({"data": [True, 0, 0, 0, 0, 0]}, "data[0] must be a finite number, not true."),
-        ({"data": [10**400, 0, 0, 0, 0, 0]}, f"data[0] must be a finite number, not {'1' + '0' * 56}...."),
+        ({"data": [True, 0, 0, 0, 0, 0]}, "data[0] must be a finite number, not True."),
         ({"data": 0.0}, "data must be a list of numbers, not 0.0."),
         ({}, "the field data is missing; found: ."),
-        (None, "a message must be an object with fields, not null."),
+        (None, "a message must be an object with fields, not None."),
     ],
 )
 def test_commands_that_are_refused(message, text):
@@ -401,13 +400,13 @@ def test_info():
 @pytest.mark.parametrize(
     ("field", "value", "text"),
     [
-        ("simulated", '"false"', "simulated must be true or false, not 'false'."),
-        ("simulated", "1", "simulated must be true or false, not 1."),
-        ("simulated", "null", "simulated must be true or false, not null."),
-        ("lockstep", '"no"', "lockstep must be true or false, not 'no'."),
-        ("period", '"0.05"', "period must be a finite number, not '0.05'."),
-        ("period", "0", "period must be above 0 s, not 0."),
-        ("text", "[1]", "text must be a text, not [1]."),
+        ("simulated", '"false"', "simulated: expected true or false, found 'false'"),
+        ("simulated", "1", "simulated: expected true or false, found 1"),
+        ("simulated", "null", "simulated: expected true or false, found None"),
+        ("lockstep", '"no"', "lockstep: expected true or false, found 'no'"),
+        ("period", '"0.05"', "period: expected a number above 0, found '0.05'"),
+        ("period", "0", "period: expected a number above 0, found 0"),
+        ("text", "[1]", "text: expected text, found [1]"),
     ],
 )
 def test_info_of_the_wrong_kind_is_not_believed(field, value, text):
@@ -436,7 +435,7 @@ def test_a_pose_in_the_frame_of_the_profile(frame):
     assert signals["object_position"].tolist() == [0.4, -0.2, 0.1]
 
 
-@pytest.mark.parametrize(("frame", "found"), [("base", "'base'"), ("", "''"), (None, "null"), (7, "7")])
+@pytest.mark.parametrize(("frame", "found"), [("base", "'base'"), ("", "''"), (None, "None"), (7, "7")])
 @pytest.mark.parametrize("signal", ["object_position", "object_quaternion"])
 def test_a_pose_in_another_frame_or_in_none_is_refused(signal, frame, found):
     with pytest.raises(ProtocolError) as caught:

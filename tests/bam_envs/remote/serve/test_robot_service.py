@@ -228,7 +228,7 @@ def test_in_real_time_states_come_with_or_without_commands(serve, bus):
 def refused():
     return [
         ([1.0, 2.0], f"ProtocolError: {ARM}: data must have 6 (", "not 2."),
-        ([None] + [0.0] * 5, f"ProtocolError: {ARM}: data[0] must be a finite number, not null.", ""),
+        ([None] + [0.0] * 5, f"ProtocolError: {ARM}: data[0] must be a finite number, not None.", ""),
         ([float("nan")] + [0.0] * 5, f"ProtocolError: {ARM}: data[0] must be a finite number, not nan.", ""),
         (["1"] + [0.0] * 5, f"ProtocolError: {ARM}: data[0] must be a finite number, not '1'.", ""),
         (
