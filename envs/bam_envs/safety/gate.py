@@ -606,9 +606,8 @@ class _StartPose:
         return self.is_open(measured) and not self.joints_off(measured)
 
     def is_reached(self, measured: Array, sent: Array) -> bool:
-        """Whether all joints are measured there, and were told to be."""
-        told = bool((sent == self.command)[self._joints].all())
-        return told and not self.joints_off(measured)
+        """Whether all joints are measured there, and were sent there."""
+        return bool((sent == self.command)[self._joints].all()) and not self.joints_off(measured)
 
     def failure(self, measured: Array, why: str | None = None) -> StartNotReached:
         """The error that names the joints, and `why` the robot cannot move, if it says so."""

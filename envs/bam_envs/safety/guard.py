@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from types import MappingProxyType
 from typing import Any
 
@@ -17,89 +17,67 @@ from bam_envs.core.robot import RobotSpec, RobotState, SignalSpec
 Array = NDArray[np.float64]
 ToolPosition = Callable[[Array], Array]
 """Forward kinematics: joints (n, k) [rad] to tool positions (n, 3) [m]."""
-_FINITE = ("position_margin", "reset_speed", "ramp_time", "reset_tolerance", "reset_timeout", "follow_tolerance")
-_FROM_SPEC = ("max_age", "lag")
-BOUNDS: Mapping[str, tuple[float, float, str]] = MappingProxyType(
-    {
-        "position_margin": (0.01, 1.0, "rad"),
-        "joint_speed": (0.01, math.pi, "rad/s"),
-        "joint_acceleration": (0.1, 20.0, "rad/s^2"),
-        "tool_speed": (0.005, 1.0, "m/s"),
-        "base_speed": (0.01, 1.5, "m/s"),
-        "turn_speed": (0.01, 2.0, "rad/s"),
-        "base_acceleration": (0.1, 5.0, "m/s^2"),
-        "turn_acceleration": (0.1, 5.0, "rad/s^2"),
-        "max_age": (0.01, 1.0, "s"),
-        "bad_ticks": (1.0, 10.0, "ticks"),
-        "hold_time": (0.05, 2.0, "s"),
-        "max_pause": (0.1, 5.0, "s"),
-        "answer_time": (0.05, 2.0, "s"),
-        "lag": (0.001, 0.5, "s"),
-        "follow_tolerance": (0.001, 0.05, "rad"),
-        "reset_speed": (0.01, 1.0, "rad/s"),
-        "ramp_time": (0.5, 30.0, "s"),
-        "reset_tolerance": (0.001, 0.1, "rad"),
-        "reset_timeout": (0.1, 300.0, "s"),
-    }
-)
-"""Minimum and maximum of each limit of a live robot, with its unit. They hold whoever sets the limit: no typing error
-opens a guard."""
 LONGEST_PERIOD = 1.0
 """Longest time between two commands to a live robot [s]: a command may go as far as its limits allow in that time."""
+
+
+def _limit(default: float | None, least: float, most: float, unit: str, *, finite: bool = False) -> Any:
+    """A limit, with the minimum and maximum that a live robot may have; `finite` if it cannot be switched off."""
+    return field(default=default, metadata={"bounds": (least, most, unit), "finite": finite})
 
 
 @dataclass(frozen=True)
 class Limits:
     """How far the guards let a robot go; infinity switches a speed, an acceleration, an age or a count off."""
 
-    position_margin: float = 0.1
+    position_margin: float = _limit(0.1, 0.01, 1.0, "rad", finite=True)
     """Distance of the joints from the ends of their travel [rad]."""
-    joint_speed: float = 1.0
+    joint_speed: float = _limit(1.0, 0.01, math.pi, "rad/s")
     """Maximum speed of a joint [rad/s]."""
-    joint_acceleration: float = 10.0
+    joint_acceleration: float = _limit(10.0, 0.1, 20.0, "rad/s^2")
     """Maximum acceleration of a joint [rad/s^2]."""
-    tool_speed: float = 0.25
+    tool_speed: float = _limit(0.25, 0.005, 1.0, "m/s")
     """Maximum speed of the tool [m/s]."""
-    base_speed: float = 0.5
+    base_speed: float = _limit(0.5, 0.01, 1.5, "m/s")
     """Maximum speed of a base, forwards or backwards [m/s]."""
-    turn_speed: float = 0.7
+    turn_speed: float = _limit(0.7, 0.01, 2.0, "rad/s")
     """Maximum turning speed of a base [rad/s]."""
-    base_acceleration: float = 2.5
+    base_acceleration: float = _limit(2.5, 0.1, 5.0, "m/s^2")
     """Maximum acceleration of a base [m/s^2]."""
-    turn_acceleration: float = 3.2
+    turn_acceleration: float = _limit(3.2, 0.1, 5.0, "rad/s^2")
     """Maximum turning acceleration of a base [rad/s^2]."""
-    max_age: float | None = None
+    max_age: float | None = _limit(None, 0.01, 1.0, "s")
     """Age of the oldest state that is acted on [s]; None for 0.1 of an arm and 0.5 of a base."""
-    bad_ticks: float = 3
+    bad_ticks: float = _limit(3, 1.0, 10.0, "ticks")
     """This many commands in a row that are not finite stop the robot."""
-    hold_time: float = 0.5
+    hold_time: float = _limit(0.5, 0.05, 2.0, "s")
     """How long the robot is held without a fresh state, or without an answer, before it is stopped [s]."""
-    max_pause: float = 1.0
+    max_pause: float = _limit(1.0, 0.1, 5.0, "s")
     """Longest time between two commands after which the robot is not stopped [s]."""
-    answer_time: float = 0.3
+    answer_time: float = _limit(0.3, 0.05, 2.0, "s")
     """Longest time in which a robot that answers commands has to answer one [s]."""
-    lag: float | None = None
+    lag: float | None = _limit(None, 0.001, 0.5, "s")
     """How far a robot that follows is behind its commands [s]; None for the lag in its spec."""
-    follow_tolerance: float = 0.005
+    follow_tolerance: float = _limit(0.005, 0.001, 0.05, "rad", finite=True)
     """How far a joint at rest may be from its command, where `joint_speed` times the period is less [rad]."""
-    reset_speed: float = 0.25
+    reset_speed: float = _limit(0.25, 0.01, 1.0, "rad/s", finite=True)
     """Maximum joint speed on the way to the start pose, and until a distant first command is reached [rad/s]."""
-    ramp_time: float = 3.0
+    ramp_time: float = _limit(3.0, 0.5, 30.0, "s", finite=True)
     """Longest time for which a distant first command is approached slowly [s]."""
-    reset_tolerance: float = 0.02
+    reset_tolerance: float = _limit(0.02, 0.001, 0.1, "rad", finite=True)
     """How far a joint may be from the start pose [rad]."""
-    reset_timeout: float = 30.0
+    reset_timeout: float = _limit(30.0, 0.1, 300.0, "s", finite=True)
     """Longest time to reach the start pose [s]."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if value is None and field.name in _FROM_SPEC:
+        for one in fields(self):
+            value = getattr(self, one.name)
+            if value is None and one.default is None:
                 continue
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
-                raise InvalidValue(f"The limit {field.name} must be above 0, not {value!r}.")
-            if value == math.inf and field.name in _FINITE:
-                raise InvalidValue(f"The limit {field.name} must be finite.")
+                raise InvalidValue(f"The limit {one.name} must be above 0, not {value!r}.")
+            if value == math.inf and one.metadata["finite"]:
+                raise InvalidValue(f"The limit {one.name} must be finite.")
 
     @classmethod
     def of(cls, values: Mapping[str, float]) -> Limits:
@@ -109,7 +87,7 @@ class Limits:
             UnknownName: There is no such limit.
             InvalidValue: One is not above 0, or outside `BOUNDS`.
         """
-        names = [field.name for field in fields(cls)]
+        names = [one.name for one in fields(cls)]
         for name in values:
             if name not in names:
                 raise UnknownName("limit", name, names)
@@ -129,6 +107,13 @@ class Limits:
                 raise InvalidValue(
                     f"The limit {name} of a live robot must be {least:g} to {most:g} {unit}, not {value:g}."
                 )
+
+
+BOUNDS: Mapping[str, tuple[float, float, str]] = MappingProxyType(
+    {one.name: one.metadata["bounds"] for one in fields(Limits)}
+)
+"""Minimum and maximum of each limit of a live robot, with its unit. They hold whoever sets the limit: no typing error
+opens a guard."""
 
 
 def require_bounded(limits: Limits, spec: RobotSpec) -> None:

@@ -32,7 +32,8 @@ def callers(name):
     """Files of both packages that call `name`, whatever it is reached through."""
     found = []
     for path in SOURCES:
-        calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+        text = path.read_text()
+        calls = [node for node in ast.walk(ast.parse(text if name in text else "")) if isinstance(node, ast.Call)]
         names = [getattr(call.func, "id", None) or getattr(call.func, "attr", None) for call in calls]
         found += [path.name] * (name in names)
     return found
