@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import gymnasium as gym
@@ -88,9 +89,13 @@ def same_name(one: str, other: str) -> bool:
 
 
 def _bare(name: str) -> str:
-    others = {_spelt(other): _spelt(ours) for other, ours in OTHER_NAMES.items()}
     spelt = _spelt(name)
-    return others.get(spelt, spelt)
+    return _other_names().get(spelt, spelt)
+
+
+@cache
+def _other_names() -> dict[str, str]:
+    return {_spelt(other): _spelt(ours) for other, ours in OTHER_NAMES.items()}
 
 
 def _spelt(name: str) -> str:

@@ -1,11 +1,11 @@
-"""A served robot's topics: its states out, commands in, from one client at a time; halt, scene, and who it is.
+"""The topics of a served robot: states out, commands in from one client at a time; halt, scene, and its description.
 
-Commands are checked where they arrive, in the thread of the network, and what is refused is told to who sent it. What
-passes goes into one slot; the clock's thread takes it from there, moves the robot and publishes. In lockstep a robot
-that is quick enough is moved where its command arrives: the way to another thread and back costs more than its step.
+Commands are checked in the thread of the network, where they arrive, and their sender is told what is refused. An
+accepted command goes into one slot; the clock's thread takes it from there, moves the robot and publishes. In lockstep
+a quick robot is moved where its command arrives: the way to another thread and back costs more than its step.
 
-The file is long because everything that moves the robot, or keeps it from moving, is in it: that a halt wins over each
-of them is to be seen here.
+Everything that moves the robot, or keeps it from moving, is in this file, so that one can see that a halt wins over
+each of them.
 """
 
 from __future__ import annotations
@@ -113,8 +113,11 @@ class RobotService:
         self._robot, self._profile, self._bus, self._lease = robot, profile, bus, lease
         self._namespace, self._clock = namespace, clock
         lockstep = not robot.realtime
-        self.info = RobotInfo(profile.name, simulated, lockstep, robot.spec.period, _text(robot, profile))
-        """What it says of itself."""
+        text = f"{profile.name}, served in real time; it rests {robot.command_timeout:g} s after the last command"
+        if lockstep:
+            text = f"{profile.name}, served in lockstep: its time goes on with commands, {robot.spec.period:g} s each"
+        self.info = RobotInfo(profile.name, simulated, lockstep, robot.spec.period, text)
+        """Its description for clients."""
         self._slot = CommandSlot()
         self._sessions = Sessions(lambda name: lease.holder == Caller("", session=name).client)
         self._completing = {way[-1].topic for way in profile.commands.values()}
@@ -127,9 +130,8 @@ class RobotService:
         self._scene = (
             StringRpcService(bus, namespace + SCENE_TOPIC, self._set_scene, self._sessions) if simulated else None
         )
-        self.clock = Ticker(
-            self._tick_lockstep if lockstep else self._tick, IDLE_PERIOD if lockstep else robot.tick_period
-        )
+        tick, period = (self._tick_lockstep, IDLE_PERIOD) if lockstep else (self._tick, robot.tick_period)
+        self.clock = Ticker(tick, period)
         """Moves the robot and publishes."""
 
     def start(self) -> None:
@@ -166,7 +168,8 @@ class RobotService:
             places, values, tag, content = decode_command(self._profile, self._robot.spec, topic, message)
             told = values.tolist()
             self._require_within(topic, places, told)
-            self._require_sound()
+            if self._robot.fault is not None:
+                raise RemoteError(f"{self._profile.name} failed, and needs a reset: {self._robot.fault}")
             if tag is not None:
                 self._sessions.require(tag, topic, content, caller)
                 caller = replace(caller, session=tag.session)
@@ -179,7 +182,7 @@ class RobotService:
         return listen
 
     def _on_lease(self, message: Message, caller: Caller) -> None:
-        """Who drives is there, or leaves: over any of its connections, and whoever does not drive says nothing."""
+        """The client in command says that it is there, or leaves, over any of its connections."""
         word, _, text = str(message.get("data")).partition(" ")
         tag = read_tag(text)
         if tag is None or word not in (RENEW, LEAVE):
@@ -193,17 +196,13 @@ class RobotService:
             self._lease.release(client)
 
     def _require_within(self, topic: str, places: list[int], values: list[float]) -> None:
-        """Every number is one that the robot can be told at all; how fast it goes there is its own affair."""
+        """Refuse numbers outside the range of the command; how fast the robot goes there is its own affair."""
         command = self._robot.spec.command
         for place, value in zip(places, values, strict=True):
             low, high = command.low[place], command.high[place]
             if not low - _ROUNDING <= value <= high + _ROUNDING:
                 label, unit = command.labels[place], command.units[place]
                 raise ProtocolError(f"{topic}: {label} must be {low:g} to {high:g} {unit}, not {value:g} {unit}.")
-
-    def _require_sound(self) -> None:
-        if self._robot.fault is not None:
-            raise RemoteError(f"{self._profile.name} failed, and needs a reset: {self._robot.fault}")
 
     def _on_halt(self, message: Message, caller: Caller) -> None:
         """Anybody may halt; it waits for nothing but the part of a period that is being computed.
@@ -214,7 +213,7 @@ class RobotService:
             self.clock.wake()
 
     def _rest(self) -> Order:
-        """What was to be executed next, and is not."""
+        """Halt; the order that was to be executed next, and is not."""
         with self._moving:
             order = self._slot.take()
             self._robot.halt()
@@ -270,17 +269,14 @@ class RobotService:
         with self._moving:
             order = self._slot.take(complete=True)
             if order.values and order.client == self._lease.holder:
-                self._execute(order)
+                began = time.perf_counter()
+                try:
+                    self._robot.step(self._merged(order))
+                    self._answered = order.tag
+                except RobotFault as fault:
+                    _log.warning("%s: %s", self._profile.name, fault)
+                self._took = time.perf_counter() - began
         self._publish()
-
-    def _execute(self, order: Order) -> None:
-        began = time.perf_counter()
-        try:
-            self._robot.step(self._merged(order))
-            self._answered = order.tag
-        except RobotFault as fault:
-            _log.warning("%s: %s", self._profile.name, fault)
-        self._took = time.perf_counter() - began
 
     def _merged(self, order: Order) -> Any:
         command = self._robot.target()
@@ -303,12 +299,6 @@ class RobotService:
             if self._connected:
                 _log.warning("%s: %s", self._profile.name, error)
             self._connected = False
-
-
-def _text(robot: ServedRobot, profile: RobotProfile) -> str:
-    if robot.realtime:
-        return f"{profile.name}, served in real time; it rests {robot.command_timeout:g} s after the last command"
-    return f"{profile.name}, served in lockstep: its time goes on with commands, {robot.spec.period:g} s each"
 
 
 def _pose(value: object) -> Any:

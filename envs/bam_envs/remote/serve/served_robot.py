@@ -1,7 +1,8 @@
 """One robot that an environment, topics and a clock use together: how time passes for it, and its command timeout.
 
-Two ways time passes. Fast: a period passes at once with each step, and none between steps. In real time: a clock calls
-`ServedRobot.tick`, a command is executed over the period that follows it, and without fresh commands the robot rests.
+Time passes in one of two modes. Fast: a period passes at once with each step, and none between steps. In real time: a
+clock calls `ServedRobot.tick`, a command is executed over the period that follows it, and without fresh commands the
+robot rests.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ class ServedRobot:
     """A Robot around a Robot, for several threads.
 
     Args:
-        robot: What moves.
-        command_timeout: For how long a command means something [s].
-        zero_rests: Whether a command of zeros is rest, as for speeds; else it rests where it is.
+        robot: The robot that moves.
+        command_timeout: For how long a command is executed at most [s].
+        zero_rests: Whether a command of zeros is rest, as for speeds; else the robot rests where it is.
         realtime: How time passes; see the module.
         now: Monotonic clock [s].
     """
@@ -65,7 +66,7 @@ class ServedRobot:
         self._orders = self._begun = self._done = 0  # commands given, begun, executed over a whole period
 
     def __getattr__(self, name: str) -> Any:
-        """Whatever else this robot can: pictures, `state_dict`."""
+        """Whatever else the robot has, such as `render` and `state_dict`."""
         if name.startswith("_"):
             raise AttributeError(name)
         value = getattr(self._robot, name)
@@ -102,14 +103,16 @@ class ServedRobot:
                 return self._step_now(command)
             self.follow(command)
             self._expires, order = math.inf, self._orders
-            if not self._changed.wait_for(lambda: self._over(order), _LONGEST_WAIT):
+            if not self._changed.wait_for(
+                lambda: self._done >= order or self.fault is not None or self.state is None, _LONGEST_WAIT
+            ):
                 raise RemoteError(f"The clock of {self.spec.name} has stood still for {_LONGEST_WAIT:g} s.")
             self._expires = self._now() + self.command_timeout
-            return self._newest()
-
-    def _over(self, order: int) -> bool:
-        """Whether there is nothing to wait for any more."""
-        return self._done >= order or self.fault is not None or self.state is None
+            if self.fault is not None:
+                raise self.fault
+            if self.state is None:
+                raise ResetNeeded("The served robot was closed.")
+            return self.state
 
     def _step_now(self, command: Array) -> RobotState:
         try:
@@ -118,13 +121,6 @@ class ServedRobot:
             self.fault = fault
             raise
         self._target, self._resting = command, False
-        return self.state
-
-    def _newest(self) -> RobotState:
-        if self.fault is not None:
-            raise self.fault
-        if self.state is None:
-            raise ResetNeeded("The served robot was closed.")
         return self.state
 
     def follow(self, command: Array, *, at_once: bool = True) -> None:
@@ -155,18 +151,15 @@ class ServedRobot:
             if not self._resting and self._now() > self._expires:
                 self.halt()
             try:
-                self.state = self._next_part()
+                if not self._left:
+                    self._begin_period()
+                self._left -= 1
+                self.state = next(self._parts)
             except RobotFault as fault:
                 self.fault, self._left = fault, 0
             if not self._left:
                 self._done = self._begun
                 self._changed.notify_all()
-
-    def _next_part(self) -> RobotState:
-        if not self._left:
-            self._begin_period()
-        self._left -= 1
-        return next(self._parts)
 
     def _begin_period(self) -> None:
         slices, command = getattr(self._robot, "slices", None), self._reachable()
@@ -229,10 +222,9 @@ class ServedRobot:
         if self._zero_rests:
             return np.zeros_like(self._target)
         setpoint = self._setpoint()  # which also says how hard a gripper holds
-        return self._measured(state) if setpoint is None else setpoint
-
-    def _measured(self, state: RobotState) -> Array:
-        """The target, with what is measured in place of what was commanded. Shape: (n, m)."""
+        if setpoint is not None:
+            return setpoint
+        # What is measured, in place of what was commanded.
         measured = {
             (label, unit): state.signals[signal.name][:, place]
             for signal in self.spec.signals
@@ -242,7 +234,7 @@ class ServedRobot:
         return np.stack([measured.get(one, self._target[:, i]) for i, one in enumerate(wanted)], axis=1)
 
     def close(self) -> None:
-        """Halt, and let go of the robot."""
+        """Halt, and close the robot."""
         with self._changed:
             self._drop_parts()
             self.state = None
