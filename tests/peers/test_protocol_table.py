@@ -112,7 +112,7 @@ TABLE = {
     "a wrong type": (publish("/ping", {"data": 1}), Answer(text="expected a text"), Answer(text="field .*data")),
     "NaN": (raw("NaN"), Answer(text="finite number.*found nan"), Answer(text="expected value")),
     "Infinity": (raw("Infinity"), Answer(text="found inf"), Answer(text="expected value")),
-    "-Infinity": (raw("-Infinity"), Answer(text="found -Infinity"), Answer(text="invalid number")),
+    "-Infinity": (raw("-Infinity"), Answer(text="found -inf"), Answer(text="invalid number")),
     "1e400": (raw("1e400"), Answer(text="finite number.*found inf"), Answer(text="out of range")),
     "null in a float": (raw("null"), Answer(text="expected a number, found None"), Answer(text="field .*data")),
     "a text in a float": (raw('"0.1"'), Answer(text="expected a number"), Answer(text="field .*data")),
