@@ -103,6 +103,8 @@ def connect(url):
 
 
 def main(url):
+    if "--transport=asyncio" in sys.argv:
+        roslibpy.set_default_transport("asyncio")
     ros = connect(url)
     results = {
         "topics": ping_pong(ros),

@@ -56,7 +56,7 @@ from bam_envs.safety.gate import ClearedCommand
 
 Array = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
-_HEARTBEAT, _LOST_AFTER = 0.2, 1.0
+_LOST_AFTER = 1.0
 ANSWER_TIMEOUT = 5.0
 """Longest time that a robot in lockstep takes for a period [s]."""
 _RESET_TIMEOUT = 3.0
@@ -149,7 +149,8 @@ class RosbridgeRobot:
         """
         if self._control is not None:
             return
-        control, halting = RosbridgeLink(self._endpoint, name="control"), RosbridgeLink(self._endpoint, name="halt")
+        control = RosbridgeLink(self._endpoint, name="control")
+        halting = RosbridgeLink(self._endpoint, name="halt", lost_after=_LOST_AFTER)
         self._state.restart()
         try:
             self._open(control, halting)
@@ -166,7 +167,6 @@ class RosbridgeRobot:
         control.on_status(self._on_status)
         control.connect()
         halting.connect()
-        halting.heartbeat(_HEARTBEAT, _LOST_AFTER)
         said = ask_info(control)
         self._describes_itself, self._info = said is not None, said or info_by_profile(self.url, self.profile)
         if said is not None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
+import math
 import os
 import threading
 import time
@@ -24,7 +25,7 @@ from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NoServer,
 from bam_envs.core.wording import brief
 from bam_envs.ros.interfaces import normal_name
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller, Handler, Listener, Message
-from bam_envs.rosbridge.client_connection import Connection, Heartbeat, ServerClock, bare_reason, tell_all
+from bam_envs.rosbridge.client_connection import Connection, ServerClock, bare_reason, tell_all
 from bam_envs.rosbridge.declarations import Declarations
 from bam_envs.rosbridge.encoding import encode_frame
 from bam_envs.rosbridge.endpoint import Endpoint
@@ -50,6 +51,9 @@ class RosbridgeLink:
     Args:
         endpoint: The server; the text of a URL stands for `Endpoint(url)`.
         name: What it is for; in the names of its threads.
+        lost_after: The link drops when the server gives no sign of life for so long [s]; infinite: only when the
+            network says so. The server is asked by a WebSocket ping, which a bridge answers also while it holds
+            everything else back for a call.
         max_message: Largest message, in either direction [bytes].
         clock: Our wall clock [s].
 
@@ -62,6 +66,7 @@ class RosbridgeLink:
         endpoint: Endpoint | str,
         *,
         name: str = "control",
+        lost_after: float = math.inf,
         max_message: int = 64 * 1024 * 1024,
         clock: Callable[[], float] = time.time,
     ) -> None:
@@ -71,7 +76,9 @@ class RosbridgeLink:
         """The last `status` messages of the server."""
         self.epoch = 0
         """Counts the connections; 0 before the first."""
-        self._max_message, self._clock = max_message, clock
+        if not lost_after > 0.0:
+            raise InvalidValue(f"lost_after: expected a time above 0 s, found {lost_after!r}.")
+        self._lost_after, self._max_message, self._clock = lost_after, max_message, clock
         self._declarations = Declarations()
         # A declaration and its announcement must reach the network thread in the same order.
         self._declaring = threading.Lock()
@@ -79,7 +86,6 @@ class RosbridgeLink:
         self._why = "not connected yet: call connect()"
         self._server = ServerClock()
         self._seen_ros: str | None = None
-        self._beat: Heartbeat | None = None
         self._down_callbacks: list[Callable[[LinkLost], None]] = []
         self._status_callbacks: list[Callable[[Mapping[str, Any]], None]] = []
         self._numbers = itertools.count(1)
@@ -149,22 +155,6 @@ class RosbridgeLink:
         """
         self._down_callbacks.append(callback)
 
-    def heartbeat(self, every: float = 0.2, lost_after: float = 1.0) -> None:
-        """From now on ask the server for a sign of life, and drop the link when it gives none for `lost_after` [s].
-
-        The question is a WebSocket ping: a bridge answers it also while it holds everything else back for a call.
-
-        Raises:
-            InvalidValue: Not 0 < every < lost_after.
-        """
-        beat = self._beat = Heartbeat(every, lost_after)
-        self._thread.post(lambda: None if self._up is None else self._up.watch(beat))
-
-    @property
-    def last_answer_age(self) -> float:
-        """How long the server has said nothing [s]; infinite while the link is down."""
-        return float("inf") if self._up is None else time.monotonic() - self._up.heard_at
-
     # ---- the server's time
 
     @property
@@ -194,10 +184,6 @@ class RosbridgeLink:
     def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
         """Say that `topic` of type `kind` will be published."""
         self._declare(lambda: self._declarations.advertise(topic, kind, latch))
-
-    def unadvertise(self, topic: str) -> None:
-        """Say that `topic` will be published no more."""
-        self._declare(lambda: self._declarations.unadvertise(topic))
 
     def publish(self, topic: str, message: Message) -> None:
         """Send `message` now, or not at all: on return it has been written to the socket.
@@ -428,7 +414,9 @@ class RosbridgeLink:
                     self._why = f"{type(error).__name__}: {error}"
 
     async def _open(self, timeout: float) -> Connection:
-        connection = Connection(self._endpoint, self.epoch + 1, self._max_message, self._take, self._note_end)
+        connection = Connection(
+            self._endpoint, self.epoch + 1, self._max_message, self._lost_after, self._take, self._note_end
+        )
         await connection.open(timeout, self._clock)
         try:
             for request in self._declarations.greeting():
@@ -438,7 +426,6 @@ class RosbridgeLink:
         except BamEnvsError as error:
             connection.drop(error)
             raise
-        connection.watch(self._beat)
         self.epoch, self._server = connection.epoch, connection.clock
         with self._changed:
             self._up = connection

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import time
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
@@ -30,13 +31,16 @@ T = TypeVar("T")
 _LOG = logging.getLogger(__name__)
 _CLOCK_PROBES = 3
 _LOOK = 0.5
-"""Time between two looks at a connection that has no heartbeat [s]."""
+"""Time between two looks at a connection whose silence is no loss [s]."""
+_PINGS = 5
+"""How often a server is asked for a sign of life before its silence is a loss."""
 _MOST_UNSENT = 1024 * 1024
 """Bytes that wait for the server to read, from which on nothing more is sent."""
 _MOST_PASSED_OVER = 20
 """Meaningless messages of one connection, after which it is ended."""
 _TOO_LARGE = 1009
 """WebSocket's close code for a message above the limit."""
+_NOT_KEPT = "Nothing was sent, and nothing is kept."
 _DEAD_NODE = "context is invalid"
 """What rosbridge_suite answers to everything after its node was told to end."""
 
@@ -60,22 +64,6 @@ def _tell_one(callback: Callable[[T], None], news: T) -> None:
 
 
 @dataclass(frozen=True)
-class Heartbeat:
-    """How often to ask a server for a sign of life, and when to give up."""
-
-    every: float
-    """Time between two pings [s]."""
-    lost_after: float
-    """Silence after which the link is lost [s]."""
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.every < self.lost_after:
-            raise InvalidValue(
-                f"Heartbeat: every {self.every} s, lost_after {self.lost_after} s. Expected 0 < every < lost_after."
-            )
-
-
-@dataclass(frozen=True)
 class ServerClock:
     """What a server says of itself and its time."""
 
@@ -92,6 +80,7 @@ class Connection:
         endpoint: The server.
         epoch: Its number among the connections of a link.
         max_message: Largest message, in either direction [bytes].
+        lost_after: Silence of the server after which the connection is lost [s]; infinite: it never is.
         on_message: Takes each message that is not an answer: publish, call_service, status.
         on_end: Called once, when it has ended, before whoever waits for an answer is told.
     """
@@ -101,6 +90,7 @@ class Connection:
         endpoint: Endpoint,
         epoch: int,
         max_message: int,
+        lost_after: float,
         on_message: Callable[[Connection, dict[str, Any]], None],
         on_end: Callable[[Connection, BamEnvsError], None],
     ) -> None:
@@ -115,7 +105,7 @@ class Connection:
         """What has been declared on it: id of the declaration -> its frame."""
         self.clock = ServerClock()
         """What the server says of its time; known once it is open."""
-        self._endpoint, self._max_message = endpoint, max_message
+        self._endpoint, self._max_message, self._lost_after = endpoint, max_message, lost_after
         self._on_message, self._on_end = on_message, on_end
         self._socket: ClientConnection | None = None
         self._tasks: list[asyncio.Task[None]] = []
@@ -139,7 +129,8 @@ class Connection:
         deadline = time.monotonic() + timeout
         self._socket = await open_socket(self._endpoint, timeout, self._max_message)
         self.heard_at = time.monotonic()
-        self._start(self._read(self._socket))
+        loop = asyncio.get_running_loop()
+        self._tasks = [loop.create_task(work(self._socket)) for work in (self._read, self._watch)]
         try:
             self.clock = await asyncio.wait_for(self._first_answer(clock), deadline - time.monotonic())
             self._ready = True
@@ -148,16 +139,6 @@ class Connection:
         finally:
             if not self._ready:
                 self.drop(LinkLost(f"{self.url}: no answer."))
-
-    def watch(self, beat: Heartbeat | None) -> None:
-        """From now on end the connection when the server gives no sign of life, or does not finish closing."""
-        if self._socket is not None and self.error is None:
-            for task in self._tasks[1:]:
-                task.cancel()
-            self._start(self._watch(self._socket, beat))
-
-    def _start(self, work: Any) -> None:
-        self._tasks.append(asyncio.get_running_loop().create_task(work))
 
     async def _first_answer(self, clock: Callable[[], float]) -> ServerClock:
         best, best_trip = ServerClock(), float("inf")
@@ -208,9 +189,9 @@ class Connection:
         socket = self._socket
         if socket is None or self.error is not None:
             why = "not open" if self.error is None else bare_reason(self.url, self.error)
-            raise LinkLost(f"{self.url}: the link is down ({why}). Nothing was sent.")
+            raise LinkLost(f"{self.url}: the link is down ({why}). {_NOT_KEPT}")
         if not self.is_open or socket.transport.is_closing():
-            raise LinkLost(f"{self.url}: the link is being closed. Nothing was sent.")
+            raise LinkLost(f"{self.url}: the link is being closed. {_NOT_KEPT}")
         if socket.transport.get_write_buffer_size() > _MOST_UNSENT:
             raise LinkLost(f"{self.url}: the server does not read what it is sent. Nothing more was sent.")
         largest = max(map(len, frames), default=0)
@@ -267,28 +248,25 @@ class Connection:
                 task.cancel()
         self.ended.set()
 
-    async def _watch(self, socket: ClientConnection, beat: Heartbeat | None) -> None:
-        self.heard_at, closing_since = time.monotonic(), float("inf")
-        while True:
-            pause = _LOOK
-            if beat is not None:
-                pause = max(0.0, min(beat.every, self.heard_at + beat.lost_after - time.monotonic()))
-                # A server that does not read what waits for it answers no ping either.
-                if self.is_open and not socket.transport.get_write_buffer_size():
-                    with contextlib.suppress(ConnectionClosed):
-                        asyncio.ensure_future(await socket.ping()).add_done_callback(self._ponged)
-            woken = time.monotonic() + pause
-            await asyncio.sleep(pause)
+    async def _watch(self, socket: ClientConnection) -> None:
+        """End the connection when the server gives no sign of life, or does not finish closing."""
+        lost_after, closing_since = self._lost_after, math.inf
+        every = _LOOK if lost_after == math.inf else lost_after / _PINGS
+        while self.error is None:
+            # A server that does not read what waits for it answers no ping either.
+            if lost_after < math.inf and self.is_open and not socket.transport.get_write_buffer_size():
+                with contextlib.suppress(ConnectionClosed):
+                    asyncio.ensure_future(await socket.ping()).add_done_callback(self._ponged)
+            woken = time.monotonic() + min(every, max(0.0, self.heard_at + lost_after - time.monotonic()))
+            await asyncio.sleep(woken - time.monotonic())
             now = time.monotonic()
-            if beat is not None and now - woken > beat.every:
+            if now - woken > every:
                 self.heard_at = now  # this process itself stood still, and what came meanwhile is still unread
-            if beat is not None and now - self.heard_at >= beat.lost_after:
-                self.drop(LinkLost(f"{self.url}: nothing from the server for {beat.lost_after:g} s."))
-                return
-            closing_since = float("inf") if self.is_open else min(closing_since, now)
-            if now - closing_since > CLOSE_WITHIN:
+            closing_since = math.inf if self.is_open else min(closing_since, now)
+            if now - self.heard_at >= lost_after:
+                self.drop(LinkLost(f"{self.url}: nothing from the server for {lost_after:g} s."))
+            elif now - closing_since > CLOSE_WITHIN:
                 self.drop(LinkLost(f"{self.url}: the link dropped: the server did not finish closing it."))
-                return
 
     def _ponged(self, pong: asyncio.Future[float]) -> None:
         if not pong.cancelled() and pong.exception() is None:

@@ -42,12 +42,6 @@ class Declarations:
         with self._lock:
             return _same_type(self._topics.setdefault(topic, {**request, "latch": latch}), topic, kind)
 
-    def unadvertise(self, topic: str) -> dict[str, Any]:
-        """`topic` will be published no more."""
-        with self._lock:
-            self._topics.pop(topic, None)
-        return {"op": "unadvertise", "id": f"advertise:{topic}", "topic": topic}
-
     def require_advertised(self, topic: str) -> None:
         """Raise `InvalidValue` unless `topic` may be published."""
         if topic not in self._topics:

@@ -17,7 +17,7 @@ def _published(server, topic):
 
 def test_the_constructor_connects_nowhere(scripted, new_link):
     link = new_link(scripted, connect=False)
-    assert (link.is_up, link.epoch, scripted.headers, link.last_answer_age) == (False, 0, [], float("inf"))
+    assert (link.is_up, link.epoch, scripted.headers) == (False, 0, [])
 
 
 def test_connect_is_done_when_a_request_is_answered(scripted, link):
@@ -81,9 +81,7 @@ def test_a_topic_must_be_advertised_before_it_is_published(link):
     expected = "Topic '/ping' was not advertised: call advertise(topic, type) before publish."
     assert str(raised.value) == expected
     link.advertise("/ping", STRING)
-    link.unadvertise("/ping")
-    with pytest.raises(InvalidValue):
-        link.publish("/ping", {})
+    link.publish("/ping", {})
 
 
 def test_a_topic_keeps_its_type(link, heard):

@@ -133,9 +133,8 @@ def test_a_program_that_forgets_to_close_ends(python, scripted):
         import json, os
         from bam_envs.rosbridge.client import RosbridgeLink
 
-        link = RosbridgeLink(os.environ["BAM_TEST_URL"])
+        link = RosbridgeLink(os.environ["BAM_TEST_URL"], lost_after=1.0)
         link.connect()
-        link.heartbeat()
         print(json.dumps(link.call("/rosapi/get_time", "rosapi/GetTime", {}, 5.0)))
         """,
     )
