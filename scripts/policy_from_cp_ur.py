@@ -5,7 +5,7 @@ present API or by the old one. Only the policy is read: no Ray is started, no wo
 
 Examples:
   python scripts/policy_from_cp_ur.py checkpoints/ur-reach-rllib-ppo.zip
-  python scripts/policy_from_cp_ur.py ray_results/run/checkpoint_000024 --num-episodes 20 --seed 7
+  python scripts/policy_from_cp_ur.py ray_results/run/checkpoint_000024 --trust-pickle --seed 7
   python scripts/policy_from_cp_ur.py checkpoint_000024/policies/default_policy --env EndEffectorPositioningURSim-v0
   python scripts/policy_from_cp_ur.py checkpoints/ur-reach-rllib-ppo.zip --robot ws://10.0.0.5:9090
 """
@@ -39,7 +39,7 @@ def open_checkpoint(path: Path, env: str | None, env_kwargs: dict[str, Any], tru
         if env is not None:
             checkpoint.requires_env(resolve_id(env))
         return checkpoint
-    from bam_train.compat.rllib.export import export
+    from bam_train.compat.rllib_export import export
 
     def warn(text: str) -> None:
         say(f"{NAME}: warning: {text}")
@@ -96,7 +96,7 @@ def parse() -> argparse.Namespace:
     add("--set", action="append", default=[], metavar="env_kwargs.NAME=VALUE", help=text)
     add("--num-episodes", type=whole(1), default=5, metavar="N", help="how many (default 5)")
     add("--seed", type=whole(0), default=FIRST_SEED, metavar="N", help=f"of the first episode (default {FIRST_SEED})")
-    add("--trust-pickle", action="store_true", help="unpickle what cannot be read otherwise, which runs what is in it")
+    add("--trust-pickle", action="store_true", help="let RLlib read its directory, which runs what is in it")
     parser.add_robot()
     args: argparse.Namespace = parser.parse_args()
     return args

@@ -24,7 +24,7 @@ for name in ("SIGTERM", "SIGHUP"):
 KINDS = {
     "ray": (
         "bam_train/trainers/rllib",
-        "bam_train/compat/rllib",
+        "bam_train/compat/test_rllib_new_layout.py",
         "bam_train/cli/test_train_rllib.py",
         "bam_train/cli/test_export.py",
         "scripts/test_bench_scale.py",

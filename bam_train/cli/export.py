@@ -11,13 +11,13 @@ from bam_train.cli.program import parse, run_program
 if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.flags import ExportConfig
-    from bam_train.compat.rllib.export import Exported
+    from bam_train.compat.rllib_export import Exported
     from bam_train.trainers.output import Output
 
 
 def export_directory(config: ExportConfig) -> int:
     """The program, with its arguments read."""
-    from bam_train.compat.rllib.export import export
+    from bam_train.compat.rllib_export import export
     from bam_train.settings import read_env_kwargs
 
     exported = export(

@@ -181,7 +181,7 @@ class ExportConfig:
     set: Assignments = ()
     """env_kwargs.NAME=VALUE: an argument of the environment, any number of times; it wins over the directory's."""
     trust_pickle: bool = False
-    """Unpickle files that cannot be read otherwise, which runs whatever code is in them."""
+    """Let RLlib read a directory of its present API, which runs whatever code is in it."""
     force: bool = False
     """Overwrite the checkpoint at --out instead of adding a number to its name."""
 

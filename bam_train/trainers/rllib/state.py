@@ -20,9 +20,9 @@ import numpy as np
 import torch
 
 from bam_train.checkpoint import Checkpoint
-from bam_train.compat.rllib.pickles import read_state
 from bam_train.errors import AlteredCheckpoint, CheckpointMismatch, FormatError
 from bam_train.trainers.rllib.learner_extras import extras_of, set_extras
+from bam_train.trainers.rllib.state_pickles import read_state
 
 FOLDER, NOTES, EXTRAS = "bam/resume/rllib/", "bam/resume/notes.json", "bam/resume/learner.json"
 STATES = ("state.pkl", "algorithm_state.pkl", "module_state.pkl", "policy_state.pkl")

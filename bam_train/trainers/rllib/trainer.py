@@ -37,10 +37,7 @@ from bam_train.trainers.rllib import hyperparameters, state
 from bam_train.trainers.rllib.cluster.cluster import cluster
 from bam_train.trainers.rllib.cluster.fault_tolerance import RunnerWatch
 from bam_train.trainers.rllib.config import envs_each, make_config, refusals
-from bam_train.trainers.rllib.exploring import ExploringPolicy
-from bam_train.trainers.rllib.freezing.freeze import freeze
-from bam_train.trainers.rllib.freezing.golden import golden
-from bam_train.trainers.rllib.freezing.parts import PolicyParts, parts_of
+from bam_train.trainers.rllib.rllib_freezing import PolicyParts, RLlibPolicy, freeze, golden, parts_of
 from bam_train.trainers.rllib.sampling.env_runner import ENDS
 from bam_train.trainers.rllib.tensorboard import TensorBoard
 from bam_train.trainers.rllib_algorithms import ALGORITHMS
@@ -237,6 +234,10 @@ class RLlibTrainer:
         pair = self._seen.observation_space, self._seen.action_space
         return parts_of(module, self._env_to_module(), self._config, pair)
 
+    def _run_by_rllib(self, module: Any, explore: bool = False) -> RLlibPolicy:
+        pair = self._seen.observation_space, self._seen.action_space
+        return RLlibPolicy(module, self._env_to_module(), self._config, pair, explore=explore)
+
     def save(self, path: Path, scores: Mapping[str, Any], notes: Mapping[str, Any]) -> Checkpoint:
         """Write a checkpoint that can be resumed and deployed."""
         with state.undisturbed():
@@ -244,7 +245,7 @@ class RLlibTrainer:
             parts = self._parts(module)
             members = {
                 "bam/policy.onnx": freeze(parts),
-                "bam/golden.safetensors": golden(parts, module, self._env_to_module(), self._config),
+                "bam/golden.safetensors": golden(parts, self._run_by_rllib(module)),
                 **state.members(self.algorithm, notes),
             }
         return write_checkpoint(path, self._manifest(scores), members)
@@ -266,11 +267,10 @@ class RLlibTrainer:
         spaces = space_to_json(self._seen.observation_space), space_to_json(self._seen.action_space)
         return FrozenPolicy.from_graph(graph, *spaces)
 
-    def exploring(self) -> ExploringPolicy:
+    def exploring(self) -> RLlibPolicy:
         """The policy as it is now, drawing its actions as in training."""
         with state.undisturbed():
-            module = copy.deepcopy(self._module())
-            return ExploringPolicy(self._parts(module), module, self._env_to_module(), self._config)
+            return self._run_by_rllib(self._module(), explore=True)
 
     @contextlib.contextmanager
     def undisturbed(self) -> Iterator[None]:

@@ -17,6 +17,8 @@ from ray.rllib.connectors.env_to_module.mean_std_filter import MeanStdFilter as 
 from ray.rllib.utils.filter import RunningStat
 from ray.rllib.utils.numpy import SMALL_NUMBER
 
+from bam_train.trainers.rllib.state_pickles import unpacked_array
+
 Array = NDArray[Any]
 
 
@@ -57,7 +59,14 @@ class MeanStdFilter(_MeanStdFilter):  # type: ignore[misc]
         return kwargs["batch"]
 
     def set_state(self, state: Any) -> None:
-        """As RLlib's, which also takes over what another has not handed in yet: it would be counted twice."""
+        """As RLlib's, which also takes over what another has not handed in yet: it would be counted twice.
+
+        Raises:
+            FormatError: A packed array holds more than numbers, which RLlib would unpickle.
+        """
+        for text in tree.flatten(state):
+            if isinstance(text, str):
+                unpacked_array(text)
         super().set_state(state)
         for own in self._filters.values():
             for stat in _statistics(own):

@@ -9,9 +9,7 @@ from ray.rllib.algorithms.ppo import PPOConfig
 from bam_envs.core.spaces import space_to_json
 from bam_train.errors import SettingsError
 from bam_train.policy import FrozenPolicy
-from bam_train.trainers.rllib.exploring import ExploringPolicy
-from bam_train.trainers.rllib.freezing.freeze import freeze
-from bam_train.trainers.rllib.freezing.parts import parts_of
+from bam_train.trainers.rllib.rllib_freezing import RLlibPolicy, freeze, parts_of
 
 OBSERVED = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
 ACTED = gym.spaces.Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 4.0], np.float32))
@@ -45,7 +43,7 @@ def drawn(policy, count):
 
 
 def test_actions_are_drawn_about_the_best_one_and_stay_inside(parts, module, config):
-    policy = ExploringPolicy(parts, module, None, config)
+    policy = RLlibPolicy(module, None, config, (OBSERVED, ACTED), explore=True)
     policy.reset()
     actions = drawn(policy, 300)
     assert actions.dtype == np.float32
@@ -56,7 +54,7 @@ def test_actions_are_drawn_about_the_best_one_and_stay_inside(parts, module, con
 
 
 def test_a_seed_gives_the_same_actions(parts, module, config):
-    policy = ExploringPolicy(parts, module, None, config)
+    policy = RLlibPolicy(module, None, config, (OBSERVED, ACTED), explore=True)
     torch.manual_seed(3)
     first = drawn(policy, 4)
     torch.manual_seed(3)
@@ -64,7 +62,7 @@ def test_a_seed_gives_the_same_actions(parts, module, config):
 
 
 def test_the_trainer_may_go_on(parts, module, config):
-    policy = ExploringPolicy(parts, module, None, config)
+    policy = RLlibPolicy(module, None, config, (OBSERVED, ACTED), explore=True)
     before = {name: value.clone() for name, value in module.state_dict().items()}
     torch.manual_seed(0)
     first = policy.act(SEEN)
@@ -76,7 +74,8 @@ def test_the_trainer_may_go_on(parts, module, config):
     module.load_state_dict(before)
 
 
-def test_a_recurrent_policy_is_refused(parts, module, config, monkeypatch):
-    monkeypatch.setattr(module, "is_stateful", lambda: True)
+def test_a_recurrent_policy_is_refused(config):
+    recurrent = config.copy(copy_frozen=False).rl_module(model_config={"fcnet_hiddens": [8], "use_lstm": True})
+    module = recurrent.get_rl_module_spec(spaces={"default_policy": (OBSERVED, ACTED)}).build()
     with pytest.raises(SettingsError, match="a recurrent policy cannot explore here"):
-        ExploringPolicy(parts, module, None, config)
+        RLlibPolicy(module, None, recurrent, (OBSERVED, ACTED), explore=True)

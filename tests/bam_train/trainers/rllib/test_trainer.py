@@ -15,7 +15,7 @@ pytest.importorskip("ray")
 import ray
 
 from bam_train.checkpoint import Checkpoint
-from bam_train.compat.rllib.export import export
+from bam_train.compat.rllib_export import export
 from bam_train.errors import BamTrainError, CheckpointMismatch, EnvironmentFailed, SettingsError
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
@@ -101,12 +101,11 @@ def test_it_goes_on_where_it_stopped(trained):
     [
         ("ppo", {"train_batch_size_per_learner": 100, "num_epochs": 1}),
         ("dqn", {"epsilon": [[0, 1.0], [10000, 0.05]]}),
-        ("tuned", {"tau": 0.005, "n_step": 1}),  # sac, as Tune saves it
     ],
 )
 def test_training_goes_on_from_a_directory_of_rllib(name, hyper, rllib_directories, tmp_path):
     """Of its present API: settings, weights, filter and counters are the directory's."""
-    saved = Checkpoint.open(export(rllib_directories / name).write(tmp_path / "a.zip").path)
+    saved = Checkpoint.open(export(rllib_directories / name, trust=True).write(tmp_path / "a.zip").path)
     settings = resolve_resumed({"steps": saved.manifest.steps + 100}, saved)
     assert settings.hyperparameters["model_config"]["fcnet_hiddens"] == [16, 16]
     assert {key: settings.hyperparameters[key] for key in hyper} == hyper

@@ -1,23 +1,26 @@
 """From a checkpoint directory of RLlib to a checkpoint.zip that can be evaluated and deployed, and resumed if whole.
 
-The file is long because every way in which directory and environment may differ has a refusal of its own.
+A directory of RLlib's present API is restored by the installed RLlib, which runs what is in it, so only with ``trust``;
+one of the old layout is read without running anything. The file is long because every way in which directory and
+environment may differ has a refusal of its own.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
-import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
 from gymnasium import spaces
 
 from bam_envs.core.errors import UnknownName
@@ -25,10 +28,9 @@ from bam_envs.core.registry import are_same, entry_of, resolve_id
 from bam_envs.core.spaces import space_to_json
 from bam_envs.robo_gym.options import PLACES
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, safetensors_file, write_checkpoint
-from bam_train.compat.rllib.directory import Directory, find_policy
-from bam_train.compat.rllib.parts import ForeignPolicy
-from bam_train.compat.rllib.reading import read_policy
-from bam_train.compat.rllib.training import states, training_settings
+from bam_train.compat.rllib_directory import Directory, find_policy
+from bam_train.compat.rllib_new_layout import Restored, algorithm_of, restore, states, training_settings
+from bam_train.compat.rllib_old_layout import read_old_policy
 from bam_train.environments import (
     control_period,
     first_difference,
@@ -44,14 +46,37 @@ from bam_train.policy.golden_check import TOLERANCE, worst_difference
 from bam_train.settings import TrainSettings
 from bam_train.trainers.freezing.golden import pack
 from bam_train.trainers.manifest import origin
-from bam_train.trainers.rllib.freezing.by_hand import actions_by_hand
-from bam_train.trainers.rllib.freezing.freeze import freeze
-from bam_train.trainers.rllib.freezing.golden import clear_observations
-from bam_train.trainers.rllib.freezing.parts import AnySpace, Array, PolicyParts, leaf_spaces
+from bam_train.trainers.rllib.rllib_freezing import (
+    AnySpace,
+    FrozenModule,
+    PolicyParts,
+    clear_observations,
+    flat_width,
+    freeze,
+    golden,
+    leaf_spaces,
+)
 from bam_train.trainers.rllib_algorithms import ALGORITHMS
 
 EXPORTED = "exported"
 """Setting of the manifest that says where an exported checkpoint comes from; a run's own has none of this name."""
+
+
+@dataclass(frozen=True)
+class _Policy:
+    """What a directory says of one policy."""
+
+    directory: Directory
+    parts: PolicyParts
+    """Its spaces are the environment's own if the directory has them, else the network's."""
+    env: str | None
+    """Name of the environment; None if the directory does not say it."""
+    env_kwargs: Mapping[str, Any]
+    steps: int
+    whole: bool
+    """Whether the directory says what RLlib's connectors do before and after the network."""
+    restored: Restored | None = field(default=None, repr=False)
+    """What RLlib made of a directory of its present API."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +111,7 @@ class Exported:
             OutputError: It cannot be written there.
         """
         source = {
-            "directory": str(self.directory.folder),
+            "directory": str(self.directory.given.expanduser().absolute()),
             "policy": self.directory.name,
             "ray": self.directory.ray_version,
             "golden": self.checked_by,
@@ -145,87 +170,125 @@ def export(
         UnknownName: No environment is called `env`, or no algorithm `algo`.
         SettingsError: The environment cannot be made.
     """
-    directory = find_policy(given, policy, trust=trust, warn=warn)
-    foreign = read_policy(directory)
-    if env is None and foreign.env is None:
-        env = otherwise
-    env_id, kwargs = _environment(directory, foreign, env)
+    directory = find_policy(given, policy)
+    found = _read(directory, trust, warn)
+    env_id, kwargs = _environment(found, env or (otherwise if found.env is None else None), trust, warn)
     require_env_kwargs(env_id, env_kwargs or {})
-    kwargs, (parts, signals, period) = parity_if_needed(
-        env_id, {**kwargs, **(env_kwargs or {})}, partial(_in_environment, directory, foreign, env_id, warn), warn
-    )
-    parts = replace(parts, algorithm=_algorithm(directory, foreign, algo))
+    fitted = partial(_in_environment, found, env_id, warn)
+    kwargs, (parts, signals, period) = parity_if_needed(env_id, {**kwargs, **(env_kwargs or {})}, fitted, warn)
+    parts = replace(parts, algorithm=_algorithm(found, algo))
     graph = freeze(parts)
-    golden, by = _golden(parts)
-    frozen = FrozenPolicy.from_graph(graph, *_spaces(parts))
-    difference = _checked(directory, frozen, golden, by)
+    arrays, by = _golden(found, parts)
+    frozen = FrozenPolicy.from_graph(graph, *map(space_to_json, (parts.observation_space, parts.action_space)))
+    difference = _checked(directory, frozen, arrays, by)
+    made = directory, parts, env_id, kwargs, found.steps, signals, period
+    return Exported(*made, graph, arrays, by, difference, frozen, _training(found, parts, env_id, kwargs))
+
+
+def _read(directory: Directory, trust: bool, warn: Callable[[str], None]) -> _Policy:
+    """What the directory says.
+
+    Raises:
+        CheckpointMismatch: Only RLlib can read it, and it is not trusted, or RLlib is not installed.
+        CheckpointError: It is damaged.
+        PolicyError: Its policy cannot be frozen.
+    """
+    if directory.old_layout:
+        parts, config, steps = read_old_policy(directory)
+        env, kwargs = config.get("env"), config.get("env_config")
+        found = _Policy(directory, parts, None, {}, steps, whole=True)
+    else:
+        if not trust:
+            text = "is read by RLlib itself, which runs whatever code is in its pickles. If you trust its maker, add "
+            raise CheckpointMismatch(directory.given, f"{text}--trust-pickle")
+        if find_spec("ray") is None:
+            text = 'is read by RLlib itself, which is not installed. Run: pip install "bam-train[rllib]"'
+            raise CheckpointMismatch(directory.given, text)
+        warn(f"reading {directory.given} runs whatever code is in it (--trust-pickle)")
+        restored = restore(directory)
+        env, kwargs = restored.config.env, restored.config.env_config
+        parts = replace(restored.parts, algorithm=restored.parts.algorithm or algorithm_of(restored))
+        whole = restored.env_to_module is not None
+        found = _Policy(directory, parts, None, {}, restored.steps, whole, restored)
+    return replace(
+        found,
+        env=env if isinstance(env, str) else None,
+        env_kwargs=dict(kwargs) if isinstance(kwargs, Mapping) else {},
+    )
+
+
+def _training(found: _Policy, parts: PolicyParts, env_id: str, env_kwargs: Mapping[str, Any]) -> TrainSettings | str:
+    """Settings of a run that goes on from the directory, or why there is none."""
+    if found.restored is None:
+        return "it is not of RLlib's present API"
     try:
-        training: TrainSettings | str = training_settings(directory, foreign, parts, env_id, kwargs)
+        return training_settings(found.directory, found.restored, parts, env_id, env_kwargs)
     except SettingsError as error:
-        training = str(error)
-    made = directory, parts, env_id, kwargs, foreign.steps, signals, period
-    return Exported(*made, graph, golden, by, difference, frozen, training)
+        return str(error)
 
 
-def _spaces(parts: PolicyParts) -> tuple[dict[str, Any], dict[str, Any]]:
-    return space_to_json(parts.observation_space), space_to_json(parts.action_space)
-
-
-def _algorithm(directory: Directory, foreign: ForeignPolicy, asked: str | None) -> str:
-    found = foreign.parts.algorithm if re.fullmatch(r"\w{1,40}", foreign.parts.algorithm, re.ASCII) else ""
+def _algorithm(found: _Policy, asked: str | None) -> str:
+    """Name of the algorithm; the directory of a policy alone only says whose network it has."""
+    own = found.parts.algorithm if re.fullmatch(r"\w{1,40}", found.parts.algorithm, re.ASCII) else ""
     asked = None if asked is None else asked.lower()  # PPO, as RLlib says it
     if asked is not None and asked not in ALGORITHMS:
         raise UnknownName("algorithm", asked, ALGORITHMS)
-    if asked is None and not found:
-        raise CheckpointMismatch(directory.given, "does not say which algorithm trained it; give --algo NAME")
-    if asked is not None and found and asked != found and foreign.algorithm_known:
-        raise CheckpointMismatch(directory.given, f"was trained by {found}, not by {asked}; leave --algo out")
-    return asked or found
+    if asked is None and not own:
+        raise CheckpointMismatch(found.directory.given, "does not say which algorithm trained it; give --algo NAME")
+    known = found.restored is None or found.restored.whole
+    if asked is not None and own and asked != own and known:
+        raise CheckpointMismatch(found.directory.given, f"was trained by {own}, not by {asked}; leave --algo out")
+    return asked or own
 
 
-def _environment(directory: Directory, foreign: ForeignPolicy, asked: str | None) -> tuple[str, dict[str, Any]]:
+def _environment(
+    found: _Policy, asked: str | None, trust: bool, warn: Callable[[str], None]
+) -> tuple[str, dict[str, Any]]:
     """Id and keyword arguments of the environment: what was asked for, else what the directory says."""
-    own = _own_environment(directory, foreign.env, asked)
+    own = _own_environment(found, asked, trust)
     if asked is None and own is None:
-        raise CheckpointMismatch(directory.given, "does not say on which environment it was trained; give --env ID")
+        text = "does not say on which environment it was trained; give --env ID"
+        raise CheckpointMismatch(found.directory.given, text)
     env = resolve_id(asked) if asked is not None else str(own)
     if own is not None and are_same(env, own):
-        given = _plain(directory, foreign.env_kwargs)
+        given = _plain(found)
         return env, {name: given[name] for name in given if entry_of(env) is None or name not in PLACES}
-    if foreign.env_kwargs:
-        names = ", ".join(map(str, foreign.env_kwargs))
-        directory.warn(f"the env_config of its own environment ({names:.200}) is not given to {env}")
+    if found.env_kwargs:
+        names = ", ".join(map(str, found.env_kwargs))
+        warn(f"the env_config of its own environment ({names:.200}) is not given to {env}")
     return env, {}
 
 
-def _own_environment(directory: Directory, name: str | None, asked: str | None) -> str | None:
+def _own_environment(found: _Policy, asked: str | None, trust: bool) -> str | None:
     """The environment that the directory names, if it is known here; its module is imported only if the user says so.
 
     Raises:
         CheckpointMismatch: It is not known, and no other was asked for.
     """
+    name, given = found.env, found.directory.given
     module = (name or "").rpartition(":")[0]
     if name is None or (asked is not None and module and asked != name):
         return None
-    if asked is None and not directory.trust and must_be_named(name):
+    if asked is None and not trust and must_be_named(name):
         text = f"was trained on {name!r}, and importing {module!r} runs its code. If you trust it, give --env {name!r}"
-        raise CheckpointMismatch(directory.given, text)
+        raise CheckpointMismatch(given, text)
     try:
         return resolve_id(name)
     except UnknownName as error:
         if asked is not None:
             return None
         text = f"was trained on {name!r}, which is not known here; give --env ID, or --env module:ID"
-        raise CheckpointMismatch(directory.given, text) from error
+        raise CheckpointMismatch(given, text) from error
 
 
-def _plain(directory: Directory, kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Keyword arguments as JSON values; NumPy's numbers and arrays as Python's."""
+def _plain(found: _Policy) -> dict[str, Any]:
+    """The keyword arguments as JSON values; NumPy's numbers and arrays as Python's."""
     try:
-        return dict(json.loads(json.dumps(dict(kwargs), allow_nan=False, default=_of_numpy)))
+        return dict(json.loads(json.dumps(dict(found.env_kwargs), allow_nan=False, default=_of_numpy)))
     except (TypeError, ValueError, RecursionError) as error:
-        text = f"its env_config holds more than plain values ({', '.join(map(str, kwargs))}), which cannot be kept"
-        raise CheckpointMismatch(directory.given, f"{text}; train with plain ones") from error
+        names = ", ".join(map(str, found.env_kwargs))
+        text = f"its env_config holds more than plain values ({names}), which cannot be kept; train with plain ones"
+        raise CheckpointMismatch(found.directory.given, text) from error
 
 
 def _of_numpy(value: Any) -> Any:
@@ -235,69 +298,57 @@ def _of_numpy(value: Any) -> Any:
 
 
 def _in_environment(
-    directory: Directory,
-    foreign: ForeignPolicy,
-    env_id: str,
-    warn: Callable[[str], None],
-    env_kwargs: dict[str, Any],
+    found: _Policy, env_id: str, warn: Callable[[str], None], env_kwargs: dict[str, Any]
 ) -> tuple[PolicyParts, dict[str, Any], float | None]:
     """The parts with the environment's own spaces, its signals and its period."""
     with contextlib.closing(make_env(env_id, env_kwargs)) as env:
-        parts = _fitted(directory, foreign, env_id, env, warn)
+        parts = _fitted(found, env_id, env, warn)
         describe = getattr(env.unwrapped, "describe", None)
         return parts, {} if describe is None else describe(), control_period(env)
 
 
-def _fitted(
-    directory: Directory, foreign: ForeignPolicy, env_id: str, env: gym.Env[Any, Any], warn: Callable[[str], None]
-) -> PolicyParts:
+def _fitted(found: _Policy, env_id: str, env: gym.Env[Any, Any], warn: Callable[[str], None]) -> PolicyParts:
     """The parts with the environment's own spaces, which must be those that the policy was trained with.
 
     Raises:
         CheckpointMismatch: Names the first difference.
     """
-    parts = foreign.parts
+    parts = found.parts
     pairs = [("action_space", parts.action_space, env.action_space)]
-    if foreign.whole:
+    if found.whole:
         pairs.append(("observation_space", parts.observation_space, env.observation_space))
     else:
-        parts = _guessed(directory, parts, env_id, env.observation_space, warn)
+        parts = _guessed(found, env_id, env.observation_space, warn)
     for name, theirs, ours in pairs:
-        found = first_difference(_from_zero(space_to_json(theirs)), _from_zero(space_to_json(ours)), name)
-        if found is not None:
-            what, there, here = found
+        differing = first_difference(_from_zero(space_to_json(theirs)), _from_zero(space_to_json(ours)), name)
+        if differing is not None:
+            what, there, here = differing
             text = f"{what} is {_short(there)} in the directory and {_short(here)} in {env_id}"
-            raise CheckpointMismatch(directory.given, f"{text}; give the environment it was trained on with --env")
-    _require_from_zero(parts.action_space)
+            raise CheckpointMismatch(found.directory.given, f"{text}; {_NAME_IT}")
+    if isinstance(parts.action_space, (spaces.Discrete, spaces.MultiDiscrete)) and np.any(parts.action_space.start):
+        text = "RLlib counts actions from 0 whatever their start; it cannot be frozen"
+        raise PolicyError(f"action space {parts.action_space}: {text}")
     return replace(parts, observation_space=env.observation_space, action_space=env.action_space)
 
 
-def _guessed(
-    directory: Directory, parts: PolicyParts, env_id: str, ours: AnySpace, warn: Callable[[str], None]
-) -> PolicyParts:
+_NAME_IT = "give the environment it was trained on with --env"
+
+
+def _guessed(found: _Policy, env_id: str, ours: AnySpace, warn: Callable[[str], None]) -> PolicyParts:
     """Parts of a policy alone, whose directory does not say what came before and after the network."""
+    parts, given = found.parts, found.directory.given
     theirs = parts.observation_space
     if space_to_json(theirs) == space_to_json(ours):
         return parts
-    shape, width = theirs.shape or (), sum(_width(leaf) for leaf in leaf_spaces(ours).values())
+    shape, width = theirs.shape or (), sum(flat_width(leaf) for leaf in leaf_spaces(ours).values())
+    text = f"its network takes observations {_space(theirs)}, and {env_id} gives {_space(ours)}"
     if not isinstance(theirs, spaces.Box) or (theirs.shape != ours.shape and shape != (width,)):
-        text = f"its network takes observations {_space(theirs)}, and {env_id} gives {_space(ours)}"
-        raise CheckpointMismatch(directory.given, f"{text}; give the environment it was trained on with --env")
+        raise CheckpointMismatch(given, f"{text}; {_NAME_IT}")
     if np.isfinite(theirs.low).any() or np.isfinite(theirs.high).any():
-        text = f"its network takes observations {_space(theirs)}, and {env_id} gives {_space(ours)}: what RLlib did to "
-        more = "them in between (MeanStdFilter) is not in a policy's directory. Give that of the whole algorithm"
-        raise CheckpointMismatch(directory.given, text + more)
+        more = "what RLlib did to them in between (MeanStdFilter) is not in a policy's directory"
+        raise CheckpointMismatch(given, f"{text}: {more}. Give that of the whole algorithm")
     warn("a policy's directory does not say how observations were flattened: taken as FlattenObservations does it")
     return replace(parts, flatten=True)
-
-
-def _width(space: AnySpace) -> int:
-    """Numbers of a flattened array."""
-    if isinstance(space, spaces.Discrete):
-        return int(space.n)
-    if isinstance(space, spaces.MultiDiscrete):
-        return int(space.nvec.sum())
-    return math.prod(space.shape or ())
 
 
 def _from_zero(space: Any) -> Any:
@@ -307,13 +358,6 @@ def _from_zero(space: Any) -> Any:
     if space.get("type") == "Dict":
         return {**space, "spaces": {key: _from_zero(inner) for key, inner in sorted(dict(space["spaces"]).items())}}
     return {key: value for key, value in space.items() if key != "start"}
-
-
-def _require_from_zero(space: AnySpace) -> None:
-    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)) and np.any(space.start):
-        raise PolicyError(
-            f"action space {space}: RLlib counts actions from 0 whatever their start; it cannot be frozen"
-        )
 
 
 def _space(space: AnySpace) -> str:
@@ -326,27 +370,21 @@ def _short(value: Any, most: int = 60) -> str:
     return text if len(text) <= most else text[: most - 3] + "..."
 
 
-def _golden(parts: PolicyParts) -> tuple[bytes, str]:
-    """Observations and actions for them, and who computed those: RLlib's own code if it is there, else NumPy."""
+def _golden(found: _Policy, parts: PolicyParts) -> tuple[bytes, str]:
+    """Observations and actions for them, and what computed those: RLlib, of the old layout the network in PyTorch."""
+    if found.restored is not None:
+        policy = found.restored.policy((parts.observation_space, parts.action_space))
+        return golden(parts, policy), f"RLlib {metadata.version('ray')}"
     observations = clear_observations(parts)
-    actions, by = _reference_actions(parts, observations)
-    return pack(observations, actions), by
+    with torch.no_grad():
+        actions = FrozenModule(parts)(*map(torch.as_tensor, observations.values())).numpy()
+    return pack(observations, np.asarray(actions, parts.action_space.dtype)), "PyTorch"
 
 
-def _reference_actions(parts: PolicyParts, observations: dict[str, Array]) -> tuple[Array, str]:
-    if parts.old_stack:
-        return actions_by_hand(parts, observations), "NumPy"
-    try:
-        from bam_train.trainers.rllib.freezing.reference import remade, rllib_actions
-    except ModuleNotFoundError:
-        return actions_by_hand(parts, observations), "NumPy"
-    return rllib_actions(parts, *remade(parts), observations), f"RLlib {metadata.version('ray')}"
-
-
-def _checked(directory: Directory, policy: FrozenPolicy, golden: bytes, by: str) -> float:
+def _checked(directory: Directory, policy: FrozenPolicy, arrays: bytes, by: str) -> float:
     """Act on the golden observations; the largest difference."""
     parts, action = observation_arrays(policy.observation_space), array_spec("action", policy.action_space)
-    worst, _ = worst_difference(policy, parts, action, safetensors_file.parse(golden))
+    worst, _ = worst_difference(policy, parts, action, safetensors_file.parse(arrays))
     if not worst <= TOLERANCE:  # NaN too
         text = f"its frozen policy differs by {worst:.3g} from the actions of {by}"
         raise PolicyError(f"{directory.given}: {text}, expected at most {TOLERANCE}: this network cannot be exported")

@@ -6,7 +6,8 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
-from ray.rllib.connectors.env_to_module import FlattenObservations, MeanStdFilter
+from ray.rllib.connectors.connector_v2 import ConnectorV2
+from ray.rllib.connectors.env_to_module import EnvToModulePipeline, FlattenObservations, MeanStdFilter
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.core.rl_module.torch import TorchRLModule
@@ -17,11 +18,7 @@ from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import safetensors_file
 from bam_train.errors import PolicyError
 from bam_train.policy import FrozenPolicy
-from bam_train.trainers.rllib.freezing.by_hand import actions_by_hand
-from bam_train.trainers.rllib.freezing.freeze import freeze
-from bam_train.trainers.rllib.freezing.golden import clear_observations, draw, golden
-from bam_train.trainers.rllib.freezing.parts import connector_parts, parts_of
-from bam_train.trainers.rllib.freezing.reference import remade, rllib_actions
+from bam_train.trainers.rllib.rllib_freezing import RLlibPolicy, draw, freeze, golden, one_by_one, parts_of
 from bam_train.trainers.rllib_algorithms import ALGORITHMS
 
 NUMBERS = Box(-np.array([1, 2, 3], np.float32), np.array([1, 2, 3], np.float32))
@@ -79,8 +76,12 @@ class Live:
     def policy(self):
         return FrozenPolicy.from_graph(freeze(self.parts), *map(space_to_json, self.spaces))
 
+    @property
+    def own(self):
+        return RLlibPolicy(self.module, self.before, self.config, self.spaces)
+
     def actions(self, observations):
-        return rllib_actions(self.parts, self.module, self.before, self.config, observations)
+        return self.own.actions(one_by_one(observations))
 
 
 def both(live, n=300):
@@ -208,16 +209,14 @@ class OwnModule(TorchRLModule):
 
 
 def test_a_module_of_ones_own_is_traced():
-    live = Live(spec=RLModuleSpec(module_class=OwnModule))
-    require_same(live)
-    assert live.parts.module is live.module
+    require_same(Live(spec=RLModuleSpec(module_class=OwnModule)))
 
 
 def test_the_live_module_is_left_as_it_was():
     live = Live(pieces=[MeanStdFilter])
     before = {name: weight.clone() for name, weight in live.module.state_dict().items()}
     state = live.before.get_state()
-    golden(live.parts, live.module, live.before, live.config)
+    golden(live.parts, live.own)
     live.policy()
     assert live.before.get_state() == state
     assert all(torch.equal(weight, before[name]) for name, weight in live.module.state_dict().items())
@@ -225,53 +224,34 @@ def test_the_live_module_is_left_as_it_was():
 
 def test_golden_actions_are_rllibs():
     live = Live(pieces=[MeanStdFilter])
-    arrays = safetensors_file.parse(golden(live.parts, live.module, live.before, live.config, n=50))
+    arrays = safetensors_file.parse(golden(live.parts, live.own, n=50))
     assert {name: array.shape for name, array in arrays.items()} == {"observation": (50, 3), "action": (50, 2)}
     np.testing.assert_array_equal(arrays["action"], live.actions({"": arrays["observation"]}))
 
 
-@pytest.mark.parametrize(
-    "live",
-    [
-        {},
-        {"algo": "sac", "pieces": [MeanStdFilter]},
-        {"algo": "dqn", "acts": Discrete(3)},
-        {"algo": "bc", "seen": SEVERAL, "pieces": [FlattenObservations, MeanStdFilter], "free_log_std": True},
-        {"fcnet_use_layernorm": True, "acts": MultiDiscrete([2, 3]), "fcnet_activation": "silu"},
-    ],
-)
-def test_made_again_from_parts_and_computed_by_hand(live):
-    live = Live(**live)
-    observations = clear_observations(live.parts, 100)
-    expected = live.actions(observations)
-    np.testing.assert_array_equal(rllib_actions(live.parts, *remade(live.parts), observations), expected)
-    np.testing.assert_allclose(actions_by_hand(live.parts, observations), expected, rtol=0, atol=1e-5)
+class OwnConnector(ConnectorV2):
+    def __call__(self, *, batch, **kwargs):
+        return batch
 
 
-@pytest.mark.parametrize(
-    ("live", "message"),
-    [
-        ({"use_lstm": True}, "a recurrent network of RLlib cannot be frozen; train without use_lstm"),
-        ({"fcnet_activation": "PReLU"}, "activation 'PReLU' has weights of its own and cannot be frozen"),
-    ],
-)
-def test_what_cannot_be_frozen(live, message):
+def test_what_cannot_be_frozen():
     with pytest.raises(PolicyError) as error:
-        freeze(Live(**live).parts)
-    assert str(error.value) == message
+        freeze(Live(use_lstm=True).parts)
+    assert str(error.value) == "a recurrent network of RLlib cannot be frozen; train without use_lstm"
 
 
 @pytest.mark.parametrize(
-    ("names", "message"),
+    ("pieces", "message"),
     [
-        (["FrameStacking"], "connector FrameStacking cannot be frozen; expected FlattenObservations or MeanStdFilter"),
-        (["MeanStdFilter"] * 2, "connectors MeanStdFilter, MeanStdFilter cannot be frozen: one is there twice"),
+        ([OwnConnector], "connector OwnConnector cannot be frozen; expected FlattenObs"),
+        ([MeanStdFilter] * 2, "connectors MeanStdFilter, MeanStdFilter cannot be frozen: expected one of them"),
     ],
 )
-def test_other_connectors_cannot_be_frozen(names, message):
-    with pytest.raises(PolicyError) as error:
-        connector_parts([*names, "NumpyToTensor"])
-    assert str(error.value) == message
+def test_other_connectors_cannot_be_frozen(pieces, message):
+    live = Live()
+    live.before = EnvToModulePipeline(NUMBERS, ARM, connectors=[piece() for piece in pieces])
+    with pytest.raises(PolicyError, match=message):
+        _ = live.parts
 
 
 def test_starts_of_whole_numbers():
@@ -281,7 +261,8 @@ def test_starts_of_whole_numbers():
     policy = FrozenPolicy.from_graph(freeze(parts), *map(space_to_json, (parts.observation_space, parts.action_space)))
     found = policy.act_batch(np.arange(5, 9))
     np.testing.assert_array_equal(found, live.actions({"": np.arange(4)}) - 1)
-    arrays = safetensors_file.parse(golden(parts, live.module, live.before, live.config, n=50))
+    own = RLlibPolicy(live.module, live.before, live.config, (parts.observation_space, parts.action_space))
+    arrays = safetensors_file.parse(golden(parts, own, n=50))
     np.testing.assert_array_equal(arrays["action"], policy.act_batch(arrays["observation"]))
 
 

@@ -1,1 +1,0 @@
-"""Checkpoint folders that RLlib itself wrote, read without running code, and made into a checkpoint.zip."""

@@ -1,0 +1,181 @@
+"""The folders that RLlib writes checkpoints into: which layout one has, which policies, and where."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bam_train.errors import AlteredCheckpoint, CheckpointMismatch, NotACheckpoint
+
+OLD_STATE, MODULE, ARGUMENTS = "policy_state.pkl", "module_state.pkl", "class_and_ctor_args.pkl"
+AGAIN = "Copy it again from its source"
+_MODULES = ("learner_group/learner/rl_module", "learner/rl_module", "rl_module")
+_VERSIONS = ("1.0", "1.1", "2.0", "2.1")
+_MSGPACK = "was written as msgpack; expected pickles. Save it again without use_msgpack"
+
+
+@dataclass(frozen=True)
+class Directory:
+    """One policy in a checkpoint directory."""
+
+    given: Path
+    """As the user named it."""
+    root: Path | None
+    """Of the whole algorithm; None if only the policy is there."""
+    policy: Path
+    """The folder with the policy's weights."""
+    name: str
+    """Of the policy."""
+    old_layout: bool
+    """Whether it has ``policies/<name>/policy_state.pkl``, as RLlib's old API stack writes it."""
+    ray_version: str
+    """That wrote it; "" if it does not say."""
+
+    def altered(self, path: Path, text: str) -> AlteredCheckpoint:
+        """The error for a file that cannot be used."""
+        folder = Path(os.path.abspath(self.given))
+        above = folder if path.is_relative_to(folder) else self.root
+        member = path.relative_to(above).as_posix() if above else str(path)
+        return AlteredCheckpoint(self.given, member, f"{member} {text}")
+
+    def read_bytes(self, path: Path) -> bytes:
+        """A file's content.
+
+        Raises:
+            AlteredCheckpoint: It is missing, no file, or too large.
+        """
+        try:
+            return _content(path, 2**31)
+        except FileNotFoundError as error:
+            raise self.altered(path, f"is missing. {AGAIN}, whole") from error
+        except OSError as error:
+            raise self.altered(path, f"cannot be read: {error.strerror or error}") from error
+
+
+def find_policy(given: Path, name: str | None = None) -> Directory:
+    """Find the policy in a checkpoint directory of an algorithm or of a policy, in the new or the old layout.
+
+    Args:
+        given: The directory.
+        name: Of the policy, where there are several.
+
+    Raises:
+        NotACheckpoint: No such directory, or none of RLlib's.
+        CheckpointMismatch: Several policies and no name, or none of this name, or of a version that is not known.
+    """
+    given = given.expanduser()
+    _require_directory(given)
+    root, policies, old = _policies(Path(os.path.abspath(given)))
+    if not policies:
+        raise NotACheckpoint(given, _not_rllib(given))
+    if name is not None and name not in policies:
+        raise CheckpointMismatch(given, f"has no policy {name!r}; it has {', '.join(policies)}")
+    if name is None and len(policies) > 1:
+        names = ", ".join(policies)
+        raise CheckpointMismatch(given, f"has {len(policies)} policies; choose one with --policy: {names}")
+    name = name or next(iter(policies))
+    facts = (_facts(root) if root else {}) or _facts(policies[name])
+    version, by = (_word(facts.get(key, "")) for key in ("checkpoint_version", "ray_version"))
+    if version and version not in _VERSIONS:
+        by = f" by Ray {by}" if by else ""
+        text = f"was written{by} in checkpoint version {version}; expected one of {', '.join(_VERSIONS)}"
+        raise CheckpointMismatch(given, f"{text}. Load it and save it again with Ray 2.60")
+    return Directory(given, root, policies[name], name, old, by)
+
+
+def _policies(given: Path) -> tuple[Path | None, dict[str, Path], bool]:
+    """The algorithm's folder, the policies' by name, and whether they are of the old layout."""
+    if (given / OLD_STATE).is_file():
+        root = given.parent.parent if given.parent.name == "policies" else None
+        return root if root and (root / "algorithm_state.pkl").is_file() else None, {given.name: given}, True
+    if (given / "policies").is_dir():
+        return given, {one.name: one for one in sorted((given / "policies").iterdir()) if one.is_dir()}, True
+    for below in _MODULES:
+        if (given / below).is_dir():
+            return _root_of(given / below), _modules(given / below), False
+    if (given / MODULE).is_file() or (given / ARGUMENTS).is_file():
+        modules = _modules(given)
+        return _root_of(given.parent if given.name in modules else given), modules, False
+    return None, {}, False
+
+
+def _modules(folder: Path) -> dict[str, Path]:
+    """The folders of modules in the folder of a MultiRLModule; one folder of a module alone is its own."""
+    found = {one.name: one for one in sorted(folder.iterdir()) if (one / MODULE).is_file()}
+    return found or ({folder.name: folder} if (folder / MODULE).is_file() else {})
+
+
+def _root_of(modules: Path) -> Path | None:
+    """The algorithm's folder above the folder of all modules, if it is there."""
+    for below in _MODULES:
+        if modules.as_posix().endswith(f"/{below}"):
+            root = modules.parents[below.count("/")]
+            return root if (root / "env_runner").is_dir() or (root / "rllib_checkpoint.json").is_file() else None
+    return None
+
+
+def _facts(folder: Path) -> dict[str, Any]:
+    """What ``rllib_checkpoint.json`` or ``metadata.json`` says; {} if there is none."""
+    for name in ("rllib_checkpoint.json", "metadata.json"):
+        try:
+            facts = json.loads(_content(folder / name, 2**20))
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            raise AlteredCheckpoint(folder, name, f"{name} cannot be read: {error.strerror or error}") from error
+        except (ValueError, RecursionError) as error:
+            raise AlteredCheckpoint(folder, name, f"{name} is not JSON ({error}). {AGAIN}") from error
+        if not isinstance(facts, Mapping):
+            raise AlteredCheckpoint(folder, name, f"{name} holds a {type(facts).__name__}, expected an object")
+        if facts.get("format") == "msgpack":
+            raise NotACheckpoint(folder, _MSGPACK)
+        return dict(facts)
+    return {}
+
+
+def _content(path: Path, most: int) -> bytes:
+    """Read a file; a pipe or a device, which may never end, is refused unopened."""
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode):
+        raise OSError(None, "it is not a file")
+    if found.st_size > most:
+        raise OSError(None, f"it has {found.st_size} bytes, expected at most {most}")
+    return path.read_bytes()
+
+
+def _word(value: Any) -> str:
+    """A version as a file says it, which may be anything: one short word."""
+    return "".join(letter for letter in str(value) if letter.isprintable() and letter != " ")[:40]
+
+
+def _require_directory(given: Path) -> None:
+    try:
+        if given.is_dir():
+            next(given.iterdir(), None)
+            return
+        found = given.exists()
+    except OSError as error:
+        raise NotACheckpoint(given, f"cannot be read: {error.strerror or error}") from error
+    if found:
+        raise NotACheckpoint(given, "is a file, expected a checkpoint directory of RLlib")
+    raise NotACheckpoint(given, "no such directory. Give one that algo.save_to_path or algo.save wrote")
+
+
+def _not_rllib(given: Path) -> str:
+    """What is wrong with a directory without policies."""
+    inside = sorted(one.name for one in given.glob("checkpoint_*") if one.is_dir())
+    if inside:
+        return f"is a folder of {len(inside)} checkpoints; give one of them, such as {given / inside[-1]}"
+    below = [given, *(given / name for name in ("learner_group", *_MODULES, "policies", "env_runner"))]
+    if any(any(folder.glob("*.msgp*ck")) for folder in below):
+        return _MSGPACK
+    if any(given.glob("checkpoint-[0-9]*")):
+        return "was written by a Ray before 2.1; load and save it with a newer one"
+    if (given / "rllib_checkpoint.json").is_file() or (given / "algorithm_state.pkl").is_file():
+        return f"is RLlib's, but has no policy in it: {_MODULES[0]} and policies are both missing. {AGAIN}, whole"
+    return "is no checkpoint directory of RLlib: it has neither learner_group nor policies, nor a policy's weights"
