@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gymnasium import Space, spaces
 from gymnasium.vector.utils import concatenate, create_empty_array
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
@@ -131,15 +131,6 @@ def there_and_back(transport, env, values):
         assert_same_value(env.seen[-1], value, "action")
 
 
-@settings(max_examples=300, deadline=None)
-@given(cases())
-def test_local(case):
-    space, values = case
-    env = MirrorEnv(space)
-    there_and_back(LocalTransport(env), env, values)
-
-
-@settings(max_examples=200, deadline=None)
 @given(cases())
 def test_tcp(case):
     space, values = case
@@ -148,7 +139,6 @@ def test_tcp(case):
         there_and_back(transport, env, values)
 
 
-@settings(max_examples=300, deadline=None)
 @given(cases())
 def test_strict_json(case):
     space, values = case

@@ -1,7 +1,7 @@
 """Every transport keeps the same promises."""
 
 from bam_envs.remote.serve.env_server import EnvServer
-from bam_envs.remote.serve.local_transport import FakeTransport, LocalTransport
+from bam_envs.remote.serve.local_transport import LocalTransport
 from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.remote.tcp_transport import TcpTransport
 from bam_envs.remote.transport import Transport
@@ -11,11 +11,6 @@ from bam_envs.testing import TransportContract
 class TestLocalTransport(TransportContract):
     def make(self, env) -> Transport:
         return LocalTransport(env)
-
-
-class TestFakeTransport(TransportContract):
-    def make(self, env) -> Transport:
-        return FakeTransport(env)
 
 
 class TestTcpTransport(TransportContract):

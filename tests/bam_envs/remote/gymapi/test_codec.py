@@ -90,7 +90,7 @@ def result_back(codec, result):
     return codec.read_result(read_response(through_json(write_response(codec.write_result(result, STAMP), 0.0, STAMP))))
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(suppress_health_check=[HealthCheck.too_slow])
 @given(SPACES, st.integers(0, 2**31 - 1))
 def test_every_space_bit_for_bit(space, seed):
     space.seed(seed)

@@ -4,7 +4,7 @@ import json
 from contextlib import suppress
 
 from gymnasium import spaces
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from bam_envs.core.errors import BamEnvsError
@@ -85,7 +85,6 @@ class NoBus:
 SERVICES = [GymApiService(EnvServer(MirrorEnv(space), env_id="Mirror"), NoBus()) for space in SPACES]
 
 
-@settings(max_examples=400, deadline=None)
 @given(st.sampled_from(SERVICES), REQUEST | JSON)
 def test_every_request_is_answered(service, request):
     response = service.handle(request, UNKNOWN_CALLER)
@@ -95,7 +94,6 @@ def test_every_request_is_answered(service, request):
     json.dumps(response, allow_nan=False, default=lambda data: data.hex())
 
 
-@settings(max_examples=400, deadline=None)
 @given(st.sampled_from(SPACES), RESPONSE | JSON)
 def test_every_response_is_read_or_refused(space, message):
     codec = EnvCodec(EnvSpecMessage("x", space, spaces.Discrete(2)))
