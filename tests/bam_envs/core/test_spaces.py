@@ -202,13 +202,13 @@ BOX = {"type": "Box", "shape": [2], "dtype": "float32", "low": -1.0, "high": 1.0
         ),
         (
             {"type": "Discrete", "n": "4", "start": 0, "dtype": "int64"},
-            "n of the Discrete space must be a whole number, not '4'.",
+            "Discrete space: n: expected a whole number, found '4'",
         ),
         ({"type": "Tuple", "spaces": [{"type": "Box"}]}, "The Box space has no field 'dtype'."),
         ({"type": "Sequence", "space": BOX}, "The Sequence space has no field 'stack'."),
         (
             {"type": "Sequence", "space": BOX, "stack": 1},
-            "stack of the Sequence space must be true or false, not 1.",
+            "Sequence space: stack: expected true or false, found 1",
         ),
         ({"type": "Dict", "spaces": [1]}, "The fields of the Dict space do not make one: "),
         ({"type": "MultiBinary", "n": []}, None),
