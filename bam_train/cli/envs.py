@@ -16,20 +16,15 @@ if TYPE_CHECKING:
 
 def show_environments(config: EnvsConfig) -> None:
     """The program, with its arguments read."""
-    if config.env is None:
-        rows = overview()
-        _tell(rows, overview_lines(rows), as_json=config.json)
-        return
-    facts = details(config.env)
-    _tell(facts, detail_lines(facts), as_json=config.json)
-
-
-def _tell(facts: Any, lines: list[str], *, as_json: bool) -> None:
-    tell(*(json_module.dumps(facts, indent=2, allow_nan=False).split("\n") if as_json else lines))
+    facts: Any = overview() if config.env is None else details(config.env)
+    if config.json:
+        tell(*json_module.dumps(facts, indent=2, allow_nan=False).split("\n"))
+    else:
+        tell(*(overview_lines(facts) if config.env is None else detail_lines(facts)))
 
 
 def overview() -> list[dict[str, Any]]:
-    """One row of plain values for each of our environments; imports no simulator."""
+    """One dict of plain values for each of our environments; imports no simulator."""
     from bam_envs.core.registry import ENVIRONMENTS, resolve
     from bam_envs.robo_gym.table import ROBO_GYM
 
@@ -58,23 +53,24 @@ def short_space(space: Any) -> str:
 
 
 def overview_lines(rows: list[dict[str, Any]]) -> list[str]:
-    """The rows as a table."""
-    header = {"id": "id", "observation": "observation", "action": "action", "episode_steps": "steps", "rate_hz": "Hz"}
-    cells = [header, *({**row, "rate_hz": f"{row['rate_hz']:g}"} for row in rows)]
-    widths = {key: max(len(str(row[key])) for row in cells) for key in header}
-    lines = ["  ".join(str(row[key]).ljust(widths[key]) for key in header) for row in cells]
-    summaries = ["what to do", *(row["summary"] for row in rows)]
-    table = [f"{line}  {summary}" for line, summary in zip(lines, summaries, strict=True)]
-    more = "Details: bam-envs ID. Training: bam-train --env ID --algo ppo; any Gymnasium id will do."
-    return [*table, "", *_robo_gym_lines(rows), "", more]
-
-
-def _robo_gym_lines(rows: list[dict[str, Any]]) -> list[str]:
-    """robo-gym's names of the same environments, two ids in a line: ``EmptyEnvironmentUR{Sim,Rob}-v0``."""
+    """The environments as a table, then robo-gym's names of them, two ids in a line."""
+    keys = ("id", "observation", "action", "episode_steps", "rate_hz", "summary")
+    table = aligned(
+        [
+            ["id", "observation", "action", "steps", "Hz", "what to do"],
+            *([f"{row[key]:g}" if key == "rate_hz" else str(row[key]) for key in keys] for row in rows),
+        ]
+    )
     pairs = {name.replace("Sim-v0", "{Sim,Rob}-v0"): row["id"] for row in rows for name in row["robo_gym"][::2]}
-    width = max(map(len, pairs), default=0)
-    lines = [f"{name.ljust(width)}  {env_id}" for name, env_id in pairs.items()]
-    return ["robo-gym's ids work too, with robo-gym's options; Rob is the one with a live robot:", *lines]
+    more = "Details: bam-envs ID. Training: bam-train --env ID --algo ppo; any Gymnasium id will do."
+    theirs = "robo-gym's ids work too, with robo-gym's options; Rob is the one with a live robot:"
+    return [*table, "", theirs, *aligned(list(map(list, pairs.items()))), "", more]
+
+
+def aligned(rows: list[list[str]]) -> list[str]:
+    """The cells of a table in columns of one width each."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
 
 
 def details(name: str) -> dict[str, Any]:
@@ -95,7 +91,7 @@ def details(name: str) -> dict[str, Any]:
             "summary": None if entry is None else entry.summary,
             "same_as": None if theirs is None else theirs.env_id,
             "is_live": theirs is not None and theirs.is_live,
-            "episode_steps": _limit(env) if entry is None else entry.max_episode_steps,
+            "episode_steps": getattr(env.spec, "max_episode_steps", None) if entry is None else entry.max_episode_steps,
             "rate_hz": None if period is None else 1 / period,
             "observation_space": space_to_json(env.observation_space),
             "action_space": space_to_json(env.action_space),
@@ -103,11 +99,6 @@ def details(name: str) -> dict[str, Any]:
         }
     finally:
         env.close()  # type: ignore[no-untyped-call]
-
-
-def _limit(env: Any) -> int | None:
-    steps: int | None = None if env.spec is None else env.spec.max_episode_steps
-    return steps
 
 
 def detail_lines(facts: dict[str, Any]) -> list[str]:
@@ -141,14 +132,8 @@ def folded(rows: list[dict[str, Any]], most: int = 16) -> list[dict[str, Any]]:
 
 def _signal_lines(rows: list[dict[str, Any]]) -> list[str]:
     keys = [key for key in ("name", "low", "high", "scale", "unit", "meaning") if any(key in row for row in rows)]
-    cells = [keys, *([_cell(row.get(key, "")) for key in keys] for row in rows)]
-    widths = [max(len(line[i]) for line in cells) for i in range(len(keys))]
-    padded = [[text.ljust(width) for text, width in zip(line, widths, strict=True)] for line in cells]
-    return ["  " + "  ".join(line).rstrip() for line in padded]
-
-
-def _cell(value: Any) -> str:
-    return value if isinstance(value, str) else f"{value:.4g}"
+    cells = [[one if isinstance(one, str) else f"{one:.4g}" for one in (row.get(k, "") for k in keys)] for row in rows]
+    return [f"  {line}" for line in aligned([keys, *cells])]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -36,10 +36,12 @@ def evaluate_checkpoint(config: EvalConfig) -> int:
     """The program, with its arguments read."""
     from bam_train.environments import make_rows, require_fit
     from bam_train.evaluation import default_rows, evaluate
+    from bam_train.trainers.sb3.foreign import is_plain_sb3
     from bam_train.video import require_video_path
 
     video = None if config.video is None else require_video_path(config.video)
-    subject = _subject(config)
+    path = config.checkpoint.expanduser()
+    subject = _foreign(config, path) if is_plain_sb3(path) else _own(config, path)
     if video is not None:
         _require_picture(subject)
     rows = make_rows(subject.env, subject.env_kwargs, config.num_envs or default_rows(subject.env, config.episodes))
@@ -51,17 +53,13 @@ def evaluate_checkpoint(config: EvalConfig) -> int:
         )
     finally:
         rows.close()
-    _show(report, subject.facts, as_json=config.json)
+    if config.json:
+        tell(json_module.dumps({**report.to_json(), **subject.facts}, allow_nan=False))
+    else:
+        tell(*table(report, subject.facts))
     if video is not None:
         _film(config, subject, video)
     return 0
-
-
-def _subject(config: EvalConfig) -> Subject:
-    from bam_train.trainers.sb3.foreign import is_plain_sb3
-
-    path = config.checkpoint.expanduser()
-    return _foreign(config, path) if is_plain_sb3(path) else _own(config, path)
 
 
 def _own(config: EvalConfig, path: Path) -> Subject:
@@ -116,41 +114,28 @@ def _foreign(config: EvalConfig, path: Path) -> Subject:
     return Subject(model.policy, env, env_kwargs, facts, None)
 
 
-def _show(report: EvaluationReport, facts: dict[str, Any], *, as_json: bool) -> None:
-    if as_json:
-        tell(json_module.dumps({**report.to_json(), **facts}, allow_nan=False))
-        return
-    tell(*table(report, facts))
-
-
 def table(report: EvaluationReport, facts: dict[str, Any]) -> list[str]:
     """The report for people, line by line."""
     given = ", ".join(f"{name}={value!r}" for name, value in facts.get("env_kwargs", {}).items())
+    success = "unknown: the environment does not report is_success"
+    if report.success_rate is not None and report.success_interval is not None:
+        interval = "95 % interval {:.1%} to {:.1%}".format(*report.success_interval)
+        success = f"{report.success_rate:.1%} ({report.successes} of {report.episodes}; {interval})"
+    extremes = "range not finite"
+    if report.return_min is not None and report.return_max is not None:
+        extremes = f"from {report.return_min:.2f} to {report.return_max:.2f}"
     return [
         f"{facts['checkpoint']} ({facts['algorithm']}, {facts['steps']:,} steps) on {report.env}"
         + (f" with {given}" if given else ""),
-        f"  success   {_success(report)}",
-        f"  return    {_spread(report.return_mean, report.return_std)}, {_range(report)}",
+        f"  success   {success}",
+        f"  return    {_spread(report.return_mean, report.return_std)}, {extremes}",
         f"  length    {_spread(report.length_mean, report.length_std)} steps",
         f"  episodes  {report.episodes}, seeds {report.seed} to {report.seed + report.episodes - 1}",
     ]
 
 
-def _success(report: EvaluationReport) -> str:
-    if report.success_rate is None or report.success_interval is None:
-        return "unknown: the environment does not report is_success"
-    low, high = report.success_interval
-    return f"{report.success_rate:.1%} ({report.successes} of {report.episodes}; 95 % interval {low:.1%} to {high:.1%})"
-
-
 def _spread(mean: float | None, deviation: float | None) -> str:
     return "not finite" if mean is None or deviation is None else f"{mean:.2f} ± {deviation:.2f}"
-
-
-def _range(report: EvaluationReport) -> str:
-    if report.return_min is None or report.return_max is None:
-        return "range not finite"
-    return f"from {report.return_min:.2f} to {report.return_max:.2f}"
 
 
 def _require_picture(subject: Subject) -> None:

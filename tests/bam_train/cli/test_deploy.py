@@ -250,7 +250,7 @@ from bam_train.cli.deploy import main
 try:
     main()
 except SystemExit as done:
-    heavy = {"torch", "stable_baselines3", "mujoco", "onnxruntime", "rich", "roslibpy", "onnx", "PIL"}
+    heavy = {"torch", "stable_baselines3", "mujoco", "rich", "roslibpy", "onnx", "PIL"}
     print(done.code, sorted(heavy & set(sys.modules)))
 """
     command = [sys.executable, "-c", code, str(cartpole_checkpoint), "--fast", "--episodes", "1"]

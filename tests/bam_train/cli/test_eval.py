@@ -148,7 +148,7 @@ from bam_train.cli.eval import main
 try:
     main()
 except SystemExit as done:
-    heavy = {"torch", "stable_baselines3", "mujoco", "onnxruntime", "rich", "onnx", "PIL"}
+    heavy = {"torch", "stable_baselines3", "mujoco", "rich", "onnx", "PIL"}
     print(done.code, sorted(heavy & set(sys.modules)))
 """
     command = [sys.executable, "-c", code, str(cartpole_checkpoint), "--episodes", "2"]
