@@ -18,6 +18,7 @@ from bam_envs.core import registry
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.registry import entry_of, resolve_id
 from bam_envs.core.spaces import space_to_json
+from bam_envs.core.wording import did_you_mean
 from bam_envs.robo_gym.options import constructor_options, require_values
 from bam_envs.robo_gym.table import ROBO_GYM
 from bam_envs.tasks.options import in_our_words, option_names, require_kinds
@@ -25,7 +26,6 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import WHERE
 from bam_train.errors import CheckpointMismatch, SettingsError
 from bam_train.place import HERE, Place
-from bam_train.values import closest
 
 _OWN = ("bam_envs", "bam_train", "gymnasium")
 
@@ -97,7 +97,9 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
     known = own | taken | option_names(task) | {"max_episode_steps"}
     for name in given:
         if name not in known | refused:  # making it says why it is refused
-            raise SettingsError(f"env_kwargs: unknown setting {name!r} of {env}. {closest(in_our_words(name), known)}")
+            raise SettingsError(
+                f"env_kwargs: unknown setting {name!r} of {env}. {did_you_mean(in_our_words(name), known)}"
+            )
     try:
         require_values(theirs, given) if theirs else require_kinds(env, task, given)
     except InvalidValue as error:

@@ -1,7 +1,7 @@
 """What makes a training run: one frozen dataclass, merged from presets, files and flags.
 
 Layers, later ones win: the trainer's defaults, the preset of the environment and algorithm, the ``--config`` file,
-``--set`` and flags.
+``--set`` and flags. Every field but the tables is a flag of `bam-train`, and its docstring the line of ``--help``.
 """
 
 from __future__ import annotations
@@ -11,63 +11,76 @@ import json
 import math
 import re
 import sys
-import typing
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from msgspec import Meta
 
 from bam_train.errors import SettingsError
-from bam_train.place import Place
-from bam_train.values import closest, fit, parse_assignment
+
+if TYPE_CHECKING:
+    from bam_train.place import Place
 
 tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
+
+TABLES = frozenset({"env_kwargs", "normalize", "hyperparameters"})
+"""Settings that are tables of names of their own."""
+
+_Steps = Annotated[int, Meta(ge=1, le=10**15)]
+_Processes = Annotated[int, Meta(ge=0, le=1000)]
+_Share = Annotated[float, Meta(gt=0, le=1, description="a share above 0 and at most 1, such as 0.99")]
 
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """Everything that makes a run; saved as JSON in ``config.json`` and in every checkpoint."""
+    """Everything that makes a run; saved as JSON in ``config.json`` and in every checkpoint.
+
+    The ranges of what asks for memory, processes or hours end where no run has more.
+    """
 
     env: str
-    """Gymnasium id, e.g. bam/pick-v0."""
+    """Environment: any Gymnasium id, such as bam/pick, CartPole-v1 or some_module:Env-v0."""
     algo: str
-    """Algorithm, e.g. ppo."""
-    steps: int = 100_000
-    """Steps of the whole run, over all environments, counted from its first."""
-    seed: int = 0
-    """Seed of weights, exploration and environments (row i gets seed + i)."""
-    num_envs: int = 1
-    """Environments stepped side by side, in all: RLlib's runners share them."""
+    """Algorithm: ppo, a2c, sac, td3, ddpg, dqn, tqc, trpo, qrdqn, crossq or recurrent-ppo.
+    With --trainer rllib: ppo, appo, impala, sac, tqc, dqn, bc, marwil, cql or iql."""
+    steps: _Steps = 100_000
+    """Environment steps of the whole run, also after --resume."""
+    seed: Annotated[int, Meta(ge=0, le=10**15)] = 0
+    """Seed of weights, exploration and environments (environment i gets seed + i)."""
+    num_envs: Annotated[int, Meta(ge=1, le=100_000)] = 1
+    """Environments stepped side by side, in all: the runners of rllib share them."""
     device: str = "auto"
-    """cpu, cuda, cuda:1, …; auto is the GPU for images if there is one, else the CPU."""
-    threads: int = 1
-    """Threads that torch computes with; more than one is slower on small networks."""
+    """Where to compute: auto (the GPU for images if there is one, else the CPU), cpu, cuda, cuda:1."""
+    threads: Annotated[int, Meta(ge=1, le=1024)] = 1
+    """Threads that torch computes with (default 1: more is slower on small networks)."""
     trainer: str = "sb3"
-    """Library that trains."""
-    until_success: float | None = None
-    """Stop once this share of evaluation episodes succeeds, in (0, 1]."""
-    eval_every: int | None = None
-    """Steps between evaluations; by default a twentieth of the run, and at least 1000."""
-    eval_episodes: int = 20
+    """Library that trains: sb3 (default) or rllib."""
+    until_success: _Share | None = None
+    """Stop once this share of evaluation episodes succeeds, such as 0.99."""
+    eval_every: _Steps | None = None
+    """Steps between two evaluations (default a twentieth of the run, and at least 1000)."""
+    eval_episodes: Annotated[int, Meta(ge=1, le=1_000_000)] = 20
     """Episodes of one evaluation."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the environment."""
     transport: list[str] = field(default_factory=list)
-    """Addresses of environments that run elsewhere, such as tcp://10.0.0.5:9091, all stepped at once; [] for here."""
+    """Train on an environment that runs elsewhere, such as ws://host:9090/name or tcp://host:port, or on several."""
     ca_file: str | None = None
     """Certificates that wss:// trusts instead of the system's."""
     token_file: str | None = None
-    """File with the token that the servers at `transport` ask for."""
-    num_env_runners: int = 0
-    """RLlib's processes that collect samples, each with its share of num_envs; 0 collects in the trainer's own."""
-    num_learners: int = 0
-    """RLlib's processes that update the weights; 0 updates in the trainer's own."""
-    num_gpus: int | None = None
-    """GPUs that RLlib's learners use in all; None is RLLIB_NUM_GPUS, else 0."""
+    """File with the token that the servers ask for."""
+    num_env_runners: Annotated[int, Meta(ge=0, le=10_000)] = 0
+    """Processes of rllib that collect samples (default 0: the trainer's own does)."""
+    num_learners: _Processes = 0
+    """Processes of rllib that update the weights (default 0: the trainer's own does)."""
+    num_gpus: _Processes | None = None
+    """GPUs that learners of rllib use in all (default RLLIB_NUM_GPUS, else 0)."""
     address: str | None = None
-    """Ray cluster to train on, such as auto or 10.0.0.5:6379; None starts one here for the run."""
+    """Ray cluster that rllib trains on; by default it starts one on this computer, for this run."""
     data: str | None = None
-    """Recorded episodes that bc, marwil, cql and iql learn from: a folder of Parquet files, or its fsspec address."""
+    """Recorded episodes that bc, marwil, cql and iql of rllib learn from: Parquet files, also at an fsspec address."""
     normalize: bool | dict[str, Any] = False
     """Normalise observations and rewards by running statistics; a table gives VecNormalize's arguments."""
     hyperparameters: dict[str, Any] = field(default_factory=dict)
@@ -88,14 +101,18 @@ class TrainSettings:
         for name in ("env", "algo"):
             if values.get(name) is None:
                 raise SettingsError(f"{name}: expected a name, found nothing. Give --{name} NAME")
-        fitted = {name: fit(name, value, HINTS[name]) for name, value in values.items()}
-        settings = cls(**json.loads(json.dumps(fitted)))  # a deep copy: nothing shares the caller's tables
-        check_ranges(settings)
+        checked = _checked(values)
+        for name in sorted(TABLES):
+            _require_finite(name, values.get(name))
+        settings = cls(**json.loads(json.dumps(checked)))  # a deep copy: nothing shares the caller's tables
+        settings.place.require_sane()
         return settings
 
     @property
     def place(self) -> Place:
         """Where the environment runs."""
+        from bam_train.place import Place
+
         return Place(transport=tuple(self.transport), ca_file=self.ca_file, token_file=self.token_file)
 
     def to_mapping(self) -> dict[str, Any]:
@@ -103,63 +120,59 @@ class TrainSettings:
         return asdict(self)
 
 
-HINTS: dict[str, Any] = typing.get_type_hints(TrainSettings)
-"""Name of every top-level setting to its type."""
-
-TABLES = frozenset({"env_kwargs", "normalize", "hyperparameters"})
-"""Settings that are tables of names of their own."""
-
-
 def check_names(values: Mapping[str, Any], source: str) -> None:
     """Refuse a top-level setting that does not exist."""
+    from bam_envs.core.wording import did_you_mean
+
     for name in values:
-        if name not in HINTS:
-            raise SettingsError(f"{source}: unknown setting {name!r}. {closest(name, HINTS)}")
+        if name not in NAMES:
+            raise SettingsError(f"{source}: unknown setting {name!r}. {did_you_mean(name, NAMES)}")
 
 
-_MOST = {"num_envs": 100_000, "threads": 1024, "num_env_runners": 10_000, "num_learners": 1000, "num_gpus": 1000}
-_MOST |= {"eval_episodes": 1_000_000}
-"""Of settings that ask for memory, processes or hours, what no run has more of."""
+NAMES = tuple(TrainSettings.__dataclass_fields__)
+"""Names of all top-level settings."""
 
 
-def check_ranges(settings: TrainSettings) -> None:
-    """Refuse numbers that cannot be."""
-    least = {"steps": 1, "seed": 0, "num_envs": 1, "threads": 1, "eval_every": 1, "eval_episodes": 1}
-    least |= {"num_env_runners": 0, "num_learners": 0, "num_gpus": 0}
-    for name, lowest in least.items():
-        value = getattr(settings, name)
-        if value is not None and value < lowest:
-            raise SettingsError(f"{name}: expected at least {lowest}, found {value}")
-        if value is not None and value > _MOST.get(name, 10**15):
-            raise SettingsError(f"{name}: expected at most {_MOST.get(name, 10**15)}, found {value}")
-    settings.place.require_sane()
-    share = settings.until_success
-    if share is not None and not 0 < share <= 1:
-        raise SettingsError(f"until_success: expected a share above 0 and at most 1, such as 0.99, found {share}")
-    for name in sorted(TABLES):
-        _require_finite(name, getattr(settings, name))
+def _checked(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Top-level settings, each of its type and in its range."""
+    from bam_envs.core.validation import check, type_hints  # imports Gymnasium, and --help reads this file
+
+    hints = type_hints(TrainSettings)
+    return {name: check(value, hints[name], prefix + name, SettingsError) for name, value in values.items()}
 
 
 def _require_finite(name: str, value: Any) -> None:
     """Refuse NaN and infinity, which JSON, and so a checkpoint, cannot hold."""
-    if isinstance(value, dict):
-        for key, one in value.items():
+    if isinstance(value, (dict, list)):
+        for key, one in value.items() if isinstance(value, dict) else enumerate(value):
             _require_finite(f"{name}.{key}", one)
-    elif isinstance(value, list):
-        for index, one in enumerate(value):
-            _require_finite(f"{name}[{index}]", one)
     elif isinstance(value, float) and not math.isfinite(value):
         raise SettingsError(f"{name}: expected a finite number, found {value}")
 
 
-def merge(*layers: Mapping[str, Any]) -> dict[str, Any]:
-    """One mapping out of several, later ones winning; tables within are merged too. No layer is changed."""
-    merged: dict[str, Any] = {}
-    for layer in layers:
-        for name, value in layer.items():
-            old = merged.get(name)
-            merged[name] = merge(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
-    return merged
+# Values and assignments that people type
+
+_WORDS = {"true": True, "True": True, "false": False, "False": False, "null": None, "None": None, "none": None}
+
+
+def parse_value(text: str) -> Any:
+    """Read one typed value: JSON, Python's True/False/None, else the text itself.
+
+    ``64`` is an int, ``3e-4`` a float, ``[64,64]`` a list, ``true`` a bool, ``lin_3e-4`` text.
+    """
+    try:
+        return _WORDS[text] if text in _WORDS else json.loads(text)
+    except ValueError:
+        return text
+
+
+def parse_assignment(text: str, example: str) -> tuple[list[str], Any]:
+    """Split ``name.of.it=value`` into the parts of its name and its typed value."""
+    name, equals, value = text.partition("=")
+    path = name.strip().split(".")
+    if not equals or not all(path):
+        raise SettingsError(f"--set {text}: expected name=value, such as --set {example}, found {text!r}")
+    return path, parse_value(value.strip())
 
 
 def read_assignments(texts: Iterable[str]) -> dict[str, Any]:
@@ -169,8 +182,8 @@ def read_assignments(texts: Iterable[str]) -> dict[str, Any]:
     """
     layer: dict[str, Any] = {}
     for text in texts:
-        path, value = parse_assignment(text)
-        layer = merge(layer, _nest(path if path[0] in HINTS else ["hyperparameters", *path], value, text))
+        path, value = parse_assignment(text, "learning_rate=3e-4")
+        layer = merge(layer, _nest(path if path[0] in NAMES else ["hyperparameters", *path], value, text))
     return layer
 
 
@@ -188,6 +201,16 @@ def read_env_kwargs(texts: Iterable[str]) -> dict[str, Any]:
         layer = merge(layer, _nest(path, value, text))
     found: dict[str, Any] = layer["env_kwargs"]
     return found
+
+
+def merge(*layers: Mapping[str, Any]) -> dict[str, Any]:
+    """One mapping out of several, later ones winning; tables within are merged too. No layer is changed."""
+    merged: dict[str, Any] = {}
+    for layer in layers:
+        for name, value in layer.items():
+            old = merged.get(name)
+            merged[name] = merge(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+    return merged
 
 
 def _nest(path: list[str], value: Any, text: str) -> dict[str, Any]:
@@ -221,10 +244,8 @@ def parse_config(name: str, text: str) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise SettingsError(f"{name}: expected a table of settings, found a {type(values).__name__}")
     check_names(values, name)
-    for setting, value in values.items():
-        if value is not None:  # a flag may give it
-            fit(f"{name}: {setting}", value, HINTS[setting])
-    return values
+    _checked({setting: value for setting, value in values.items() if value is not None}, f"{name}: ")
+    return values  # a flag may give what is None
 
 
 def _read_text(path: Path) -> str:

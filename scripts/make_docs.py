@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import contextlib
 import dataclasses
 import importlib
 import inspect
@@ -45,13 +46,14 @@ def _cell(value: object) -> str:
 
 
 def field_docs(kind: type) -> dict[str, str]:
-    """The string below each field of a dataclass."""
-    tree = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
-    body = tree.body if isinstance(tree, ast.ClassDef) else []
+    """The string below each field of a dataclass, inherited ones too."""
     docs = {}
-    for field, text in itertools.pairwise(body):
-        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
-            docs[ast.unparse(field.target)] = code(str(text.value.value))
+    for owner in reversed(kind.__mro__[:-1]):
+        with contextlib.suppress(OSError):  # made without a source
+            body = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0].body  # type: ignore[attr-defined]
+            for field, text in itertools.pairwise(body):
+                if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+                    docs[ast.unparse(field.target)] = code(str(ast.literal_eval(text.value)))
     return docs
 
 

@@ -7,12 +7,14 @@ begun to handle signals, as tyro takes a while.
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, make_dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, get_args, get_type_hints
 
 import tyro
 from msgspec import Meta
+
+from bam_train.settings import TABLES, TrainSettings
 
 Count = Annotated[int, Meta(ge=1)]
 Seed = Annotated[int, Meta(ge=0)]
@@ -30,44 +32,40 @@ def _unset(metavar: str) -> object:
     return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
 
 
-_Text = Annotated[str | None, _unset("NAME")]
-_Whole = Annotated[int | None, _unset("N")]
-_Share = Annotated[float | None, _unset("SHARE")]
 _File = Annotated[Path | None, _unset("FILE")]
+_METAVARS = {
+    "until_success": "SHARE",
+    "address": "auto|HOST:PORT",
+    "data": "FOLDER",
+    "transport": "URL,...",
+    "ca_file": "FILE",
+    "token_file": "FILE",
+}
+"""What a flag shows if it is neither a number nor a name."""
+
+
+def _settings_flags() -> Any:
+    """`TrainSettings` with flags for fields: None is not given, and comes from ``--config``, the preset or a default.
+
+    Ranges are checked when all of them are together, and the tables are no flags: ``--set`` reaches into them.
+    """
+    flags: list[tuple[str, Any, None]] = []
+    for name, hint in get_type_hints(TrainSettings).items():
+        kind = hint if isinstance(hint, type) else next((one for one in get_args(hint) if one is not type(None)), str)
+        kind = kind if kind in (int, float) else str
+        metavar = _METAVARS.get(name, "N" if kind is int else "NAME")
+        hidden = Annotated[None, tyro.conf.Suppress]
+        flags.append((name, hidden if name in TABLES else Annotated[kind | None, _unset(metavar)], None))
+    return make_dataclass("SettingsFlags", flags, bases=(TrainSettings,), frozen=True)
+
+
+SettingsFlags: Any = _settings_flags()
 
 
 @dataclass(frozen=True)
-class TrainConfig:
+class TrainConfig(SettingsFlags):  # type: ignore[misc]
     """Train a policy and keep the best as one checkpoint.zip."""
 
-    # What is not given here comes from --config, then the preset, then the algorithm's defaults.
-    env: _Text = None
-    """Environment: any Gymnasium id, such as bam/pick, CartPole-v1 or some_module:Env-v0."""
-    algo: _Text = None
-    """Algorithm: ppo, a2c, sac, td3, ddpg, dqn, tqc, trpo, qrdqn, crossq or recurrent-ppo.
-    With --trainer rllib: ppo, appo, impala, sac, tqc, dqn, bc, marwil, cql or iql."""
-    trainer: _Text = None
-    """Library that trains: sb3 (default) or rllib."""
-    steps: _Whole = None
-    """Environment steps of the whole run, also after --resume."""
-    seed: _Whole = None
-    """Seed of weights, exploration and environments."""
-    num_envs: _Whole = None
-    """Environments stepped side by side, in all: the runners of rllib share them."""
-    num_env_runners: _Whole = None
-    """Processes of rllib that collect samples (default 0: the trainer's own does)."""
-    num_learners: _Whole = None
-    """Processes of rllib that update the weights (default 0: the trainer's own does)."""
-    num_gpus: _Whole = None
-    """GPUs that learners of rllib use in all (default RLLIB_NUM_GPUS, else 0)."""
-    address: Annotated[str | None, _unset("auto|HOST:PORT")] = None
-    """Ray cluster that rllib trains on; by default it starts one on this computer, for this run."""
-    data: Annotated[str | None, _unset("FOLDER")] = None
-    """Recorded episodes that bc, marwil, cql and iql of rllib learn from: Parquet files, also at an fsspec address."""
-    device: _Text = None
-    """Where to compute: auto, cpu, cuda, cuda:1."""
-    threads: _Whole = None
-    """Threads that torch computes with (default 1: more is slower on small networks)."""
     config: _File = None
     """File of settings, .toml or .json, such as --print-config writes."""
     set: Assignments = ()
@@ -81,18 +79,6 @@ class TrainConfig:
     """Copy every checkpoint that goes to --out to an fsspec address too, such as s3://bucket/runs/."""
     resume: _File = None
     """Checkpoint to go on from, with its settings and up to --steps in all."""
-    until_success: _Share = None
-    """Stop once this share of evaluation episodes succeeds, such as 0.99."""
-    eval_every: _Whole = None
-    """Steps between two evaluations (default a twentieth of the run)."""
-    eval_episodes: _Whole = None
-    """Episodes of one evaluation."""
-    transport: Annotated[str | None, _unset("URL,...")] = None
-    """Train on an environment that runs elsewhere, such as ws://host:9090/name or tcp://host:port, or on several."""
-    ca_file: _File = None
-    """Certificates that wss:// trusts instead of the system's."""
-    token_file: _File = None
-    """File with the token that the servers ask for."""
     force: bool = False
     """Overwrite the checkpoint at --out instead of adding a number to its name."""
     runs: Path = Path("runs")

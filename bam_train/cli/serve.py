@@ -107,7 +107,7 @@ def env_kwargs(assignments: Sequence[str]) -> dict[str, Any]:
         SettingsError: One of them is none.
     """
     from bam_train.errors import SettingsError
-    from bam_train.values import parse_assignment
+    from bam_train.settings import parse_assignment
 
     kwargs = {}
     for text in assignments:

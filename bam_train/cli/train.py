@@ -9,7 +9,6 @@ import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
 from typing import TYPE_CHECKING
 
 from bam_train.cli.console import count, tell
@@ -30,8 +29,6 @@ if TYPE_CHECKING:
 
 _STARTED = time.monotonic()
 
-_NOT_SETTINGS = frozenset({"config", "set", "print_config", "out", "copy_to", "resume", "force", "runs"})
-
 
 def train(config: TrainConfig) -> int:
     """Do what the flags say; returns the exit status."""
@@ -47,16 +44,11 @@ def train(config: TrainConfig) -> int:
 
 def _settings(config: TrainConfig, checkpoint: Checkpoint | None) -> TrainSettings:
     from bam_train.place import addresses
-    from bam_train.settings import merge, read_assignments, read_config
+    from bam_train.settings import NAMES, merge, read_assignments, read_config
     from bam_train.trainers.resolve import resolve, resolve_resumed
 
     file = {} if config.config is None else read_config(config.config)
-    flags = {
-        field.name: getattr(config, field.name)
-        for field in fields(config)
-        if field.name not in _NOT_SETTINGS and getattr(config, field.name) is not None
-    }
-    flags |= {name: str(flags[name]) for name in ("ca_file", "token_file") if name in flags}
+    flags = {name: getattr(config, name) for name in NAMES if getattr(config, name) is not None}
     if "transport" in flags:
         flags["transport"] = list(addresses(flags["transport"]))
     given = merge(file, read_assignments(config.set), flags)

@@ -6,8 +6,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from bam_envs.core.errors import MissingExtra
+from bam_envs.core.wording import did_you_mean
 from bam_train.errors import SettingsError
-from bam_train.values import closest
 
 if TYPE_CHECKING:
     from bam_train.trainers.trainer import Trainer
@@ -37,7 +37,7 @@ def load_trainer(name: str) -> type[Trainer]:
         MissingExtra: A package that its library needs is not installed.
     """
     if name not in TRAINERS:
-        raise SettingsError(f"Unknown trainer {name!r}. {closest(name, TRAINERS)}")
+        raise SettingsError(f"Unknown trainer {name!r}. {did_you_mean(name, TRAINERS)}")
     try:
         trainer: type[Trainer] = _resolve(TRAINERS[name])
     except ModuleNotFoundError as error:
@@ -52,14 +52,14 @@ def require_algorithm(trainer: str, algorithm: str) -> None:
         SettingsError: Carries the closest match, or the other trainer that has it.
     """
     if trainer not in ALGORITHMS:
-        raise SettingsError(f"Unknown trainer {trainer!r}. {closest(trainer, ALGORITHMS)}")
+        raise SettingsError(f"Unknown trainer {trainer!r}. {did_you_mean(trainer, ALGORITHMS)}")
     table = _resolve(ALGORITHMS[trainer])
     if algorithm not in table:
         others = [name for name in ALGORITHMS if algorithm in _resolve(ALGORITHMS[name])]
         if others:
             hint = f"It is one of {others[0]}'s; those of {trainer} are: {', '.join(sorted(table))}."
         else:
-            hint = closest(algorithm, table)
+            hint = did_you_mean(algorithm, table)
         raise SettingsError(f"Unknown algorithm {algorithm!r}. {hint}")
 
 

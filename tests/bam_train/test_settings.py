@@ -31,14 +31,14 @@ def test_settings_share_nothing_with_what_they_are_made_from():
     ("extra", "message"),
     [
         ({"stps": 3}, "settings: unknown setting 'stps'. Did you mean 'steps'?"),
-        ({"steps": "many"}, "steps: expected an int, found 'many' (text)"),
-        ({"steps": 0}, "steps: expected at least 1, found 0"),
-        ({"num_envs": 0}, "num_envs: expected at least 1, found 0"),
-        ({"seed": -1}, "seed: expected at least 0, found -1"),
+        ({"steps": "many"}, "steps: expected a whole number from 1 to 1000000000000000, found 'many'"),
+        ({"steps": 0}, "steps: expected a whole number from 1 to 1000000000000000, found 0"),
+        ({"num_envs": 0}, "num_envs: expected a whole number from 1 to 100000, found 0"),
+        ({"seed": -1}, "seed: expected a whole number from 0 to 1000000000000000, found -1"),
         ({"until_success": 1.5}, "until_success: expected a share above 0 and at most 1, such as 0.99, found 1.5"),
-        ({"normalize": 3}, "normalize: expected true or false or a table, found 3 (an int)"),
+        ({"normalize": 3}, "normalize: expected true or false or a table of named values, found 3"),
         ({"env_kwargs": {"value": float("nan")}}, "env_kwargs.value: expected a finite number, found nan"),
-        ({"env_kwargs": {"a": [{"b": 1e400}]}}, "env_kwargs.a[0].b: expected a finite number, found inf"),
+        ({"env_kwargs": {"a": [{"b": 1e400}]}}, "env_kwargs.a.0.b: expected a finite number, found inf"),
         ({"hyperparameters": {"gamma": float("nan")}}, "hyperparameters.gamma: expected a finite number, found nan"),
         ({"env": None}, "env: expected a name, found nothing. Give --env NAME"),
     ],
@@ -46,6 +46,22 @@ def test_settings_share_nothing_with_what_they_are_made_from():
 def test_bad_settings_say_what_is_wrong(extra, message):
     with pytest.raises(SettingsError) as caught:
         TrainSettings.from_mapping({**BASE, **extra})
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("64", 64), ("3e-4", 3e-4), ("[64,64]", [64, 64]), ("true", True), ("None", None), ("lin_3e-4", "lin_3e-4")],
+)
+def test_typed_values(text, value):
+    assert read_assignments([f"policy_kwargs.x={text}"]) == {"hyperparameters": {"policy_kwargs": {"x": value}}}
+
+
+@pytest.mark.parametrize("text", ["gamma", "=3", "a..b=3", "gamma 0.9"])
+def test_what_is_no_assignment_is_refused(text):
+    message = f"--set {text}: expected name=value, such as --set learning_rate=3e-4, found {text!r}"
+    with pytest.raises(SettingsError) as caught:
+        read_assignments([text])
     assert str(caught.value) == message
 
 

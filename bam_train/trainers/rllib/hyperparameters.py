@@ -21,11 +21,12 @@ from ray.rllib.connectors.env_to_module.mean_std_filter import MeanStdFilter
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.utils.replay_buffers import EpisodeReplayBuffer, PrioritizedEpisodeReplayBuffer
 
+from bam_envs.core.wording import brief, did_you_mean
 from bam_train.errors import SettingsError
-from bam_train.settings import HINTS
+from bam_train.settings import NAMES
+from bam_train.trainers.library_arguments import fit, fits
 from bam_train.trainers.rllib.ranges import check_ranges
 from bam_train.trainers.rllib_algorithms import Algorithm
-from bam_train.values import closest, describe, fit, fits
 
 ELSEWHERE = {
     "train_batch_size": "train_batch_size_per_learner",
@@ -111,7 +112,7 @@ def complete(algorithm: Algorithm, given: Mapping[str, Any]) -> dict[str, Any]:
     config = algorithm.load()()
     defaults = _defaults(algorithm, config)
     for name in given:
-        _require_known(name, [*defaults, "model_config"], f"{algorithm.name} hyperparameter", HINTS)
+        _require_known(name, [*defaults, "model_config"], f"{algorithm.name} hyperparameter", NAMES)
     values = {
         name: _fit(name, given[name], _hint(name, hint, default)) if name in given else _plain(default)
         for name, (hint, default) in defaults.items()
@@ -172,7 +173,7 @@ def _fit(name: str, value: Any, hint: Any) -> Any:
     """`fit`; RLlib's annotation of a schedule is not for the user to read."""
     if hint is Any or not fits(_SCHEDULE, hint) or fits(value, hint):
         return fit(name, value, hint)
-    raise SettingsError(f"{name}: expected a number or a schedule [[step, value], ...], found {describe(value)}")
+    raise SettingsError(f"{name}: expected a number or a schedule [[step, value], ...], found {brief(value)}")
 
 
 _SCHEDULE = [[0, 3e-4], [1000000, 0.0]]
@@ -256,4 +257,4 @@ def _require_known(name: str, known: Iterable[str], what: str, others: Iterable[
         raise SettingsError(f"{name}: there is none here; {_NONE_HERE[name]}. Leave it out")
     if name in _OF_THE_OLD_STACK:
         raise SettingsError(f"{name} cannot be set: it belongs to RLlib's old API stack, or bam-train takes care of it")
-    raise SettingsError(f"Unknown {what} {name!r}. {closest(name, [*known, *others])}")
+    raise SettingsError(f"Unknown {what} {name!r}. {did_you_mean(name, [*known, *others])}")

@@ -5,27 +5,33 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from bam_envs.core.validation import Fraction, NonNegative, Positive, PositiveInt
 from bam_train.errors import SettingsError
-from bam_train.trainers.ranges import Ranges
-from bam_train.values import expected
+from bam_train.trainers.library_arguments import check_range, ranges
 
-_RANGES = Ranges(
-    shares=("gamma", "lambda_", "tau", "expectile", "epsilon"),
-    positive=(
-        *("lr", "actor_lr", "critic_lr", "alpha_lr", "value_lr", "adam_epsilon"),
-        *("grad_clip", "clip_param", "vf_clip_param", "kl_target", "initial_alpha", "temperature"),
-    ),
-    counts=(
-        *("train_batch_size_per_learner", "minibatch_size", "num_epochs", "rollout_fragment_length", "n_step"),
-        *("num_atoms", "n_quantiles", "n_critics", "num_actions", "broadcast_interval", "simple_queue_size"),
-        *("circular_buffer_num_batches", "circular_buffer_iterations_per_batch"),
-    ),
-    not_negative=(
-        *("action_init_scale", "entropy_coeff", "vf_loss_coeff", "vf_coeff", "kl_coeff", "beta", "sigma0"),
-        *("num_steps_sampled_before_learning_starts", "target_network_update_freq", "top_quantiles_to_drop_per_net"),
-    ),
+_RANGES = ranges(
+    {
+        Fraction: ("gamma", "lambda_", "tau", "expectile", "epsilon"),
+        Positive: (
+            *("lr", "actor_lr", "critic_lr", "alpha_lr", "value_lr", "adam_epsilon"),
+            *("grad_clip", "clip_param", "vf_clip_param", "kl_target", "initial_alpha", "temperature"),
+        ),
+        PositiveInt: (
+            *("train_batch_size_per_learner", "minibatch_size", "num_epochs", "rollout_fragment_length", "n_step"),
+            *("num_atoms", "n_quantiles", "n_critics", "num_actions", "broadcast_interval", "simple_queue_size"),
+            *("circular_buffer_num_batches", "circular_buffer_iterations_per_batch"),
+        ),
+        NonNegative: (
+            *("action_init_scale", "entropy_coeff", "vf_loss_coeff", "vf_coeff", "kl_coeff", "beta", "sigma0"),
+            *(
+                "num_steps_sampled_before_learning_starts",
+                "target_network_update_freq",
+                "top_quantiles_to_drop_per_net",
+            ),
+        ),
+    }
 )
-_LAST = Ranges(shares=_RANGES.shares, positive=(), counts=(), not_negative=_RANGES.positive + _RANGES.not_negative)
+_LAST = {name: NonNegative if kind is Positive else kind for name, kind in _RANGES.items() if kind is not PositiveInt}
 """What a schedule may come to: a rate of 0 ends learning, and does no harm at its end."""
 
 
@@ -39,9 +45,9 @@ def check_ranges(values: Mapping[str, Any]) -> None:
         if isinstance(value, bool):
             continue
         if isinstance(value, (int, float)):
-            _RANGES.require(name, value, value)
+            check_range(name, value, _RANGES)
         elif name == "rollout_fragment_length" and value != "auto":
-            raise SettingsError(f"{name}: expected {expected(int)} or 'auto', found {value!r}")
+            raise SettingsError(f"{name}: expected a whole number or 'auto', found {value!r}")
         elif name == "target_entropy" and value not in (None, "auto"):
             raise SettingsError(f"{name}: expected a number or 'auto', found {value!r}")
         elif name == "n_step" and value is not None:
@@ -63,9 +69,9 @@ def _require_schedule(name: str, value: list[list[float]]) -> None:
     if len(steps) < max(2, len(value)) or steps[0] != 0 or sorted(set(steps)) != steps:
         text = "expected a number or a schedule [[0, value], [step, value], ...] with rising steps"
         raise SettingsError(f"{name}: {text}, found {value!r}")
-    _RANGES.require(name, value[0][1], value)
+    check_range(name, value[0][1], _RANGES)
     for _, number in value[1:]:
-        _LAST.require(name, number, value)
+        check_range(name, number, _LAST)
 
 
 def _require_layers(model_config: Mapping[str, Any]) -> None:

@@ -7,9 +7,10 @@ In settings they are JSON: a schedule is ``"lin_3e-4"`` (linear to 0), action no
 from __future__ import annotations
 
 import copy
+import functools
 import inspect
+import operator
 import re
-import types
 import typing
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -21,11 +22,12 @@ from stable_baselines3.common import noise, torch_layers, utils
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecNormalize
 
+from bam_envs.core.validation import Fraction, NonNegative, Positive, PositiveInt
+from bam_envs.core.wording import did_you_mean
 from bam_train.errors import SettingsError
-from bam_train.settings import HINTS
+from bam_train.settings import NAMES
+from bam_train.trainers.library_arguments import check_range, fit, linear_start, ranges
 from bam_train.trainers.sb3.algorithms import Algorithm
-from bam_train.trainers.sb3.ranges import check_ranges
-from bam_train.values import closest, fit, linear_start
 
 ELSEWHERE = {
     "self": None,
@@ -56,6 +58,23 @@ CLASSES: dict[str, dict[str, type]] = {
 _NOISE = re.compile(r"(?P<kind>normal|ornstein-uhlenbeck)_(?P<sigma>\d.*)")
 
 
+_RANGES = ranges(
+    {
+        Fraction: (
+            *("gamma", "gae_lambda", "tau"),
+            *("exploration_fraction", "exploration_initial_eps", "exploration_final_eps"),
+        ),
+        Positive: ("learning_rate", "clip_range", "max_grad_norm", "rms_prop_eps", "target_kl"),
+        PositiveInt: (
+            *("n_steps", "batch_size", "n_epochs", "buffer_size", "train_freq"),
+            *("target_update_interval", "policy_delay"),
+        ),
+        NonNegative: ("learning_starts", "ent_coef", "vf_coef"),
+    }
+)
+"""Numbers that no algorithm can learn with, but the library takes without a word, are out of these."""
+
+
 def complete(algorithm: Algorithm, given: Mapping[str, Any], observation_space: spaces.Space[Any]) -> dict[str, Any]:
     """Check hyperparameters by name and type and add the defaults of those that are not given.
 
@@ -68,7 +87,7 @@ def complete(algorithm: Algorithm, given: Mapping[str, Any], observation_space: 
         if name not in ELSEWHERE
     }
     for name in given:
-        _require_known(name, parameters, f"{algorithm.name} hyperparameter", HINTS)
+        _require_known(name, parameters, f"{algorithm.name} hyperparameter", NAMES)
     values: dict[str, Any] = {"policy": default_policy(algorithm, observation_space)}
     for name, parameter in parameters.items():
         if name in given:
@@ -77,10 +96,10 @@ def complete(algorithm: Algorithm, given: Mapping[str, Any], observation_space: 
             values[name] = list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
     policies, policy = algorithm.load().policy_aliases, values["policy"]
     if policy not in policies:
-        raise SettingsError(f"policy: unknown policy {policy!r} of {algorithm.name}. {closest(policy, policies)}")
+        raise SettingsError(f"policy: unknown policy {policy!r} of {algorithm.name}. {did_you_mean(policy, policies)}")
     values["policy_kwargs"] = _checked_policy(policies[policy], values["policy_kwargs"] or {})
     _check_noise(values.get("action_noise"))
-    check_ranges(values)
+    _check_ranges(values)
     return values
 
 
@@ -103,7 +122,7 @@ def complete_normalize(given: bool | Mapping[str, Any], gamma: float) -> bool | 
     for name in given:
         _require_known(name, known, "normalize argument")
     fitted = {name: fit(f"normalize.{name}", value, known[name].annotation) for name, value in given.items()}
-    check_ranges(fitted)
+    _check_ranges(fitted)
     return {"gamma": gamma, **fitted}
 
 
@@ -132,17 +151,22 @@ def _require_known(name: str, parameters: Mapping[str, Any], what: str, others: 
         raise SettingsError(f"{name} is not a hyperparameter here: use {ELSEWHERE[name]}")
     if name in ELSEWHERE:
         raise SettingsError(f"{name} cannot be set: bam-train takes care of it")
-    raise SettingsError(f"Unknown {what} {name!r}. {closest(name, [*parameters, *others])}")
+    raise SettingsError(f"Unknown {what} {name!r}. {did_you_mean(name, [*parameters, *others])}")
 
 
 def _written(hint: Any) -> Any:
-    """The annotation of a value as it is written down: classes and noise objects are names."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (typing.Union, types.UnionType):
-        return typing.Union[tuple(_written(argument) for argument in arguments)]  # noqa: UP007 - built at run time
-    if origin is type or hint is noise.ActionNoise:
-        return str
-    return hint
+    """The annotation of a value as it is written in settings: action noise is text too."""
+    parts = [str if one is noise.ActionNoise else one for one in typing.get_args(hint)]
+    return functools.reduce(operator.or_, parts) if noise.ActionNoise in typing.get_args(hint) else hint
+
+
+def _check_ranges(values: Mapping[str, Any]) -> None:
+    """Refuse a number out of its range; text such as ``auto`` is none, a schedule is its first value."""
+    for name, value in values.items():
+        first = value[0] if isinstance(value, list) and value else value
+        number = linear_start(first) if isinstance(first, str) else first
+        if isinstance(number, (int, float)) and not isinstance(number, bool):
+            check_range(name, number, _RANGES)
 
 
 def _checked_policy(policy: Any, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -156,7 +180,9 @@ def _checked_policy(policy: Any, given: Mapping[str, Any]) -> dict[str, Any]:
         _require_known(name, parameters, "policy_kwargs argument")
         values[name] = fit(f"policy_kwargs.{name}", value, _written(parameters[name].annotation))
         if name in CLASSES and values[name].lower() not in CLASSES[name]:
-            raise SettingsError(f"policy_kwargs.{name}: unknown {value!r}. {closest(value.lower(), CLASSES[name])}")
+            raise SettingsError(
+                f"policy_kwargs.{name}: unknown {value!r}. {did_you_mean(value.lower(), CLASSES[name])}"
+            )
     return values
 
 

@@ -16,6 +16,7 @@ refuses NaN and infinity. ``Meta(description=...)`` replaces the words that an e
 
 from __future__ import annotations
 
+import re
 import sys
 import types
 from collections.abc import Callable, Mapping, Sequence
@@ -166,11 +167,10 @@ def _number(limit: float) -> str:
 
 def _plural(text: str) -> str:
     """``numbers above 0`` of ``a number above 0``."""
-    for noun in ("number", "text", "table", "list"):
-        head, found, tail = text.partition(noun)
-        if found:
-            return f"{head.removeprefix('a ')}{noun}s{tail}"
-    return f"({text})"
+    noun = re.search("number|text|table|list", text)
+    if noun is None:
+        return f"({text})"
+    return f"{text[: noun.start()].removeprefix('a ')}{noun[0]}s{text[noun.end() :]}"
 
 
 def _plain(value: Any) -> Any:

@@ -142,7 +142,7 @@ ERRORS = [
         "Use one of: a2c, dqn, ppo, qrdqn, recurrent-ppo, trpo.",
     ),
     ({"set": ("lerning_rate=1",)}, "Unknown ppo hyperparameter 'lerning_rate'. Did you mean 'learning_rate'?"),
-    ({"set": ("n_steps=1.5",)}, "n_steps: expected an int, found 1.5 (a float)"),
+    ({"set": ("n_steps=1.5",)}, "n_steps: expected a whole number, found 1.5"),
     ({"set": ("n_steps",)}, "--set n_steps: expected name=value, such as --set learning_rate=3e-4, found 'n_steps'"),
     ({"out": Path("policy")}, "policy: expected a file name that ends in .zip. Choose another one with --out"),
     (
@@ -169,7 +169,7 @@ ERRORS = [
         "no.toml: no such file. Check the name after --config, or make one with --print-config",
     ),
     ({"until_success": 2.0}, "until_success: expected a share above 0 and at most 1, such as 0.99, found 2.0"),
-    ({"steps": 0}, "steps: expected at least 1, found 0"),
+    ({"steps": 0}, "steps: expected a whole number from 1 to 1000000000000000, found 0"),
 ]
 
 
@@ -181,7 +181,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(bam_train, here, flags, line):
 
 def test_a_wrong_value_in_a_file_names_the_file(bam_train, here):
     (here / "a.toml").write_text("steps = 'many'\n")
-    line = "bam-train: a.toml: steps: expected an int, found 'many' (text)\n"
+    line = "bam-train: a.toml: steps: expected a whole number from 1 to 1000000000000000, found 'many'\n"
     assert bam_train(config=Path("a.toml"), steps=None) == (1, "", line)
 
 

@@ -293,7 +293,7 @@ def test_what_cannot_be_frozen_is_refused_before_training(spaces, hyper, text, s
         ),
         (
             {"hyperparameters": {"lr": "fast"}},
-            "lr: expected a number or a schedule [[step, value], ...], found 'fast' (text)",
+            "lr: expected a number or a schedule [[step, value], ...], found 'fast'",
         ),
         ({"hyperparameters": {"lr": -1}}, "lr: expected a number above 0, found -1"),
         *(
@@ -304,10 +304,10 @@ def test_what_cannot_be_frozen_is_refused_before_training(spaces, hyper, text, s
             for name in ("lr", "entropy_coeff")
             for schedule in ([], [[0, 1e-3]], [[5, 1e-3], [9, 0.0]], [[0, 1e-3], [9, 0.0], [8, 0.0]], [[0, 1e-3], [9]])
         ),
-        ({"hyperparameters": {"lr": [[0, 1e-3], [9, -1]]}}, "lr: expected at least 0, found [[0, 0.001], [9, -1]]"),
+        ({"hyperparameters": {"lr": [[0, 1e-3], [9, -1]]}}, "lr: expected a number of at least 0, found -1"),
         ({"hyperparameters": {"gamma": None}}, "gamma: expected a number, found None"),
-        ({"hyperparameters": {"num_epochs": None}}, "num_epochs: expected an int, found None"),
-        ({"hyperparameters": {"model_config": 5}}, "model_config: expected a table, found 5 (an int)"),
+        ({"hyperparameters": {"num_epochs": None}}, "num_epochs: expected a whole number, found None"),
+        ({"hyperparameters": {"model_config": 5}}, "model_config: expected a table of named values, found 5"),
         *(
             (
                 {"hyperparameters": {"model_config": {"fcnet_hiddens": sizes}}},
@@ -319,7 +319,7 @@ def test_what_cannot_be_frozen_is_refused_before_training(spaces, hyper, text, s
             {"hyperparameters": {"model_config": {"head_fcnet_hiddens": [0]}}},
             "model_config.head_fcnet_hiddens: expected",
         ),
-        ({"algo": "sac", "hyperparameters": {"n_step": 0}}, "n_step: expected at least 1, found 0"),
+        ({"algo": "sac", "hyperparameters": {"n_step": 0}}, "n_step: expected a whole number of at least 1, found 0"),
         (
             {"algo": "sac", "hyperparameters": {"target_entropy": "x"}},
             "target_entropy: expected a number or 'auto', found",

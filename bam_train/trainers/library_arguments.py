@@ -1,0 +1,82 @@
+"""Hyperparameters as JSON values, checked against the annotations of a learning library's own functions.
+
+Everything stays within JSON: settings can be written and read back. A schedule is ``"lin_3e-4"``, linear to 0.
+"""
+
+from __future__ import annotations
+
+import types
+import typing
+from collections.abc import Callable, Iterable, Mapping
+from typing import Annotated, Any
+
+import msgspec
+
+from bam_envs.core.validation import Finite, check, expected
+from bam_envs.core.wording import brief
+from bam_train.errors import SettingsError
+
+Schedule = Annotated[
+    str, msgspec.Meta(pattern=r"^lin_\d+\.?\d*([eE][-+]?\d+)?$", description='a schedule such as "lin_3e-4"')
+]
+"""A linear schedule as it is written; the annotation of the library is a ``Callable``."""
+
+_UNIONS = (typing.Union, types.UnionType)
+
+
+def linear_start(text: str) -> float | None:
+    """The first value of a linear schedule such as ``lin_3e-4``; None if `text` is not one."""
+    return float(text.removeprefix("lin_")) if fits(text, Schedule) else None
+
+
+def fit(name: str, value: Any, hint: Any) -> Any:
+    """Return `value` if `hint` takes it; a whole float becomes an int where only an int is taken (``1e6``).
+
+    Args:
+        name: What the value is for, as errors name it.
+        value: A JSON value.
+        hint: An annotation of the library.
+
+    Raises:
+        SettingsError: It does not fit; names the thing, the expected and the found.
+    """
+    if fits(value, hint):
+        return value
+    if isinstance(value, float) and value.is_integer() and fits(int(value), hint):
+        return int(value)
+    raise SettingsError(f"{name}: expected {expected(as_written(hint))}, found {brief(value)}")
+
+
+def fits(value: Any, hint: Any) -> bool:
+    """Whether a library's annotation takes a JSON value."""
+    if typing.get_origin(hint) in _UNIONS:  # msgspec refuses unions of several kinds of lists
+        return any(fits(value, one) for one in typing.get_args(hint))
+    try:
+        msgspec.convert(value, as_written(hint))
+    except (msgspec.ValidationError, TypeError):  # TypeError: a class that is not written as JSON
+        return False
+    return True
+
+
+def as_written(hint: Any) -> Any:
+    """The annotation of a value as it is written in settings: a schedule and a class are text."""
+    origin = typing.get_origin(hint)
+    if origin in _UNIONS:
+        return typing.Union[tuple(map(as_written, typing.get_args(hint)))]  # noqa: UP007 - built at run time
+    if Callable in (hint, origin):
+        return Schedule
+    return str if origin is type else hint
+
+
+def ranges(kinds: Mapping[Any, Iterable[str]]) -> dict[str, Any]:
+    """Name of a hyperparameter to the kind of number it is, out of names by kind."""
+    return {name: kind for kind, names in kinds.items() for name in names}
+
+
+def check_range(name: str, number: float, kinds: Mapping[str, Any]) -> None:
+    """Refuse a number out of its range, which the library itself would take; every number must be finite.
+
+    Raises:
+        SettingsError: Names it, its range and the number.
+    """
+    check(number, kinds.get(name, Finite), name, SettingsError)
