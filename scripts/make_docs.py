@@ -278,7 +278,7 @@ def _flag_rows(kind: type) -> list[list[object]]:
     for field in dataclasses.fields(kind):
         if isinstance(field.default_factory, type) and dataclasses.is_dataclass(field.default_factory):
             rows += _flag_rows(field.default_factory)
-        else:
+        elif "Suppress" not in str(get_type_hints(kind, include_extras=True)[field.name]):
             rows.append([flag(kind, field), flag_default(field), docs[field.name]])
     return rows
 
