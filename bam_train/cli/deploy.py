@@ -20,14 +20,11 @@ from bam_train.cli.program import parse, run_program
 from bam_train.signals import SignalMemory
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import gymnasium as gym
 
-    from bam_envs.core.timing import Pacer
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.flags import DeployConfig
-    from bam_train.deploy.deployment import Deployment, Watcher
+    from bam_train.deploy.deployment import Watcher
     from bam_train.deploy.journal import Journal
     from bam_train.place import Place
 
@@ -38,10 +35,11 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
 
     startup = Startup()
     startup.mark("python and arguments")
-    _require_sane(config)
+    place = checked_place(config)
     from bam_envs.core.timing import Pacer
     from bam_train.checkpoint import Checkpoint
-    from bam_train.deploy.deployment import Deployment
+    from bam_train.deploy.deployment import Deployment, stop_signals
+    from bam_train.deploy.report import DeployReport
     from bam_train.environments import environment_of, make_env, require_fit
     from bam_train.policy import FrozenPolicy
 
@@ -50,7 +48,6 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     checkpoint = Checkpoint.open(config.checkpoint)
     policy = FrozenPolicy.from_checkpoint(checkpoint)
     startup.mark("policy")
-    place = place_of(config)
     env_id, env_kwargs = environment_of(checkpoint, config.env, elsewhere=bool(place.transport))
     env = make_env(env_id, env_kwargs, render_mode="human" if config.render else None, place=place)
     try:
@@ -67,32 +64,16 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
         env.close()  # type: ignore[no-untyped-call]
         raise
     startup.mark("environment")
-    return _run(config, checkpoint, env, deployment, pacer, journal, signals)
-
-
-def _run(
-    config: DeployConfig,
-    checkpoint: Checkpoint,
-    env: gym.Env[Any, Any],
-    deployment: Deployment,
-    pacer: Pacer,
-    journal: Journal,
-    signals: SignalMemory,
-) -> int:
-    from bam_train.deploy.deployment import stop_signals
-    from bam_train.deploy.report import DeployReport
-
     with stop_signals() as switch:  # a second Ctrl-C must not lose the report
         switch.waiting += signals.came  # one that was lost: the deployment ends before it begins
-        place = place_of(config).text
-        title = f"{checkpoint.path} on {checkpoint.manifest.env}{place and f' at {place}'}"
+        title = f"{checkpoint.path} on {checkpoint.manifest.env}{place.text and f' at {place.text}'}"
         with _display(title, env, journal) as watcher:
-            journal.startup.mark("display")
+            startup.mark("display")
             ending = deployment.run(watcher, seed=config.seed, switch=switch)
         if ending.status:
             say(f"bam-deploy: {ending.reason}")
-        guards = guards_of(env)
-        report = DeployReport(checkpoint, config.seed, ending, journal, pacer, place or "simulated here", guards)
+        where = place.text or "simulated here"
+        report = DeployReport(checkpoint, config.seed, ending, journal, pacer, where, guards_of(env))
         for warning in report.warnings():
             say(f"bam-deploy: warning: {warning}")
         tell(*([json_module.dumps(report.to_json(), allow_nan=False)] if config.json else report.lines()))
@@ -110,21 +91,29 @@ def _display(title: str, env: gym.Env[Any, Any], journal: Journal) -> Iterator[W
         yield display
 
 
-def _require_sane(config: DeployConfig) -> None:
-    """Refuse what cannot be, before anything is loaded."""
-    from bam_train.errors import SettingsError
+def checked_place(config: DeployConfig) -> Place:
+    """Where the flags say that the environment runs; what cannot be is refused before anything is loaded.
 
+    Raises:
+        SettingsError: Flags that exclude each other, or nothing to show.
+    """
+    from bam_train.errors import SettingsError
+    from bam_train.place import Place, addresses
+
+    files = (None if path is None else str(path) for path in (config.ca_file, config.token_file))
+    place = Place(config.robot, addresses(config.transport), config.profile, *files, config.timeout)
     if config.rate is not None and config.fast:
         raise SettingsError("--fast does not wait for deadlines, so --rate has no meaning with it; give one of the two")
-    if config.transport is not None and not place_of(config).transport:
+    if config.transport is not None and not place.transport:
         raise SettingsError("--transport: expected an address, found none; leave it out for the simulation here")
-    place_of(config).require_sane()
+    place.require_sane()
     if config.robot is not None and (config.rate is not None or config.fast):
         raise SettingsError(
             "a live robot is driven at the rate that its policy was made for; leave out --rate and --fast"
         )
     if config.render:
-        require_screen(remote=place_of(config).is_remote)
+        require_screen(remote=place.is_remote)
+    return place
 
 
 def require_screen(*, remote: bool) -> None:
@@ -144,18 +133,6 @@ def require_screen(*, remote: bool) -> None:
             "--render needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set; "
             "leave it out, or make a film: bam-eval CHECKPOINT --video film.gif"
         )
-
-
-def place_of(config: DeployConfig) -> Place:
-    """Where the flags say that the environment runs."""
-    from bam_train.place import Place, addresses
-
-    files = {name: None if path is None else str(path) for name, path in _files(config)}
-    return Place(config.robot, addresses(config.transport), config.profile, timeout=config.timeout, **files)
-
-
-def _files(config: DeployConfig) -> list[tuple[str, Path | None]]:
-    return [("ca_file", config.ca_file), ("token_file", config.token_file)]
 
 
 def period_of(config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> float | None:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.core.at_exit import close_at_exit
+from bam_envs.core.close_at_exit import close_at_exit
 from bam_envs.core.errors import (
     BamEnvsError,
     InvalidValue,

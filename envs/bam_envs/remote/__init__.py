@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from bam_envs.core.on_use import imported_on_use
+from bam_envs.core.lazy_imports import lazy_imports
 
 if TYPE_CHECKING:
     from bam_envs.remote.remote_env import RemoteEnv, make_remote_env, make_remote_vector_env, open_transport
@@ -57,4 +57,4 @@ __all__ = [
     "open_transport",
 ]
 
-__getattr__, __dir__ = imported_on_use(__name__, _MODULES)
+__getattr__, __dir__ = lazy_imports(__name__, _MODULES)

@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium import Space
 
-from bam_envs.core.at_exit import close_at_exit
+from bam_envs.core.close_at_exit import close_at_exit
 from bam_envs.core.errors import InvalidValue, ResetNeeded, UnknownName
 from bam_envs.remote.remote_vector_env import Described, RemoteVectorEnv
 from bam_envs.remote.transport import EnvSpecMessage, Info, Transport

@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space, iterate
 from numpy.typing import NDArray
 
-from bam_envs.core.at_exit import close_at_exit
+from bam_envs.core.close_at_exit import close_at_exit
 from bam_envs.core.errors import InvalidValue, ResetNeeded
 from bam_envs.core.spaces import space_to_json
 from bam_envs.remote.batches import join_final, join_infos, join_observations

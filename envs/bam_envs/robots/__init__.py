@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from bam_envs.core.on_use import imported_on_use
+from bam_envs.core.lazy_imports import lazy_imports
 
 if TYPE_CHECKING:
     from bam_envs.core.robot import Initial, Robot, RobotSpec, RobotState, SignalSpec
@@ -44,4 +44,4 @@ __all__ = [
     "load_profile",
 ]
 
-__getattr__, __dir__ = imported_on_use(__name__, _MODULES)
+__getattr__, __dir__ = lazy_imports(__name__, _MODULES)
