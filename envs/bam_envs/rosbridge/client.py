@@ -267,17 +267,20 @@ class RosbridgeLink:
         self._require_waiting_allowed("call")
         if not isinstance(timeout, int | float) or not 0.0 < timeout < float("inf"):
             raise InvalidValue(f"{service}: timeout is {timeout!r}: expected a time above 0 s, for a call can be lost.")
-        connection, identity, answer = self._require_up(), f"call:{next(self._numbers)}", Future[dict[str, Any]]()
+        connection, identity, begun = self._require_up(), f"call:{next(self._numbers)}", time.monotonic()
         # Servers that know the field `timeout` end the call then, and not after a shorter time of their own.
         request = {"op": "call_service", "id": identity, "service": service, "args": args, "timeout": timeout}
         frame = encode_frame({**request, "type": normal_name(kind)} if kind else request)
-        begun = time.monotonic()
-        self._hand_over(lambda: connection.ask(identity, frame, answer))
+        answer: Future[dict[str, Any]] = Future()
         try:
+            self._post(answer, lambda: connection.ask(identity, frame, answer))
             said = answer.result(timeout)
         except NoResultYet as error:
+            self._require_taken(answer, timeout)
             self._thread.post(lambda: connection.forget(identity))
             raise LinkLost(f"{self.url}: {service} did not answer in {timeout:g} s; it may still be at it.") from error
+        finally:
+            answer.cancel()
         if said.get("result") is False and _ENDED in str(said.get("values")):
             raise self._given_up(service, time.monotonic() - begun, timeout)
         return _response(service, said)
@@ -298,36 +301,45 @@ class RosbridgeLink:
     # ---- any thread: sending
 
     def _send(self, connection: Connection, *frames: str) -> None:
-        self._hand_over(lambda: connection.send(*frames))
-
-    def _hand_over(self, work: Callable[[], None]) -> None:
-        """Run `work` on the network thread now, or not at all: one that waited too long is taken back."""
+        """Write frames to the socket now, or not at all: what waited too long is taken back."""
         if self._thread.is_current:
-            work()
+            connection.send(*frames)
             return
         done: Future[None] = Future()
+
+        def send() -> None:
+            connection.send(*frames)
+            done.set_result(None)
+
+        try:
+            self._post(done, send)
+            done.result(_SEND_WITHIN)
+        except NoResultYet:
+            self._require_taken(done, _SEND_WITHIN)
+            done.result()  # it is being written
+        finally:
+            done.cancel()  # also after Ctrl-C: what was not sent by now is not to be sent any more
+
+    def _post(self, done: Future[Any], work: Callable[[], None]) -> None:
+        """Run `work` on the network thread, unless `done` is cancelled before; what it raises goes to `done`."""
 
         def run() -> None:
             if done.set_running_or_notify_cancel():
                 try:
                     work()
-                    done.set_result(None)
                 except BaseException as error:
                     done.set_exception(error)
 
-        try:
-            if not self._thread.post(run):
-                raise LinkLost(f"{self.url}: the link is down ({self._why}). Nothing was sent, and nothing is kept.")
-            done.result(_SEND_WITHIN)
-        except NoResultYet:
-            if done.cancel():
-                raise LinkLost(
-                    f"{self.url}: the network thread took nothing for {_SEND_WITHIN:g} s; nothing was sent. "
-                    "A listener must return at once: do work in another thread."
-                ) from None
-            done.result()
-        finally:
-            done.cancel()  # also after Ctrl-C: what was not sent by now is not to be sent any more
+        if not self._thread.post(run):
+            raise LinkLost(f"{self.url}: the link is down ({self._why}). Nothing was sent, and nothing is kept.")
+
+    def _require_taken(self, done: Future[Any], waited: float) -> None:
+        """Take the work of `done` back, or see that it has begun."""
+        if done.cancel():
+            raise LinkLost(
+                f"{self.url}: the network thread took nothing for {waited:g} s; nothing was sent. "
+                "A listener must return at once: do work in another thread."
+            )
 
     def _declare(self, declare: Callable[[], dict[str, Any] | None]) -> None:
         """Note a declaration; tell it now if there is a connection: the greeting of the next one contains it anyway."""
