@@ -18,6 +18,7 @@ from __future__ import annotations
 import copy
 import sys
 from collections.abc import Iterable
+from contextlib import ExitStack
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -102,7 +103,13 @@ class Agent(_Base):  # type: ignore[misc]
         raise NotImplementedError(f"{type(self).__name__} must override forward(self, t, **kwargs).")
 
     def close(self) -> None:
-        """Stop what moves and release what is open; called when an exception leaves the loop. Nothing by default."""
+        """Stop what moves and release what is open; called when an exception leaves the loop.
+
+        By default it closes the agents in it, those that move something real first; a failure is raised at the end.
+        """
+        with ExitStack() as stack:  # closes what is left when one fails, last one first
+            for agent in sorted(self._inner(), key=is_live):
+                stack.callback(agent.close)
 
     def _inner(self) -> tuple[Agent, ...]:
         """The agents in it."""
@@ -173,8 +180,9 @@ class Agent(_Base):  # type: ignore[misc]
         return self
 
     def get_by_name(self, n: str) -> list[Agent]:
-        """The agents of that name in the tree: members first, then the container."""
-        return [self] if n == self._name else []
+        """The agents of that name in the tree: those in it first, then itself."""
+        found = [one for agent in self._inner() for one in agent.get_by_name(n)]
+        return [*found, self] if n == self._name else found
 
     def with_prefix(self, prefix: str) -> Self:
         """Set `prefix`; the agent itself is returned."""
@@ -182,7 +190,9 @@ class Agent(_Base):  # type: ignore[misc]
         return self
 
     def seed(self, seed: int) -> Any:
-        """Nothing: an agent that draws random numbers overrides it."""
+        """Seed the agents in it; an agent that draws random numbers overrides this."""
+        for agent in self._inner():
+            agent.seed(seed)
 
     def clone(self) -> Self:
         """A deep copy that belongs to no workspace; the gradients of this one are zeroed, as BBRL does."""
@@ -233,6 +243,11 @@ def import_torch(purpose: str) -> Any:
 def agent_name(agent: Agent) -> str:
     """Its class, and its name if it has one, for error messages."""
     return type(agent).__name__ + (f" {agent._name!r}" if agent._name else "")
+
+
+def is_live(agent: Agent) -> bool:
+    """Whether it, or an agent in it, moves something real."""
+    return agent.live or any(is_live(one) for one in agent._inner())
 
 
 def is_module(agent: Agent) -> bool:

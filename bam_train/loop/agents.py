@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -49,22 +48,6 @@ class Agents(Agent):
         for agent in self._members():
             agent(workspace, **kwargs)
 
-    def seed(self, seed: int) -> None:
-        """Seed every member."""
-        for agent in self._members():
-            agent.seed(seed)
-
-    def close(self) -> None:
-        """Close every member, those that move something real first; a failure is raised at the end."""
-        with ExitStack() as stack:  # closes what is left when one fails, last one first
-            for agent in sorted(self._members(), key=is_live):
-                stack.callback(agent.close)
-
-    def get_by_name(self, n: str) -> list[Agent]:
-        """The agents of that name in the tree: members first, then the container."""
-        found = [one for agent in self._members() for one in agent.get_by_name(n)]
-        return found + super().get_by_name(n)
-
     def __getitem__(self, k: Any) -> Any:
         return self.agents[k]
 
@@ -103,14 +86,6 @@ class KWAgentWrapper(Agent):
     def forward(self, **kwargs: Any) -> None:
         """Run the agent on the same workspace."""
         self.wrapped(self.workspace, **kwargs, **self.kwargs)
-
-    def seed(self, seed: int) -> Any:
-        """Seed the agent."""
-        return self.wrapped.seed(seed)
-
-    def close(self) -> None:
-        """Close the agent."""
-        self.wrapped.close()
 
     def _inner(self) -> tuple[Agent, ...]:
         return (self.wrapped,)
@@ -204,11 +179,6 @@ def leaves(agent: Agent) -> list[Agent]:
     """The agents that do the work, in the order in which they run."""
     parts = agent._parts()
     return [agent] if parts is None else [leaf for part in parts for leaf in leaves(part)]
-
-
-def is_live(agent: Agent) -> bool:
-    """Whether it, or an agent in it, moves something real."""
-    return agent.live or any(is_live(one) for one in agent._inner())
 
 
 def describe(agent: Agent) -> str:

@@ -33,32 +33,20 @@ def progress_display(
 ) -> Iterator[Advance]:
     """Shows how far a loop has come; gives a function to be called with the number of steps just done.
 
+    A loop that ends early is shown as finished; one that an exception leaves stays where it was.
+
     Args:
         progress: A :class:`rich.progress.Progress` of the caller's, which gets one more task, or True for a display
             of its own on stderr, which is drawn on a terminal and in a notebook only.
-        n_steps: How many steps there will be at most; None where only a stop variable ends the loop.
+        n_steps: The most steps there will be; None where only a stop variable ends the loop.
         t: The time of the first step.
         description: What is written in front of the bar.
-
-    A loop that ends early is shown as finished; one that an exception leaves stays where it was.
     """
     text = f"{description} from t={t}" if t else description
     if isinstance(progress, Progress):
-        with _task(progress, n_steps, text, redraw=None) as advance:
+        with _task(progress, n_steps, text, redraw=_nothing) as advance:
             yield advance
-    elif progress:
-        with _own_display(n_steps, text) as advance:
-            yield advance
-    else:
-        yield _nothing
-
-
-def _nothing(steps: int) -> None:
-    """Nobody is looking."""
-
-
-@contextmanager
-def _own_display(n_steps: int | None, text: str) -> Iterator[Advance]:
+        return
     console = Console(stderr=True)
     display = Progress(
         TextColumn("{task.description}", markup=False),
@@ -70,29 +58,30 @@ def _own_display(n_steps: int | None, text: str) -> Iterator[Advance]:
         auto_refresh=False,  # no thread: the loop itself redraws
         redirect_stdout=sys.stdout.isatty(),  # what is printed goes above the bar; into a file it goes as always
     )
-    if console.is_jupyter:
+    if progress and console.is_jupyter:
         with _task(display, n_steps, text, _notebook_line(display)) as advance:
             yield advance
-    elif console.is_terminal:
+    elif progress and console.is_terminal:
         with display, _task(display, n_steps, text, display.refresh) as advance:
             yield advance
     else:
         yield _nothing
 
 
+def _nothing(*steps: int) -> None:
+    """Nobody is looking."""
+
+
 @contextmanager
-def _task(
-    progress: Progress, n_steps: int | None, text: str, redraw: Callable[[], None] | None = None
-) -> Iterator[Advance]:
-    """One task of a display, told how far it is every REDRAW_SECONDS; without `redraw` the display draws itself."""
+def _task(progress: Progress, n_steps: int | None, text: str, redraw: Callable[[], None]) -> Iterator[Advance]:
+    """One task of a display, told how far it is every REDRAW_SECONDS."""
     task = progress.add_task(text, total=n_steps)
     clock = time.perf_counter
     done, due = 0, clock() + REDRAW_SECONDS
 
     def show(total: int | None = None) -> None:
         progress.update(task, completed=done, total=total)  # a total of None leaves it as it is
-        if redraw is not None:
-            redraw()
+        redraw()
 
     def advance(steps: int = 1) -> None:
         nonlocal done, due
@@ -101,8 +90,7 @@ def _task(
             show()
             due = clock() + REDRAW_SECONDS
 
-    if redraw is not None:
-        redraw()
+    redraw()
     try:
         yield advance
     except BaseException:
@@ -114,7 +102,7 @@ def _task(
 
 
 def _notebook_line(display: Progress) -> Callable[[], None]:
-    """One line of a notebook's output that is written over; rich's own way needs ipywidgets."""
+    """One line of a notebook's output that is written over; rich itself needs ipywidgets for this."""
     show_in_notebook = importlib.import_module("IPython.display").display
     handle: Any = None
 

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from contextlib import nullcontext
-from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
 from bam_train.errors import LoopError, UnknownVariable, WiringError
-from bam_train.loop.agent import Agent, agent_name
-from bam_train.loop.agents import describe, is_live, leaves, members
+from bam_train.loop.agent import Agent, agent_name, is_live
+from bam_train.loop.agents import describe, leaves, members
 from bam_train.loop.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -139,18 +138,6 @@ class TemporalAgent(Agent):
         """A display of the caller's stays with the original."""
         return {**super().__getstate__(), "progress": self.progress is True}
 
-    def close(self) -> None:
-        """Close the agent."""
-        self.agent.close()
-
-    def seed(self, seed: int) -> Any:
-        """Seed the agent."""
-        return self.agent.seed(seed)
-
-    def get_by_name(self, n: str) -> list[Agent]:
-        """The agents of that name in the tree: members first, then the container."""
-        return self.agent.get_by_name(n) + super().get_by_name(n)
-
 
 def _is_reached(workspace: Workspace, stop_variable: str, t: int) -> bool:
     """Whether the stop variable is true for the whole batch."""
@@ -216,7 +203,9 @@ def _check_chain(chain: list[Agent], held: frozenset[str], stop_variable: str | 
 
 
 def _close(name: str, known: Iterable[str]) -> str:
+    from bam_envs.core.wording import closest  # brings Gymnasium
+
     names = sorted(known)
-    close = get_close_matches(name, names, n=1)
-    question = f", did you mean {close[0]!r}?" if close else "."
+    match = closest(name, names)
+    question = "." if match is None else f", did you mean {match!r}?"
     return f"{question} Written are {', '.join(map(repr, names))}." if names else f"{question} Nothing is written."

@@ -4,8 +4,8 @@ A variable that `set` writes is a list. One that `set_full` writes is one array,
 of a list is kept until the next write through the workspace, so that a second full read costs only a copy. A stored
 value that is changed in place after a full read does not show in the next full read.
 
-`NumpyVariable` copies values in. `bam_train.loop.tensors.tensor_variable.TensorVariable` keeps the tensor objects
-themselves, with their graph: what was written at t and read at t + 1 can still be differentiated through, as in BBRL.
+NumPy values are copied in. `bam_train.loop.tensors.tensor_variable.TensorVariable` keeps the tensor objects themselves,
+with their graph: what was written at t and read at t + 1 can still be differentiated through, as in BBRL.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ UNLIMITED = 2**62
 
 
 class Variable:
-    """One variable, T x B x ...; B x ... at one time.
+    """One variable of NumPy arrays, T x B x ...; B x ... at one time.
 
     Args:
         name: For error messages.
@@ -33,12 +33,14 @@ class Variable:
     Attributes:
         shape: The shape of one time; None before the first write.
         dtype: The dtype of the values; None before the first write.
+        library: Has `stack` and `concatenate` for its values.
     """
 
-    ARRAY: type
+    ARRAY: type = np.ndarray
     """The class of its values."""
-    KIND: str
+    KIND = "a numpy.ndarray"
     """The same, for error messages."""
+    library: Any = np
 
     def __init__(
         self, name: str, first: int = 0, limit: int = UNLIMITED, make_room: Callable[[int], None] | None = None
@@ -119,8 +121,8 @@ class Variable:
         self._be_like(value.shape[1:], value)
 
     def full(self) -> Any:
-        """All times kept, T x B x ...: one array itself, of a list a copy."""
-        return self._whole if self._values is None else self.copied(self.view())
+        """A copy of all times kept, T x B x ...."""
+        return self.copied(self.view())
 
     def view(self) -> Any:
         """All times kept, T x B x ..., to be read at once and not to be changed."""
@@ -131,7 +133,7 @@ class Variable:
         return self._joined
 
     def truncated(self, begin: int, end: int) -> Any:
-        """Times [begin, end), cut off at the end: a view of one array, a copy of a list."""
+        """Times [begin, end), cut off at the end; a view of one array, a copy of a list."""
         times = slice(max(0, begin - self.first), max(0, end - self.first))
         if self._values is None:
             return self._whole[times]
@@ -156,48 +158,44 @@ class Variable:
     def detach(self) -> None:
         """Cut every value off its graph."""
 
-    # -- what a kind of array does its own way ---------------------------------------------------------------------
+    # -- what another kind of array does its own way ---------------------------------------------------------------
 
     def _fits(self, value: Any) -> bool:
         """Whether the value is like those before; quick."""
-        raise NotImplementedError
+        return type(value) is np.ndarray and value.shape == self.shape and value.dtype == self.dtype
 
     def _own(self, value: Any) -> Any:
         """The value as it is kept."""
-        return value
+        return np.array(value)
 
     def _join(self, values: Sequence[Any]) -> Any:
         """T values B x ..., at least one, as one new array T x B x ...."""
-        raise NotImplementedError
+        if not self.shape:
+            return np.stack(values)
+        return np.concatenate(values).reshape(len(values), *self.shape)  # several times as quick as `stack`
 
     def _zeros(self) -> Any:
         """A time that nobody wrote."""
-        raise NotImplementedError
-
-    @staticmethod
-    def stack(arrays: Sequence[Any]) -> Any:
-        """Arrays of one shape along a new first axis."""
-        raise NotImplementedError
-
-    @staticmethod
-    def concatenate(arrays: Sequence[Any], axis: int) -> Any:
-        """Arrays one after the other along `axis`."""
-        raise NotImplementedError
+        return np.zeros(self.shape, self.dtype)
 
     @staticmethod
     def index(index: Any, like: Any) -> Any:
         """`index` (integers or booleans) as an array that indexes `like`."""
-        raise NotImplementedError
+        array = np.asarray(index)
+        empty = array.dtype.kind == "f" and not array.size  # what an empty list becomes
+        return np.empty(0, dtype=np.int64) if empty else array
 
     @staticmethod
     def copied(array: Any) -> Any:
         """A copy that shares no memory, and keeps the graph."""
-        raise NotImplementedError
+        return np.array(array)
 
     @staticmethod
     def on_device(array: Any, device: Any) -> Any:
         """The array on `device`; itself if it is there."""
-        raise NotImplementedError
+        if str(device).partition(":")[0] != "cpu":
+            raise WorkspaceError(f"A NumPy array cannot be moved to {device}; only tensors can.")
+        return array
 
     # -- inside ----------------------------------------------------------------------------------------------------
 
@@ -261,64 +259,6 @@ class Variable:
         several = self.stop - self.first > 1
         text = f"it has times {self.first} to {self.stop - 1}" if several else f"it has time {self.first} only"
         return f"{text}; earlier ones have left the window" if self.first else text
-
-
-class NumpyVariable(Variable):
-    """One variable of NumPy arrays."""
-
-    ARRAY = np.ndarray
-    KIND = "a numpy.ndarray"
-
-    def _fits(self, value: Any) -> bool:
-        return type(value) is np.ndarray and value.shape == self.shape and value.dtype == self.dtype
-
-    def _own(self, value: Any) -> Any:
-        return np.array(value)
-
-    def _join(self, values: Sequence[Any]) -> Any:
-        if not self.shape:
-            return np.stack(values)
-        return np.concatenate(values).reshape(len(values), *self.shape)  # several times as quick as `stack`
-
-    def _zeros(self) -> Any:
-        return np.zeros(self.shape, self.dtype)
-
-    def full(self) -> Any:
-        """A copy of all times kept, T x B x ...."""
-        return np.array(self.view())
-
-    def truncated(self, begin: int, end: int) -> Any:
-        """A copy of times [begin, end), cut off at the end."""
-        return np.array(super().truncated(begin, end))
-
-    @staticmethod
-    def stack(arrays: Sequence[Any]) -> Any:
-        """Arrays of one shape along a new first axis."""
-        return np.stack(arrays)
-
-    @staticmethod
-    def concatenate(arrays: Sequence[Any], axis: int) -> Any:
-        """Arrays one after the other along `axis`."""
-        return np.concatenate(arrays, axis=axis)
-
-    @staticmethod
-    def index(index: Any, like: Any) -> Any:
-        """`index` (integers or booleans) as an array."""
-        array = np.asarray(index)
-        empty = array.dtype.kind == "f" and not array.size  # what an empty list becomes
-        return np.empty(0, dtype=np.int64) if empty else array
-
-    @staticmethod
-    def copied(array: Any) -> Any:
-        """A copy that shares no memory."""
-        return np.array(array)
-
-    @staticmethod
-    def on_device(array: Any, device: Any) -> Any:
-        """The array itself: NumPy's are on the CPU."""
-        if str(device).partition(":")[0] != "cpu":
-            raise WorkspaceError(f"A NumPy array cannot be moved to {device}; only tensors can.")
-        return array
 
 
 def kind_name(value: Any) -> str:

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bam_train.errors import TimeNotWritten, UnknownVariable, WorkspaceError
-from bam_train.loop.variables import UNLIMITED, NumpyVariable, Variable, kind_mismatch, no_batch
+from bam_train.loop.variables import UNLIMITED, Variable, kind_mismatch, no_batch
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -101,7 +101,7 @@ class Workspace:
     def set_deferred(self, name: str, t: int, array: np.ndarray) -> None:
         """Write the tensor of a NumPy array (B x ...) that nobody changes any more, made when somebody reads it."""
         variable: Any = self.variables.get(name)
-        if variable is None or isinstance(variable, NumpyVariable):  # which refuses tensors
+        if variable is None or variable.ARRAY is np.ndarray:  # which refuses tensors
             self.set(name, t, sys.modules["torch"].from_numpy(array))
         else:
             variable.set_deferred(t, array)
@@ -299,7 +299,7 @@ class Workspace:
                     f"{int(start.max()) + self.first_time} are wanted; {one.kept_times()}."
                 )
             columns = one.index(range(one.batch_size()), array)
-            result[name] = one.stack([array[start + k, columns] for k in range(window_size)])
+            result[name] = one.library.stack([array[start + k, columns] for k in range(window_size)])
         return _of(result)
 
     def sample_subworkspace(self, n_times: int, n_batch_elements: int, n_timesteps: int) -> Workspace:
@@ -353,7 +353,7 @@ class Workspace:
                     f"cat_batch: expected workspaces of {first.time_size()} times, found one of {other.time_size()}."
                 )
         arrays = {
-            name: one.concatenate([workspace.get_full(name) for workspace in workspaces], 1)
+            name: one.library.concatenate([workspace.get_full(name) for workspace in workspaces], 1)
             for name, one in first.variables.items()
         }
         return _of(arrays)
@@ -446,7 +446,7 @@ class Workspace:
     def _new(self, name: str, value: Any, where: str) -> Variable:
         """An empty variable for values of this kind."""
         if isinstance(value, np.ndarray):
-            kind: type[Variable] = NumpyVariable
+            kind: type[Variable] = Variable
         elif sys.modules.get("torch") is not None and isinstance(value, sys.modules["torch"].Tensor):
             from bam_train.loop.tensors.tensor_variable import TensorVariable
 
@@ -464,7 +464,7 @@ class Workspace:
         return {name: self._variable(name) for name in (self.variables if names is None else names)}
 
     def _has_tensors(self) -> bool:
-        return not all(isinstance(one, NumpyVariable) for one in self.variables.values())
+        return not all(one.ARRAY is np.ndarray for one in self.variables.values())
 
     def _require_times(self, name: str, begin: int, end: int) -> None:
         """Refuse a range of times that is empty, negative, or has left the window."""
@@ -512,9 +512,9 @@ def _pairs(one: Variable, inside: Any) -> Any:
     array = one.view()
     if inside is None:
         shape = (-1, *array.shape[2:]) if array.shape[0] > 1 else (0, *array.shape[2:])
-        return one.stack([array[:-1].reshape(shape), array[1:].reshape(shape)])
+        return one.library.stack((array[:-1].reshape(shape), array[1:].reshape(shape)))
     chosen = one.index(inside, array)
-    return one.stack([array[:-1][chosen], array[1:][chosen]])
+    return one.library.stack((array[:-1][chosen], array[1:][chosen]))
 
 
 def _common(what: str, sizes: Mapping[str, int]) -> int | None:

@@ -14,9 +14,6 @@ from bam_train.loop.agent import Agent
 class TimeAgent(Agent, ABC):
     """An agent whose ``forward`` takes the time t."""
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-
     def forward(self, t: int, *args: Any, **kwargs: Any) -> Any:
         """What it does at time t; to be overridden."""
         raise NotImplementedError(f"{type(self).__name__} must override forward(self, t, **kwargs).")
@@ -32,6 +29,7 @@ class SeedableAgent(Agent, ABC):
     def __init__(self, seed: int | None = None, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self._seed = seed
+        self._seeds: list[int] = []
 
     def seed(self, seed: int) -> Any:
         """Take the seed; the agent itself is returned.
@@ -51,47 +49,32 @@ class SeedableAgent(Agent, ABC):
 class SeedableAgentLast(SeedableAgent, ABC):
     """An agent that has the last seed it was given."""
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-
     def seed(self, seed: int) -> Any:
         """Take the seed; the agent itself is returned."""
-        self._seed = seed
+        self._seeds.append(seed)
+        self._seed = self._combined(self._seeds)
         return self
 
+    def _combined(self, seeds: list[int]) -> int:
+        return seeds[-1]
 
-class SeedableAgentSum(SeedableAgent, ABC):
+
+class SeedableAgentSum(SeedableAgentLast, ABC):
     """An agent that has the sum of the seeds it was given."""
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self._seeds: list[int] = []
-
-    def seed(self, seed: int) -> Any:
-        """Add the seed; the agent itself is returned."""
-        self._seeds.append(seed)
-        self._seed = sum(self._seeds)
-        return self
+    def _combined(self, seeds: list[int]) -> int:
+        return sum(seeds)
 
 
-class SeedableAgentMean(SeedableAgentSum, ABC):
+class SeedableAgentMean(SeedableAgentLast, ABC):
     """An agent that has the mean of the seeds it was given, rounded down to a whole number."""
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-
-    def seed(self, seed: int) -> Any:
-        """Add the seed; the agent itself is returned."""
-        super().seed(seed)
-        self._seed = int(sum(self._seeds) / len(self._seeds))
-        return self
+    def _combined(self, seeds: list[int]) -> int:
+        return int(sum(seeds) / len(seeds))
 
 
 class SerializableAgent(Agent, ABC):
     """An agent that can be saved; override `serialize` to leave out what cannot."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
 
     def serialize(self) -> Any:
         """What is saved: the agent without what cannot be pickled."""
@@ -121,7 +104,6 @@ def load(filename: str | Path) -> Any:
         LoopError: No such file, or not a pickle.
     """
     try:
-        with open(Path(filename).expanduser(), "rb") as file:
-            return pickle.load(file)
+        return pickle.loads(Path(filename).expanduser().read_bytes())
     except (OSError, pickle.UnpicklingError, EOFError) as error:
         raise LoopError(f"{filename}: no agent can be loaded: {error}") from error

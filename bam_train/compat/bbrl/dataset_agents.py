@@ -19,8 +19,6 @@ from bam_train.loop.agent import Agent
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-_NAMES = ("x", "y")
-
 
 class _DatasetAgent(Agent):
     """Writes batches, on the device where the agent is (`to`)."""
@@ -29,14 +27,29 @@ class _DatasetAgent(Agent):
 
     def __init__(self, output_names: Sequence[str]) -> None:
         super().__init__()
-        self.output_names = tuple(output_names)
-        self.writes = self.output_names
+        self.output_names = self.writes = tuple(output_names)
         self.ghost_params = torch.nn.Parameter(torch.empty(0))
 
-    def _write(self, batch: Any) -> None:
-        """Write the values of one batch at time 0, by name, in order."""
-        for name, value in zip(self.output_names, _values(batch, self.output_names), strict=False):
+    def _write(self, values: Sequence[Any]) -> None:
+        for name, value in zip(self.output_names, values, strict=True):
             self.set((name, 0), torch.as_tensor(value).to(self.ghost_params.device))
+
+    def _values(self, batch: Any) -> list[Any]:
+        """The values that the names stand for, of a tuple, a mapping or one tensor."""
+        names = self.output_names
+        if isinstance(batch, Mapping):
+            missing = [name for name in names if name not in batch]
+            if missing:
+                raise WorkspaceError(
+                    f"The dataset has no {missing[0]!r}; its items have {', '.join(map(repr, batch))}."
+                )
+            return [batch[name] for name in names]
+        values = [batch] if isinstance(batch, (torch.Tensor, np.ndarray)) else list(batch)
+        if len(values) < len(names):
+            raise WorkspaceError(
+                f"output_names: expected as many as the dataset has values ({len(values)}), found {names}."
+            )
+        return values[: len(names)]
 
 
 class DataLoaderAgent(_DatasetAgent):
@@ -54,7 +67,7 @@ class DataLoaderAgent(_DatasetAgent):
         output_names: Variables for the values of a batch, B x ... each; further values are left out.
     """
 
-    def __init__(self, dataloader: Any, output_names: Sequence[str] = _NAMES) -> None:
+    def __init__(self, dataloader: Any, output_names: Sequence[str] = ("x", "y")) -> None:
         super().__init__(output_names)
         self.dataloader = dataloader
         self.reset()
@@ -76,12 +89,10 @@ class DataLoaderAgent(_DatasetAgent):
         """
         if self._finished:
             return
-        try:
-            batch = next(self.iter)
-        except StopIteration:
-            self._finished = True
-        else:
-            self._write(batch)
+        for batch in self.iter:
+            self._write(self._values(batch))
+            return
+        self._finished = True
 
 
 class ShuffledDatasetAgent(_DatasetAgent):
@@ -89,11 +100,11 @@ class ShuffledDatasetAgent(_DatasetAgent):
 
     Args:
         dataset: A ``torch.utils.data.Dataset`` with a length, whose items are tuples of tensors or numbers.
-        batch_size: Items of each batch.
+        batch_size: The number of items of each batch.
         output_names: Variables for the values of an item, batch_size x ... each; further values are left out.
     """
 
-    def __init__(self, dataset: Any, batch_size: int, output_names: Sequence[str] = _NAMES) -> None:
+    def __init__(self, dataset: Any, batch_size: int, output_names: Sequence[str] = ("x", "y")) -> None:
         super().__init__(output_names)
         self.dataset = dataset
         self.batch_size = batch_size
@@ -102,7 +113,7 @@ class ShuffledDatasetAgent(_DatasetAgent):
     def seed(self, seed: int | None = None) -> Self:
         """Draw from a generator of its own from now on; the agent itself is returned.
 
-        Without a seed at all it draws from torch's global generator.
+        An agent that is never seeded draws from torch's global generator.
 
         Args:
             seed: The same one gives the same batches; None gives others every time.
@@ -121,29 +132,9 @@ class ShuffledDatasetAgent(_DatasetAgent):
         Raises:
             WorkspaceError: The dataset is empty, or its items have fewer values than there are names.
         """
-        items = [_values(self.dataset[k], self.output_names) for k in self._drawn()]
-        self._write([torch.stack([torch.as_tensor(value) for value in column]) for column in zip(*items, strict=True)])
-
-    def _drawn(self) -> list[int]:
-        """Which items."""
-        size = len(self.dataset)
+        size, count = len(self.dataset), self.batch_size
         if not size:
             raise WorkspaceError("The dataset is empty: there is nothing to draw from.")
-        if self._rng is None:
-            return [int(k) for k in torch.randint(size, (self.batch_size,))]
-        return [int(k) for k in self._rng.integers(size, size=self.batch_size)]
-
-
-def _values(batch: Any, names: Sequence[str]) -> list[Any]:
-    """The values that `names` stand for, of a tuple, a mapping or one tensor."""
-    if isinstance(batch, Mapping):
-        missing = [name for name in names if name not in batch]
-        if missing:
-            raise WorkspaceError(f"The dataset has no {missing[0]!r}; its items have {', '.join(map(repr, batch))}.")
-        return [batch[name] for name in names]
-    values = [batch] if isinstance(batch, (torch.Tensor, np.ndarray)) else list(batch)
-    if len(values) < len(names):
-        raise WorkspaceError(
-            f"output_names: expected as many as the dataset has values ({len(values)}), found {names}."
-        )
-    return values[: len(names)]
+        drawn = torch.randint(size, (count,)) if self._rng is None else self._rng.integers(size, size=count)
+        items = [self._values(self.dataset[int(k)]) for k in drawn]
+        self._write([torch.stack([torch.as_tensor(value) for value in column]) for column in zip(*items, strict=True)])

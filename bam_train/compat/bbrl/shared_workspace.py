@@ -18,7 +18,7 @@ import torch
 
 from bam_train.errors import WorkspaceError
 from bam_train.loop.tensors.tensor_variable import TensorVariable
-from bam_train.loop.variables import NumpyVariable, Variable, mismatch
+from bam_train.loop.variables import Variable, mismatch
 from bam_train.loop.workspace import Workspace
 
 
@@ -88,10 +88,6 @@ class _SharedVariable(Variable):
 class _SharedTensorVariable(_SharedVariable, TensorVariable):
     def set_deferred(self, t: int, array: np.ndarray) -> None:
         self.set(t, torch.from_numpy(array))
-
-
-class _SharedNumpyVariable(_SharedVariable, NumpyVariable):
-    pass
 
 
 class SharedWorkspace(Workspace):
@@ -169,4 +165,4 @@ def _shared(name: str, value: Any, n_repeat: int, time_size: int | None) -> _Sha
     memory = tensor.new_zeros((time_size or times, n_repeat * columns, *tensor.shape[2:])).share_memory_()
     if time_size is None:
         memory.copy_(torch.cat([tensor] * n_repeat, dim=1))
-    return (_SharedNumpyVariable if isinstance(value, np.ndarray) else _SharedTensorVariable)(name, memory)
+    return (_SharedVariable if isinstance(value, np.ndarray) else _SharedTensorVariable)(name, memory)

@@ -16,6 +16,7 @@ class TensorVariable(Variable):
 
     ARRAY = torch.Tensor
     KIND = "a torch.Tensor"
+    library = torch
 
     _device: torch.device | None = None
     _is_cpu = False
@@ -53,6 +54,10 @@ class TensorVariable(Variable):
         tensor: torch.Tensor = value
         return tensor
 
+    def full(self) -> torch.Tensor:
+        """All times kept, T x B x ...: one tensor itself, of a list a copy."""
+        return self._whole if self._values is None else self.view().clone()
+
     def view(self) -> torch.Tensor:
         """All times kept, T x B x ..., to be read at once and not to be changed."""
         if self._values is None:
@@ -76,6 +81,9 @@ class TensorVariable(Variable):
             self._whole = self._whole.detach()
         else:
             self._values = [value if type(value) is np.ndarray else value.detach() for value in self._values]
+
+    def _own(self, value: Any) -> Any:
+        return value
 
     def _fits(self, value: Any) -> bool:
         try:
@@ -105,16 +113,6 @@ class TensorVariable(Variable):
 
     def _zeros(self) -> torch.Tensor:
         return torch.zeros(self.shape, dtype=self.dtype, device=self._device)
-
-    @staticmethod
-    def stack(arrays: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Tensors of one shape along a new first axis."""
-        return torch.stack(list(arrays))
-
-    @staticmethod
-    def concatenate(arrays: Sequence[torch.Tensor], axis: int) -> torch.Tensor:
-        """Tensors one after the other along `axis`."""
-        return torch.cat(list(arrays), dim=axis)
 
     @staticmethod
     def index(index: Any, like: torch.Tensor) -> torch.Tensor:

@@ -56,16 +56,20 @@ def test_arguments_need_no_classname():
         ({"classname": ".Fraction"}, "classname: expected a path such as \"package.module.Class\", found '.Fraction'."),
         (
             {"classname": "fractions.Fractoin"},
-            "classname 'fractions.Fractoin': module 'fractions' has no 'Fractoin', did you mean 'Fraction'?",
+            "classname 'fractions.Fractoin': module 'fractions' has no 'Fractoin'. Did you mean 'Fraction'?",
         ),
-        ({"classname": "fractions.Zzz"}, "classname 'fractions.Zzz': module 'fractions' has no 'Zzz'."),
+        (
+            {"classname": "numbers.Zzz"},
+            "classname 'numbers.Zzz': module 'numbers' has no 'Zzz'. "
+            "Choose from: ABCMeta, Complex, Integral, Number, Rational, Real, abstractmethod.",
+        ),
         (
             {"classname": "fractoins.Fraction"},
-            "classname 'fractoins.Fraction': there is no module 'fractoins'; install it or correct the name.",
+            "classname 'fractoins.Fraction': No module named 'fractoins'; install it or correct the name.",
         ),
         (
             {"classname": "json.decodr.JSONDecoder"},
-            "classname 'json.decodr.JSONDecoder': there is no module 'json.decodr'; install it or correct the name.",
+            "classname 'json.decodr.JSONDecoder': No module named 'json.decodr'; install it or correct the name.",
         ),
         (3, "configuration: expected a mapping with a classname, found 3."),
     ],
@@ -81,4 +85,7 @@ def test_a_module_whose_own_import_is_missing(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(SettingsError) as caught:
         get_class({"classname": "needs_more.Thing"})
-    assert str(caught.value) == "classname 'needs_more.Thing': it needs 'not_there_at_all', which is not installed."
+    assert (
+        str(caught.value)
+        == "classname 'needs_more.Thing': No module named 'not_there_at_all'; install it or correct the name."
+    )

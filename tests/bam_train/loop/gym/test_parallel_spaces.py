@@ -167,6 +167,11 @@ def test_a_missing_action(toys):
         agent(ws, t=1)
 
 
+def test_an_action_in_one_piece_where_the_space_is_a_dict(toys):
+    with pytest.raises(UnknownVariable, match=r"^'action/go' is not in the workspace, did you mean 'action'\?"):
+        step_with(toys, spaces.Dict(go=spaces.Discrete(2)), torch.tensor([0, 1]))
+
+
 def test_a_missing_part_of_the_action(toys):
     with pytest.raises(UnknownVariable, match=r"^'action/stop' is not in the workspace"):
         step_with(
@@ -194,11 +199,6 @@ def test_a_missing_part_of_the_action(toys):
             spaces.Discrete(2, start=-1),
             torch.tensor([-2, 0]),
             "'action' at t=0: Discrete(2, start=-1) takes -1 to 0, found -2 for environment 0.",
-        ),
-        (
-            spaces.Dict(go=spaces.Discrete(2)),
-            torch.tensor([0, 1]),
-            "'action' at t=0: expected the variables 'action/go', found 'action' itself.",
         ),
         (spaces.Text(3), torch.tensor([0, 1, 1]), "'action' at t=0: expected batch size 2, found 3."),
     ],

@@ -162,7 +162,7 @@ def state(buffer):
         (
             full(x=torch.zeros(2, 1), done=torch.zeros(2, 2) > 0),
             WorkspaceError,
-            "Expected one batch size for all variables, found 'x' 1, 'done' 2.",
+            "The variables have different batch sizes: 'x' has 1, 'done' has 2.",
         ),
         (
             full(x=torch.zeros(2), done=torch.zeros(2, 2) > 0),
@@ -197,5 +197,5 @@ def test_an_empty_buffer_says_so():
 
 
 def test_a_buffer_has_room_for_a_row():
-    with pytest.raises(WorkspaceError, match=r"^max_size: expected at least 1 row, found 0\.$"):
+    with pytest.raises(WorkspaceError, match=r"^max_size: expected at least 1, found 0\.$"):
         ReplayBuffer(0)
