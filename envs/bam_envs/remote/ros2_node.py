@@ -54,7 +54,7 @@ class RclpyBus:
         self._threads: list[threading.Thread] = []
 
     def start(self) -> None:
-        """Become a node. Its signals stay the program's.
+        """Create the node. Signals stay the program's own.
 
         Raises:
             InvalidValue: rclpy is not here.
@@ -216,7 +216,7 @@ class RclpyBus:
         return self._node
 
     def close(self) -> None:
-        """Leave the graph. As often as one likes."""
+        """Leave the graph. Idempotent."""
         with self._lock:
             nodes = [node for node in (self._node, self._caller) if node is not None]
             self._node = self._caller = None
@@ -238,7 +238,7 @@ class RclpyBus:
 
 
 def _refusal(listener: Listener, message: Message) -> str:
-    """Why `listener` refuses `message`, which ROS has no way of telling its sender; empty if it does not."""
+    """Why `listener` refuses `message`, empty if it does not; ROS cannot tell the sender."""
     try:
         listener(message, UNKNOWN_CALLER)
     except BamEnvsError as error:

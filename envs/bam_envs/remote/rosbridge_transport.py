@@ -56,7 +56,7 @@ class RosbridgeTransport:
         name: The name of this client that others are told; computer and process by default.
         ca_file: PEM file of the authorities to trust instead of the system's.
         token: The server's shared secret, if it has one.
-        take: Take command from whoever has it.
+        take: Take command from the client that has it.
         observation_space: Of another rack; see `ForeignRack`.
         action_space, num_envs, period, action_type, gymapi_version, autoreset: Likewise.
 

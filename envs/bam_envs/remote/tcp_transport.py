@@ -46,7 +46,7 @@ class TcpTransport:
         connect_timeout: Longest time to connect [s].
         token: The server's shared secret, if it has one. Nothing is encrypted.
         name: What other clients are told of this one; computer and process by default.
-        take: Take command from whoever has it.
+        take: Take command from the client that has it.
 
     Raises:
         InvalidValue: `url` is not such a URL.

@@ -121,7 +121,7 @@ class Reset(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
     seed: Any
     options: Any
     take: Any
-    """Whether to take command from whoever has it."""
+    """Whether to take command from the client that has it."""
 
 
 class Step(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="step"):

@@ -1,4 +1,4 @@
-"""JSON without NaN and infinities, both ways."""
+"""JSON without NaN and infinities, written and read."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def dump_json(value: Any, what: str) -> str:
     """`value` as strict JSON; bytes as base64, as rosbridge has them.
 
     Raises:
-        InvalidValue: It holds what JSON has no word for: NaN, an infinity, an array.
+        InvalidValue: It holds what JSON cannot hold: NaN, an infinity, an array.
     """
     try:
         return json.dumps(value, allow_nan=False, separators=(",", ":"), default=_base64)

@@ -88,7 +88,7 @@ class GymRequest:
     tag: Tag | None = None
     """When it was sent and until when it counts; None from clients that say nothing."""
     take: bool = False
-    """Take command from whoever has it."""
+    """Take command from the client that has it."""
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ def refuse_foreign(seed: Seed, options: Info | None) -> None:
 
 
 def read_request(message: object) -> GymRequest:
-    """The request in `message`, whoever sent it.
+    """The request in `message`, of any client.
 
     Raises:
         InvalidValue: A field is of the wrong kind: its name, what was expected, what was found.
@@ -258,7 +258,7 @@ def write_failure(error: BamEnvsError, duration: float, stamp: Message, version:
 
 
 def read_response(message: object) -> GymResponse:
-    """The answer in `message`, whoever sent it.
+    """The answer in `message`, of any server.
 
     Raises:
         ProtocolError: A field is of the wrong kind.

@@ -61,7 +61,7 @@ class CommandLease:
 
         Args:
             client: Its name.
-            force: Take it from whoever has it.
+            force: Take it from the client that has it.
             shown: What the others are told instead of its name, where that is a secret.
             silence: How long its connection has given no sign of life [s].
 

@@ -134,7 +134,7 @@ class EnvServer:
         self.env = env
         self.lease = lease if isinstance(lease, CommandLease) else CommandLease(lease, clock)
         self.lock = threading.RLock()
-        """Held while the environment runs; whoever moves its robot in another way holds it, too."""
+        """Held while the environment runs, and by everything else that moves its robot."""
         self._spec = spec = describe_env(env, env_id)
         if realtime and spec.period is None:
             raise InvalidValue(f"{spec.env_id} does not say its period, so it has no real time; serve it with --fast.")
@@ -174,9 +174,9 @@ class EnvServer:
             client: Its name.
             seed: As for `gymnasium.Env.reset`; one or a list for a vector environment.
             options: As for `gymnasium.Env.reset`.
-            take: Take command from whoever has it, which only an operator may.
+            take: Take command from the client that has it, which only an operator may.
             deadline: When it is too late to begin [s], on the clock of this server.
-            caller: On whose connection it asks.
+            caller: The connection on which it asks.
             shown: What the others are told instead of its name, where that is a secret.
 
         Raises:
@@ -206,7 +206,7 @@ class EnvServer:
             NotInCommand: Another client is in command.
             ResetNeeded: No episode of this client is running.
             InvalidValue: The action does not fit; nothing moved.
-            RemoteError: The environment failed, or said NaN. A reset is needed.
+            RemoteError: The environment failed, or returned NaN. A reset is needed.
         """
         if self.lease.holder is None:
             raise ResetNeeded(_NO_EPISODE)
@@ -229,7 +229,7 @@ class EnvServer:
         return self._over == client
 
     def _take(self, client: str, force: bool, caller: Caller, shown: str | None) -> None:
-        """Put `client` in command; whoever it is taken from left a robot that rests."""
+        """Put `client` in command; the robot of the client before it halts."""
         before = self.lease.holder
         try:
             changed = self.lease.take(client, force=force and caller.operator, shown=shown, silence=caller.silence)
@@ -240,13 +240,13 @@ class EnvServer:
                 self._halt()
 
     def leave(self, client: str) -> None:
-        """`client` goes: if it was in command, the robot halts and another client may take command."""
+        """Release command, if `client` has it: the robot halts and another client may take command."""
         if self.lease.release(client):
             with self.lock:
                 self._halt()
 
     def end(self) -> None:
-        """Refuse whatever comes from now on; returns when what was under way is done."""
+        """Refuse every request from now on; returns when the one that runs is done."""
         with self.lock:
             self._ended = True
 
@@ -314,14 +314,14 @@ class EnvServer:
         return each
 
     def _run(self, work: Callable[[], Any]) -> Any:
-        """What `work` returns. Whatever the environment raises is the client's to know, and the server goes on."""
+        """What `work` returns. The client is told what the environment raises, and the server goes on."""
         try:
             return work()
         except Exception as error:  # environments are other people's code and raise anything
             raise RemoteError(f"{type(error).__name__}: {' '.join(str(error).split())}") from error
 
     def _options(self, options: Mapping[str, Any] | None) -> Info | None:
-        """A dict of their own, which environments may change; a mask as the array that they expect."""
+        """A copy, which environments may change, with the mask as the array that they expect."""
         if options is None:
             return None
         mask = {key: np.asarray(options[key], dtype=bool) for key in options.keys() & {"reset_mask"}}

@@ -2,7 +2,7 @@
 
 Commands are checked in the thread of the network, where they arrive, and their sender is told what is refused. An
 accepted command goes into one slot; the clock's thread takes it from there, moves the robot and publishes. In lockstep
-a quick robot is moved where its command arrives: the way to another thread and back costs more than its step.
+a quick robot is moved where its command arrives: handing it to another thread costs more than its step.
 
 Everything that moves the robot, or keeps it from moving, is in this file, so that one can see that a halt wins over
 each of them.
@@ -89,10 +89,10 @@ class RobotService:
     """Puts one robot on a bus.
 
     Args:
-        robot: The robot; whoever else moves it does so through this object, too.
+        robot: The robot; everything else that moves it does so through this object, too.
         profile: Its topics; those of commands that `robot` does not take are not offered.
         bus: Carries them.
-        lease: Who is in command; shared with whoever else moves the robot.
+        lease: Who is in command; shared with everything else that moves the robot.
         namespace: Before every topic, such as ``/cell_1``; or nothing.
         simulated: Whether nothing real moves; then a scene can be set.
         clock: Wall clock [s], for stamps.
@@ -120,7 +120,7 @@ class RobotService:
         """Its description for clients."""
         self._slot = CommandSlot()
         self._sessions = Sessions(lambda name: lease.holder == Caller("", session=name).client)
-        self._completing = {way[-1].topic for way in profile.commands.values()}
+        self._completing = {mode[-1].topic for mode in profile.commands.values()}
         self._low, self._high = np.array(robot.spec.command.low), np.array(robot.spec.command.high)
         self._answered = ""  # `Tag.echo` of the last command that was executed
         self._connected = True
@@ -135,11 +135,11 @@ class RobotService:
         """Moves the robot and publishes."""
 
     def start(self) -> None:
-        """Advertise, listen, and let time go on."""
+        """Advertise, listen, and start the clock."""
         measured = {signal.name for signal in self._robot.spec.signals}
         for topic, kind in {(one.topic, one.type) for one in self._profile.state if one.signal in measured}:
             self._bus.advertise(self._namespace + topic, kind)
-        for topic, kind in {(sink.topic, sink.type) for way in self._profile.commands.values() for sink in way}:
+        for topic, kind in {(sink.topic, sink.type) for mode in self._profile.commands.values() for sink in mode}:
             self._listen(topic, kind, self._command_listener(topic))
         self._listen(HALT_TOPIC, "std_msgs/Empty", self._on_halt)
         self._listen(LEASE_TOPIC, "std_msgs/String", self._on_lease)
@@ -152,7 +152,7 @@ class RobotService:
         self.clock.start()
 
     def close(self) -> None:
-        """Stop listening, halt, and let time stand still. Idempotent."""
+        """Stop listening, halt, and stop the clock. Idempotent."""
         while self._unsubscribe:
             self._unsubscribe.pop()()
         self.clock.stop()
@@ -205,7 +205,7 @@ class RobotService:
                 raise ProtocolError(f"{topic}: {label} must be {low:g} to {high:g} {unit}, not {value:g} {unit}.")
 
     def _on_halt(self, message: Message, caller: Caller) -> None:
-        """Anybody may halt; it waits for nothing but the part of a period that is being computed.
+        """Halt, for any client; waits only for the part of a period that is being computed.
 
         In lockstep the one whose command it overtook waits for an answer, and gets it: nothing moved.
         """
@@ -305,7 +305,7 @@ def _pose(value: object) -> Any:
     """x, y [m] and yaw [rad] of the object, or None if it is to stay. Shape: (1, 3)."""
     if value is None:
         return None
-    pose = numbers(_only_row(value), "object_pose")
+    pose = numbers(_only_one(value), "object_pose")
     if len(pose) != 3:
         raise ProtocolError(f"object_pose must be 3 numbers (x, y [m], yaw [rad]), not {len(pose)}.")
     return pose[None]
@@ -313,12 +313,12 @@ def _pose(value: object) -> Any:
 
 def _seeds(value: object) -> Any:
     """The seed of the one robot; 0 if none is given. Shape: (1,) int64."""
-    seed = _only_row(0 if value is None else value)
+    seed = _only_one(0 if value is None else value)
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
         raise ProtocolError(f"seeds must be one number, 0 or more, not {value!r}.")
     return np.array([seed], dtype=np.int64)
 
 
-def _only_row(value: object) -> object:
-    """A list of one row is that row."""
+def _only_one(value: object) -> object:
+    """A list with the value of one robot is that value."""
     return value[0] if isinstance(value, list) and len(value) == 1 else value

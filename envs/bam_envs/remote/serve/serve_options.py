@@ -47,7 +47,7 @@ class ServeOptions:
     operator_token_file: str | None = None
     """File with another secret: who shows that one may take command from others."""
     no_token: bool = False
-    """Listen on a network without a token: whoever reaches this computer may command what is served."""
+    """Listen on a network without a token: anybody who reaches this computer may command what is served."""
     ca_file: str | None = None
     """With --via wss://: certificates to trust instead of the system's."""
     image_format: str = "png"

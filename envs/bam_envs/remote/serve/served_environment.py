@@ -51,7 +51,7 @@ class ServedEnvironment:
         options.require_sane()
         self.env, self.options = env, options
         self.endpoints: list[str] = []
-        """One line for each way in; known when it is started."""
+        """One line for each address where it is served; known when it is started."""
         self.lease = CommandLease(options.lease)
         """Who is in command."""
         self.bus: Bus | None = None
@@ -79,11 +79,11 @@ class ServedEnvironment:
         self.close()
 
     def close(self) -> None:
-        """Halt the robot, say goodbye, close the environment. Idempotent."""
+        """Halt the robot, drop the clients, close the environment. Idempotent."""
         self._stack.close()
 
     def require_running(self) -> None:
-        """Nothing that it needs has ended.
+        """Check that everything that it needs still runs.
 
         Raises:
             RemoteError: The robot's clock stands still.
@@ -157,7 +157,7 @@ class ServedEnvironment:
         return server.start()
 
     def _require_own_names(self, bus: Bus) -> None:
-        """Two robots under the same names would both do what a client tells one of them."""
+        """Refuse names that another robot has: both would do what a client tells one of them."""
         if not isinstance(bus, RosbridgeLink):
             return
         service = self.prefix + INFO_SERVICE
@@ -189,7 +189,7 @@ class ServedEnvironment:
         """What is of use in spite of what is `refused`.
 
         Raises:
-            RemoteError: Nothing, and there is no other way in.
+            RemoteError: Nothing, and it is served nowhere else.
         """
         prefix, base = self.prefix, base_name(self.prefix)
         offered = [service_name(prefix)] if service_name(prefix) not in refused else []
@@ -222,7 +222,7 @@ def _profile_of(env: Env) -> RobotProfile | None:
 def _take_robot(env: Env, profile: RobotProfile, realtime: bool) -> ServedRobot:
     """Put a `ServedRobot` between the environment and its robot, at the start of an episode."""
     inner: Any = env.unwrapped
-    resting = any(sink.hold == "zero" for way in profile.commands.values() for sink in way)
+    resting = any(sink.hold == "zero" for mode in profile.commands.values() for sink in mode)
     life = profile.command_life(inner.robot.spec.period)
     robot = ServedRobot(inner.robot, command_timeout=life, zero_rests=resting, realtime=realtime)
     inner.robot = robot
@@ -231,10 +231,10 @@ def _take_robot(env: Env, profile: RobotProfile, realtime: bool) -> ServedRobot:
 
 
 def _is_usable(profile: RobotProfile, prefix: str, refused: frozenset[str]) -> bool:
-    """Whether every state gets out, and commands get in on one of the ways at least."""
-    ways = [{prefix + sink.topic for sink in way} for way in profile.commands.values()]
+    """Whether every state gets out, and commands get in by one mode at least."""
+    modes = [{prefix + sink.topic for sink in mode} for mode in profile.commands.values()]
     states = {prefix + source.topic for source in profile.state}
-    return not states & refused and any(not way & refused for way in ways)
+    return not states & refused and any(not mode & refused for mode in modes)
 
 
 class Refusals:

@@ -83,7 +83,7 @@ class ServedRobot:
             self._robot.connect()
 
     def reset(self, rows: Rows, initial: Initial) -> RobotState:
-        """Bring `rows` to `initial`; what was being executed is over, and so is a fault."""
+        """Bring the robot to `initial`; ends what was being executed, and clears a fault."""
         with self._changed:
             self._drop_parts()
             self.fault = None
@@ -186,7 +186,7 @@ class ServedRobot:
         return getattr(self._robot, "setpoint", None)
 
     def _drop_parts(self) -> None:
-        """Whoever waits for them is told when the next period is over."""
+        """Drop the rest of this period; a step that waits for it ends with the next one."""
         self._midway = self._left > 0
         self._parts, self._left = iter(()), 0
 

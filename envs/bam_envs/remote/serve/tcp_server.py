@@ -43,7 +43,7 @@ _ROOM = 2**20
 
 
 class TcpServer:
-    """Listens on one port. Whatever a client sends or leaves undone, the others and the environment do not notice.
+    """Listens on one port. Nothing that one client sends or leaves undone affects the others or the environment.
 
     Args:
         server: What is served.
@@ -102,7 +102,7 @@ class TcpServer:
         self._thread.start()
 
     def close(self) -> None:
-        """Drop every client and stop listening. As often as one likes."""
+        """Drop every client and stop listening. Idempotent."""
         listener, self._listener = self._listener, None
         if listener is None or self._thread is None:
             return
@@ -146,7 +146,7 @@ class TcpServer:
             self._connections[connection] = None
             strangers = [one for one in self._connections if one.caller is None]
             mine = [one for one in strangers if one.host == connection.host]
-        # What says nothing keeps nobody out: whoever comes is listened to.
+        # Connections that say nothing keep nobody out: a new one is always accepted.
         if len(mine) > _STRANGERS_OF_ONE:
             mine[0].drop()
         elif len(strangers) > _STRANGERS:
