@@ -1,11 +1,11 @@
-"""What happened so far, kept up to date tick by tick so that a report can be made at any moment."""
+"""What has happened so far, kept up to date tick by tick so that a report can be made at any moment."""
 
 from __future__ import annotations
 
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -45,7 +45,7 @@ class EpisodeRecord:
 
 @dataclass
 class Startup:
-    """CPU seconds of this process from its very start to the first action, stage by stage."""
+    """CPU time of this process from its start to the first action, stage by stage."""
 
     clock: Callable[[], float] = time.process_time
     """CPU time of the process [s]; counts the interpreter's own start."""
@@ -55,11 +55,11 @@ class Startup:
     """Whether the first action has been reached."""
 
     def mark(self, stage: str) -> None:
-        """The CPU time since the mark before was `stage`."""
+        """Assign the CPU time since the previous mark to `stage`."""
         self.stages[stage] = self.clock() - self.total
 
     def finish(self, stage: str) -> None:
-        """The first action is there; later calls change nothing."""
+        """The first action is decided; later calls change nothing."""
         if not self.finished:
             self.mark(stage)
             self.finished = True
@@ -81,52 +81,33 @@ class Journal:
     wanted: int
     """Episodes asked for."""
     startup: Startup = field(default_factory=Startup)
-    records: deque[EpisodeRecord] = field(default_factory=deque)
+    records: deque[EpisodeRecord] = field(default_factory=lambda: deque(maxlen=KEPT))
     """The last `KEPT` episodes."""
-    _older: _Count = field(default_factory=lambda: _Count())
+    begun: int = 0
+    """Episodes begun."""
+    _earlier: Counter[str] = field(default_factory=Counter)  # of all episodes but the last one
 
     def begin(self, seed: int) -> EpisodeRecord:
-        """A new episode, appended and returned."""
-        if len(self.records) == KEPT:
-            self._older.add(self.records.popleft())
+        """A new episode, appended and returned; the one before does not change any more."""
+        self._earlier = self._counts()
         self.records.append(EpisodeRecord(seed))
+        self.begun += 1
         return self.records[-1]
-
-    @property
-    def begun(self) -> int:
-        """Episodes begun."""
-        return self._older.episodes + len(self.records)
 
     @property
     def completed(self) -> int:
         """Episodes that the environment ended."""
-        return self._count().completed
+        return self._counts()["completed"]
 
     @property
     def successes(self) -> int | None:
         """How many complete episodes succeeded; None if the environment does not say, 0 before the first."""
-        count = self._count()
-        return count.succeeded if count.known or not count.completed else None
+        counts = self._counts()
+        return counts["succeeded"] if counts["said"] or not counts["completed"] else None
 
-    def _count(self) -> _Count:
-        count = replace(self._older)
-        for record in self.records:
-            count.add(record)
-        return count
-
-
-@dataclass
-class _Count:
-    """How many of some episodes were what."""
-
-    episodes: int = 0
-    completed: int = 0
-    known: int = 0
-    succeeded: int = 0
-
-    def add(self, record: EpisodeRecord) -> None:
-        self.episodes += 1
-        if record.complete:
-            self.completed += 1
-            self.known += record.success is not None
-            self.succeeded += bool(record.success)
+    def _counts(self) -> Counter[str]:
+        counts = self._earlier.copy()
+        if self.records and self.records[-1].complete:
+            success = self.records[-1].success
+            counts.update(completed=1, said=success is not None, succeeded=bool(success))
+        return counts
