@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from bam_envs.rosbridge.client import RosbridgeLink
 
 TIMEOUT = 3.0
-"""Longest wait for the answer of a service, and for a first message [s]."""
+"""Longest wait for the answer of a service, and for a first message, if the endpoint says nothing else [s]."""
 _TRIES, _TRY_AGAIN = 3, 0.1
-"""How often a service is called within `TIMEOUT`, and the time between two looks at a topic [s]."""
+"""How often a service is called within that time, and the time between two looks at a topic [s]."""
 _STATES = 5
 """How many states of a topic should arrive in a period, and in the time after which one is too old."""
 FIRST_WITHIN = 0.3
@@ -42,7 +42,7 @@ def ask_info(link: RosbridgeLink) -> RobotInfo | None:
     return None if answer is None else read_info(answer.get("message"), service)
 
 
-def ask(link: RosbridgeLink, service: str, tries: int = _TRIES) -> dict[str, Any] | None:
+def ask(link: RosbridgeLink, service: str, timeout: float = TIMEOUT, tries: int = _TRIES) -> dict[str, Any] | None:
     """The answer of `service`, which takes no arguments; None if there is no such service.
 
     It is called several times: a ROS 2 bridge creates a client for each call, and loses an answer that comes before
@@ -52,13 +52,13 @@ def ask(link: RosbridgeLink, service: str, tries: int = _TRIES) -> dict[str, Any
         LinkLost: No answer.
     """
     try:
-        return link.call(service, "", {}, TIMEOUT / _TRIES)
+        return link.call(service, "", {}, timeout / _TRIES)
     except RemoteError:  # there is no such service
         return None
     except LinkLost:
         if tries == 1 or not link.is_up:
             raise
-        return ask(link, service, tries - 1)
+        return ask(link, service, timeout, tries - 1)
 
 
 def info_by_profile(url: str, profile: RobotProfile, unknown: Iterable[str] = ()) -> RobotInfo:
@@ -106,11 +106,12 @@ class TopicTypes:
 
     Args:
         link: To the server.
-        profile: For texts.
+        profile: Its name is in error messages.
+        timeout: Longest wait for an answer, and for a listener [s].
     """
 
-    def __init__(self, link: RosbridgeLink, profile: RobotProfile) -> None:
-        self._link, self._profile, self._answers = link, profile, True
+    def __init__(self, link: RosbridgeLink, profile: RobotProfile, timeout: float) -> None:
+        self._link, self._profile, self._timeout, self._answers = link, profile, timeout, True
 
     def check(self, topic: str, expected: str) -> str:
         """The type to use for `topic`: the server's, or `expected` if the server does not know.
@@ -140,7 +141,7 @@ class TopicTypes:
         Raises:
             ProtocolError: `topic` has another type there, or nobody knows it.
         """
-        deadline, expected = Deadline(TIMEOUT), sink.type
+        deadline, expected = Deadline(self._timeout), sink.type
         while not self._found(topic) and self._answers:
             if deadline.passed:
                 raise ProtocolError(
@@ -159,7 +160,7 @@ class TopicTypes:
         if not self._answers:
             return ""
         try:
-            answer = self._link.call("/rosapi/topic_type", "rosapi/TopicType", {"topic": topic}, TIMEOUT)
+            answer = self._link.call("/rosapi/topic_type", "rosapi/TopicType", {"topic": topic}, self._timeout)
         except RemoteError:  # rosapi is a node of its own, which does not run
             self._answers = False
             return ""
@@ -179,15 +180,15 @@ def throttle(profile: RobotProfile, topic: str, period: float) -> int:
     return int(1000 * min(period, profile.max_age) / _STATES)
 
 
-def await_first(link: RosbridgeLink, state: LiveState, profile: RobotProfile) -> None:
-    """Wait until every source has sent a message.
+def await_first(link: RosbridgeLink, state: LiveState, profile: RobotProfile, timeout: float) -> None:
+    """Wait until every source has sent a message, at most `timeout` [s].
 
     Raises:
         LinkLost: The link dropped.
         StaleState: A source is silent; names its topic, its type, and the last status of the server.
     """
     wanted = {source.signal for source in state.sources}
-    arrived = state.mailbox.wait_for(lambda slots: wanted <= slots.keys() or not link.is_up, TIMEOUT)
+    arrived = state.mailbox.wait_for(lambda slots: wanted <= slots.keys() or not link.is_up, timeout)
     if not link.is_up:
         raise LinkLost(f"{link.url}: the link dropped while the robot's topics were looked at.")
     if arrived:
@@ -195,7 +196,7 @@ def await_first(link: RosbridgeLink, state: LiveState, profile: RobotProfile) ->
     silent = dict.fromkeys(f"{link.namespace}{source.topic} ({source.type})" for source in state.silent())
     said = [str(status.get("msg")) for status in link.statuses]
     raise StaleState(
-        f"{', '.join(silent)}: no message in {TIMEOUT:g} s. Does it run, and is the topic called so? "
+        f"{', '.join(silent)}: no message in {timeout:g} s. Does it run, and is the topic called so? "
         f"Topics are in the profile of {profile.name}." + (f" The server said: {said[-1]}" if said else "")
     )
 

@@ -24,7 +24,7 @@ from bam_envs.rosbridge.endpoint import Endpoint
 
 Pixels = NDArray[Any]
 FIRST_IMAGE = 3.0
-"""Longest wait for a first image [s]."""
+"""Longest wait for a first image, if the endpoint says nothing else [s]."""
 _SLOT = "image"
 _COLOURS: dict[str, tuple[int, list[int]]] = {
     "rgb8": (3, [0, 1, 2]),
@@ -90,9 +90,10 @@ class LiveCamera:
         )
         try:
             link.connect()
-            if not mailbox.wait_for(bool, FIRST_IMAGE):
+            timeout = self._endpoint.timeout or FIRST_IMAGE
+            if not mailbox.wait_for(bool, timeout):
                 raise StaleState(
-                    f"{self._topic} ({self.source.type}): no image in {FIRST_IMAGE:g} s. "
+                    f"{self._topic} ({self.source.type}): no image in {timeout:g} s. "
                     "Does the camera run, and is the topic called so?"
                 )
         except BaseException:

@@ -32,6 +32,7 @@ from bam_envs.core.errors import (
 from bam_envs.core.robot import Initial, RobotSpec, RobotState, Rows
 from bam_envs.core.timing import Pacer
 from bam_envs.live.bringup import (
+    TIMEOUT,
     LiveReadiness,
     TopicTypes,
     ask_info,
@@ -57,8 +58,8 @@ from bam_envs.safety.gate import ClearedCommand
 Array = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
 _LOST_AFTER = 1.0
-ANSWER_TIMEOUT = 5.0
-"""Longest time that a robot in lockstep takes for a period [s]."""
+_ANSWER_TIMEOUT = 5.0
+"""Longest time that a robot in lockstep takes for a period, if the endpoint says nothing else [s]."""
 _RESET_TIMEOUT = 3.0
 """Longest wait for a fresh state, or for a scene to be set [s]."""
 _HALT_WAITS = 0.05
@@ -102,6 +103,8 @@ class RosbridgeRobot:
     ) -> None:
         self._endpoint = Endpoint(endpoint) if isinstance(endpoint, str) else endpoint
         self.url, self.namespace = self._endpoint.url, self._endpoint.address.namespace
+        self._timeout = self._endpoint.timeout or TIMEOUT
+        self._answer_timeout = self._endpoint.timeout or _ANSWER_TIMEOUT
         self._spec = profile.spec(spec, command)
         self.profile = profile.narrowed(self.spec.command.labels, command)
         self._mode, self._sinks = command, self.profile.sinks(command)
@@ -175,7 +178,7 @@ class RosbridgeRobot:
             tagged = all(sink.tag and has_room(sink.type) for sink in self._sinks)
             self._answers = tagged and not said.lockstep
         self._state.server_offset = lambda: control.clock_offset
-        types = TopicTypes(control, self.profile)
+        types = TopicTypes(control, self.profile, self._timeout)
         self._declare(control, halting, types)
         self._readiness = None
         if said is None:
@@ -201,7 +204,7 @@ class RosbridgeRobot:
         self._cut.clear()
         self._epoch = control.epoch
         self._state.forget_ages()
-        await_first(control, self._state, self.profile)
+        await_first(control, self._state, self.profile, self._timeout)
         if self._readiness is not None:
             self._readiness.begin(control)
             self._info = info_by_profile(self.url, self.profile, self._readiness.unknown)
@@ -304,7 +307,7 @@ class RosbridgeRobot:
         self._require_link()
         self._require_accepted()
         lockstep = self.info.lockstep  # no time passes between commands: a late one does no harm until it is given up
-        tag = self._session.tagger.next(self._epoch, ANSWER_TIMEOUT if lockstep else self._command_life)
+        tag = self._session.tagger.next(self._epoch, self._answer_timeout if lockstep else self._command_life)
         self._pacer.tick()
         self._send(control, told, tag, halts)
         if lockstep:
@@ -336,9 +339,9 @@ class RosbridgeRobot:
         def stopped() -> bool:
             return self._cut.is_set() or bool(self._refusals)
 
-        if not self._state.await_answer(tag.echo, stopped, ANSWER_TIMEOUT):
+        if not self._state.await_answer(tag.echo, stopped, self._answer_timeout):
             raise StaleState(
-                f"{self.url}: no state answered the command in {ANSWER_TIMEOUT:g} s. Does the simulation run?",
+                f"{self.url}: no state answered the command in {self._answer_timeout:g} s. Does the simulation run?",
                 self.age(),
                 self.profile.max_age,
             )

@@ -144,7 +144,9 @@ class ScriptedRobot:
         self.stamp = lambda: write_stamp(time.time())
         self._bus, self._namespace, self._info = bus, namespace, info
         self._lock, self._changed = threading.RLock(), threading.Condition()
-        self._told, self._tag = {}, ""
+        self._told = {}
+        self.tag = ""
+        """Echo of the last complete command."""
         self._stopped, self._thread = threading.Event(), None
 
     def start(self):
@@ -186,7 +188,7 @@ class ScriptedRobot:
             with self._lock:
                 self._told.update(zip(places, values.tolist(), strict=True))
                 complete = topic in {way[-1].topic for way in self.profile.commands.values()}
-                self._tag = tag.echo if tag and complete else self._tag
+                self.tag = tag.echo if tag and complete else self.tag
                 if complete:
                     self._move()
             with self._changed:
@@ -214,7 +216,7 @@ class ScriptedRobot:
         with self._lock:
             signals = {name: values[None] for name, values in self.signals.items()}
             state = RobotState(signals, np.zeros(1), np.zeros((1, len(self.spec.command.labels))))
-            for topic, _, message in encode_state(self.profile, state, 0, self.stamp(), self._tag):
+            for topic, _, message in encode_state(self.profile, state, 0, self.stamp(), self.tag):
                 mangled = self.mangle(topic, message)
                 if mangled is not None:
                     self._bus.publish(self._namespace + topic, mangled)

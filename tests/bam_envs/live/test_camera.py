@@ -11,6 +11,7 @@ from bam_envs.live.camera import LiveCamera, decode_pixels
 from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.ros.images import color_message
 from bam_envs.ros.profile_tables import CameraSource
+from bam_envs.rosbridge.endpoint import Endpoint
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
 JPEG = CameraSource("hand", "/hand/compressed")
@@ -109,9 +110,8 @@ def test_a_raw_image_comes_as_cbor(show, connect):
     assert one.latest().number > first.number
 
 
-def test_no_image(server, monkeypatch):
-    monkeypatch.setattr("bam_envs.live.camera.FIRST_IMAGE", 0.2)
-    one = LiveCamera(server.url, JPEG)
+def test_no_image(server):
+    one = LiveCamera(Endpoint(server.url, timeout=0.2), JPEG)
     with pytest.raises(StaleState) as caught:
         one.connect()
     assert str(caught.value) == (

@@ -87,7 +87,6 @@ def test_at_ten_hertz_a_command_means_something_for_two_periods(served, make):
     live = make("bam/ur-reach-v0", robot=served("bam/ur-reach-v0"), ur_model="ur5e")
     live.reset(seed=1)
     assert live.unwrapped.robot.info.text == "ur5e, served in real time; it rests 0.2 s after the last command"
-    assert live.unwrapped.robot._robot._command_life == 0.2
 
 
 def test_a_command_means_something_for_two_periods_at_least():

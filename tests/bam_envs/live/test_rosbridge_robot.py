@@ -20,6 +20,7 @@ from bam_envs.core.errors import (
     UnknownName,
 )
 from bam_envs.core.robot import Initial
+from bam_envs.core.timing import Deadline
 from bam_envs.live.rosbridge_robot import RosbridgeRobot
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.profiles.profile import load_profile
@@ -27,6 +28,7 @@ from bam_envs.robots.ur5e import JOINTS
 from bam_envs.ros.codec import HALT_TOPIC, SCENE_TOPIC, RobotInfo
 from bam_envs.ros.freshness import read_tag
 from bam_envs.ros.messages import tag_text, write_stamp
+from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.rosbridge.string_rpc import StringRpcService
 from bam_envs.safety.gate import _clear
@@ -64,6 +66,23 @@ def connect():
     yield start
     for robot in robots:
         robot.close()
+
+
+def until(found):
+    """Wait until `found()`."""
+    deadline = Deadline(DEADLINE)
+    while not found():
+        assert not deadline.passed
+        time.sleep(0.005)
+
+
+def steps(gate, command):
+    """Whether the gate's robot takes a command."""
+    try:
+        gate.step(command)
+    except LinkLost:
+        return False
+    return True
 
 
 def raised(kind, act):
@@ -167,10 +186,10 @@ def test_wrong_addresses_and_ways():
 def test_steps_last_a_period_each(server, robot_on, connect):
     robot_on(server)
     robot, gate = connect(server.url)
-    begin = robot._clock()
+    begin = time.monotonic()
     for _ in range(4):
         gate.step(gate.state.command)
-    assert robot._clock() - begin >= 4 * robot.spec.period - 0.001
+    assert time.monotonic() - begin >= 4 * robot.spec.period - 0.001
 
 
 def test_lockstep(server, robot_on, connect, simulation):
@@ -187,26 +206,26 @@ def test_lockstep(server, robot_on, connect, simulation):
 
 def test_a_robot_that_answers_commands_owes_an_answer_to_what_does_not_arrive(server, robot_on, connect):
     scripted = robot_on(server, info=RobotInfo("ur5e", simulated=True, lockstep=False, period=0.05))
-    robot, gate = connect(server.url)
+    ahead = [0.0]
+    robot, gate = connect(server.url, clock=lambda: time.monotonic() + ahead[0])
     assert robot.waiting() == 0.0
     for _ in range(3):
         gate.step(gate.state.command)
     assert robot.waiting() < 0.05
-    answered, now = scripted._tag, robot._clock
+    answered = scripted.tag
     scripted.mangle = lambda topic, message: (
         message | {"header": message["header"] | {"frame_id": answered}} if topic == "/joint_states" else message
     )
     gate.step(gate.state.command)
-    robot._clock = lambda: now() + 0.5
+    ahead[0] = 0.5
     assert 0.5 <= robot.waiting() < 1.5
     robot.halt()  # what has not been executed is not any more
     assert robot.waiting() == 0.0
 
 
-def test_lockstep_without_an_answer(server, robot_on, connect, simulation, monkeypatch):
-    monkeypatch.setattr("bam_envs.live.rosbridge_robot.ANSWER_TIMEOUT", 0.2)
+def test_lockstep_without_an_answer(server, robot_on, connect, simulation):
     scripted = robot_on(server, info=simulation)
-    _, gate = connect(server.url)
+    _, gate = connect(Endpoint(server.url, timeout=0.2))
     scripted.mangle = lambda topic, message: None
     assert raised(StaleState, lambda: gate.step(gate.state.command)) == (
         f"{server.url}: no state answered the command in 0.2 s. Does the simulation run?"
@@ -247,14 +266,11 @@ def test_a_cut_link_delivers_nothing_afterwards(server, robot_on, connect, start
         raised(LinkLost, lambda: gate.step(command))
     with BridgeServer(port=server.port) as again:
         other = robot_on(again)
-        robot._control.wait_up(DEADLINE)
-        robot._halting.wait_up(DEADLINE)
-        assert raised(LinkLost, lambda: gate.step(command)) == (
-            f"{server.url}: the link dropped, and is back. Nothing is sent before reset()."
-        )
+        back = f"{server.url}: the link dropped, and is back. Nothing is sent before reset()."
+        until(lambda: raised(LinkLost, lambda: gate.step(command)) == back)
         assert [topic for topic, _, _ in other.commands if topic == JOINT_COMMANDS] == []
         robot.reset(ROW, start_pose)
-        gate.step(command)
+        until(lambda: steps(gate, command))  # the connection for the halt may come back a little later
         other.wait_for(lambda: other.on(JOINT_COMMANDS))
         (message,) = other.on(JOINT_COMMANDS)
         assert message["data"] == command[0, :6].tolist()
@@ -336,9 +352,7 @@ def test_what_a_halt_says(server, robot_on, connect):
         gate.step(command)
         there = (command[0, :6] + way).tolist()
         scripted.signals["gripper_width"], scripted.signals["joint_position"] = np.array([0.04]), np.array(there)
-        robot._state.mailbox.wait_for(
-            lambda slots, there=there: slots["joint_position"].message["position"] == there, DEADLINE
-        )
+        until(lambda there=there: robot.measure().signals["joint_position"][0].tolist() == there)
         before = len(scripted.commands)
         robot.halt()
         scripted.wait_for(lambda before=before: len(scripted.commands) == before + 3)
@@ -429,12 +443,11 @@ def test_a_command_that_must_be_stamped(server, robot_on):
     )
 
 
-def test_a_controller_that_is_not_there(server, monkeypatch):
-    monkeypatch.setattr("bam_envs.live.bringup.TIMEOUT", 0.3)
+def test_a_controller_that_is_not_there(server):
     for topic in ("/joint_states", "/gripper/joint_states"):
         server.advertise(topic, "sensor_msgs/JointState")
     server.subscribe(GRIPPER_COMMANDS, "std_msgs/Float64MultiArray", lambda message, caller: None)
-    robot = robot_at(server.url)
+    robot = robot_at(Endpoint(server.url, timeout=0.3))
     assert raised(ProtocolError, robot.connect) == (
         f"Nobody listens to {JOINT_COMMANDS} (std_msgs/Float64MultiArray), which takes {', '.join(JOINTS)}. Is the "
         "controller active, and is the topic called so? Topics are in the profile of ur5e; this may be another "
@@ -442,11 +455,10 @@ def test_a_controller_that_is_not_there(server, monkeypatch):
     )
 
 
-def test_a_silent_topic(server, robot_on, monkeypatch):
-    monkeypatch.setattr("bam_envs.live.bringup.TIMEOUT", 0.5)
+def test_a_silent_topic(server, robot_on):
     scripted = robot_on(server)
     scripted.mangle = lambda topic, message: None if topic == "/object_pose" else message
-    robot = robot_at(server.url)
+    robot = robot_at(Endpoint(server.url, timeout=0.5))
     assert raised(StaleState, robot.connect) == (
         "/object_pose (geometry_msgs/PoseStamped): no message in 0.5 s. Does it run, and is the topic called so? "
         "Topics are in the profile of ur5e."
@@ -578,9 +590,7 @@ def test_age(server, robot_on, connect):
     assert robot.age() >= begin + 0.04
     scripted.mangle = lambda topic, message: message
     scripted.stamp = lambda: write_stamp(1_000_000_000.0)
-    before = robot._state.mailbox.newest()["joint_position"].number
-    robot._state.mailbox.wait_for(lambda slots: slots["joint_position"].number >= before + 10, DEADLINE)
-    assert robot.age() >= 0.05
+    until(lambda: robot.age() >= 0.05)
 
 
 def drive(url, results):

@@ -199,7 +199,7 @@ def test_a_stamp_that_is_none(state):
     with pytest.raises(ProtocolError) as caught:
         state.age()
     assert str(caught.value) == (
-        "/joint_states: header.stamp must be seconds and nanoseconds, not {'sec': 1, 'nanosec': 2000000000}."
+        "/joint_states: header.stamp must be seconds and nanoseconds, not {'nanosec': 2000000000, 'sec': 1}."
     )
 
 

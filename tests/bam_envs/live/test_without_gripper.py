@@ -19,6 +19,7 @@ from bam_envs.robots.physics.ur import empty_arm
 from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.robots.ur import START as EMPTY_START
 from bam_envs.robots.ur import ur_model, ur_spec
+from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.tasks.ur_reach import START
 
@@ -123,11 +124,10 @@ def test_a_served_arm_with_a_gripper_keeps_its_width(serve, make, realtime):
     np.testing.assert_array_equal(served.state.signals["gripper_width"], [[HELD]])
 
 
-def test_a_served_arm_without_gripper_offers_none_and_says_so(serve, monkeypatch):
+def test_a_served_arm_without_gripper_offers_none_and_says_so(serve):
     """To who commands one: one error, at once when connecting, and nothing has moved."""
-    monkeypatch.setattr("bam_envs.live.bringup.TIMEOUT", 0.5)
     url, served = serve(empty_arm(1, ur_model="ur5e"), realtime=True)
-    robot = live_robot(url, FakeRobot(1).spec)
+    robot = RosbridgeRobot(Endpoint(url, timeout=0.5), load_profile("ur5e"), spec=FakeRobot(1).spec)
     with pytest.raises(ProtocolError) as caught:
         robot.connect()
     assert str(caught.value) == (
