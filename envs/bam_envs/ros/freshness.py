@@ -1,9 +1,9 @@
 """Old messages are refused: tags that say who sent what when, their check on the robot's side, and clock offsets.
 
 A tag travels as text in a field that the message type has anyway: ``header.frame_id``, or the label of the first
-dimension of a multi-array. It looks like ``bam1 s=4f1c e=2 q=17 t=1700000000.250000 d=1700000000.350000``, and with a
-signature behind it, ``m=`` and 32 hexadecimal digits, where its session was opened (`bam_envs.rosbridge.sessions`).
-Everybody may read a tag; the state that answers a command repeats its session and number alone (`echo`).
+dimension of a multi-array. It looks like ``bam1 s=4f1c e=2 q=17 t=1700000000.250000 d=1700000000.350000``, followed by
+a signature, ``m=`` and 32 hexadecimal digits, where its session was opened (`bam_envs.rosbridge.sessions`). Everybody
+may read a tag; the state that answers a command repeats only its session and number (`Tag.echo`).
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import time
 import uuid
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, field
+from functools import lru_cache
 
 from bam_envs.core.errors import RemoteError
 
@@ -27,7 +27,7 @@ _LONGEST = 256  # characters of a tag: what is read is kept for a while
 
 @dataclass(frozen=True)
 class Tag:
-    """Who sent a message, and for how long it means anything."""
+    """Who sent a message, and until when it is valid."""
 
     session: str
     """One client, from its start to its end; without blanks."""
@@ -36,44 +36,42 @@ class Tag:
     sequence: int
     """Counts its messages over all epochs."""
     sent: float
-    """When it was sent [s], on the sender's steady clock (any zero: the receiver works out the offset)."""
+    """When it was sent [s], on the sender's steady clock (any zero: the receiver estimates the offset)."""
     deadline: float
-    """From when on it must not be executed [s], same clock."""
-
+    """Time after which it must not be executed [s], same clock."""
     mac: str = ""
     """The signature that came with it; empty without one."""
+    received: str = field(default="", compare=False)
+    """The text that it was read from, without the signature: that text is signed. Empty for a new tag."""
 
     def to_text(self) -> str:
-        """As it travels, without a signature."""
-        return self._text
+        """The tag as it travels, without a signature."""
+        return self.received or (
+            f"{_MARK} s={self.session} e={self.epoch} q={self.sequence} t={self.sent:.6f} d={self.deadline:.6f}"
+        )
 
     @property
     def echo(self) -> str:
-        """What the state that answers it repeats of it; see `read_echo`."""
+        """What the state that answers the message repeats of it; see `read_echo`."""
         return f"{_MARK} s={self.session} q={self.sequence}"
-
-    @cached_property
-    def _text(self) -> str:
-        return f"{_MARK} s={self.session} e={self.epoch} q={self.sequence} t={self.sent:.6f} d={self.deadline:.6f}"
 
 
 def read_tag(text: object) -> Tag | None:
-    """The tag that `text` is, or None for anything else: other people's messages have none."""
+    """The tag in `text`, or None for anything else: messages of other programs have none."""
     if not isinstance(text, str) or len(text) > _LONGEST or not text.startswith(_MARK + " "):
         return None
     return _read_tag(text)
 
 
-@lru_cache(maxsize=64)  # every message of a command has the same one
+@lru_cache(maxsize=64)  # all messages of a command carry the same tag
 def _read_tag(text: str) -> Tag | None:
     fields = dict(part.split("=", 1) for part in text.split()[1:] if "=" in part)
+    mac = fields.get("m", "")
     try:
         numbers = int(fields["e"]), int(fields["q"]), float(fields["t"]), float(fields["d"])
-        tag = Tag(fields["s"], *numbers, fields.get("m", ""))
+        tag = Tag(fields["s"], *numbers, mac, text.rpartition(" m=")[0] if mac else "")
     except (KeyError, ValueError):
         return None
-    if tag.mac:  # it is of the text as it came
-        tag.__dict__["_text"] = text.rpartition(" m=")[0]
     return tag if math.isfinite(tag.sent) and math.isfinite(tag.deadline) else None
 
 
@@ -89,7 +87,7 @@ def read_echo(text: object) -> tuple[str, int] | None:
 
 
 def signature(key: bytes, tag: Tag, channel: str, content: bytes) -> str:
-    """What only who knows `key` can say: that `content` is sent on `channel` under `tag`. 32 hexadecimal digits."""
+    """HMAC-SHA256 of `content` that is sent on `channel` under `tag`, its first 32 hexadecimal digits."""
     return hmac.digest(key, f"{tag.to_text()}\n{channel}\n".encode() + content, "sha256")[:16].hex()
 
 
@@ -104,7 +102,7 @@ class Tagger:
     Args:
         clock: Steady clock [s]: a step of the wall clock must not make commands old.
         session: Its name; None: a new one.
-        key: What its messages are signed with; empty: they are not.
+        key: What its messages are signed with; empty: they are not signed.
     """
 
     def __init__(
@@ -124,7 +122,7 @@ class Tagger:
         return f"{tag.to_text()} m={signature(self._key, tag, channel, content)}" if self._key else tag.to_text()
 
     def next(self, epoch: int, lifetime: float) -> Tag:
-        """A new tag, for a message that means something for `lifetime` [s]."""
+        """A new tag, for a message that is valid for `lifetime` [s]."""
         with self._lock:
             self._sequence += 1
             now = self._clock()
@@ -132,10 +130,10 @@ class Tagger:
 
 
 class ClockOffset:
-    """How far a clock over there is ahead of ours, from one-way messages: the quickest one was about instant.
+    """Estimates the offset to the clock of a sender from one-way messages: the quickest one took about no time.
 
-    It is the smallest difference seen, so a message's age is how much longer it took than the quickest; a drift of
-    the clocks is followed by forgetting the smallest slowly (`drift`).
+    The offset is the smallest difference seen, so the age of a message is how much longer it took than the quickest.
+    The smallest difference grows by `drift`, which follows clocks that drift apart.
     """
 
     def __init__(self, drift: float = 1e-4) -> None:
@@ -157,7 +155,7 @@ class ClockOffset:
 
 
 class Freshness:
-    """What is fresh of one session, whatever a bridge kept in its queues. Any thread.
+    """Decides which messages of one session are fresh, whatever a bridge kept in its queues. Thread-safe.
 
     Args:
         clock: Steady clock [s]: a step of the wall clock must not make commands old.
@@ -187,7 +185,7 @@ class Freshness:
 
 
 class FreshnessCheck:
-    """The robot's side: `Freshness` of the sessions that were heard of last. Any thread.
+    """`Freshness` of each of the sessions that were heard of last. Thread-safe.
 
     Args:
         clock: As of `Freshness`.

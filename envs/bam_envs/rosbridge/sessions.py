@@ -1,9 +1,9 @@
-"""Sessions: who drives is proven by a key that is never published.
+"""Sessions: a client proves that it is the driver with a key that is never published.
 
-A client that wants to drive calls the service `SESSION_SERVICE` (std_srvs/Trigger), whose answer only it gets: a public
-name and a secret key. Every command is signed with the key, over its tag (number, deadline), its topic and its numbers.
-Whoever reads the topics learns the name and the signatures, and cannot make another one; what was heard once is
-refused when it comes again. Where the server knows connections, a session is also of the one that opened it.
+A client that wants to drive calls the service `SESSION_SERVICE` (std_srvs/Trigger). The answer, which only this client
+gets, has a public name and a secret key. Every command is signed with the key, over its tag (number, deadline), its
+topic and its numbers. Whoever reads the topics learns the name and the signatures, and cannot make another one; a
+command that is repeated is refused. Where the server knows connections, a session belongs to the one that opened it.
 """
 
 from __future__ import annotations
@@ -24,25 +24,23 @@ from bam_envs.rosbridge.bus import Caller, Message
 SESSION_SERVICE = "/bam/session"
 """Where a session is opened (std_srvs/Trigger)."""
 LEASE_TOPIC = "/bam/lease"
-"""Where who drives says that it is there, or leaves (std_msgs/String: `RENEW` or `LEAVE`, a blank, a signed tag)."""
+"""Where the driver says that it is there, or leaves (std_msgs/String: `RENEW` or `LEAVE`, a blank, a signed tag)."""
 RENEW, LEAVE = "renew", "leave"
 _NOT_OPEN, _ELSEWHERE = "is not open here", "is of another connection"
 _MOST = 64
-"""Sessions of one caller; its oldest gives way."""
+"""Sessions of one caller; the oldest is closed for a new one."""
 
 
 class _Session:
-    """One that is open."""
-
     def __init__(self, caller: str, clock: Callable[[], float]) -> None:
         self.caller, self.key, self.fresh = caller, secrets.token_bytes(32), Freshness(clock)
 
 
 class Sessions:
-    """The robot's side: every open session. Any thread.
+    """The robot's side: every open session. Thread-safe.
 
     Args:
-        is_driving: Whether the session of that name is in command: it never gives way to a new one.
+        is_driving: Whether the session of that name is in command: it is never closed for a new one.
         clock: Steady clock [s].
     """
 
@@ -63,17 +61,17 @@ class Sessions:
         return {"success": True, "message": json.dumps({"session": name, "key": session.key.hex()})}
 
     def prove(self, tag: Tag, channel: str, content: bytes, caller: Caller, *, anywhere: bool = False) -> Freshness:
-        """What is fresh of the session of `tag`, with whose key somebody signed `content` for `channel`.
+        """Check that `content` was signed for `channel` by the session of `tag`; returns what is fresh of the session.
 
         Args:
             tag: With its signature.
-            channel: Where it came.
+            channel: Topic or service.
             content: What is signed beside the tag.
-            caller: On whose connection it came.
-            anywhere: It may come over another connection than the one that opened the session.
+            caller: Who sent it.
+            anywhere: Accept it also from another connection than the one that opened the session.
 
         Raises:
-            RemoteError: That session is not open, or nobody of it sent this.
+            RemoteError: The session is not open, or did not send this.
         """
         with self._lock:
             session = self._sessions.get(tag.session)
@@ -83,7 +81,8 @@ class Sessions:
                     "both sides must be of one version of bam-train"
                 )
             self._sessions.move_to_end(tag.session)
-        if not hmac.compare_digest(_bytes(tag.mac), signature(session.key, tag, channel, content).encode()):
+        expected = signature(session.key, tag, channel, content).encode()
+        if not hmac.compare_digest(tag.mac.encode(errors="surrogatepass"), expected):
             raise RemoteError(f"session {tag.session}: the signature of a message on {channel} is wrong")
         if not anywhere and session.caller != caller.name:
             raise RemoteError(f"session {tag.session} {_ELSEWHERE}")
@@ -98,7 +97,7 @@ class Sessions:
         self.prove(tag, channel, content, caller, anywhere=anywhere).require(tag, channel)
 
     def left(self, caller: Caller) -> list[str]:
-        """End the sessions of `caller`, whose connection ended; their names."""
+        """Close the sessions of `caller`, whose connection ended; their names."""
         with self._lock:
             gone = [name for name, session in self._sessions.items() if session.caller == caller.name]
             for name in gone:
@@ -106,13 +105,9 @@ class Sessions:
         return gone
 
     def end(self, name: str) -> None:
-        """End one session."""
+        """Close one session."""
         with self._lock:
             self._sessions.pop(name, None)
-
-
-def _bytes(text: str) -> bytes:
-    return text.encode(errors="surrogatepass")
 
 
 def is_over(error: RemoteError) -> bool:
@@ -121,7 +116,7 @@ def is_over(error: RemoteError) -> bool:
 
 
 def read_session(response: Mapping[str, Any], where: str) -> Tagger:
-    """What signs for the session that `response` of `SESSION_SERVICE` opened.
+    """The tagger, with its key, of the session that `response` of `SESSION_SERVICE` opened.
 
     Raises:
         ProtocolError: It is something else.
@@ -129,8 +124,8 @@ def read_session(response: Mapping[str, Any], where: str) -> Tagger:
     try:
         said = json.loads(response["message"])
         name, key = said["session"], bytes.fromhex(said["key"])
+        if not isinstance(name, str) or not name.isalnum() or len(key) < 16:
+            raise ValueError
     except (KeyError, TypeError, ValueError) as error:
         raise ProtocolError(f"{where}: expected a session and its key, found something else.") from error
-    if not isinstance(name, str) or not name.isalnum() or len(key) < 16:
-        raise ProtocolError(f"{where}: expected a session and its key, found something else.")
     return Tagger(session=name, key=key)
