@@ -146,7 +146,8 @@ _Answer = tuple[int, str, Any]
 
 def refusal(sequence: int, error: BamEnvsError) -> Tree:
     """The answer that something went wrong."""
-    return [sequence, "NotInCommand" if isinstance(error, NotInCommand) else "RemoteError", str(error)]
+    text = str(error).encode(errors="replace").decode()  # halves of surrogate pairs cannot be sent
+    return [sequence, "NotInCommand" if isinstance(error, NotInCommand) else "RemoteError", text]
 
 
 def content_of(answer: Tree, sequence: int) -> Tree:

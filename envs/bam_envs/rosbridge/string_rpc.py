@@ -1,9 +1,9 @@
 """Requests and replies over a pair of topics, as JSON in std_msgs/String.
 
-Every ROS graph has std_msgs, and a topic pair goes through a bridge several times faster than a service. On
-``<name>/request`` goes ``{"id": …, "tag": …, "payload": {…}}``; on ``<name>/reply`` comes ``{"id": …, "payload": {…}}``
-or ``{"id": …, "error": text, "kind": name}``. A request without a tag is somebody else's and as good; one whose tag is
-signed is of its session.
+Every ROS graph has std_msgs, and a topic pair goes through a bridge several times faster than a service. A request on
+``<name>/request`` is ``{"id": …, "tag": …, "payload": {…}}``; its reply on ``<name>/reply`` is
+``{"id": …, "payload": {…}}`` or ``{"id": …, "error": text, "kind": name}``. A request without a tag, as other people's
+clients send it, is executed too; one whose tag is signed belongs to its session.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from bam_envs.rosbridge.strict_json import dump_json, load_json
 _log = logging.getLogger(__name__)
 _STRING = "std_msgs/String"
 _RESEND = 0.5
-"""Until a first reply came, a request is said again so often [s]: a ROS graph loses what is published before the two
-ends of a topic found each other. The service executes one id once."""
+"""Time between two publications of a request until a first reply came [s]: a ROS graph loses what is published before
+the two ends of a topic found each other. The service executes one id once."""
 _MOST_WAITING = 64
-"""Requests of a service that may be under way together."""
+"""Requests that a service executes or keeps waiting at once."""
 _WORKERS = 8
 
 Answer = TypeVar("Answer")
@@ -45,18 +45,17 @@ class RecentAnswers(Generic[Answer]):
     """
 
     def __init__(self, size: int = 32) -> None:
-        self.size = size
-        """See above."""
+        self._size = size
         self._lock = threading.Lock()
         self._futures: OrderedDict[Hashable, Future[Answer]] = OrderedDict()
 
     def claim(self, key: Hashable) -> tuple[Future[Answer], bool]:
-        """Where the answer to `key` will be, and whether it is for the caller to make it."""
+        """The future with the answer to `key`, and whether the caller is the one to make it."""
         with self._lock:
             if key in self._futures:
                 return self._futures[key], False
             future = self._futures[key] = Future()
-            if len(self._futures) > self.size:
+            if len(self._futures) > self._size:
                 self._futures.popitem(last=False)
             return future, True
 
@@ -99,7 +98,7 @@ class StringRpc:
             self._pending.pop(identity, None)
 
     def close(self) -> None:
-        """Let go of the topics; calls under way fail."""
+        """Unsubscribe; calls under way fail."""
         with self._lock:
             unsubscribe, self._unsubscribe = self._unsubscribe, None
         if unsubscribe is not None:
@@ -183,7 +182,7 @@ class StringRpcService:
         return self
 
     def close(self) -> None:
-        """Listen no more and wait for what is being answered. As often as one likes."""
+        """Listen no more and wait for what is being answered. Idempotent."""
         unsubscribe, self._unsubscribe = self._unsubscribe, None
         if unsubscribe is not None:
             unsubscribe()
@@ -234,22 +233,18 @@ class StringRpcService:
 
     def _reply(self, request: dict[str, Any], caller: Caller, refused: str, arrived: float) -> str:
         identity, what = request["id"], f"The reply of {self.name}"
+        tag, payload = read_tag(request.get("tag")), request.get("payload")
         try:
             if refused:
                 raise RemoteError(refused)
-            payload = self._handle(request, caller, arrived)
-            return dump_json({"id": identity, "payload": payload}, what)
+            if not isinstance(payload, dict):
+                raise ProtocolError(f"{self.name}/request: payload must be an object, not {type(payload).__name__}.")
+            if tag is not None and (waited := time.monotonic() - arrived) > tag.deadline - tag.sent:
+                raise RemoteError(f"expired: it waited {waited:.3f} s for others")
+            return dump_json({"id": identity, "payload": self._handler(payload, caller)}, what)
         except BamEnvsError as error:
-            return dump_json({"id": identity, "error": str(error), "kind": type(error).__name__}, what)
+            kind, text = type(error).__name__, str(error)
         except Exception as error:  # a service always answers, whatever its handler does
             _log.exception("%s: the handler failed", self.name)
-            text = f"{type(error).__name__}: {error}"
-            return dump_json({"id": identity, "error": text, "kind": "RemoteError"}, what)
-
-    def _handle(self, request: dict[str, Any], caller: Caller, arrived: float) -> Message:
-        tag, payload = read_tag(request.get("tag")), request.get("payload")
-        if not isinstance(payload, dict):
-            raise ProtocolError(f"{self.name}/request: payload must be an object, not {type(payload).__name__}.")
-        if tag is not None and (waited := time.monotonic() - arrived) > tag.deadline - tag.sent:
-            raise RemoteError(f"expired: it waited {waited:.3f} s for others")
-        return self._handler(payload, caller)
+            kind, text = "RemoteError", f"{type(error).__name__}: {error}"
+        return dump_json({"id": identity, "error": text, "kind": kind}, what)

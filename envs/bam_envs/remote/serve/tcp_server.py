@@ -115,7 +115,7 @@ class TcpServer:
         for connection in connections:
             connection.drop()
         for connection in connections:
-            connection.join()
+            connection.thread.join()
 
     def __enter__(self) -> Self:
         self.start()
@@ -153,7 +153,7 @@ class TcpServer:
             host, _ = Counter(one.host for one in strangers).most_common(1)[0]
             next(one for one in strangers if one.host == host).drop()
         try:
-            connection.start()
+            connection.thread.start()
         except RuntimeError:
             with self._lock:
                 del self._connections[connection]
@@ -211,22 +211,10 @@ class _Connection:
         self.caller: Caller | None = None  # known when it is let in
         self._owner, self._frames = owner, FrameSocket(sock)
         self._answered: tuple[tuple[str, int, int], list[bytes | memoryview]] | None = None
-        self._thread = threading.Thread(target=self._run, name=f"bam-tcp {self.client}", daemon=True)
-
-    def start(self) -> None:
-        self._thread.start()
+        self.thread = threading.Thread(target=self._run, name=f"bam-tcp {self.client}", daemon=True)
 
     def drop(self) -> None:
         self._frames.close()
-
-    def join(self) -> None:
-        self._thread.join()
-
-    def refuse(self, text: str) -> None:
-        """Say why, and hang up."""
-        with suppress(LinkLost):
-            self._frames.send(encode(refusal(0, RemoteError(text))), time.monotonic() + _POLL)
-        self.drop()
 
     def _run(self) -> None:
         try:
@@ -235,7 +223,8 @@ class _Connection:
                 request = self._frames.receive(limit=self._owner.most, patience=self._owner.patience, kind=Request)
                 self._send(self._answer(request))
         except (ProtocolError, RemoteError) as error:
-            self.refuse(str(error))
+            with suppress(LinkLost):  # it is told why the connection ends
+                self._frames.send(encode(refusal(0, RemoteError(str(error)))), time.monotonic() + _POLL)
         except LinkLost:
             pass  # it went away
         finally:
