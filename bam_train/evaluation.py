@@ -1,4 +1,4 @@
-"""Seeded evaluation of a policy: success, return and length over a fixed list of episodes; and films of some.
+"""Seeded evaluation of a policy: success, return and length over a fixed list of episodes; and videos of some.
 
 Episode k starts from ``reset(seed=seed + k)`` however many rows run side by side. Rows are run in waves, each a run of
 one `TemporalAgent` (environment, policy) until all rows have ended: every row plays one episode, and what a row does
@@ -189,8 +189,8 @@ def play_wave(env: VectorEnv[Any, Any, Any], policy: BatchPolicy, seed: int, cou
     return [_episode(last, seed, row) for row in range(count)]
 
 
-def film_episodes(env: gym.Env[Any, Any], policy: Any, add: Callable[[Frame], Any], *, episodes: int, seed: int) -> int:
-    """Film a policy, the first picture of every episode included; episode k gets ``seed + k``.
+def record_video(env: gym.Env[Any, Any], policy: Any, add: Callable[[Frame], Any], *, episodes: int, seed: int) -> int:
+    """Record a video of a policy, the first frame of every episode included; episode k gets ``seed + k``.
 
     Args:
         env: Made with ``render_mode="rgb_array"``.
@@ -202,11 +202,11 @@ def film_episodes(env: gym.Env[Any, Any], policy: Any, add: Callable[[Frame], An
     Returns:
         How many pictures.
     """
-    robot, film = RobotAgent(env), VideoAgent(env, add)
-    loop = TemporalAgent(Agents(robot, film, PolicyAgent(policy, robot.observation_names, single=True)))
+    robot, video = RobotAgent(env), VideoAgent(env, add)
+    loop = TemporalAgent(Agents(robot, video, PolicyAgent(policy, robot.observation_names, single=True)))
     for k in range(episodes):
         loop(Workspace(window=2), t=0, stop_variable="env/done", seed=seed + k)
-    return film.count
+    return video.count
 
 
 class _Rows(VecGymAgent):

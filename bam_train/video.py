@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import os
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, MissingExtra
+from bam_train.atomic_file import replacing
 from bam_train.errors import OutputError, SettingsError
 
 Frame = NDArray[np.uint8]
@@ -22,16 +22,16 @@ Frame = NDArray[np.uint8]
 
 
 def require_video_path(path: Path) -> Path:
-    """The path with ``~`` expanded, if a film could be written there; to be called before the work is done.
+    """The path with ``~`` expanded, if a video could be written there; to be called before the work is done.
 
     Raises:
         SettingsError: Neither ``.gif`` nor ``.mp4``.
         OutputError: No such folder, or it may not be written to.
-        MissingExtra: The package that writes this kind of film is not installed.
+        MissingExtra: The package that writes this kind of video is not installed.
     """
     path = path.expanduser()
     if path.suffix.lower() not in _WRITERS:
-        raise SettingsError(f"{path}: expected a film that ends in .gif or .mp4, found {path.suffix or 'no suffix'!r}")
+        raise SettingsError(f"{path}: expected a video that ends in .gif or .mp4, found {path.suffix or 'no suffix'!r}")
     if not path.parent.is_dir():
         raise OutputError(f"{path}: there is no folder {path.parent}; make it first")
     if path.is_dir() or not os.access(path.parent, os.W_OK):
@@ -51,15 +51,15 @@ def picture(env: gym.Env[Any, Any]) -> Frame:
     try:
         image: Any = env.render()
     except (gym.error.Error, InvalidValue) as error:  # a package that draws is missing; a robot without a picture
-        raise SettingsError(f"{name}: no film can be made of it: {' '.join(str(error).split())}") from error
+        raise SettingsError(f"{name}: no video can be made of it: {' '.join(str(error).split())}") from error
     if not isinstance(image, np.ndarray) or image.ndim != 3:
-        raise SettingsError(f"{name}: render() gives no picture; a film cannot be made of it")
+        raise SettingsError(f"{name}: render() gives no picture; a video cannot be made of it")
     return image.astype(np.uint8, copy=False)
 
 
 @contextmanager
 def open_video(path: Path, rate: float) -> Iterator[Callable[[Frame], None]]:
-    """A film to add pictures to, all of one size; it is there at the end, whole, or not at all after an exception.
+    """A video to add frames to, all of one size; it is there at the end, whole, or not at all after an exception.
 
     Args:
         path: Ends in ``.gif`` or ``.mp4``.
@@ -76,15 +76,18 @@ def open_video(path: Path, rate: float) -> Iterator[Callable[[Frame], None]]:
         write(frame)
         count += 1
 
-    with _replacing(path) as temporary, _WRITERS[path.suffix.lower()](temporary, rate) as write:
-        yield add
-        if count == 0:
-            raise SettingsError(f"{path}: a film needs at least one picture")
+    try:
+        with replacing(path, path.suffix) as temporary, _WRITERS[path.suffix.lower()](temporary, rate) as write:
+            yield add
+            if count == 0:
+                raise SettingsError(f"{path}: a video needs at least one frame")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
 @contextmanager
 def _gif(path: Path, rate: float) -> Iterator[Callable[[Frame], None]]:
-    """One palette, from the first picture, for the whole film: what stands still does not flicker and costs nothing."""
+    """One palette, from the first picture, for the whole video: what stands still does not flicker or cost."""
     from PIL import Image
 
     pictures: list[Image.Image] = []
@@ -119,22 +122,4 @@ def _require_writer(suffix: str) -> None:
         for module in ("PIL",) if suffix == ".gif" else ("imageio", "imageio_ffmpeg"):
             importlib.import_module(module)
     except ModuleNotFoundError as error:
-        raise MissingExtra(str(error.name), "video", f"A {suffix} film") from error
-
-
-@contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
-    """A temporary file in the same folder that becomes `path` at the end, or is gone."""
-    temporary = None
-    try:
-        descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
-        os.close(descriptor)
-        temporary = Path(name)
-        yield temporary
-        temporary.chmod(0o644)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
-    finally:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
+        raise MissingExtra(str(error.name), "video", f"A {suffix} video") from error

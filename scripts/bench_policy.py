@@ -45,7 +45,7 @@ def contenders(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
 
     from bam_envs.core.spaces import space_to_json
     from bam_train.policy import FrozenPolicy
-    from bam_train.trainers.sb3.freeze import freeze
+    from bam_train.trainers.sb3.sb3_freezing import freeze
 
     torch.set_num_threads(1)
     observation, action = spaces.Box(-1, 1, (options.observation,)), spaces.Box(-1, 1, (options.action,))

@@ -299,7 +299,7 @@ def algorithms(trainer: str = "sb3") -> str:
     """The table of a trainer's algorithms."""
     if trainer == "rllib":
         return rllib_algorithms()
-    from bam_train.trainers.sb3.algorithms import ALGORITHMS
+    from bam_train.trainers.sb3.sb3_algorithms import ALGORITHMS
 
     rows = []
     for row in ALGORITHMS.values():

@@ -11,7 +11,7 @@ from bam_envs.core.errors import BamEnvsError
 from bam_train.checkpoint import Checkpoint
 from bam_train.environments import make_env
 from bam_train.errors import BamTrainError
-from bam_train.evaluation import film_episodes
+from bam_train.evaluation import record_video
 from bam_train.policy import FrozenPolicy
 from bam_train.video import Frame
 
@@ -34,7 +34,7 @@ def film(checkpoint: Path, episodes: int, seed: int) -> tuple[list[Image.Image],
 
     try:
         for k in range(episodes):
-            count = film_episodes(env, policy, add, episodes=1, seed=seed + k)
+            count = record_video(env, policy, add, episodes=1, seed=seed + k)
             durations += [round(1000 * (manifest.period or 0.05))] * (count - 1) + [PAUSE]
     finally:
         env.close()  # type: ignore[no-untyped-call]

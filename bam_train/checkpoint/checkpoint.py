@@ -14,7 +14,6 @@ into place. Reading needs the standard library and NumPy, and never unpickles.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import math
@@ -27,9 +26,9 @@ from typing import Any
 
 import numpy as np
 
+from bam_train.atomic_file import replacing
 from bam_train.checkpoint import safetensors_file
 from bam_train.checkpoint.manifest import AGAIN, MANIFEST, Manifest, manifest_bytes, parse_manifest
-from bam_train.checkpoint.temporary import temporary_file
 from bam_train.checkpoint.zip_members import (
     CHUNK,
     RESUME,
@@ -144,7 +143,8 @@ def write_checkpoint(path: str | Path, manifest_fields: Mapping[str, Any], membe
         if target.is_dir():
             raise IsADirectoryError(None, "it is a folder; give the name of a file in it")
         target.parent.mkdir(parents=True, exist_ok=True)
-        _write_then_replace(target, {**members, MANIFEST: text})
+        with replacing(target) as temporary, temporary.open("wb") as file:
+            _write_zip(file, {**members, MANIFEST: text})
     except OSError as error:
         why = error.strerror or error
         raise OutputError(f"{path}: cannot be written: {why}. Choose another place with --out") from error
@@ -179,17 +179,6 @@ def _require_names(path: Path, members: Mapping[str, bytes]) -> None:
             raise CheckpointError(path, f"member {name!r} cannot be written: the name is reserved")
 
 
-def _write_then_replace(target: Path, members: Mapping[str, bytes]) -> None:
-    with temporary_file(target) as temporary:
-        with temporary.open("wb") as file:
-            _write_zip(file, members)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.chmod(0o666 & ~_umask())
-        os.replace(temporary, target)
-    _sync_folder(target.parent)
-
-
 def _write_zip(file: Any, members: Mapping[str, bytes]) -> None:
     with zipfile.ZipFile(file, "w") as archive:
         for name, data in members.items():
@@ -197,19 +186,3 @@ def _write_zip(file: Any, members: Mapping[str, bytes]) -> None:
             info.external_attr = 0o644 << 16
             level = 1 if len(data) > CHUNK else 6
             archive.writestr(info, data, zipfile.ZIP_DEFLATED, level)
-
-
-def _umask() -> int:
-    mask = os.umask(0o022)
-    os.umask(mask)
-    return mask
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make the rename itself durable, where the system can."""
-    with contextlib.suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

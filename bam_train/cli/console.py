@@ -11,7 +11,7 @@ import traceback
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from bam_train.shown import shown
+from bam_train.terminal_text import shown
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -131,7 +131,7 @@ def require_screen(*, remote: bool) -> None:
     if sys.platform == "linux" and not (os.environ.keys() & {"DISPLAY", "WAYLAND_DISPLAY"}):
         raise SettingsError(
             "--render needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set; "
-            "leave it out, or make a film: bam-eval CHECKPOINT --video film.gif"
+            "leave it out, or make a video: bam-eval CHECKPOINT --video video.gif"
         )
 
 

@@ -36,7 +36,7 @@ def evaluate_checkpoint(config: EvalConfig) -> int:
     """The program, with its arguments read."""
     from bam_train.environments import make_rows, require_fit
     from bam_train.evaluation import default_rows, evaluate
-    from bam_train.trainers.sb3.foreign import is_plain_sb3
+    from bam_train.trainers.sb3.plain_sb3_zip import is_plain_sb3
     from bam_train.video import require_video_path
 
     video = None if config.video is None else require_video_path(config.video)
@@ -58,7 +58,7 @@ def evaluate_checkpoint(config: EvalConfig) -> int:
     else:
         tell(*table(report, subject.facts))
     if video is not None:
-        _film(config, subject, video)
+        _record(config, subject, video)
     return 0
 
 
@@ -91,7 +91,7 @@ def _foreign(config: EvalConfig, path: Path) -> Subject:
     from bam_train.errors import NotACheckpoint, SettingsError
     from bam_train.settings import read_env_kwargs
     from bam_train.trainers import require_algorithm
-    from bam_train.trainers.sb3.foreign import load_trusted
+    from bam_train.trainers.sb3.plain_sb3_zip import load_trusted
 
     if not config.trust_pickle:
         raise NotACheckpoint(
@@ -151,9 +151,9 @@ def _require_picture(subject: Subject) -> None:
         env.close()  # type: ignore[no-untyped-call]
 
 
-def _film(config: EvalConfig, subject: Subject, path: Path) -> None:
+def _record(config: EvalConfig, subject: Subject, path: Path) -> None:
     from bam_train.environments import control_period, make_env
-    from bam_train.evaluation import film_episodes
+    from bam_train.evaluation import record_video
     from bam_train.video import open_video
 
     env = make_env(subject.env, subject.env_kwargs, render_mode="rgb_array")
@@ -161,7 +161,7 @@ def _film(config: EvalConfig, subject: Subject, path: Path) -> None:
     episodes = min(config.video_episodes, config.episodes)
     try:
         with open_video(path, 1 / period) as add:
-            count = film_episodes(env, subject.policy, add, episodes=episodes, seed=config.seed)
+            count = record_video(env, subject.policy, add, episodes=episodes, seed=config.seed)
     finally:
         env.close()  # type: ignore[no-untyped-call]
     say(f"bam-eval: {path}: {episodes} episode{'' if episodes == 1 else 's'}, {count} pictures")

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.flags import ExportConfig
     from bam_train.compat.rllib_export import Exported
-    from bam_train.trainers.output import Output
+    from bam_train.trainers.best_checkpoint import Output
 
 
 def export_directory(config: ExportConfig) -> int:
@@ -39,7 +39,7 @@ def export_directory(config: ExportConfig) -> int:
 
 def _output(config: ExportConfig, exported: Exported) -> Output:
     from bam_train.settings import TrainSettings
-    from bam_train.trainers.output import choose_output
+    from bam_train.trainers.best_checkpoint import choose_output
 
     settings = TrainSettings(env=exported.env, algo=exported.parts.algorithm, trainer="rllib")
     return choose_output(settings, config.out, config.force, None)

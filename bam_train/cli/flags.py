@@ -107,9 +107,9 @@ class EvalConfig:
     json: bool = False
     """Print one JSON object on standard output instead of a table."""
     video: File = None
-    """Film the first episodes into this .gif or .mp4 file."""
+    """Record the first episodes into this .gif or .mp4 file."""
     video_episodes: Count = 3
-    """How many episodes the film shows."""
+    """How many episodes the video shows."""
     trust_pickle: bool = False
     """Load a plain stable-baselines3 zip, which runs whatever code is in it."""
 

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.flags import TrainConfig
     from bam_train.settings import TrainSettings
-    from bam_train.trainers.copies import Copies
-    from bam_train.trainers.output import Output
+    from bam_train.trainers.best_checkpoint import Output
+    from bam_train.trainers.checkpoint_copies import Copies
     from bam_train.trainers.run import TrainingRun
     from bam_train.trainers.run_folder import RunFolder
     from bam_train.trainers.trainer import Trainer
@@ -59,8 +59,8 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
     """Train with complete settings; returns the exit status."""
     from bam_train.cli.train_display import nobody_need_read
     from bam_train.trainers import load_trainer
-    from bam_train.trainers.copies import Copies
-    from bam_train.trainers.output import choose_output
+    from bam_train.trainers.best_checkpoint import choose_output
+    from bam_train.trainers.checkpoint_copies import Copies
     from bam_train.trainers.run_folder import require_room
 
     require_room(config.runs.expanduser())

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from bam_train.cli.console import count, duration, is_terminal, make_console, number, percent, say
 from bam_train.errors import OutputError
-from bam_train.shown import rich_text
+from bam_train.terminal_text import rich_text
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -262,7 +262,7 @@ def _short(path: Path) -> str:
 
 
 def _draw(settings: TrainSettings, folder: RunFolder) -> None:
-    from bam_train.trainers.curve import draw_curve
+    from bam_train.trainers.run_folder import draw_curve
 
     try:
         draw_curve(folder.records(), f"{settings.algo} on {settings.env}, seed {settings.seed}", folder.curve)

@@ -14,7 +14,7 @@ import numpy as np
 from bam_envs.core.timing import Pacer
 from bam_train.deploy.journal import EpisodeRecord, Journal
 from bam_train.deploy.report import lateness_text, rate_text
-from bam_train.shown import rich_text
+from bam_train.terminal_text import rich_text
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType

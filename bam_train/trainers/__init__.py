@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 
 TRAINERS: dict[str, str] = {
     "rllib": "bam_train.trainers.rllib.trainer:RLlibTrainer",
-    "sb3": "bam_train.trainers.sb3.trainer:SB3Trainer",
+    "sb3": "bam_train.trainers.sb3.sb3_trainer:SB3Trainer",
 }
 """Name of a trainer to its ``"module:Class"``."""
 
 ALGORITHMS: dict[str, str] = {
     "rllib": "bam_train.trainers.rllib_algorithms:ALGORITHMS",
-    "sb3": "bam_train.trainers.sb3.algorithms:ALGORITHMS",
+    "sb3": "bam_train.trainers.sb3.sb3_algorithms:ALGORITHMS",
 }
 """Name of a trainer to the table of its algorithms; reading it imports no learning library."""
 

@@ -13,7 +13,7 @@ from bam_train.environments import make_rows
 from bam_train.errors import EnvironmentFailed
 from bam_train.evaluation import evaluate
 from bam_train.finite import FiniteEnv, FiniteRows
-from bam_train.trainers.sb3.vec_env import make_training_env
+from bam_train.trainers.sb3.sb3_vec_env import make_training_env
 
 CASES = [
     ({}, "observation[1] is nan at step 3 of an episode"),

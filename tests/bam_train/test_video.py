@@ -8,7 +8,7 @@ from PIL import Image
 
 from bam_envs.core.errors import MissingExtra
 from bam_train.errors import OutputError, SettingsError
-from bam_train.evaluation import film_episodes
+from bam_train.evaluation import record_video
 from bam_train.video import open_video, require_video_path
 
 
@@ -23,7 +23,7 @@ class Right:
 def test_every_picture_of_every_episode(corridor, starting_cell):
     env = gym.make(corridor, render_mode="rgb_array")
     pictures = []
-    count = film_episodes(env, Right(), pictures.append, episodes=2, seed=7)
+    count = record_video(env, Right(), pictures.append, episodes=2, seed=7)
     env.close()
     assert count == len(pictures)
     cells = [cell for seed in (7, 8) for cell in range(starting_cell(seed), 5)]
@@ -34,7 +34,7 @@ def test_gif(corridor, tmp_path):
     env = gym.make(corridor, render_mode="rgb_array")
     path = tmp_path / "film.gif"
     with open_video(path, rate=20) as add:
-        count = film_episodes(env, Right(), add, episodes=2, seed=7)
+        count = record_video(env, Right(), add, episodes=2, seed=7)
     env.close()
     with Image.open(path) as film:
         assert film.n_frames == count
@@ -75,14 +75,14 @@ def test_a_film_needs_a_picture(tmp_path):
     path = tmp_path / "film.gif"
     with pytest.raises(SettingsError) as caught, open_video(path, rate=20):
         pass
-    assert str(caught.value) == f"{path}: a film needs at least one picture"
+    assert str(caught.value) == f"{path}: a video needs at least one frame"
     assert list(tmp_path.iterdir()) == []
 
 
 def test_paths_are_refused_before_the_work(tmp_path):
     with pytest.raises(SettingsError) as suffix:
         require_video_path(tmp_path / "film.avi")
-    assert str(suffix.value) == f"{tmp_path}/film.avi: expected a film that ends in .gif or .mp4, found '.avi'"
+    assert str(suffix.value) == f"{tmp_path}/film.avi: expected a video that ends in .gif or .mp4, found '.avi'"
     with pytest.raises(OutputError) as folder:
         require_video_path(tmp_path / "films" / "film.gif")
     assert str(folder.value) == f"{tmp_path}/films/film.gif: there is no folder {tmp_path}/films; make it first"
@@ -103,12 +103,12 @@ def test_a_missing_writer_is_named(tmp_path, monkeypatch):
     with pytest.raises(MissingExtra) as caught:
         require_video_path(tmp_path / "film.mp4")
     assert str(caught.value) == (
-        'A .mp4 film needs imageio_ffmpeg, which is not installed. Run: pip install "bam-train[video]"'
+        'A .mp4 video needs imageio_ffmpeg, which is not installed. Run: pip install "bam-train[video]"'
     )
 
 
 def test_an_environment_without_pictures():
     env = gym.make("CartPole-v1")
     with pytest.warns(UserWarning, match="render method without specifying"), pytest.raises(SettingsError) as caught:
-        film_episodes(env, Right(), [].append, episodes=1, seed=0)
-    assert str(caught.value) == "CartPole-v1: render() gives no picture; a film cannot be made of it"
+        record_video(env, Right(), [].append, episodes=1, seed=0)
+    assert str(caught.value) == "CartPole-v1: render() gives no picture; a video cannot be made of it"

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bam_train.atomic_file import remove_orphans, replacing
 from bam_train.checkpoint import MANIFEST, Checkpoint, next_free_path, safetensors_file, write_checkpoint, zip_members
 from bam_train.checkpoint import checkpoint as module
 from bam_train.checkpoint.manifest import WHERE
-from bam_train.checkpoint.temporary import remove_orphans, temporary_file
 from bam_train.errors import (
     AlteredCheckpoint,
     CheckpointError,
@@ -504,7 +504,7 @@ def test_killed_while_writing_leaves_the_old_file_whole(path: Path):
         other.write_text("somebody else's")
     numbered = orphan.with_name(f".{path.stem}-12.zip.abcdefgh.tmp")
     numbered.write_text("of a run whose name was taken")
-    with temporary_file(path) as alive:
+    with replacing(path) as alive:
         remove_orphans(path)
         assert sorted(path.parent.glob("*.tmp")) == sorted([*others, alive])
     assert not alive.exists()

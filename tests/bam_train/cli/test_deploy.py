@@ -175,7 +175,7 @@ def test_no_screen(run, monkeypatch):
         1,
         "",
         "bam-deploy: --render needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set; "
-        "leave it out, or make a film: bam-eval CHECKPOINT --video film.gif\n",
+        "leave it out, or make a video: bam-eval CHECKPOINT --video video.gif\n",
     )
 
 

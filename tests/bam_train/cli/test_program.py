@@ -18,7 +18,7 @@ from bam_train.cli import console
 from bam_train.cli.console import count, duration, number, percent
 from bam_train.cli.program import guarded, parse, run_program, usage_error
 from bam_train.errors import OutputError, SettingsError
-from bam_train.shown import rich_text, shown
+from bam_train.terminal_text import rich_text, shown
 
 
 @dataclass(frozen=True)

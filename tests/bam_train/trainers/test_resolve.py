@@ -16,7 +16,7 @@ from bam_train.errors import AlteredCheckpoint, CheckpointMismatch, OutputError,
 from bam_train.settings import TrainSettings
 from bam_train.trainers import load_trainer, require_algorithm
 from bam_train.trainers import presets as presets_module
-from bam_train.trainers.output import choose_output
+from bam_train.trainers.best_checkpoint import choose_output
 from bam_train.trainers.presets import list_presets, read_preset
 from bam_train.trainers.resolve import resolve, resolve_resumed
 from bam_train.trainers.run import Best
@@ -114,7 +114,7 @@ def test_every_preset_is_complete_and_of_an_environment_of_ours(name):
     from bam_envs.core.registry import ENVIRONMENTS
     from bam_train.trainers.presets import preset_name
     from bam_train.trainers.rllib_algorithms import ALGORITHMS as OF_RLLIB
-    from bam_train.trainers.sb3.algorithms import ALGORITHMS as OF_SB3
+    from bam_train.trainers.sb3.sb3_algorithms import ALGORITHMS as OF_SB3
 
     runs = [("sb3", algo) for algo in OF_SB3] + [("rllib", algo) for algo in OF_RLLIB]
     found = [(env, *run) for env in ENVIRONMENTS for run in runs if preset_name(env, run[1], run[0]) == name]

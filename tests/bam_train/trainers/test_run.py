@@ -12,7 +12,6 @@ from bam_envs.core.errors import LinkLost
 from bam_train.errors import EnvironmentFailed, OutputError, ProcessesLost, TrainingFailed
 from bam_train.evaluation import EvaluationReport, wilson_interval
 from bam_train.settings import TrainSettings
-from bam_train.trainers import judge as judge_module
 from bam_train.trainers import run as run_module
 from bam_train.trainers.run import Best, TrainingRun
 from bam_train.trainers.run_folder import RunFolder
@@ -122,7 +121,7 @@ def start(tmp_path, monkeypatch):
             found = results[policy.steps]
             return found.pop(0) if isinstance(found, list) else found
 
-        monkeypatch.setattr(judge_module, "evaluate", evaluate)
+        monkeypatch.setattr(run_module, "evaluate", evaluate)
         trainer, watcher = Counter(settings, clock), Watcher()
         folder = RunFolder(tmp_path / "runs", "count-ppo")
         run = TrainingRun(trainer, folder, tmp_path / "out.zip", watcher, best, clock or Clock(), copies)

@@ -8,10 +8,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from bam_train.checkpoint.temporary import temporary_file
+from bam_train.atomic_file import replacing
 from bam_train.errors import OutputError
-from bam_train.trainers.curve import draw_curve
-from bam_train.trainers.run_folder import RunFolder, require_room, require_writable
+from bam_train.trainers.run_folder import RunFolder, draw_curve, require_room, require_writable
 
 
 def test_each_run_has_a_folder_of_its_own(tmp_path):
@@ -24,7 +23,7 @@ def test_what_killed_runs_left_half_written_goes_with_the_next(tmp_path):
     orphans = [folder.path / f".{name}.zip.q0_w9e3r.tmp" for folder in folders for name in ("last", "best")]
     for orphan in orphans:
         orphan.write_text("half")
-    with temporary_file(folders[0].last) as alive:
+    with replacing(folders[0].last) as alive:
         RunFolder(tmp_path, "pick-ppo")
         assert [orphan.exists() for orphan in orphans] == [False] * 4 + [True] * 2
         assert alive.exists()

@@ -90,7 +90,7 @@ def test_mp4_is_the_default(drawn, tmp_path):
 def test_an_environment_without_pictures(toys, tmp_path):
     env = toys.Counting()
     env.render = lambda: None
-    with pytest.raises(SettingsError, match=r"render\(\) gives no picture; a film cannot be made of it"):
+    with pytest.raises(SettingsError, match=r"render\(\) gives no picture; a video cannot be made of it"):
         record_video(env, Push(torch.tensor([1])), tmp_path / "film.gif")
     assert env.closed
     assert list(tmp_path.iterdir()) == []

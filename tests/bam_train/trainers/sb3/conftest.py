@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from bam_train.trainers.sb3 import trainer as trainer_module
-from bam_train.trainers.sb3 import vec_env
+from bam_train.trainers.sb3 import sb3_trainer as trainer_module
+from bam_train.trainers.sb3 import sb3_vec_env as vec_env
 
 
 class Walk(VectorEnv):

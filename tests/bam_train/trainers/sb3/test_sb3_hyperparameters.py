@@ -12,8 +12,8 @@ import torch
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 
 from bam_train.errors import SettingsError
-from bam_train.trainers.sb3.algorithms import ALGORITHMS
-from bam_train.trainers.sb3.hyperparameters import build, complete, complete_normalize, default_policy
+from bam_train.trainers.sb3.sb3_algorithms import ALGORITHMS
+from bam_train.trainers.sb3.sb3_hyperparameters import build, complete, complete_normalize, default_policy
 
 NUMBERS = gym.spaces.Box(-1, 1, (3,))
 IMAGE = gym.spaces.Box(0, 255, (36, 36, 3), np.uint8)

@@ -19,7 +19,7 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.errors import EnvironmentFailed, SettingsError, TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
-from bam_train.trainers.sb3.trainer import SB3Trainer
+from bam_train.trainers.sb3.sb3_trainer import SB3Trainer
 
 FIRST = {"n_steps": 32, "batch_size": 32, "n_epochs": 2}
 

@@ -28,14 +28,15 @@ from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.manifest import manifest
 from bam_train.trainers.resolve import own_settings
-from bam_train.trainers.sb3 import hyperparameters, resume
-from bam_train.trainers.sb3.algorithms import ALGORITHMS
-from bam_train.trainers.sb3.freeze import freeze
-from bam_train.trainers.sb3.golden import golden
-from bam_train.trainers.sb3.model import library_notices, make_model, meaning, one_env, refusals, sb3_members
-from bam_train.trainers.sb3.state import all_finite, refused_distribution, undisturbed
-from bam_train.trainers.sb3.tensorboard import ForgivingTensorBoard
-from bam_train.trainers.sb3.vec_env import RowsVecEnv, make_training_env
+from bam_train.trainers.sb3 import sb3_hyperparameters as hyperparameters
+from bam_train.trainers.sb3 import sb3_resume as resume
+from bam_train.trainers.sb3.sb3_algorithms import ALGORITHMS
+from bam_train.trainers.sb3.sb3_freezing import freeze
+from bam_train.trainers.sb3.sb3_golden import golden
+from bam_train.trainers.sb3.sb3_model import library_notices, make_model, meaning, one_env, refusals, sb3_members
+from bam_train.trainers.sb3.sb3_state import all_finite, refused_distribution, undisturbed
+from bam_train.trainers.sb3.sb3_tensorboard import ForgivingTensorBoard
+from bam_train.trainers.sb3.sb3_vec_env import RowsVecEnv, make_training_env
 from bam_train.trainers.trainer import OnProgress, Progress, Statistics
 
 _FINITE = "expected finite numbers: try a smaller learning_rate"

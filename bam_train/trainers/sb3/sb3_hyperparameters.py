@@ -27,7 +27,7 @@ from bam_envs.core.wording import did_you_mean
 from bam_train.errors import SettingsError
 from bam_train.settings import NAMES
 from bam_train.trainers.library_arguments import check_range, fit, linear_start, ranges
-from bam_train.trainers.sb3.algorithms import Algorithm
+from bam_train.trainers.sb3.sb3_algorithms import Algorithm
 
 ELSEWHERE = {
     "self": None,

@@ -19,10 +19,10 @@ from bam_train.environments import control_period
 from bam_train.errors import SettingsError
 from bam_train.settings import TrainSettings
 from bam_train.trainers.from_zero import FromZero
-from bam_train.trainers.sb3 import hyperparameters
-from bam_train.trainers.sb3.algorithms import ALGORITHMS
-from bam_train.trainers.sb3.frozen_layers import leaves
-from bam_train.trainers.sb3.vec_env import RowsVecEnv
+from bam_train.trainers.sb3 import sb3_hyperparameters as hyperparameters
+from bam_train.trainers.sb3.sb3_algorithms import ALGORITHMS
+from bam_train.trainers.sb3.sb3_freezing import leaves
+from bam_train.trainers.sb3.sb3_vec_env import RowsVecEnv
 
 
 def make_model(settings: TrainSettings, venv: VecEnv) -> Any:

@@ -18,7 +18,7 @@ from bam_train.environments import make_env
 from bam_train.errors import CheckpointMismatch, NotACheckpoint
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.from_zero import from_zero
-from bam_train.trainers.sb3.algorithms import ALGORITHMS
+from bam_train.trainers.sb3.sb3_algorithms import ALGORITHMS
 
 # What SB3's load lets out for a file of another algorithm or another version, then what it does for a damaged one.
 _MISFIT = (ValueError, TypeError, KeyError, AttributeError, RuntimeError, AssertionError, ImportError)
@@ -58,7 +58,7 @@ def load_trusted(path: Path, algo: str, env_id: str, env_kwargs: Mapping[str, An
     Raises:
         CheckpointMismatch: It is not of this algorithm, or not for this environment.
     """
-    from bam_train.trainers.sb3.freeze import freeze
+    from bam_train.trainers.sb3.sb3_freezing import freeze
 
     algorithm = ALGORITHMS[algo].load()
     env = make_env(env_id, env_kwargs)

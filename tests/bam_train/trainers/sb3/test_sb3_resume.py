@@ -15,11 +15,11 @@ import pytest
 import torch
 
 from bam_train.checkpoint import Checkpoint
+from bam_train.checkpoint.nested_state import pack
 from bam_train.errors import AlteredCheckpoint
 from bam_train.settings import TrainSettings
-from bam_train.trainers.sb3 import state
-from bam_train.trainers.sb3.trainer import SB3Trainer
-from bam_train.trainers.tree import pack
+from bam_train.trainers.sb3 import sb3_state as state
+from bam_train.trainers.sb3.sb3_trainer import SB3Trainer
 
 SMALL = {"net_arch": [16, 16]}
 OFF = {"batch_size": 16, "learning_starts": 60, "gradient_steps": 2, "train_freq": 4, "policy_kwargs": SMALL}
@@ -148,9 +148,9 @@ import hashlib, sys
 from pathlib import Path
 from bam_train.checkpoint import Checkpoint
 from bam_train.settings import TrainSettings
-from bam_train.trainers.sb3 import state
-from bam_train.trainers.sb3.trainer import SB3Trainer
-from bam_train.trainers.tree import pack
+from bam_train.trainers.sb3 import sb3_state as state
+from bam_train.trainers.sb3.sb3_trainer import SB3Trainer
+from bam_train.checkpoint.nested_state import pack
 import json
 given, first, total, path = json.loads(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), Path(sys.argv[4])
 if path.exists():

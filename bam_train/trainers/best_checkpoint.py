@@ -9,9 +9,9 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
+from bam_train.atomic_file import remove_orphans
 from bam_train.checkpoint import Checkpoint, next_free_path
 from bam_train.checkpoint.manifest import AGAIN
-from bam_train.checkpoint.temporary import remove_orphans
 from bam_train.errors import AlteredCheckpoint, CheckpointError, OutputError, SettingsError
 from bam_train.settings import TrainSettings, file_stem, read_config
 from bam_train.trainers.resolve import CHANGEABLE

@@ -14,8 +14,7 @@ from torch import nn
 
 from bam_train.trainers.freezing.golden import affordable, clearest, draw_array, pack
 from bam_train.trainers.from_zero import less_start, plus_start
-from bam_train.trainers.sb3.freeze import FrozenModule
-from bam_train.trainers.sb3.frozen_layers import leaves
+from bam_train.trainers.sb3.sb3_freezing import FrozenModule, leaves
 
 
 def golden(

@@ -8,7 +8,7 @@ from stable_baselines3 import PPO
 from bam_train.cli.eval import main
 from bam_train.environments import make_env
 from bam_train.errors import CheckpointMismatch
-from bam_train.trainers.sb3.foreign import _sentence, is_plain_sb3, load_trusted
+from bam_train.trainers.sb3.plain_sb3_zip import _sentence, is_plain_sb3, load_trusted
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,8 @@
-"""Temporary files that become checkpoints: locked while somebody writes them, so that those of the dead can be told.
+"""Files that are whole or absent: written beside their place and moved into it; a checkpoint, a video.
 
-A process that is killed cannot remove its file, but the system releases its lock. A process number in the name would
-not do: computers and containers that share a folder number their processes alike.
+The temporary file is locked while somebody writes it: a process that is killed cannot remove its file, but the system
+releases its lock. A process number in the name would not do: computers and containers that share a folder number their
+processes alike.
 """
 
 from __future__ import annotations
@@ -20,25 +21,50 @@ except ImportError:  # Windows: files that were left stay
 
 
 @contextlib.contextmanager
-def temporary_file(target: Path) -> Iterator[Path]:
-    """A private file beside `target`, to be written and then moved; what is still there at the end is removed.
+def replacing(target: Path, suffix: str = ".tmp") -> Iterator[Path]:
+    """A private file beside `target`, to be written: then it becomes `target` in one step, and on an error it is gone.
+
+    Args:
+        target: The file.
+        suffix: End of the private file's name.
 
     Raises:
-        OSError: It cannot be made there.
+        OSError: It cannot be made or moved there.
     """
-    descriptor, path = _locked(target)
+    descriptor, path = _locked(target, suffix)
     try:
         yield path
+        if fcntl is not None:
+            os.fsync(descriptor)
+        path.chmod(0o666 & ~_umask())
+        os.replace(path, target)
     finally:
         with contextlib.suppress(OSError):
             path.unlink()
         if fcntl is not None:
             os.close(descriptor)
+    _sync_folder(target.parent)
 
 
-def _locked(target: Path) -> tuple[int, Path]:
+def _umask() -> int:
+    mask = os.umask(0o022)
+    os.umask(mask)
+    return mask
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make the rename itself durable, where the system can."""
+    with contextlib.suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def _locked(target: Path, suffix: str) -> tuple[int, Path]:
     while True:
-        descriptor, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".tmp")
+        descriptor, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=suffix)
         if fcntl is None:
             os.close(descriptor)
             return -1, Path(name)

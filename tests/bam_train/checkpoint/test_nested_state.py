@@ -8,8 +8,8 @@ import math
 import numpy as np
 import pytest
 
+from bam_train.checkpoint.nested_state import pack, unpack
 from bam_train.errors import FormatError
-from bam_train.trainers.tree import pack, unpack
 
 
 def same(one, other):

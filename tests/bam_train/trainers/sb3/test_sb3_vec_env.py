@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from bam_train.errors import SettingsError
-from bam_train.trainers.sb3.vec_env import RowsVecEnv, make_training_env
+from bam_train.trainers.sb3.sb3_vec_env import RowsVecEnv, make_training_env
 
 
 def right(venv):

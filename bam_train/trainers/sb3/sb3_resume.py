@@ -13,10 +13,10 @@ import torch
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from bam_train.checkpoint import Checkpoint
+from bam_train.checkpoint.nested_state import pack, unpack
 from bam_train.errors import AlteredCheckpoint, FormatError
-from bam_train.trainers.sb3 import state
-from bam_train.trainers.sb3.vec_env import RowsVecEnv
-from bam_train.trainers.tree import pack, unpack
+from bam_train.trainers.sb3 import sb3_state as state
+from bam_train.trainers.sb3.sb3_vec_env import RowsVecEnv
 
 MODEL, STATE, REPLAY, NOTES = "bam/resume/model", "bam/resume/state", "bam/resume/replay", "bam/resume/notes.json"
 
