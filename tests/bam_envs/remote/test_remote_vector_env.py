@@ -73,15 +73,6 @@ def test_rows_are_those_in_process_bit_for_bit(racks, make_rows, actions_of, kin
     envs.close()
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
-def test_over_tcp_as_well(make_rows, actions_of, env_id):
-    alone, there = (make_rows(env_id, 4, max_episode_steps=15) for _ in range(2))
-    with TcpServer(EnvServer(there)) as server:
-        envs = RemoteVectorEnv(TcpTransport(server.url))
-        assert_same_episodes(envs, alone, actions_of, steps=35)
-        envs.close()
-
-
 def test_a_mask_goes_over_tcp(make_rows):
     alone, mask = make_rows("bam/reach-v0", 3), {"reset_mask": np.array([False, True, False])}
     with TcpServer(EnvServer(make_rows("bam/reach-v0", 3))) as server:

@@ -9,7 +9,7 @@ import pytest
 from gymnasium import spaces
 from websockets.sync.client import connect
 
-from bam_envs.core.errors import InvalidValue, RemoteError
+from bam_envs.core.errors import RemoteError
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER
@@ -150,11 +150,3 @@ def test_a_rosapi_that_says_nothing(serve, details):
     bus = CompiledBus(JUNE_22, rosapi=True)
     bus.call = lambda *_: details
     play(Client(JUNE_22, bus.ask), serve(bus).env.env.pictures)
-
-
-def test_a_version_that_there_is_not():
-    with pytest.raises(InvalidValue) as caught:
-        GymApiService(EnvServer(Scene()), MemoryBus(), version="2025-06-18")
-    assert str(caught.value) == (
-        "A version of GymAPI must be one of 2025-05-24, 2025-06-17, 2025-06-22, not '2025-06-18'."
-    )

@@ -6,7 +6,6 @@ import json
 import re
 from contextlib import contextmanager
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -98,13 +97,3 @@ def test_two_plain_clients_with_one_name(rack):
         assert one(RESET)["header"]["error_code"]["value"] == 1
         text = two(RESET)["header"]["error_msg"]
         assert re.match(r"plain \(127\.0\.0\.1:\d+\) is in command, not plain \(127\.0\.0\.1:\d+\);", text)
-
-
-def test_gymnasiums_own_environments_are_served():
-    with BridgeServer(port=0) as server:
-        service = GymApiService(EnvServer(gym.make("CartPole-v1")), server, "bam_001").start()
-        with plain_client(server.url) as call:
-            assert len(call(RESET, env_name="CartPole", seed=1)["feedback"][0]["observation"]) == 4
-            assert call(STEP, action=[{"discrete_action": [1]}])["feedback"][0]["reward"] == 1.0
-        service.close()
-        service.env.close()

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from bam_envs.core.errors import InvalidValue, LinkLost, NotInCommand, RemoteError
 from bam_envs.remote.serve.env_server import EnvServer
-from bam_envs.remote.serve.local_transport import FakeEnv, LocalTransport
+from bam_envs.remote.serve.local_transport import FakeEnv, FakeTransport, LocalTransport
 
 
 class Closing(FakeEnv):
@@ -49,3 +50,33 @@ def test_errors_are_those_of_every_transport():
     transport.reset()
     with pytest.raises(InvalidValue):
         transport.step(np.zeros(3))
+
+
+def test_it_notes_calls_and_raises_faults_once():
+    transport = FakeTransport()
+    transport.connect()
+    transport.reset(3, {"a": 1})
+    transport.faults.append(LinkLost("the cable is out"))
+    action = np.zeros(2, np.float32)
+    with pytest.raises(LinkLost) as caught:
+        transport.step(action)
+    assert str(caught.value) == "the cable is out"
+    assert transport.step(action)[4]["elapsed"] == 1
+    transport.close()
+    assert transport.calls == [
+        ("connect",),
+        ("reset", 3, {"a": 1}),
+        ("step", action),
+        ("step", action),
+        ("close",),
+    ]
+
+
+def test_its_environment_is_seeded_and_ends():
+    env = FakeEnv(spaces.Discrete(100), episode_steps=2)
+    first = [env.reset(seed=1)[0], *[env.step(None)[0] for _ in range(2)]]
+    again = [env.reset(seed=1)[0], *[env.step(None)[0] for _ in range(2)]]
+    assert first == again
+    env.reset(seed=1, options={"x": 1})
+    assert env.step(None)[1:4] == (1.0, False, False)
+    assert env.step(None)[1:4] == (2.0, True, False)
