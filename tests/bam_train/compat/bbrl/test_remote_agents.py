@@ -384,17 +384,11 @@ def test_agents_of_modules_that_only_this_process_has(started, monkeypatch):
     assert multiprocessing.active_children() == []
 
 
-def test_an_interrupt_ends_a_busy_process(started, monkeypatch):
+def test_an_interrupt_ends_a_busy_process(started):
     remote, workspace = started(loop(Trouble()))
-    remote.start(workspace, **STEPS, at=0, what="hang")
-    monkeypatch.setattr(remote._worker._connection, "poll", _interrupted)
     with pytest.raises(KeyboardInterrupt):
-        remote._worker.wait()
+        remote(workspace, **STEPS, at=0, what="interrupt")
     assert multiprocessing.active_children() == []
-
-
-def _interrupted(timeout):
-    raise KeyboardInterrupt
 
 
 # -- the end -----------------------------------------------------------------------------------------------------------
