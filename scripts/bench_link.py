@@ -323,7 +323,7 @@ def measure_steps(name: str, scheme: str, target: float, rounds: int, count: int
 def measure_camera(seconds: float) -> Iterator[str]:
     """What a camera beside 100 Hz control does to the time from command to state."""
     from bam_envs.live.camera import LiveCamera
-    from bam_envs.robots.profiles.profile import CameraSource
+    from bam_envs.ros.profile_tables import CameraSource
 
     with Server("robot") as server:
         url = f"ws://127.0.0.1:{server.ports[0]}"

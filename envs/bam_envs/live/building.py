@@ -36,7 +36,7 @@ def live_robot(
         profile: Its topics: a shipped name or a file. None: the shipped one that takes the commands of `spec`; topics
             that take other commands are left alone.
         limits: How far the guards let it go; None: those of the profile.
-        tool_position: Forward kinematics of an arm that is no UR5e, (n, k) [rad] to (n, 3) [m].
+        tool_position: Forward kinematics of an arm other than a UR5e, (n, k) [rad] to (n, 3) [m].
         command: Command mode, such as ``"trajectory"``; None: the profile's default.
         ca_file: PEM file of the authorities to trust instead of the system's.
         token_file: File with the server's shared secret.

@@ -303,13 +303,13 @@ class RosbridgeRobot:
         control, halts = self._connected(), self._halts
         if not isinstance(command, ClearedCommand):
             raise InvalidValue("Commands reach a live robot only through SafeRobot. Build it with live_robot(...).")
-        told = command.for_robot(self)[0]
+        values = command.for_robot(self)[0]
         self._require_link()
         self._require_accepted()
         lockstep = self.info.lockstep  # no time passes between commands: a late one does no harm until it is given up
         tag = self._session.tagger.next(self._epoch, self._answer_timeout if lockstep else self._command_life)
         self._pacer.tick()
-        self._send(control, told, tag, halts)
+        self._send(control, values, tag, halts)
         if lockstep:
             self._await_answer(tag)
         else:
@@ -423,7 +423,7 @@ class RosbridgeRobot:
         return hold
 
     def close(self) -> None:
-        """Halt what was commanded from here, then drop both connections. As often as one likes."""
+        """Halt if anything was commanded from here, then drop both connections. Idempotent."""
         if self._commanded:  # a client that only looked must not stop another one
             self.halt()
         self._session.leave()

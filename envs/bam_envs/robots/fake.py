@@ -1,4 +1,4 @@
-"""A robot without physics, for tests: the joints are where they were told to be, no faster than the arm can go."""
+"""A robot without physics, for tests: the joints go exactly where they are sent, at most at the arm's maximum speed."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class FakeRobot:
         self._command = self._position
 
     def connect(self) -> None:
-        """There is nothing to connect to; commands are taken from now on."""
+        """Take commands from now on."""
         self._connected = True
 
     def reset(self, rows: Rows, initial: Initial) -> RobotState:
@@ -114,11 +114,11 @@ class FakeRobot:
             raise ResetNeeded("The fake robot is not connected. Call connect() first.")
 
     def halt(self) -> None:
-        """It never moves between steps; the call is counted."""
+        """Count the call: the robot never moves between steps."""
         self.halts += 1
 
     def close(self) -> None:
-        """Halt; no command is taken until `connect`."""
+        """Halt, and take no command until `connect`."""
         self.halt()
         self._connected = False
 

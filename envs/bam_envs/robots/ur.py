@@ -34,7 +34,7 @@ __all__ = [
 
 Array = NDArray[np.float64]
 DEFAULT_MODEL = "ur5"
-"""The model that is meant where none is named: robo-gym's, so that its policies fit."""
+"""The model if none is named: robo-gym's, so that its policies fit."""
 START = (0.0, -2.5, 1.5, 0.0, -1.4, 0.0)
 """Joint positions [rad] with every model's flange in the air before it, clear of itself and of the table."""
 
@@ -117,7 +117,7 @@ def ur_model(name: str) -> UrModel:
     """The model called `name`.
 
     Raises:
-        UnknownName: There is none; it carries the closest match.
+        UnknownName: There is no such model; carries the closest match.
     """
     if name not in UR_MODELS:
         raise UnknownName("ur_model", str(name), UR_MODELS, examples=UR_MODELS, similar=0.85)  # ur7 is not ur5

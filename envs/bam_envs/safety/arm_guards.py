@@ -173,7 +173,7 @@ class JointAcceleration(Guard):
 
     @staticmethod
     def _near(wanted: Array, before: Array, change: float) -> Array:
-        """The longest part of `wanted` within reach of the step `before`; where there is none, each joint by itself."""
+        """The longest part of `wanted` within reach of the step `before`; if there is none, each joint by itself."""
         low, high = before - change, before + change
         if (wanted >= low).all() and (wanted <= high).all():
             return wanted

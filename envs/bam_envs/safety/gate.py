@@ -136,7 +136,7 @@ class SafeRobot(metaclass=Sealed):
         robot: One robot, simulated or live.
         guards: Further guards, asked before the default ones, which have the last word.
         limits: How far the guards let the robot go; those of a live robot are inside `guard.BOUNDS`.
-        tool_position: Forward kinematics of an arm that is no UR5e, (n, k) [rad] to (n, 3) [m].
+        tool_position: Forward kinematics of an arm other than a UR5e, (n, k) [rad] to (n, 3) [m].
         clock: Monotonic clock [s].
 
     Raises:
@@ -211,7 +211,7 @@ class SafeRobot(metaclass=Sealed):
         )
 
     def _claim(self) -> None:
-        """Two gates to one robot would each let a whole step through."""
+        """Refuse a second gate to one robot: each of them would let a whole step through."""
         other = _GUARDED.get(self._live)
         if other is not None and other() is not None:
             raise InvalidValue(f"{self.spec.name} stands behind a SafeRobot already; command it through that one.")
@@ -251,7 +251,7 @@ class SafeRobot(metaclass=Sealed):
         return getattr(self._robot, "info", None)
 
     def not_ready(self) -> str | None:
-        """Why a live robot cannot move now, by its own words; None if it does not say so. May ask it: at rest only."""
+        """Why a live robot cannot move now, as it says itself; None if it does not say so. May ask it: at rest only."""
         ask = getattr(self._live, "not_ready", None)
         return None if ask is None else cast("str | None", ask())
 
@@ -285,7 +285,7 @@ class SafeRobot(metaclass=Sealed):
             InvalidValue: It has another shape; nothing was sent.
             ResetNeeded: Nothing is known of the robot yet.
             SafetyStop: A guard stopped the robot, now or earlier.
-            StaleState: The same, for want of a fresh state.
+            StaleState: The same, because there was no fresh state.
         """
         self._require_free()
         return self._advance(self._shape.row(command))
@@ -329,7 +329,7 @@ class SafeRobot(metaclass=Sealed):
         )
 
     def _pause(self) -> float:
-        """Time since the last command of a motion that goes on [s]; 0 where time passes only with commands."""
+        """Time since the last command of a motion [s]; 0 for the first one, and in lockstep."""
         if self._live is None or self._sent_at is None or self._in_lockstep():
             return 0.0
         return self._clock() - self._sent_at
@@ -338,7 +338,7 @@ class SafeRobot(metaclass=Sealed):
         return bool(getattr(self.info, "lockstep", False))
 
     def _begin_at(self, pause: float) -> Array:
-        """The last command, where the robot still follows it; else where it is, at rest. Shape: (m,)."""
+        """The last command if the robot still follows it; else where the robot is, at rest. Shape: (m,)."""
         goes_on = pause <= LATE * self.spec.period and (
             self._sent_at is not None or self._live is None or self._in_lockstep()
         )
@@ -350,7 +350,7 @@ class SafeRobot(metaclass=Sealed):
         return last
 
     def _velocity(self, measured: Array, before: Array) -> Array:
-        """Of each number of the command [unit/s]: as it is measured, else from tick to tick. Shape: (m,)."""
+        """Rate of each number of the command [unit/s]: measured, else from tick to tick. Shape: (m,)."""
         velocity: Array = (measured - before) / self.spec.period
         if self._state is not None:
             for place, name, column in self._speeds:
@@ -358,7 +358,7 @@ class SafeRobot(metaclass=Sealed):
         return velocity
 
     def _measured_anew(self) -> Array:
-        """What is measured now, as a command; a gripper goes on holding, or is open if nobody knows. Shape: (m,)."""
+        """The measured pose as a command; a gripper goes on holding, or is open if it is not measured. Shape: (m,)."""
         if self._live is not None and self._state is not None:
             self._state = self._fresh_state()
         measured = self._measured()
@@ -374,7 +374,7 @@ class SafeRobot(metaclass=Sealed):
         return begin
 
     def _measured(self) -> Array:
-        """What is measured of each number of the command, NaN where nothing is. Shape: (m,)."""
+        """The measured value of each number of the command; NaN where nothing is measured. Shape: (m,)."""
         if self._state is None:
             raise ResetNeeded("Nothing is known of the robot yet. Call reset() first.")
         measured = np.full(len(self.spec.command.labels), np.nan)
@@ -441,16 +441,16 @@ class SafeRobot(metaclass=Sealed):
         self._counts[guard.name][what] += 1
 
     def _hold(self, tick: Tick, guard: Guard, reason: str) -> None:
-        """Send what leaves the robot where it is; stop the robot if that happened too often."""
+        """Send what leaves the robot where it is; stop the robot if that has happened too often."""
         self._note(guard, "held")
         self._bad += 1
         if self._bad >= guard.patience:
-            self._stop(guard, reason if self._bad == 1 else f"{reason}, {self._bad} ticks on end")
+            self._stop(guard, reason if self._bad == 1 else f"{reason}, {self._bad} ticks in a row")
         tick.command = np.zeros_like(tick.last) if self._is_base else guard.hold(tick)
-        tick.last = tick.command  # at rest: what comes next begins there
+        tick.last = tick.command  # at rest: the next command begins there
 
     def _send(self, tick: Tick, halts: int) -> RobotState:
-        """Hand the command over; whatever goes wrong with it, the robot is halted."""
+        """Hand the command over; if anything goes wrong, the robot is halted."""
         cleared = _clear(self._robot, tick.command[None])
         handed: Any = cleared.command if self._live is None else cleared
         done, self._sent_at = False, self._clock()
@@ -465,7 +465,7 @@ class SafeRobot(metaclass=Sealed):
         if self._halts == halts:
             self._last, self._speed = tick.command, (tick.command - tick.last) / tick.period
         self._require_in_range(self._state)
-        return _copied(self._state)  # what a caller changes in it, the guards do not believe
+        return _copied(self._state)  # changes by the caller must not reach the guards
 
     def _require_in_range(self, state: RobotState) -> None:
         for guard in self._guards:
@@ -474,7 +474,7 @@ class SafeRobot(metaclass=Sealed):
                 self._stop(guard, reason)
 
     def _stop(self, guard: Guard, reason: str) -> NoReturn:
-        """Halt, and stay so until a person resumes."""
+        """Halt, and refuse commands until a person resumes."""
         self.halt()
         self._counts[guard.name]["stopped"] += 1
         why = self.not_ready()
@@ -500,7 +500,7 @@ class SafeRobot(metaclass=Sealed):
 
         Raises:
             InvalidValue: The start pose is outside the position limits; nothing moved.
-            StartNotReached: It was not there in time; it carries the joints.
+            StartNotReached: The arm was not there in time; carries the joints.
             SafetyStop: A guard stopped the robot, now or earlier.
         """
         self._require_free()
@@ -513,7 +513,7 @@ class SafeRobot(metaclass=Sealed):
         state = self._take(self._robot.reset(rows, initial))
         if start is not None and not start.is_near(self._measured()):
             self._approach(start)
-            state = self._take(self._robot.reset(rows, initial))  # what the arm may have pushed is put back
+            state = self._take(self._robot.reset(rows, initial))  # put back what the arm may have pushed
             self._forgive()
         self._restart_guards()
         begin = self._begin_at(self._pause())
@@ -622,13 +622,13 @@ class _StartPose:
 
 
 def _copied(state: RobotState) -> RobotState:
-    """The same, in arrays of its own."""
+    """The state with copies of its arrays."""
     signals = {name: values.copy() for name, values in state.signals.items()}
     return replace(state, signals=signals, command=state.command.copy())
 
 
 def _copy(tick: Tick) -> Tick:
-    """For a guard that is not ours: what it changes is looked at, and nothing else."""
+    """The tick for a user's guard: only what the guard does to the command is taken over."""
     return replace(tick, **{name: value.copy() for name, value in vars(tick).items() if isinstance(value, np.ndarray)})
 
 
@@ -639,8 +639,8 @@ def _places_of(spec: RobotSpec, units: Sequence[str]) -> list[tuple[int, str, in
         for signal in reversed(spec.signals)
         for column, pair in enumerate(zip(signal.labels, signal.units, strict=True))
     }
-    told = enumerate(zip(spec.command.labels, units, strict=True))
-    return [(place, *measured[pair]) for place, pair in told if pair in measured]
+    numbers = enumerate(zip(spec.command.labels, units, strict=True))
+    return [(place, *measured[pair]) for place, pair in numbers if pair in measured]
 
 
 def _measured_places(spec: RobotSpec) -> list[tuple[int, str, int]]:
@@ -651,8 +651,8 @@ def _measured_places(spec: RobotSpec) -> list[tuple[int, str, int]]:
     """
     places = _places_of(spec, spec.command.units)
     known = {place for place, _, _ in places}
-    told = enumerate(zip(spec.command.labels, spec.command.units, strict=True))
-    missing = [label for place, (label, unit) in told if unit == "rad" and place not in known]
+    numbers = enumerate(zip(spec.command.labels, spec.command.units, strict=True))
+    missing = [label for place, (label, unit) in numbers if unit == "rad" and place not in known]
     if missing:
         raise InvalidValue(f"The guards need {', '.join(missing)} of {spec.name} measured in rad; no signal has it.")
     return places

@@ -403,7 +403,7 @@ def test_two_bad_ticks_hold_and_the_third_stops_for_good():
     assert caught.value.guard == "finite"
     assert str(caught.value) == (
         "The robot was stopped by finite (G2): the command for shoulder_pan_joint, shoulder_lift_joint, elbow_joint, "
-        "wrist_1_joint, wrist_2_joint, wrist_3_joint, gripper_width is not a finite number, 3 ticks on end. "
+        "wrist_1_joint, wrist_2_joint, wrist_3_joint, gripper_width is not a finite number, 3 ticks in a row. "
         "When it is safe, call resume()."
     )
     assert inner.halts == halts + 1
@@ -496,7 +496,7 @@ def test_stale_states_hold_for_half_a_second_and_then_stop():
         robot.step(away(state, 0.02))
     assert str(caught.value) == (
         "The robot was stopped by state age (G3): the newest state is 0.110 s old, and at most 0.1 s are allowed, "
-        "10 ticks on end. When it is safe, call resume()."
+        "10 ticks in a row. When it is safe, call resume()."
     )
     assert (caught.value.age, caught.value.limit) == (0.11, 0.1)
     assert robot.report()["state age"]["held"] == 10
@@ -809,7 +809,7 @@ def test_a_policy_that_is_too_slow_moves_nothing_and_is_stopped():
     assert str(caught.value) == (
         "The robot was stopped by command pace (G15): the command came 0.350 s after the one before, and one is "
         "expected every 0.05 s: the policy takes too long, or this process was paused or the computer is busy, "
-        "10 ticks on end. When it is safe, call resume()."
+        "10 ticks in a row. When it is safe, call resume()."
     )
 
 
@@ -871,7 +871,7 @@ def test_a_robot_that_does_not_answer_is_held_and_then_stopped():
     assert told == (
         "The robot was stopped by answer to a command (G4): a command that was sent 0.760 s ago is not answered, and "
         "at most 0.3 s are allowed: commands do not arrive, or late; look at the network and at who else commands the "
-        "robot, 10 ticks on end. When it is safe, call resume()."
+        "robot, 10 ticks in a row. When it is safe, call resume()."
     )
 
 
