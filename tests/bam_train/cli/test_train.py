@@ -76,13 +76,6 @@ def test_print_config_is_read_back(bam_train, here):
     assert not (here / "runs").exists()
 
 
-def test_print_config_twice_is_once(bam_train, here, capsys):
-    printed = bam_train(print_config=True)[1]
-    (here / "a.json").write_text(printed)
-    train(TrainConfig(config=Path("a.json"), print_config=True))
-    assert capsys.readouterr().out == printed
-
-
 def test_flags_win_over_set_over_files(bam_train, here):
     (here / "a.toml").write_text(
         "steps = 5\nseed = 6\nnum_envs = 2\n[hyperparameters]\ngamma = 0.5\ngae_lambda = 0.5\n"
@@ -192,24 +185,6 @@ def test_resume_says_from_where(bam_train):
     assert err.splitlines()[0] == f"ppo on CartPole-v1, seed 0, going on from {last} at 128 steps"
 
 
-def test_resume_with_other_settings(bam_train):
-    bam_train(out=Path("a.zip"))
-    status, _, err = bam_train(resume=Path("a.zip"), seed=5)
-    assert (status, err) == (
-        1,
-        "bam-train: a.zip: was trained with seed 0, not 5. Leave seed out to go on with it, or train anew\n",
-    )
-
-
-def test_resume_of_a_truncated_checkpoint(bam_train):
-    bam_train(out=Path("a.zip"))
-    whole = Path("a.zip").read_bytes()
-    Path("a.zip").write_bytes(whole[: len(whole) // 2])
-    status, out, err = bam_train(resume=Path("a.zip"))
-    assert (status, out, len(err.splitlines())) == (1, "", 1)
-    assert err.startswith("bam-train: a.zip: not a whole zip file")
-
-
 def test_a_nan_keeps_the_last_good_checkpoint(bam_train):
     status, _, err = bam_train(set=(*SHORT, "learning_rate=1e30"))
     assert status == 1
@@ -251,7 +226,6 @@ LONG = ("--steps", "10000000", "--eval-every", "256", "--eval-episodes", "1")
     [
         (signal.SIGINT, 130, "Ctrl-C again"),
         (signal.SIGTERM, 143, "another signal"),
-        (signal.SIGHUP, 129, "another signal"),
     ],
 )
 def test_a_signal_saves_and_ends_cleanly(here, number, status, again):
@@ -292,12 +266,11 @@ def test_a_signal_that_comes_twice_at_once_is_one(here):
     assert err.splitlines()[-1] == "  bam-train --resume runs/CartPole-v1-ppo/last.zip"
 
 
-@pytest.mark.parametrize("pause", [0.05, 0.2])
-def test_two_signals_while_saving_quit_at_once_too(here, pause):
+def test_two_signals_while_saving_quit_at_once_too(here):
     process = started(here, *LONG)
     wait_for(process, "evaluation at 512 steps")
     process.send_signal(signal.SIGINT)
-    time.sleep(pause)
+    time.sleep(0.1)
     process.send_signal(signal.SIGINT)
     before = time.monotonic()
     _, err = process.communicate(timeout=20)

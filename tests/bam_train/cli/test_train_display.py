@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import io
+import sys
 
 import pytest
-from rich.console import Console
 
-from bam_train.cli import train_display
-from bam_train.cli.train_display import LiveDisplay, PlainDisplay, evaluation_line, make_display
+from bam_train.cli.train_display import PlainDisplay, evaluation_line, make_display
 from bam_train.evaluation import EvaluationReport
 from bam_train.trainers.trainer import Progress, Statistics
 
@@ -47,12 +46,19 @@ def test_evaluations(capsys, best, end):
     assert evaluation_line(151_552, REPORT, best) == line + end
 
 
+class Terminal(io.StringIO):
+    """Standard error of a person."""
+
+    def isatty(self):
+        return True
+
+
 def test_a_terminal_gets_a_panel(monkeypatch):
-    stream = io.StringIO()
-    monkeypatch.setattr(train_display, "make_console", lambda: Console(file=stream, force_terminal=True, width=90))
-    monkeypatch.setattr(train_display, "is_terminal", lambda: True)
+    stream = Terminal()
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "90")
     with make_display("ppo on bam/pick-v0, seed 0") as display:
-        assert isinstance(display, LiveDisplay)
         display.training(progress(12_288), statistics(0.5), 5164.3, 55.7)
         display.evaluated(12_288, REPORT, best=True)
     shown = stream.getvalue()
@@ -61,6 +67,7 @@ def test_a_terminal_gets_a_panel(monkeypatch):
     assert "[dim]" not in shown
 
 
-def test_elsewhere_there_are_plain_lines(monkeypatch):
-    monkeypatch.setattr(train_display, "is_terminal", lambda: False)
-    assert type(make_display("")) is PlainDisplay
+def test_elsewhere_there_are_plain_lines(capsys):
+    with make_display("ppo on bam/pick-v0"):
+        pass
+    assert capsys.readouterr().err == "ppo on bam/pick-v0\n"

@@ -248,10 +248,7 @@ ignore: [finger_joint, elbow_joint]
         ('kind = "arm"', 'kind = "leg"', "FILE: kind: expected 'arm' or 'base', found 'leg'"),
         ('name = "lift"\n', "", "FILE: the key 'name' is missing"),
         ("period = 0.02", "perod = 0.02", "FILE: unknown key 'perod'. Did you mean 'period'?"),
-        ("period = 0.02", 'period = "fast"', "FILE: period: expected a number above 0, found 'fast'"),
-        ("period = 0.02", "period = true", "FILE: period: expected a number above 0, found True"),
         ("period = 0.02", "period = nan", "FILE: period: expected a number above 0, found nan"),
-        ("period = 0.02", "period = -1", "FILE: period: expected a number above 0, found -1"),
         (
             "period = 0.02",
             "period = 0.02\ndead_man = 1e9",
@@ -286,7 +283,6 @@ ignore: [finger_joint, elbow_joint]
         ),
         ('names = ["lift_joint"]', "partial = true", "FILE: state[0]: partial and ignore need names."),
         ('["lift_joint"]', '["a", "b"]', "FILE: state[0]: names must name the 1 numbers of field, not 2."),
-        ('["lift_joint"]', '["a", 3]', "FILE: state[0]: names[1]: expected non-empty text, found 3"),
         ("scale = 0.001\n\n[[commands", "scale = 0\n\n[[commands", "FILE: state[0]: scale must not be 0."),
         (
             "scale = 0.001\n\n[[commands",
@@ -303,11 +299,6 @@ ignore: [finger_joint, elbow_joint]
             "scale = 0.001\n\n[[commands",
             "within = [2, 1]\n\n[[commands",
             "FILE: state[0]: within must be two numbers, the least first, not [2.0, 1.0].",
-        ),
-        (
-            "scale = 0.001\n\n[[commands",
-            "max_age = 0\n\n[[commands",
-            "FILE: state[0]: max_age: expected a number above 0, found 0",
         ),
         (
             "scale = 0.001\n\n[[commands",
@@ -337,18 +328,8 @@ ignore: [finger_joint, elbow_joint]
         ),
         (
             "[command]",
-            "[limits]\njoint_speed = 0\n[command]",
-            "FILE: limits: The limit joint_speed must be above 0, not 0.0.",
-        ),
-        (
-            "[command]",
             "[limits]\ntool_speed = 25\n[command]",
             "FILE: limits: The limit tool_speed of a live robot must be 0.005 to 1 m/s, not 25.",
-        ),
-        (
-            "[command]",
-            "max_age = 1.5\n[command]",
-            "FILE: max_age: expected a number above 0 and at most 1, found 1.5",
         ),
         (
             "[command]",
