@@ -17,6 +17,9 @@ from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.scripted import SCRIPTED, scripted_policy
 from bam_envs.testing.assertions import assert_same_tree
 
+ONE_OF_EACH = ("bam/pick-v0", "bam/mir100-avoidance-v0", "bam/ur-empty-v0")
+"""An arm with a gripper, a base, an arm alone: for what does not depend on the task."""
+
 
 def size_of(env):
     return env.single_action_space.shape[0]
@@ -122,7 +125,7 @@ def assert_same_infos(ours, theirs):
                 np.testing.assert_array_equal(ours[key][row], value[row], err_msg=key)
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", ONE_OF_EACH)
 def test_reset_infos_are_those_of_gymnasiums_own_rows(make_rows, env_id):
     theirs = SyncVectorEnv([lambda: gym.make(env_id, disable_env_checker=True)] * 2)
     assert_same_infos(make_rows(env_id, 2).reset(seed=0)[1], theirs.reset(seed=0)[1])
@@ -139,7 +142,7 @@ def test_gymnasiums_own_rows_work(kind):
     envs.close()
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", ONE_OF_EACH)
 def test_seeds_are_one_a_row(make_rows, env_id):
     envs = make_rows(env_id, 3)
     together, _ = envs.reset(seed=5)
@@ -151,7 +154,7 @@ def test_seeds_are_one_a_row(make_rows, env_id):
     assert str(caught.value) == "seed must be one number or 3 of them, not 2."
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", ONE_OF_EACH)
 def test_rows_without_a_seed_go_on_from_their_generators(make_rows, env_id):
     envs, other = make_rows(env_id, 2), make_rows(env_id, 2)
     envs.reset(seed=0)
@@ -159,7 +162,7 @@ def test_rows_without_a_seed_go_on_from_their_generators(make_rows, env_id):
     np.testing.assert_array_equal(envs.reset(seed=[None, 9])[0][0], other.reset()[0][0])
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", ONE_OF_EACH)
 def test_some_rows_can_be_reset(make_rows, env_id):
     envs = make_rows(env_id, 3)
     envs.reset(seed=0)
