@@ -108,7 +108,7 @@ class LiveCamera:
             ResetNeeded: Not connected.
             StaleState: It is older than the profile allows.
             ProtocolError: It is not an image.
-            MissingExtra: Neither OpenCV nor Pillow is installed.
+            MissingExtra: Pillow is not installed.
         """
         letter = None if self._link is None else self._mailbox.newest().get(_SLOT)
         if letter is None:

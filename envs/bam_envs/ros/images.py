@@ -1,7 +1,6 @@
 """Camera images as ROS messages: colour as sensor_msgs/CompressedImage, depth as a PNG of uint16 millimetres.
 
-With OpenCV if it is installed, else with Pillow: PNG is the same bits either way. Arrays are RGB here, also where a
-library thinks in BGR. Message data are `bytes`, or base64 text as a JSON bridge sends them.
+Arrays are RGB. Message data are `bytes`, or base64 text as a JSON bridge sends them.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ import binascii
 import importlib
 import io
 from collections.abc import Mapping
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -39,7 +37,7 @@ def encode_image(image: NDArray[np.uint8], kind: str = "png") -> bytes:
 
     Raises:
         InvalidValue: Another kind, dtype or shape.
-        MissingExtra: Neither OpenCV nor Pillow is installed.
+        MissingExtra: Pillow is not installed.
     """
     if kind not in FORMATS:
         raise InvalidValue(f"The image format must be png or jpeg, not {kind!r}.")
@@ -51,7 +49,7 @@ def decode_image(data: bytes) -> NDArray[np.uint8]:
 
     Raises:
         ProtocolError: It is not such a file, or its pixels are not 8 bits.
-        MissingExtra: Neither OpenCV nor Pillow is installed.
+        MissingExtra: Pillow is not installed.
     """
     image = _decode(data)
     if image.dtype != np.uint8:
@@ -174,66 +172,16 @@ def _flat(image: NDArray[Any]) -> NDArray[Any]:
 
 
 def _encode(image: NDArray[Any], kind: str) -> bytes:
-    cv2 = _library("cv2")
-    return _encode_pillow(image, kind) if cv2 is None else _encode_cv2(cv2, image, kind)
-
-
-def _decode(data: bytes) -> NDArray[Any]:
-    if not data.startswith((_PNG, _JPEG)):
-        raise ProtocolError(f"An image must be a PNG or JPEG file, not one that begins with {data[:8]!r}.")
-    cv2 = _library("cv2")
-    return _decode_pillow(data) if cv2 is None else _decode_cv2(cv2, data)
-
-
-def _library(name: str) -> ModuleType | None:
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        return None
-
-
-def _pillow() -> Any:
-    pillow = _library("PIL.Image")
-    if pillow is None:
-        raise MissingExtra("PIL", "video", "Sending camera images")
-    return pillow
-
-
-def _encode_cv2(cv2: Any, image: NDArray[Any], kind: str) -> bytes:
-    quick = [cv2.IMWRITE_PNG_COMPRESSION, 1] if kind == "png" else [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-    done, data = cv2.imencode(f".{kind}", _swapped(image), quick)
-    if not done:
-        raise InvalidValue(f"OpenCV cannot write a {kind} of shape {image.shape}.")
-    return bytes(data)
-
-
-def _decode_cv2(cv2: Any, data: bytes) -> NDArray[Any]:
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise ProtocolError(f"An image cannot be read: {str(error).strip().splitlines()[-1]}.") from error
-    if image is None:
-        raise ProtocolError(f"An image of {len(data)} bytes cannot be read; it is damaged.")
-    return _swapped(image)
-
-
-def _swapped(image: NDArray[Any]) -> NDArray[Any]:
-    """RGB as BGR, and back."""
-    if image.ndim == 2:
-        return np.ascontiguousarray(image)
-    order = [2, 1, 0, 3][: image.shape[2]]
-    return np.ascontiguousarray(image[:, :, order])
-
-
-def _encode_pillow(image: NDArray[Any], kind: str) -> bytes:
     file, options = io.BytesIO(), {"compress_level": 1} if kind == "png" else {"quality": JPEG_QUALITY}
     _pillow().fromarray(np.ascontiguousarray(image)).save(file, kind, **options)
     return file.getvalue()
 
 
-def _decode_pillow(data: bytes) -> NDArray[Any]:
+def _decode(data: bytes) -> NDArray[Any]:
+    if not data.startswith((_PNG, _JPEG)):
+        raise ProtocolError(f"An image must be a PNG or JPEG file, not one that begins with {data[:8]!r}.")
     pillow = _pillow()
-    # SyntaxError is what a broken PNG is to Pillow, and a DecompressionBombError what would fill the memory.
+    # Pillow raises SyntaxError for a broken PNG, and DecompressionBombError for an image that would fill the memory.
     errors = (OSError, SyntaxError, ValueError, pillow.DecompressionBombError)
     try:
         with pillow.open(io.BytesIO(data)) as image:
@@ -242,3 +190,10 @@ def _decode_pillow(data: bytes) -> NDArray[Any]:
     except errors as error:
         raise ProtocolError(f"An image cannot be read: {error}.") from error
     return array.astype(np.uint16) if wide else array
+
+
+def _pillow() -> Any:
+    try:
+        return importlib.import_module("PIL.Image")
+    except ImportError as error:
+        raise MissingExtra("PIL", "video", "Sending camera images") from error

@@ -1,6 +1,7 @@
 """A camera behind a rosbridge server."""
 
 import base64
+import sys
 import threading
 
 import numpy as np
@@ -211,7 +212,8 @@ def test_what_is_no_image(message, text):
 
 def test_without_a_library(monkeypatch):
     message = color_message(PIXELS)
-    monkeypatch.setattr("bam_envs.ros.images._library", lambda name: None)
+    for name in ("PIL", "PIL.Image"):
+        monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(MissingExtra):
         decode_pixels(message, "/c")
 

@@ -1,4 +1,4 @@
-"""Images as messages: both libraries, exact pixels, errors."""
+"""Images as messages: exact pixels, errors."""
 
 import base64
 import struct
@@ -15,28 +15,19 @@ RNG = np.random.default_rng(0)
 SHAPES = [(8, 9), (8, 9, 1), (8, 9, 3), (8, 9, 4), (1, 1, 3)]
 
 
-@pytest.fixture(params=["cv2", "pillow"])
-def library(request, monkeypatch):
-    if request.param == "pillow":
-        monkeypatch.setitem(sys.modules, "cv2", None)
-    else:
-        pytest.importorskip("cv2")
-    return request.param
-
-
 def pixels(shape):
     return RNG.integers(0, 256, shape, dtype=np.uint8)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_png_keeps_every_bit(library, shape):
+def test_png_keeps_every_bit(shape):
     image = pixels(shape)
     decoded = images.decode_image(images.encode_image(image))
     np.testing.assert_array_equal(decoded.reshape(shape), image)
     assert decoded.dtype == np.uint8
 
 
-def test_channels_are_red_green_blue_in_the_file(library):
+def test_channels_are_red_green_blue_in_the_file():
     pillow = pytest.importorskip("PIL.Image")
     import io
 
@@ -49,7 +40,7 @@ def test_channels_are_red_green_blue_in_the_file(library):
 
 
 @pytest.mark.parametrize("shape", [(16, 16), (16, 16, 3)])
-def test_jpeg_is_near(library, shape):
+def test_jpeg_is_near(shape):
     image = np.full(shape, 90, np.uint8)
     decoded = images.decode_image(images.encode_image(image, "jpeg"))
     assert decoded.shape == shape
@@ -72,7 +63,7 @@ def test_what_is_no_image_is_refused(image, kind, text):
     assert text in str(error.value)
 
 
-def test_depth_is_whole_millimetres(library):
+def test_depth_is_whole_millimetres():
     depth = np.array([[0.0, 0.0004, 0.0006], [1.2345, 65.535, 70.0], [np.nan, np.inf, -1.0]])
     decoded = images.decode_depth(images.encode_depth(depth))
     expected = np.array([[0, 0, 1], [1234, 65535, 65535], [0, 0, 0]]) / np.float32(1000)
@@ -80,7 +71,7 @@ def test_depth_is_whole_millimetres(library):
     assert decoded.dtype == np.float32
 
 
-def test_a_depth_message_and_back(library):
+def test_a_depth_message_and_back():
     message = images.depth_message(np.full((3, 4, 1), 1.5), "wrist", {"sec": 1, "nanosec": 2})
     assert message["header"] == {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "wrist"}
     assert (message["height"], message["width"], message["step"]) == (3, 4, 8)
@@ -113,7 +104,7 @@ def test_depth_that_cannot_be_read(message, text):
         images.read_depth_message(message)
 
 
-def test_a_color_message_as_bytes_and_as_base64(library):
+def test_a_color_message_as_bytes_and_as_base64():
     image = pixels((8, 9, 3))
     message = images.color_message(image, "png", "camera")
     assert message["format"] == "png"
@@ -128,7 +119,7 @@ def test_an_empty_message_holds_no_image():
     assert images.read_depth_message({"data": b""}) is None
 
 
-def test_a_file_that_would_fill_the_memory(library):
+def test_a_file_that_would_fill_the_memory():
     def chunk(name, data):
         return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
@@ -137,7 +128,7 @@ def test_a_file_that_would_fill_the_memory(library):
         images.decode_image(b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", b"") + chunk(b"IEND", b""))
 
 
-def test_damaged_files(library):
+def test_damaged_files():
     whole = images.encode_image(pixels((8, 9, 3)))
     with pytest.raises(ProtocolError, match="An image must be a PNG or JPEG file, not one that begins with b'hello'"):
         images.decode_image(b"hello")
@@ -150,7 +141,7 @@ def test_damaged_files(library):
 
 
 def test_without_a_library(monkeypatch):
-    for name in ("cv2", "PIL", "PIL.Image"):
+    for name in ("PIL", "PIL.Image"):
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(MissingExtra, match=r'Sending camera images needs PIL.*pip install "bam-train\[video\]"'):
         images.encode_image(pixels((8, 8, 3)))
