@@ -1,8 +1,8 @@
 """The scripts that run the policy of a checkpoint: ours, a directory of RLlib, on a simulated and on a live robot."""
 
-import importlib.util
 import pickle
 import re
+import runpy
 import shutil
 import sys
 import zipfile
@@ -17,32 +17,23 @@ import bam_envs  # noqa: F401 - registers the environments
 from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
-from bam_train.cli.program import guarded
 
 ROOT = Path(__file__).parents[2]
+SCRIPTS = ROOT / "scripts"
 PICK = ROOT / "checkpoints" / "pick-ppo.zip"
 EPISODE = re.compile(r"episode \d+: return -?\d+\.\d\d, (?:no )?success, clipped (\d+) of (\d+) actions")
 
 
-@pytest.fixture(scope="module")
-def script():
-    spec = importlib.util.spec_from_file_location("policy_from_cp_mir", ROOT / "scripts" / "policy_from_cp_mir.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.fixture
-def run(script, capsys, monkeypatch):
+def run(capsys, monkeypatch):
     """Run it with these arguments; status, standard output, standard error."""
 
     def run_it(*arguments):
         monkeypatch.setattr(sys, "argv", ["policy_from_cp_mir.py", *map(str, arguments)])
-        try:
-            status = guarded(lambda: script.main(script.parse()), script.NAME)
-        except SystemExit as end:
-            status = end.code
-        return status, *capsys.readouterr()
+        monkeypatch.syspath_prepend(SCRIPTS)
+        with pytest.raises(SystemExit) as end:
+            runpy.run_path(str(SCRIPTS / "policy_from_cp_mir.py"), run_name="__main__")
+        return end.value.code, *capsys.readouterr()
 
     return run_it
 
@@ -149,9 +140,10 @@ class Bound:
         return np.array([0.5 if self.calls % 2 else -1.5, 0.0], np.float32)
 
 
-def test_clipped_actions_are_counted(script):
+def test_clipped_actions_are_counted():
+    script = runpy.run_path(str(SCRIPTS / "policy_from_cp.py"))
     env = gym.make("bam/mir100-navigation-v0", max_episode_steps=10)
-    total, success, clipped, steps = script.play(env, Bound(), 0)
+    total, success, clipped, steps = script["play"](env, Bound(), 0)
     env.close()
     assert (success, clipped, steps) == (False, 5, 10) or steps < 10
     assert isinstance(total, float)

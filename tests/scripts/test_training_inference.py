@@ -1,6 +1,5 @@
 """The scripts that train with RLlib and with stable-baselines3, and then use what they trained."""
 
-import difflib
 import os
 import re
 import signal
@@ -36,17 +35,9 @@ OPTIONS = (
 )
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", [*ALL, "training_inference", "policy_from_cp"])
 def test_each_is_short_enough_to_copy(name):
-    assert len((SCRIPTS / f"{name}.py").read_text().splitlines()) < 120
-
-
-@pytest.mark.parametrize(("stem", "most"), [("training_inference", 9), ("policy_from_cp", 9)])
-def test_a_pair_differs_in_its_environment_and_examples_alone(stem, most):
-    mir, ur = ((SCRIPTS / f"{stem}_{robot}.py").read_text().splitlines() for robot in ("mir", "ur"))
-    assert len(mir) == len(ur)
-    differing = [line for line in difflib.ndiff(mir, ur) if line.startswith("- ")]
-    assert len(differing) <= most, differing
+    assert len((SCRIPTS / f"{name}.py").read_text().splitlines()) < 150
 
 
 @pytest.mark.parametrize("name", ALL)

@@ -1,7 +1,7 @@
-import importlib.util
 import json
 import pickle
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -43,13 +43,12 @@ def refused(run):
 def test_the_script_runs_the_policy_of_a_directory_of_no_robot(rllib_directories, monkeypatch, capsys):
     """Its actions are choices, which nobody clips."""
     path = Path(__file__).parents[3] / "scripts" / "policy_from_cp_mir.py"
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
+    monkeypatch.syspath_prepend(path.parent)
     monkeypatch.setattr(
         sys, "argv", [path.name, str(rllib_directories / "dqn"), "--num-episodes", "1", "--trust-pickle"]
     )
-    script.main(script.parse())
+    with pytest.raises(SystemExit, match="0"):
+        runpy.run_path(str(path), run_name="__main__")
     out, err = capsys.readouterr()
     assert err.splitlines()[1:] == ["policy_from_cp_mir: note: CartPole-v1 moves no robot of ours"]
     assert re.fullmatch(r"episode 1: return \d+\.00, no success, clipped 0 of \d+ actions", out.splitlines()[0])
