@@ -74,6 +74,10 @@ class ScriptedServer:
         """Neither read nor answer, as a stopped process does."""
         self._on_each(lambda connection: connection.transport.pause_reading())
 
+    def close_without_end(self):
+        """Begin a closing handshake, and leave the TCP connections open."""
+        self._on_each(lambda connection: connection.transport.write(b"\x88\x02\x03\xe8"))
+
     def wait_for(self, op, count=1):
         """The messages with this `op`, once there are `count` of them."""
         with self._changed:

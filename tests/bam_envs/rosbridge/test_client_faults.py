@@ -136,6 +136,14 @@ def test_a_pending_call_fails_at_once_when_the_link_is_closed(scripted, link, lo
     assert lost.reasons == []
 
 
+def test_a_server_that_does_not_finish_closing_is_left(scripted, link, lost):
+    link.advertise("/cmd", STRING)
+    scripted.freeze()
+    scripted.close_without_end()
+    assert lost.wait(10.0)
+    assert lost.reasons == [f"{scripted.url}: the link dropped: the server did not finish closing it."]
+
+
 def test_a_new_connection_is_told_everything_again(scripted, link, heard):
     link.advertise("/cmd", STRING, latch=True)
     link.serve("/act", "std_srvs/Trigger", lambda request, caller: {})
