@@ -392,7 +392,7 @@ def _plain(value: Any, depth: int, *, null: bool) -> None:
 def _all_plain_numbers(values: Sequence[Any]) -> bool:
     kinds = set(map(type, values))
     if kinds == {int}:
-        return min(values) >= -(2**63) and max(values) < 2**64
+        return bool(min(values) >= -(2**63) and max(values) < 2**64)
     return kinds <= {float} and math.isfinite(sum(values))
 
 
