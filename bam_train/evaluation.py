@@ -17,6 +17,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
+from bam_envs.core.validation import NonNegativeInt, PositiveInt, check
 from bam_train.environments import is_batched, make_rows
 from bam_train.errors import SettingsError
 from bam_train.finite import FiniteRows
@@ -152,7 +153,9 @@ def evaluate(
         PolicyError: An action that is not finite.
         EnvironmentFailed: An observation or a reward that is not finite.
     """
-    require_range(episodes, seed, num_envs)
+    check(seed, NonNegativeInt, "seed", SettingsError)
+    check(episodes, PositiveInt, "episodes", SettingsError)
+    check(num_envs, PositiveInt | None, "num_envs", SettingsError)
     with _rows(env_id, env_kwargs, num_envs, episodes, env) as rows:
         done: list[Episode] = []
         while len(done) < episodes:
@@ -160,18 +163,6 @@ def evaluate(
             if on_progress is not None:
                 on_progress(len(done), episodes)
     return summarise(env_id, done)
-
-
-def require_range(episodes: int, seed: int, num_envs: int | None = None, **counts: int) -> None:
-    """Refuse numbers that cannot be; `counts` are others that have to be at least 1.
-
-    Raises:
-        SettingsError: Names the first that is out of range.
-    """
-    counts = {"episodes": episodes, "num_envs": 1 if num_envs is None else num_envs, **counts}
-    for name, value, least in [("seed", seed, 0), *((name, value, 1) for name, value in counts.items())]:
-        if value < least:
-            raise SettingsError(f"{name}: expected at least {least}, found {value}")
 
 
 def play_wave(env: VectorEnv[Any, Any, Any], policy: BatchPolicy, seed: int, count: int) -> list[Episode]:

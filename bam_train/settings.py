@@ -11,7 +11,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -155,27 +155,26 @@ def _require_finite(name: str, value: Any) -> None:
 _WORDS = {"true": True, "True": True, "false": False, "False": False, "null": None, "None": None, "none": None}
 
 
-def parse_value(text: str) -> Any:
-    """Read one typed value: JSON, Python's True/False/None, else the text itself.
-
-    ``64`` is an int, ``3e-4`` a float, ``[64,64]`` a list, ``true`` a bool, ``lin_3e-4`` text.
-    """
-    try:
-        return _WORDS[text] if text in _WORDS else json.loads(text)
-    except ValueError:
-        return text
-
-
 def parse_assignment(text: str, example: str) -> tuple[list[str], Any]:
-    """Split ``name.of.it=value`` into the parts of its name and its typed value."""
-    name, equals, value = text.partition("=")
-    path = name.strip().split(".")
+    """Split ``name.of.it=value`` into the parts of its name and its typed value.
+
+    A value is JSON, Python's True, False or None, or else the text itself: ``64`` is an int, ``3e-4`` a float,
+    ``[64,64]`` a list, ``true`` a bool, ``lin_3e-4`` text.
+
+    Raises:
+        SettingsError: There is no ``=``, or no name before it.
+    """
+    name, equals, typed = (part.strip() for part in text.partition("="))
+    path = name.split(".")
     if not equals or not all(path):
         raise SettingsError(f"--set {text}: expected name=value, such as --set {example}, found {text!r}")
-    return path, parse_value(value.strip())
+    try:
+        return path, _WORDS[typed] if typed in _WORDS else json.loads(typed)
+    except ValueError:
+        return path, typed
 
 
-def read_assignments(texts: Iterable[str]) -> dict[str, Any]:
+def read_assignments(texts: Sequence[str]) -> dict[str, Any]:
     """The layer that ``--set name=value`` texts make.
 
     A top-level setting's name goes there, any other to the algorithm: ``gamma=0.9`` is ``hyperparameters.gamma=0.9``.
@@ -183,23 +182,27 @@ def read_assignments(texts: Iterable[str]) -> dict[str, Any]:
     layer: dict[str, Any] = {}
     for text in texts:
         path, value = parse_assignment(text, "learning_rate=3e-4")
-        layer = merge(layer, _nest(path if path[0] in NAMES else ["hyperparameters", *path], value, text))
+        if path[0] not in NAMES:
+            path = ["hyperparameters", *path]
+        if len(path) > 1 and path[0] not in TABLES:
+            raise SettingsError(f"--set {text}: {path[0]} is not a table; expected {path[0]}=value")
+        for name in reversed(path):
+            value = {name: value}
+        layer = merge(layer, value)
     return layer
 
 
-def read_env_kwargs(texts: Iterable[str]) -> dict[str, Any]:
+def read_env_kwargs(texts: Sequence[str]) -> dict[str, Any]:
     """Arguments of an environment out of ``--set env_kwargs.NAME=VALUE`` texts, where nothing else can be set.
 
     Raises:
         SettingsError: One of them sets something else.
     """
-    layer: dict[str, Any] = {"env_kwargs": {}}
     for text in texts:
-        path, value = parse_assignment(text, "env_kwargs.NAME=VALUE")
+        path, _ = parse_assignment(text, "env_kwargs.NAME=VALUE")
         if path[0] != "env_kwargs" or len(path) == 1:
             raise SettingsError(f"--set {text}: expected env_kwargs.NAME=VALUE, such as env_kwargs.parity=true")
-        layer = merge(layer, _nest(path, value, text))
-    found: dict[str, Any] = layer["env_kwargs"]
+    found: dict[str, Any] = read_assignments(texts).get("env_kwargs", {})
     return found
 
 
@@ -211,14 +214,6 @@ def merge(*layers: Mapping[str, Any]) -> dict[str, Any]:
             old = merged.get(name)
             merged[name] = merge(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
     return merged
-
-
-def _nest(path: list[str], value: Any, text: str) -> dict[str, Any]:
-    if len(path) > 1 and path[0] not in TABLES:
-        raise SettingsError(f"--set {text}: {path[0]} is not a table; expected {path[0]}=value")
-    for name in reversed(path):
-        value = {name: value}
-    return dict(value)
 
 
 def read_config(path: str | Path) -> dict[str, Any]:

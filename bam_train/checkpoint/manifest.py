@@ -29,11 +29,15 @@ WHERE = frozenset({"robot", "transport", "profile", "ca_file", "token_file", "rs
 """Arguments of an environment that say where it runs; only a person says that, never a file."""
 
 
+_Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+_Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
+
+
 @dataclass(frozen=True)
 class Manifest:
     """What a checkpoint is; `bam/manifest.json`."""
 
-    format: int
+    format: Literal[1]
     """Version of the file's layout."""
     env: str
     """Versioned environment id, e.g. bam/pick-v0."""
@@ -43,9 +47,9 @@ class Manifest:
     """The environment's own, as written by `bam_envs.core.spaces.space_to_json`."""
     action_space: dict[str, Any]
     """The same for actions."""
-    signals: dict[str, Any]
+    signals: dict[str, list[dict[str, Any]]]
     """Name, unit, low and high of every entry of observation, action, command and state; {} if unknown."""
-    period: float | None
+    period: Annotated[float, Meta(gt=0)] | None
     """Time between two actions [s]; None if the environment does not say."""
     algorithm: str
     """Such as ppo."""
@@ -53,9 +57,9 @@ class Manifest:
     """Such as sb3."""
     settings: dict[str, Any]
     """Everything that made the run."""
-    steps: int
+    steps: _Count
     """Environment steps trained."""
-    seed: int
+    seed: _Count
     """Seed of the run."""
     scores: dict[str, Any]
     """What evaluation found when this was saved."""
@@ -65,11 +69,10 @@ class Manifest:
     """Of the source tree, if there was one."""
     created: str
     """UTC, ISO 8601."""
-    sha256: dict[str, str]
+    sha256: dict[str, _Digest]
     """Hex digest of every other member."""
 
 
-_Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 _Number = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 _Bound = float | Literal["inf", "-inf"] | list[Any]
 _Shape = Annotated[list[_Count], Meta(max_length=32)]
@@ -116,15 +119,9 @@ class _Scores(Struct):
 class _Contents(Struct):
     """What the types of `Manifest` do not say."""
 
-    format: Literal[1]
     observation_space: _Space
     action_space: _Space
-    signals: dict[str, list[dict[str, Any]]]
-    period: Annotated[float, Meta(gt=0)] | None
-    steps: _Count
-    seed: _Count
     scores: _Scores
-    sha256: dict[str, Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]]
 
 
 class _Head(Struct):

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import msgspec
 
-from bam_envs.core.validation import Finite, check, expected
+from bam_envs.core.validation import expected
 from bam_envs.core.wording import brief
 from bam_train.errors import SettingsError
 
@@ -71,12 +71,3 @@ def as_written(hint: Any) -> Any:
 def ranges(kinds: Mapping[Any, Iterable[str]]) -> dict[str, Any]:
     """Name of a hyperparameter to the kind of number it is, out of names by kind."""
     return {name: kind for kind, names in kinds.items() for name in names}
-
-
-def check_range(name: str, number: float, kinds: Mapping[str, Any]) -> None:
-    """Refuse a number out of its range, which the library itself would take; every number must be finite.
-
-    Raises:
-        SettingsError: Names it, its range and the number.
-    """
-    check(number, kinds.get(name, Finite), name, SettingsError)

@@ -46,7 +46,11 @@ def resolve(given: Mapping[str, Any]) -> TrainSettings:
     settings = TrainSettings.from_mapping(merge(preset, given, {"env": env}))
     _require_of_trainer(settings)
     _require_env_kwargs(env, settings.env_kwargs)
-    _require_own(given, settings)
+    if settings.transport and settings.env_kwargs:
+        raise SettingsError(
+            f"env_kwargs: {', '.join(settings.env_kwargs)}: the environment runs at {settings.place.text}; "
+            "give its arguments to bam-serve there"
+        )
     completed = load_trainer(settings.trainer).complete(settings)
     if given.get("num_envs") not in (None, completed.num_envs):
         there = f"there are {completed.num_envs} at {settings.place.text}"
@@ -69,15 +73,6 @@ def _require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
         require_no_place(given)
     except ValueError as error:
         raise SettingsError(f"{error}; leave it out") from error
-
-
-def _require_own(given: Mapping[str, Any], settings: TrainSettings) -> None:
-    """Refuse arguments of an environment that is made elsewhere."""
-    if settings.transport and given.get("env_kwargs"):
-        names = ", ".join(given["env_kwargs"])
-        raise SettingsError(
-            f"env_kwargs: {names}: the environment runs at {settings.place.text}; give its arguments to bam-serve there"
-        )
 
 
 def own_settings(checkpoint: Checkpoint, env: str | None = None, *, elsewhere: bool = False) -> dict[str, Any]:

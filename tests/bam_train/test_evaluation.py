@@ -123,10 +123,10 @@ def test_progress_after_every_wave(corridor):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"episodes": 0}, "episodes: expected at least 1, found 0"),
-        ({"episodes": -3}, "episodes: expected at least 1, found -3"),
-        ({"seed": -1}, "seed: expected at least 0, found -1"),
-        ({"num_envs": 0}, "num_envs: expected at least 1, found 0"),
+        ({"episodes": 0}, "episodes: expected a whole number of at least 1, found 0"),
+        ({"episodes": -3}, "episodes: expected a whole number of at least 1, found -3"),
+        ({"seed": -1}, "seed: expected a whole number of at least 0, found -1"),
+        ({"num_envs": 0}, "num_envs: expected a whole number of at least 1, found 0"),
     ],
 )
 def test_out_of_range(corridor, arguments, message):

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bam_envs.core.validation import Fraction, NonNegative, Positive, PositiveInt
+from bam_envs.core.validation import Finite, Fraction, NonNegative, Positive, PositiveInt, check
 from bam_train.errors import SettingsError
-from bam_train.trainers.library_arguments import check_range, ranges
+from bam_train.trainers.library_arguments import ranges
 
 _RANGES = ranges(
     {
@@ -45,7 +45,7 @@ def check_ranges(values: Mapping[str, Any]) -> None:
         if isinstance(value, bool):
             continue
         if isinstance(value, (int, float)):
-            check_range(name, value, _RANGES)
+            check(value, _RANGES.get(name, Finite), name, SettingsError)
         elif name == "rollout_fragment_length" and value != "auto":
             raise SettingsError(f"{name}: expected a whole number or 'auto', found {value!r}")
         elif name == "target_entropy" and value not in (None, "auto"):
@@ -69,9 +69,9 @@ def _require_schedule(name: str, value: list[list[float]]) -> None:
     if len(steps) < max(2, len(value)) or steps[0] != 0 or sorted(set(steps)) != steps:
         text = "expected a number or a schedule [[0, value], [step, value], ...] with rising steps"
         raise SettingsError(f"{name}: {text}, found {value!r}")
-    check_range(name, value[0][1], _RANGES)
+    check(value[0][1], _RANGES.get(name, Finite), name, SettingsError)
     for _, number in value[1:]:
-        check_range(name, number, _LAST)
+        check(number, _LAST.get(name, Finite), name, SettingsError)
 
 
 def _require_layers(model_config: Mapping[str, Any]) -> None:

@@ -22,11 +22,11 @@ from stable_baselines3.common import noise, torch_layers, utils
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecNormalize
 
-from bam_envs.core.validation import Fraction, NonNegative, Positive, PositiveInt
+from bam_envs.core.validation import Finite, Fraction, NonNegative, Positive, PositiveInt, check
 from bam_envs.core.wording import did_you_mean
 from bam_train.errors import SettingsError
 from bam_train.settings import NAMES
-from bam_train.trainers.library_arguments import check_range, fit, linear_start, ranges
+from bam_train.trainers.library_arguments import fit, linear_start, ranges
 from bam_train.trainers.sb3.sb3_algorithms import Algorithm
 
 ELSEWHERE = {
@@ -166,7 +166,7 @@ def _check_ranges(values: Mapping[str, Any]) -> None:
         first = value[0] if isinstance(value, list) and value else value
         number = linear_start(first) if isinstance(first, str) else first
         if isinstance(number, (int, float)) and not isinstance(number, bool):
-            check_range(name, number, _RANGES)
+            check(number, _RANGES.get(name, Finite), name, SettingsError)
 
 
 def _checked_policy(policy: Any, given: Mapping[str, Any]) -> dict[str, Any]:
