@@ -17,7 +17,7 @@ from bam_envs.ros.codec import INFO_SERVICE, RobotInfo, read_info
 from bam_envs.ros.command_messages import has_room
 from bam_envs.ros.messages import bare_type, same_type
 from bam_envs.ros.profile_tables import Readiness, RobotProfile, Sink
-from bam_envs.rosbridge.bus import Listener
+from bam_envs.rosbridge.bus import Listener, namespaces_with
 
 if TYPE_CHECKING:
     from bam_envs.rosbridge.client import RosbridgeLink
@@ -147,7 +147,7 @@ class TopicTypes:
                 raise ProtocolError(
                     f"Nobody listens to {topic} ({expected}), which takes {', '.join(sink.labels)}. Is the controller "
                     f"active, and is the topic called so? Topics are in the profile of {self._profile.name}; "
-                    "this may be another robot than it describes."
+                    f"this may be another robot than it describes.{namespaces_with(self._link, 'topics', sink.topic)}"
                 )
             time.sleep(_TRY_AGAIN)  # nodes of a ROS graph take a while to discover each other
         found = self._found(topic) or expected

@@ -29,6 +29,7 @@ from bam_envs.remote.gymapi.messages import (
 )
 from bam_envs.remote.transport import EnvSpecMessage, Info, Seed, plain_seed, spec_from_json, spec_to_json
 from bam_envs.ros.freshness import Tagger
+from bam_envs.rosbridge.bus import namespaces_with
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.sessions import is_over, read_session
@@ -241,7 +242,8 @@ class RosbridgeTransport:
         namespace = f" --namespace {self._link.namespace.strip('/')}" if self._link.namespace else ""
         remedy = f"Start one: bam-serve --env {self.env_id or 'bam/pick'}{namespace}"
         if "does not exist" in reason:  # the words of every bridge but one, whose text does not say
-            raise NoServer(self.url, f"{reason}. {remedy}")
+            elsewhere = namespaces_with(self._link, "services", service_name(""))
+            raise NoServer(self.url, f"{reason}.{elsewhere} {remedy}")
         try:
             return self._rack.codec(self.env_id)
         except UnknownName as error:

@@ -11,7 +11,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
+
+from bam_envs.core.errors import LinkLost, RemoteError
+from bam_envs.core.wording import listed
 
 Message = Mapping[str, Any]
 
@@ -87,3 +90,22 @@ class Bus(Protocol):
 
     def close(self) -> None:
         """Stop serving and let go of everything. As often as one likes."""
+
+
+def namespaces_with(link: Any, kind: Literal["topics", "services"], name: str) -> str:
+    """A sentence about the namespaces in which a server has the topic or service `name`; empty if rosapi knows none.
+
+    Args:
+        link: A client link that is up.
+        kind: What `name` is of.
+        name: Without namespace.
+    """
+    try:
+        names = link.call(f"/rosapi/{kind}", f"rosapi/{kind.capitalize()}", {}, 1.0).get(kind) or []
+    except (RemoteError, LinkLost):
+        return ""
+    found = [one.removesuffix(name) for one in names if isinstance(one, str) and one.endswith(name)]
+    if not found:
+        return ""
+    addresses = listed(f"ws://HOST:PORT{namespace}" for namespace in sorted(found))
+    return f" It is there at another address: {addresses}."

@@ -152,7 +152,8 @@ def test_nothing_is_served_in_that_namespace(served, open_to):
     served(MirrorEnv(spaces.Discrete(3)))
     with pytest.raises(NoServer) as error:
         open_to("bam_002").connect()
-    assert "/bam_002/gym_env/gym_api_request does not exist. Start one: bam-serve" in str(error.value)
+    assert "/bam_002/gym_env/gym_api_request does not exist. " in str(error.value)
+    assert "It is there at another address: ws://HOST:PORT/bam_001. Start one: bam-serve" in str(error.value)
     assert str(error.value).endswith("Start one: bam-serve --env bam/pick --namespace bam_002")
 
 
