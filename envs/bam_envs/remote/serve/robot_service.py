@@ -44,7 +44,7 @@ _log = logging.getLogger(__name__)
 IDLE_PERIOD = 0.05
 """Time between two states when time goes on only with commands, and none come [s]."""
 QUICK = 2e-4
-"""A robot whose last period took no longer than this to compute [s] may hold up the thread of the network for it."""
+"""Longest time that moving the robot may hold up the thread of the network [s]."""
 _ROUNDING = 1e-9
 """How far beyond a limit a number may be that went through text and other units."""
 
@@ -95,6 +95,8 @@ class RobotService:
         lease: Who is in command; shared with everything else that moves the robot.
         namespace: Before every topic, such as ``/cell_1``; or nothing.
         simulated: Whether nothing real moves; then a scene can be set.
+        quick: In lockstep, a robot whose last period took no longer than this to compute [s] is moved in the thread of
+            the network.
         clock: Wall clock [s], for stamps.
     """
 
@@ -107,6 +109,7 @@ class RobotService:
         *,
         namespace: str = "",
         simulated: bool = True,
+        quick: float = QUICK,
         clock: Callable[[], float] = time.time,
     ) -> None:
         profile = profile.narrowed(robot.spec.command.labels)
@@ -130,8 +133,8 @@ class RobotService:
         self._scene = (
             StringRpcService(bus, namespace + SCENE_TOPIC, self._set_scene, self._sessions) if simulated else None
         )
-        tick, period = (self._tick_lockstep, IDLE_PERIOD) if lockstep else (self._tick, robot.tick_period)
-        self.clock = Ticker(tick, period)
+        self._quick = quick
+        self.clock = Ticker(self.tick, IDLE_PERIOD if lockstep else robot.tick_period)
         """Moves the robot and publishes."""
 
     def start(self) -> None:
@@ -240,8 +243,12 @@ class RobotService:
         self._robot.place_object(pose, seeds)
         return {}
 
-    def _tick(self) -> None:
-        """Real time: one part of a period."""
+    def tick(self) -> None:
+        """Let time pass, as the clock does: in lockstep a period if a command is complete, else a part of one."""
+        if self.info.lockstep:
+            with self._ticking:
+                self._pass_period()
+            return
         with self._moving:
             order = self._slot.take()
             if order.values and order.client == self._lease.holder:  # it may have changed since
@@ -252,17 +259,13 @@ class RobotService:
 
     def _go_on(self) -> None:
         """A complete command came: a period in this thread, if it is short and nobody is at it, or in the clock's."""
-        if self._took > QUICK or not self._ticking.acquire(blocking=False):
+        if self._took > self._quick or not self._ticking.acquire(blocking=False):
             self.clock.wake()
             return
         try:
             self._pass_period()
         finally:
             self._ticking.release()
-
-    def _tick_lockstep(self) -> None:
-        with self._ticking:
-            self._pass_period()
 
     def _pass_period(self) -> None:
         """A whole period, if a command is there; else the state that has not changed."""

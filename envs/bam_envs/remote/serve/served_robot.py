@@ -23,8 +23,6 @@ Array = NDArray[np.float64]
 
 PARTS = 5
 """Ticks a period, of robots that can be stepped in parts (`slices`); others are stepped a period at a time."""
-_LONGEST_WAIT = 10.0
-"""When a step is given up because no clock ticks [s]."""
 
 
 class ServedRobot:
@@ -35,6 +33,7 @@ class ServedRobot:
         command_timeout: For how long a command is executed at most [s].
         zero_rests: Whether a command of zeros is rest, as for speeds; else the robot rests where it is.
         realtime: How time passes; see the module.
+        patience: In real time, how long a step waits for a clock that stands still [s].
         now: Monotonic clock [s].
     """
 
@@ -45,6 +44,7 @@ class ServedRobot:
         command_timeout: float,
         zero_rests: bool = False,
         realtime: bool = False,
+        patience: float = 10.0,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self.spec, self.num_robots = robot.spec, robot.num_robots
@@ -55,7 +55,7 @@ class ServedRobot:
         """The newest one; None before the first `reset`."""
         self.fault: RobotFault | None = None
         """What went wrong; cleared by `reset`."""
-        self._robot, self._zero_rests, self._now = robot, zero_rests, now
+        self._robot, self._zero_rests, self._patience, self._now = robot, zero_rests, patience, now
         self._changed = threading.Condition(threading.RLock())
         self._target: Array = np.zeros((self.num_robots, len(robot.spec.command.labels)))
         self._expires = -math.inf  # when the command times out; never while a step is waited for
@@ -104,9 +104,9 @@ class ServedRobot:
             self.follow(command)
             self._expires, order = math.inf, self._orders
             if not self._changed.wait_for(
-                lambda: self._done >= order or self.fault is not None or self.state is None, _LONGEST_WAIT
+                lambda: self._done >= order or self.fault is not None or self.state is None, self._patience
             ):
-                raise RemoteError(f"The clock of {self.spec.name} has stood still for {_LONGEST_WAIT:g} s.")
+                raise RemoteError(f"The clock of {self.spec.name} has stood still for {self._patience:g} s.")
             self._expires = self._now() + self.command_timeout
             if self.fault is not None:
                 raise self.fault
@@ -137,6 +137,11 @@ class ServedRobot:
             # With one part to go, a command that came a little early is not worth losing that part for.
             if at_once and self._left != 1:
                 self._drop_parts()
+
+    @property
+    def resting(self) -> bool:
+        """Whether the robot executes no command."""
+        return self._resting
 
     def target(self) -> Array:
         """A copy of what the robot is told to do now. Shape: (n, m)."""

@@ -159,6 +159,9 @@ def test_in_lockstep_nothing_goes_on_before_a_command_is_complete(serve, bus):
     np.testing.assert_allclose(service.robot.target(), [command(0.01, 0.04)])
 
 
+CLOCK, HERE = "bam-ticker", threading.current_thread().name
+
+
 class Watched(FakeRobot):
     """Keeps in which threads it is stepped."""
 
@@ -167,7 +170,7 @@ class Watched(FakeRobot):
         self.threads = []
 
     def step(self, command):
-        self.threads.append(threading.current_thread())
+        self.threads.append(threading.current_thread().name)
         return super().step(command)
 
 
@@ -177,34 +180,45 @@ def stepped(service, number):
     service.joints(lambda message: message["position"][0] == 0.001 * number)
 
 
-def test_a_quick_robot_is_moved_where_its_command_arrives(serve, monkeypatch):
-    monkeypatch.setattr("bam_envs.remote.serve.robot_service.QUICK", 1e6)
+def test_a_quick_robot_is_moved_where_its_command_arrives(serve):
     robot = Watched()
-    service = serve(robot)
+    service = serve(robot, quick=1e6)
     for number in range(1, 4):  # how quick it is turns out at the first
         stepped(service, number)
-    assert robot.threads == [service.service.clock._thread, threading.current_thread(), threading.current_thread()]
+    assert robot.threads == [CLOCK, HERE, HERE]
 
 
-def test_a_slow_robot_is_moved_by_the_clock(serve, monkeypatch):
-    monkeypatch.setattr("bam_envs.remote.serve.robot_service.QUICK", 0.0)
+def test_a_slow_robot_is_moved_by_the_clock(serve):
     robot = Watched()
-    service = serve(robot)
+    service = serve(robot, quick=0.0)
     for number in range(1, 4):
         stepped(service, number)
-    assert set(robot.threads) == {service.service.clock._thread}
+    assert set(robot.threads) == {CLOCK}
 
 
-def test_while_the_clock_is_at_it_a_command_waits_for_it(serve, monkeypatch):
-    monkeypatch.setattr("bam_envs.remote.serve.robot_service.QUICK", 1e6)
-    robot = Watched()
-    service = serve(robot)
-    stepped(service, 1)
-    with service.service._ticking:
-        assert service.send(command(0.002)) is None
-        assert len(robot.threads) == 1
+class Slow(Watched):
+    """A step of it ends when it may."""
+
+    def __init__(self):
+        super().__init__()
+        self.may, self.begun = threading.Event(), threading.Event()
+
+    def step(self, command):
+        self.begun.set()
+        self.may.wait(10.0)
+        return super().step(command)
+
+
+def test_while_the_clock_is_at_it_a_command_waits_for_it(serve):
+    robot = Slow()
+    service = serve(robot, quick=1e6)
+    assert service.send(command(0.001)) is None
+    assert robot.begun.wait(10.0)
+    assert service.send(command(0.002)) is None
+    assert robot.threads == []
+    robot.may.set()
     service.joints(lambda message: message["position"][0] == 0.002)
-    assert set(robot.threads) == {service.service.clock._thread}
+    assert set(robot.threads) == {CLOCK}
 
 
 def test_in_real_time_states_come_with_or_without_commands(serve, bus):
@@ -217,7 +231,7 @@ def test_in_real_time_states_come_with_or_without_commands(serve, bus):
     service.joints(lambda message: message["position"][0] > 0.001)
     # Nobody says anything any more: it rests, and still says where.
     deadline = time.monotonic() + 10
-    while not service.robot._resting:
+    while not service.robot.resting:
         assert time.monotonic() < deadline
         service.joints()
     stamp = service.robot.state.stamp[0]
@@ -328,7 +342,7 @@ def test_who_drives_keeps_command_by_signs_of_life_and_leaves_by_a_word(serve, b
         "ProtocolError: /bam/lease: expected renew or leave and a signed tag."
     )
     assert service.say("leave", tagger, "") is None
-    assert service.robot._resting
+    assert service.robot.resting
     assert service.lease.holder is None
     assert "is not open here" in service.say("renew", tagger, "")
 
@@ -389,15 +403,22 @@ def test_what_a_client_sent_does_not_go_on_under_the_next_one(serve, bus):
     service.lease.take("b", force=True)
     rest = service.robot.target()
     assert (rest[0, :6] < HOME[0] + 0.4).all()
-    assert service.robot._resting
+    assert service.robot.resting
+
+
+class Overtaken(CommandLease):
+    """Command changes between the check of a command and the clock."""
+
+    @property
+    def holder(self):
+        return "b"
 
 
 def test_an_order_that_waits_while_command_changes_is_not_executed(serve, bus):
-    service = serve()
+    service = serve(lease=Overtaken(5.0))
     service.service.clock.stop()
     service.send(command(0.5), caller="a")
-    service.lease._holder = "b"  # between the listener's check and the clock
-    service.service._tick_lockstep()
+    service.service.tick()
     assert service.robot.state.stamp == 0.0
 
 
@@ -406,7 +427,7 @@ def test_anybody_may_halt(serve, bus):
     service.send(command(0.5), caller="a")
     service.joints(lambda message: message["position"][0] > 0.005)
     assert bus.say("/bam/halt", {}, "somebody") is None
-    assert service.robot._resting
+    assert service.robot.resting
     assert service.lease.holder == "a:1"
 
 
@@ -417,10 +438,10 @@ def test_a_command_that_a_halt_overtakes_is_answered_and_moves_nothing(serve, bu
     service.service.clock.stop()  # the command waits for it
     assert service.send(command(0.5), tagger, "a") is None
     assert bus.say("/bam/halt", {}, "somebody") is None
-    service.service._tick_lockstep()
+    service.service.tick()
     assert service.joints()["header"]["frame_id"] == f"bam1 s={tagger.session} q=1"
     assert service.robot.state.stamp == 0.0
-    assert service.robot._resting
+    assert service.robot.resting
 
 
 @pytest.mark.parametrize("realtime", [True, False])
@@ -524,12 +545,12 @@ def test_a_link_that_is_down_is_said_once_and_the_clock_goes_on(serve, bus, capl
     service = serve()
     bus.fails = LinkLost("the link is down")
     service.service.clock.stop()
-    service.service._publish()
-    service.service._publish()
+    service.service.tick()
+    service.service.tick()
     assert [record.getMessage() for record in caplog.records] == ["ur5e: the link is down"]
     bus.fails = None
     count = len(bus.published)
-    service.service._publish()
+    service.service.tick()
     assert len(bus.published) == count + 3
 
 
@@ -554,7 +575,7 @@ def test_nothing_is_published_where_nobody_listens(serve, bus):
     service = serve()
     service.service.clock.stop()
     bus.published.clear()
-    service.service._publish()
+    service.service.tick()
     assert bus.published == []
 
 
@@ -573,7 +594,7 @@ def base(bus):
 
     def tick(number):
         for _ in range(number):
-            service._tick()
+            service.tick()
             now[0] += robot.tick_period
         return robot.state.signals["base_velocity"][0]
 
