@@ -134,7 +134,8 @@ class RosbridgeLink:
     @property
     def is_up(self) -> bool:
         """Whether a message can be sent now."""
-        return self._up is not None and self._up.is_open
+        connection = self._up
+        return connection is not None and connection.is_open
 
     def wait_up(self, timeout: float) -> None:
         """Wait until the link is up.
@@ -389,8 +390,9 @@ class RosbridgeLink:
             await self._leave()
 
     def _stop(self) -> None:
-        if self._main_task is not None:
-            self._main_task.cancel()
+        task, self._main_task = self._main_task, None  # once: a second one would interrupt the leaving
+        if task is not None:
+            task.cancel()
 
     async def _first(self) -> Connection:
         timeout = self._endpoint.connect_timeout

@@ -438,6 +438,17 @@ def test_close_leaves_nothing_behind(scripted, new_link, until):
     link.close()
 
 
+def test_several_threads_may_close_a_link(scripted, link):
+    link.advertise("/cmd", STRING)
+    threads = [threading.Thread(target=link.close) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [frame["op"] for frame in scripted.wait_for("unadvertise")] == ["unadvertise"]
+    scripted.wait_connected(0)
+
+
 def test_a_closed_link_stays_closed(scripted, link):
     link.advertise("/cmd", STRING)
     link.close()
