@@ -15,13 +15,13 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 import bam_envs  # noqa: F401 - registers our environments with Gymnasium
 from bam_envs.core import registry
+from bam_envs.core.env_options import in_our_words, require_kinds
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.registry import entry_of, resolve_id
 from bam_envs.core.spaces import space_to_json
 from bam_envs.core.wording import did_you_mean
 from bam_envs.robo_gym.options import constructor_options, require_values
 from bam_envs.robo_gym.table import ROBO_GYM
-from bam_envs.tasks.options import in_our_words, option_names, require_kinds
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import WHERE
 from bam_train.errors import CheckpointMismatch, SettingsError
@@ -91,17 +91,17 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
     entry = entry_of(env)
     if entry is None or not given:
         return
-    task, theirs = registry.resolve(entry.task), ROBO_GYM.get(env.rpartition(":")[2])
+    options, theirs = entry.options(), ROBO_GYM.get(env.rpartition(":")[2])
     taken, refused = constructor_options(theirs) if theirs else (frozenset(), frozenset())
     own = set(inspect.signature(registry.make_env).parameters) - _NO_SETTINGS
-    known = own | taken | option_names(task) | {"max_episode_steps"}
+    known = own | taken | options.keys() | {"max_episode_steps"}
     for name in given:
         if name not in known | refused:  # making it says why it is refused
             raise SettingsError(
                 f"env_kwargs: unknown setting {name!r} of {env}. {did_you_mean(in_our_words(name), known)}"
             )
     try:
-        require_values(theirs, given) if theirs else require_kinds(env, task, given)
+        require_values(theirs, given) if theirs else require_kinds(env, options | {"randomize": False}, given)
     except InvalidValue as error:
         raise SettingsError(f"env_kwargs: {error}") from error
 
@@ -164,7 +164,7 @@ def parity_if_needed(
         return given, use(given)
     except CheckpointMismatch:
         entry = entry_of(env_id)
-        if entry is None or not entry.parity or "parity" in given:
+        if entry is None or "parity" not in entry.variants or "parity" in given:
             raise
         with contextlib.suppress(CheckpointMismatch):
             found = use({**given, "parity": True})

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from bam_envs.core.registry import ENVIRONMENTS, resolve
+from bam_envs.core.registry import ENVIRONMENTS, EnvEntry, resolve
 from bam_envs.core.robot import SignalSpec
 from bam_envs.core.robot_env import describe
 
@@ -101,8 +101,9 @@ def environment(env_id: str) -> str:
     docs["Info"] += " `is_success`, as everywhere."
     names = [name for name in docs if name in (*SECTIONS, *OPTIONAL)]
     parts += [f"**{name}.** {docs[name]}" for name in names]
-    parts += [f"**Parity.** {text}" for text in _paragraphs(task, "With ``parity=True``")]
-    if options := arguments(task):
+    for variant in entry.variants.values():
+        parts += [f"**Parity.** {text}" for text in _paragraphs(resolve(variant), "With ``parity=True``")]
+    if options := arguments(entry):
         named = [[f"`{name}`", default, meaning] for name, default, meaning in options]
         parts.append(f"**Options**: arguments of `gym.make`\n\n{table(['name', 'default', 'meaning'], named)}")
     for kind in ("observation", "action"):
@@ -152,13 +153,15 @@ def _paragraphs(kind: type, beginning: str) -> list[str]:
     return [code(text) for text in found if text.startswith(beginning)]
 
 
-def arguments(task: type) -> list[tuple[str, str, str]]:
-    """Name, default and meaning of a task's options, out of its docstring and signature; ``num_rows`` is none."""
-    body = re.search(r"^Args:\n((?:[ ]{4}.*\n?|\n)+)", inspect.cleandoc(task.__doc__ or ""), re.MULTILINE)
-    found = re.findall(r"^(\w+): ((?:.*\n?)(?:^ +.*\n?)*)", textwrap.dedent(body[1]) if body else "", re.MULTILINE)
-    known = inspect.signature(task).parameters
-    values = {name: known[name].default for name, _ in found if name in known and name != "num_rows"}
-    return [(name, _default(values[name]), code(text)) for name, text in found if name in values]
+def arguments(entry: EnvEntry) -> list[tuple[str, str, str]]:
+    """Name, default and meaning of an environment's options, out of the docstrings of its task's classes."""
+    meanings = {"parity": "robo-gym's arithmetic: see above."}
+    for kind in resolve(entry.task).__mro__:
+        body = re.search(r"^Args:\n((?:[ ]{4}.*\n?|\n)+)", inspect.cleandoc(kind.__doc__ or ""), re.MULTILINE)
+        text = textwrap.dedent(body[1]) if body else ""
+        meanings = dict(re.findall(r"^(\w+): ((?:.*\n?)(?:^ +.*\n?)*)", text, re.MULTILINE)) | meanings
+    options = entry.options()
+    return [(name, _default(options[name]), code(meanings[name])) for name in options]
 
 
 def _default(value: object) -> str:
@@ -327,7 +330,7 @@ def robo_gym() -> str:
     rows = []
     for entry in (entry for entry in ROBO_GYM.values() if not entry.is_live):
         ours = ENVIRONMENTS[entry.env_id]
-        task = resolve(ours.task)(1, parity=True, **entry.defaults)
+        task = ours.make_task(1, {**entry.defaults, "parity": True})
         numbers = [len(task.observation_labels), len(task.action_labels)]
         told = ", ".join(f"`{name}={value!r}`" for name, value in entry.defaults.items() if value is not False)
         link = f"[`{ours.id}`](environments/{page_of(ours.id)})"

@@ -15,13 +15,11 @@ from bam_envs.robots.physics.imperfection import Ranges
 from bam_envs.tasks import (
     isaac_reach,
     mir100_avoidance,
-    mir100_drive,
     mir100_navigation,
     pick,
     pick_place,
     reach,
     ur_avoidance,
-    ur_obstacle,
     ur_reach,
     ur_track,
 )
@@ -123,7 +121,13 @@ def test_every_number_of_an_environment_is_in_its_table(make_docs):
         assert f"**{name}.** " in text
 
 
-DRIVING = (mir100_drive.NEARER, mir100_drive.ARRIVING, mir100_drive.FAILING, mir100_drive.TIME, *mir100_drive.POWER)
+DRIVING = (
+    mir100_navigation.NEARER,
+    mir100_navigation.ARRIVING,
+    mir100_navigation.FAILING,
+    mir100_navigation.TIME,
+    *mir100_navigation.POWER,
+)
 """Numbers in the reward of a base."""
 
 
@@ -144,11 +148,11 @@ def metres(value):
         (pick_place.PickPlaceTask, "Success", [metres(pick_place.GOAL_RADIUS), metres(pick_place.PICKED)]),
         (pick_place.PickPlaceTask, "Success", [f"{pick_place.REST_STEPS} steps", f"{pick_place.REST_STEPS / 20} s"]),
         (pick_place.PickPlaceTask, "Reward", [metres(pick_place.CARRY), metres(pick_place.PICKED)]),
-        (mir100_navigation.Mir100NavigationTask, "Success", [metres(mir100_drive.ARRIVED)]),
-        (mir100_navigation.Mir100NavigationTask, "Start", [f"at least {mir100_drive.MIN_DISTANCE:g} m"]),
-        (mir100_navigation.Mir100NavigationTask, "End", [f"{2 * mir100_drive.BOUNDARY:g} x "]),
+        (mir100_navigation.Mir100NavigationTask, "Success", [metres(mir100_navigation.ARRIVED)]),
+        (mir100_navigation.Mir100NavigationTask, "Start", [f"at least {mir100_navigation.MIN_DISTANCE:g} m"]),
+        (mir100_navigation.Mir100NavigationTask, "End", [f"{2 * mir100_navigation.BOUNDARY:g} x "]),
         (mir100_navigation.Mir100NavigationTask, "Reward", [f"{x:g}" for x in DRIVING]),
-        (mir100_avoidance.Mir100AvoidanceTask, "Success", [metres(mir100_drive.ARRIVED)]),
+        (mir100_avoidance.Mir100AvoidanceTask, "Success", [metres(mir100_navigation.ARRIVED)]),
         (mir100_avoidance.Mir100AvoidanceTask, "Start", ["{} to {} m".format(*mir100_avoidance.SIDE)]),
         (mir100_avoidance.Mir100AvoidanceTask, "End", [metres(mir100_avoidance.NEAREST)]),
         (mir100_avoidance.Mir100AvoidanceTask, "Reward", [f"{x:g}" for x in DRIVING]),
@@ -157,10 +161,10 @@ def metres(value):
         (ur_avoidance.UrAvoidanceTask, "Start", [str(list(ur_avoidance.POSE)).replace("0.0]", "0]")]),
         (ur_avoidance.UrAvoidanceTask, "Reward", [f"{ur_avoidance.NEAREST:.2f} m", f"{ur_avoidance.RAPID}"]),
         (ur_avoidance.UrAvoidanceTask, "Reward", [f"{ur_avoidance.SPREAD}", f"collision {ur_avoidance.COLLISION}"]),
-        (ur_avoidance.UrAvoidanceTask, "Success", [f"{ur_obstacle.MAX_STEPS} steps"]),
+        (ur_avoidance.UrAvoidanceTask, "Success", [f"{ur_avoidance.UrObstacleTask.max_steps} steps"]),
         (ur_track.UrTrackTask, "Reward", [f"{ur_track.NEAREST} m", f"{ur_track.RAPID}", f"{ur_track.CLOSE}"]),
         (ur_track.UrTrackTask, "Reward", [f"{ur_track.BONUS}", f"collision {ur_track.COLLISION}"]),
-        (ur_track.UrTrackTask, "Success", [f"{ur_obstacle.MAX_STEPS} steps"]),
+        (ur_track.UrTrackTask, "Success", [f"{ur_avoidance.UrObstacleTask.max_steps} steps"]),
         (isaac_reach.IsaacReachTask, "Success", [f"{isaac_reach.CLOSE} m", f"{isaac_reach.ALIGNED} rad"]),
         (isaac_reach.IsaacReachTask, "Start", [f"{x:g}" for x in isaac_reach.TARGETS.ravel()]),
     ],

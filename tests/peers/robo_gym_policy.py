@@ -17,11 +17,10 @@ from bam_envs.core.robot import Initial
 from bam_envs.robots.physics.mir100 import open_floor
 from bam_envs.robots.physics.ur import reach_arm
 from bam_envs.robots.ur import ur_model
-from bam_envs.tasks.mir100_navigation import Mir100NavigationTask
-from bam_envs.tasks.ur_control import UrControl
+from bam_envs.tasks.ur_arm import POSITIONS, UrControl, wire_states
 from bam_envs.tasks.ur_reach import RATE, VELOCITY_SCALE
-from bam_envs.tasks.ur_wire import POSITIONS, wire_states
 from bam_train.policy import FrozenPolicy
+from tests.bam_envs.making import make_task
 from tests.bam_envs.robo_gym.theirs import make_theirs
 
 with warnings.catch_warnings():
@@ -38,7 +37,7 @@ class BaseServer(services.RobotServerServicer):
     """A robot server of a simulated MiR100."""
 
     def __init__(self):
-        self.robot, self.task = open_floor(1), Mir100NavigationTask(1, parity=True)
+        self.robot, self.task = open_floor(1), make_task("bam/mir100-navigation-v0", 1, parity=True)
         self.robot.connect()
 
     def SetState(self, request, context):  # noqa: N802 - the service's names

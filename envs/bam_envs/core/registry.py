@@ -10,13 +10,13 @@ import importlib
 import inspect
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
+from bam_envs.core.env_options import constructor_options, require_kinds, require_known
 from bam_envs.core.errors import InvalidValue, UnknownName
-from bam_envs.robo_gym.table import ROBO_GYM
 
 if TYPE_CHECKING:
     from bam_envs.core.robot import Robot
@@ -44,24 +44,31 @@ class EnvEntry:
     """Steps after which an episode is truncated."""
     period: float = 0.05
     """Time between two actions [s]."""
-    parity: bool = False
-    """Whether ``parity=True`` gives robo-gym's arithmetic, which ends by itself: so the time limit is put around the
-    environment here, and not by Gymnasium, which would do it in any case."""
     robot_options: tuple[str, ...] = ()
     """Arguments of the task that its robot takes too."""
+    variants: dict[str, str] = field(default_factory=dict)
+    """Flags that plug-ins add, such as ``parity``, and ``"module:Class"`` of the task that each of them makes.
 
-    def make_task(self, num_rows: int, options: Mapping[str, Any]) -> Task:
-        """The task, of so many rows.
+    Such tasks end by themselves: so the time limit of an environment that has any is put around it here, and not by
+    Gymnasium, which would do it in any case."""
+
+    def options(self) -> dict[str, Any]:
+        """The options of the task, flags of variants among them, with their defaults."""
+        return constructor_options(resolve(self.task)) | dict.fromkeys(self.variants, False)
+
+    def make_task(self, num_envs: int, given: Mapping[str, Any]) -> Task:
+        """The task of so many environments.
 
         Raises:
             UnknownName: It has no such option.
             InvalidValue: An option cannot be what it is.
         """
-        from bam_envs.tasks.options import require_options
-
-        kind = resolve(self.task)
-        require_options(self.id, kind, options, frozenset(inspect.signature(make_env).parameters) - _NO_OPTIONS)
-        task: Task = kind(num_rows, **options)
+        options = self.options()
+        require_known(self.id, options, given, set(inspect.signature(make_env).parameters) - _NO_OPTIONS)
+        require_kinds(self.id, options, given)
+        flags = [flag for flag in self.variants if given.get(flag)]
+        kind = resolve(self.variants[flags[0]] if flags else self.task)
+        task: Task = kind(num_envs, **{name: value for name, value in given.items() if name not in self.variants})
         return task
 
     def make_robot(self, num_robots: int, randomize: bool, task_options: Mapping[str, Any]) -> Robot:
@@ -70,12 +77,20 @@ class EnvEntry:
         Raises:
             InvalidValue: `randomize` is neither True nor False.
         """
-        from bam_envs.tasks.options import require_kinds
-
-        require_kinds(self.id, resolve(self.task), {"randomize": randomize})
+        require_kinds(self.id, {"randomize": False}, {"randomize": randomize})
         shared = {name: task_options[name] for name in self.robot_options if name in task_options}
         robot: Robot = resolve(self.robot)(num_robots, randomize=randomize, **shared)
         return robot
+
+
+@dataclass(frozen=True)
+class Alias:
+    """Another id of an environment, which a plug-in adds."""
+
+    env_id: str
+    """Key of `ENVIRONMENTS`."""
+    variant: str = ""
+    """What the other id means where it is not quite the same environment; else empty."""
 
 
 _ENTRIES = (
@@ -107,7 +122,6 @@ _ENTRIES = (
         "bam_envs.robots.physics.mir100:open_floor",
         max_episode_steps=500,
         period=0.1,
-        parity=True,
     ),
     EnvEntry(
         "bam/mir100-avoidance-v0",
@@ -116,7 +130,6 @@ _ENTRIES = (
         "bam_envs.robots.physics.mir100:lab",
         max_episode_steps=500,
         period=0.1,
-        parity=True,
     ),
     EnvEntry(
         "bam/ur-reach-v0",
@@ -125,7 +138,6 @@ _ENTRIES = (
         "bam_envs.robots.physics.ur:reach_arm",
         max_episode_steps=300,
         period=0.1,
-        parity=True,
         robot_options=("ur_model",),
     ),
     EnvEntry(
@@ -134,7 +146,6 @@ _ENTRIES = (
         "bam_envs.tasks.ur_empty:UrEmptyTask",
         "bam_envs.robots.physics.ur:empty_arm",
         max_episode_steps=300,
-        parity=True,
         robot_options=("ur_model",),
     ),
     EnvEntry(
@@ -143,7 +154,6 @@ _ENTRIES = (
         "bam_envs.tasks.ur_avoidance:UrAvoidanceTask",
         "bam_envs.robots.physics.ur:obstacle_arm",
         max_episode_steps=1000,
-        parity=True,
         robot_options=("ur_model",),
     ),
     EnvEntry(
@@ -152,7 +162,6 @@ _ENTRIES = (
         "bam_envs.tasks.ur_track:UrTrackTask",
         "bam_envs.robots.physics.ur:obstacle_arm",
         max_episode_steps=1000,
-        parity=True,
         robot_options=("ur_model",),
     ),
     EnvEntry(
@@ -162,25 +171,28 @@ _ENTRIES = (
         "bam_envs.robots.physics.ur:isaac_arm",
         max_episode_steps=600,
         period=1 / 30,
-        parity=True,
         robot_options=("ur_model",),
     ),
 )
 ENVIRONMENTS: dict[str, EnvEntry] = {entry.id: entry for entry in _ENTRIES}
-OTHER_NAMES: dict[str, str] = {theirs.id: theirs.variant or theirs.env_id for theirs in ROBO_GYM.values()}
-"""What a plug-in calls our environments, such as robo-gym: to each name our id, or one name for a variant of ours."""
+ALIASES: dict[str, Alias] = {}
+"""Ids of plug-ins."""
 
 
 def register() -> None:
-    """Register every row with Gymnasium, and robo-gym's ids of them; doing it twice is once."""
+    """Register every environment with Gymnasium; idempotent. Plug-ins add their variants before."""
     for entry in ENVIRONMENTS.values():
-        _register(entry.id, "bam_envs.core.registry", None if entry.parity else entry.max_episode_steps)
-    for env_id in ROBO_GYM:
-        _register(env_id, "bam_envs.robo_gym.making", None)
+        register_id(entry.id, "bam_envs.core.registry", None if entry.variants else entry.max_episode_steps)
 
 
-def _register(env_id: str, module: str, max_episode_steps: int | None) -> None:
-    """`module` has the two functions that make it."""
+def register_alias(env_id: str, alias: Alias, module: str) -> None:
+    """Register an id of a plug-in, whose `module` has ``make_env`` and ``make_vector_env``."""
+    ALIASES[env_id] = alias
+    register_id(env_id, module, None)
+
+
+def register_id(env_id: str, module: str, max_episode_steps: int | None) -> None:
+    """Register an id with Gymnasium; `module` has the two functions that make it."""
     if env_id not in gym.registry:
         gym.register(
             env_id,
@@ -192,20 +204,20 @@ def _register(env_id: str, module: str, max_episode_steps: int | None) -> None:
 
 
 def entry_of(env_id: str) -> EnvEntry | None:
-    """The row that `env_id` names, ours or robo-gym's, with or without ``module:``; None of anything else."""
+    """The entry that `env_id` names, ours or a plug-in's, with or without ``module:``; None of anything else."""
     own = env_id.rpartition(":")[2]
-    return ENVIRONMENTS.get(ROBO_GYM[own].env_id if own in ROBO_GYM else own)
+    return ENVIRONMENTS.get(ALIASES[own].env_id if own in ALIASES else own)
 
 
 def are_same(one: str, other: str) -> bool:
-    """Whether two ids name one environment, as ours and robo-gym's do, but for robo-gym's variants of ours."""
+    """Whether two ids name one environment, as ours and a plug-in's do, but for the plug-in's variants of ours."""
     entry = entry_of(one)
     return one == other or (entry is not None and entry is entry_of(other) and _variant(one) == _variant(other))
 
 
 def _variant(env_id: str) -> str:
-    theirs = ROBO_GYM.get(env_id.rpartition(":")[2])
-    return "" if theirs is None else theirs.variant
+    alias = ALIASES.get(env_id.rpartition(":")[2])
+    return "" if alias is None else alias.variant
 
 
 def resolve_id(name: str) -> str:
@@ -300,7 +312,7 @@ def make_env(
 
 def limited(env: RobotEnv, entry: EnvEntry) -> gym.Env[Any, Any]:
     """`env` with the time limit that Gymnasium does not put around it."""
-    if not entry.parity or getattr(env.task, "ends_by_itself", False) or _gymnasium_limits():
+    if not entry.variants or getattr(env.task, "ends_by_itself", False) or _gymnasium_limits():
         return env
     return gym.wrappers.TimeLimit(env, entry.max_episode_steps)
 
@@ -384,7 +396,7 @@ def make_vector_env(
     entry = ENVIRONMENTS[env_id]
     task = entry.make_task(num_envs, task_options)
     if max_episode_steps is None and not getattr(task, "ends_by_itself", False):
-        max_episode_steps = entry.max_episode_steps if entry.parity else None  # Gymnasium gives that of the others
+        max_episode_steps = entry.max_episode_steps if entry.variants else None  # Gymnasium gives that of the others
     return RobotVectorEnv(
         entry.make_robot(num_envs, randomize, task_options),
         task,

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from bam_envs.core.errors import InvalidValue
 
 Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
+EnvIds = NDArray[np.int64]
+"""Which of the n environments that are stepped together. Shape: (k,)."""
+Rows = EnvIds
 
 
 @dataclass(frozen=True)

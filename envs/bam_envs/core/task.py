@@ -1,8 +1,8 @@
-"""The Task protocol: what is asked of a robot. Pure: no I/O, no clock; its memory is rows of arrays it owns."""
+"""The Task protocol: what a robot is asked to do. A task is pure: no I/O and no clock; its memory is arrays it owns."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
@@ -10,8 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from bam_envs.core.errors import ProtocolError
-from bam_envs.core.robot import Initial, RobotState, Rows
+from bam_envs.core.robot import EnvIds, Initial, RobotState
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -34,7 +33,7 @@ class Label:
 
 @dataclass
 class Score:
-    """How one step went, for n rows."""
+    """How one step went in each of n environments."""
 
     reward: Array
     """Shape: (n,)."""
@@ -48,26 +47,29 @@ class Score:
 
 @runtime_checkable
 class Task(Protocol):
-    """Observation, command, reward and end for `num_rows` rows; the same code for one live robot and many simulated.
+    """Observation, command, reward and end of `num_envs` environments: one live robot, or many simulated ones.
 
     A task may have two more attributes. ``reset_options`` names the options that an environment's `reset` takes; such a
     task's `sample_initial` has a third argument, ``options``, a mapping of those that were given. ``ends_by_itself`` is
     True for one that counts its own steps and terminates at its time limit; no time limit is put around it.
     """
 
-    num_rows: int
+    num_envs: int
     observation_space: spaces.Box
-    """Of one row."""
+    """Of a single environment."""
     action_space: spaces.Box
-    """Of one row."""
+    """Of a single environment."""
     observation_labels: tuple[Label, ...]
     action_labels: tuple[Label, ...]
 
-    def sample_initial(self, rows: Rows, rngs: Sequence[np.random.Generator]) -> Initial:
-        """Sample targets and start states for `rows`, each from its own generator."""
+    def sample_initial(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> Initial:
+        """Sample targets and start states of these environments, each from its own generator."""
 
-    def on_reset(self, rows: Rows, state: RobotState) -> None:
-        """The robots of `rows` are at their start; note what was measured. `state` has all n rows."""
+    def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
+        """The robots of these environments are at their start: begin the memory of the episode with what was measured.
+
+        `state` has all n environments.
+        """
 
     def observe(self, state: RobotState) -> Floats:
         """What the policy sees. Shape: (n, ...)."""
@@ -79,7 +81,7 @@ class Task(Protocol):
         """How the step that led to `state` went."""
 
     def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
-        """Spheres that a picture of row 0 shows: position (3,) [m] and colour."""
+        """Spheres that a picture of environment 0 shows: position (3,) [m] and colour."""
 
     def state_dict(self) -> dict[str, Any]:
         """The memory, as plain arrays."""
@@ -94,18 +96,29 @@ def labelled_box(labels: Sequence[Label]) -> spaces.Box:
     return spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
 
 
-def require_inside(observation: Floats, space: spaces.Box, labels: Sequence[Label]) -> Floats:
-    """`observation` (n, k), if every row is in `space`; robo-gym has no observation outside, with ``parity=True``.
+class TaskMemory:
+    """The memory of a task as `Task.state_dict` has it: copies of the arrays that `memory` names."""
 
-    Raises:
-        ProtocolError: Names the first number that is not; robo-gym raises ``InvalidStateError``.
-    """
-    outside = ~((observation >= space.low) & (observation <= space.high))  # also what is not a number
-    if outside.any():
-        row, column = np.argwhere(outside)[0]
-        label, value = labels[column], observation[row, column]
-        raise ProtocolError(
-            f"{label.name} is {value:.6g} {label.unit}, expected {label.low:.6g} to {label.high:.6g}, as in robo-gym: "
-            "with parity=True there is no observation outside its space; leave parity out, or look at the sensor."
-        )
-    return observation
+    memory: Mapping[str, str] = {}
+    """Key in the saved memory -> attribute."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """A copy of each array."""
+        return {key: getattr(self, attribute).copy() for key, attribute in self.memory.items()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go to what `state_dict` returned."""
+        for key, attribute in self.memory.items():
+            setattr(self, attribute, np.array(state[key], dtype=getattr(self, attribute).dtype))
+
+
+def draw_seeds(rngs: Sequence[np.random.Generator]) -> NDArray[np.int64]:
+    """A seed for what the robot itself draws, one from each generator; for `Initial.seeds`. Shape: (k,)."""
+    return np.array([rng.integers(2**63) for rng in rngs], dtype=np.int64)
+
+
+def as_objects(values: Sequence[Any]) -> NDArray[Any]:
+    """`values` as an info: an array of objects, one for each environment. Shape: (n,)."""
+    objects = np.empty(len(values), dtype=object)
+    objects[:] = values
+    return objects

@@ -1,4 +1,4 @@
-"""What `gymnasium.make` and `gymnasium.make_vec` call for robo-gym's ids."""
+"""robo-gym's environments: what `gymnasium.make` and `gymnasium.make_vec` call for its ids."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ import gymnasium as gym
 
 from bam_envs.core import registry
 from bam_envs.core.errors import InvalidValue
+from bam_envs.core.robot import Robot
+from bam_envs.core.robot_env import RobotEnv, RobotVectorEnv
+from bam_envs.core.task import Task
 from bam_envs.robo_gym.options import translate
 from bam_envs.robo_gym.table import ROBO_GYM
 
 if TYPE_CHECKING:
-    from bam_envs.core.robot_env import RobotVectorEnv
     from bam_envs.remote.remote_env import RemoteVectorEnv
 
 
@@ -27,9 +29,6 @@ def make_env(env_id: str, **options: Any) -> gym.Env[Any, Any]:
         UnknownName: An option that neither has.
         InvalidValue: An option that cannot be had.
     """
-    from bam_envs.core.robot_env import RobotEnv
-    from bam_envs.robo_gym.robo_gym_env import RoboGymEnv
-
     entry = ROBO_GYM[env_id]
     arguments = translate(entry, options)
     if arguments.get("transport") is not None:
@@ -57,3 +56,50 @@ def make_vector_env(env_id: str, num_envs: int = 1, **options: Any) -> RobotVect
     if "rs_state_to_info" not in options:
         arguments.pop("rs_state_to_info", None)
     return registry.make_vector_env(entry.env_id, num_envs, **arguments)
+
+
+class RoboGymEnv(RobotEnv):
+    """One robot and one task under one of robo-gym's ids, with the methods that robo-gym's environments add.
+
+    Args:
+        robot: A robot with ``num_robots == 1``.
+        task: A task with ``num_envs == 1`` and a method ``rs_state``.
+        render_mode: ``"rgb_array"``, ``"human"`` or None.
+        is_live: Whether there is a robot behind `robot`, and no simulation.
+    """
+
+    def __init__(self, robot: Robot, task: Task, render_mode: str | None = None, *, is_live: bool = False) -> None:
+        super().__init__(robot, task, render_mode)
+        self.is_live = is_live
+
+    def get_rs_state(self) -> dict[str, float] | list[float] | None:
+        """The newest state as robo-gym's robot servers send it: of an arm by key, of a base as a list of 1030 numbers.
+
+        None before the first `reset`.
+        """
+        task: Any = self.task
+        if self.last_state is None:
+            return None
+        state: dict[str, float] | list[float] = task.rs_state(self.last_state)[0]
+        return state
+
+    def kill_sim(self) -> None:
+        """End the simulation: its memory is free, and no step is taken until the next `reset`, which begins it anew.
+
+        Raises:
+            InvalidValue: The robot is live.
+        """
+        if self.is_live:
+            raise InvalidValue(
+                "kill_sim(): the robot is live, and there is no simulation to end; close() drops the link."
+            )
+        self.close()
+
+    def restart_sim(self) -> None:
+        """End the simulation and begin it anew; `reset` comes next.
+
+        Raises:
+            InvalidValue: The robot is live.
+        """
+        self.kill_sim()
+        self.robot.connect()

@@ -1,18 +1,23 @@
-"""What robo-gym's constructor options mean here: from its arguments to those of `bam_envs.core.registry.make_env`."""
+"""What robo-gym's constructor options mean here: from its arguments to those of `bam_envs.core.registry.make_env`.
+
+Where an option means something else here, that is logged, once in a process.
+"""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+import logging
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from bam_envs.core import registry
+from bam_envs.core.env_options import in_our_words, require_kinds
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot_env import render_modes
-from bam_envs.robo_gym.notices import first_told, say_once
 from bam_envs.robo_gym.table import RoboGymId
-from bam_envs.tasks.options import FLAGS, in_our_words, option_names, require_kinds
 
+_LOG = logging.getLogger(__name__)
+_SAID: set[str] = set()
 _MANAGER = ("ip", "lower_bound_port", "upper_bound_port", "server_manager_port")
 """Where robo-gym finds the Server Manager that starts Gazebo."""
 _WINDOWS = ("gui", "gazebo_gui", "rviz_gui")
@@ -73,7 +78,7 @@ def constructor_options(entry: RoboGymId) -> tuple[frozenset[str], frozenset[str
     Its other options are those of our tasks.
     """
     taken = frozenset({*_SIMULATED, "rs_address"} if entry.is_live else _SIMULATED)
-    return taken, frozenset({"rs_address", *_NOT_HERE}) - taken - option_names(_task(entry))
+    return taken, frozenset({"rs_address", *_NOT_HERE}) - taken - _task_options(entry).keys()
 
 
 def require_values(entry: RoboGymId, given: Mapping[str, Any]) -> None:
@@ -83,16 +88,16 @@ def require_values(entry: RoboGymId, given: Mapping[str, Any]) -> None:
         InvalidValue: A flag is neither True nor False, or a number is none.
     """
     said = {name: value for name, value in given.items() if value is not None or name not in _WINDOWS}
-    require_kinds(entry.id, _task(entry), said, {*FLAGS, *_WINDOWS})
+    require_kinds(entry.id, _task_options(entry) | dict.fromkeys(("randomize", *_WINDOWS), False), said)
 
 
-def _task(entry: RoboGymId) -> Any:
-    return registry.resolve(registry.ENVIRONMENTS[entry.env_id].task)
+def _task_options(entry: RoboGymId) -> dict[str, Any]:
+    return registry.ENVIRONMENTS[entry.env_id].options()
 
 
 def _require_known(entry: RoboGymId, given: Mapping[str, Any]) -> None:
     taken, refused = constructor_options(entry)
-    known = {*option_names(_task(entry)), *_OF_ENVIRONMENT, *taken} - {"env_id", "task_options"}
+    known = {*_task_options(entry), *_OF_ENVIRONMENT, *taken} - {"env_id", "task_options"}
     for name in given:
         if name in refused and name in _NOT_HERE:
             raise InvalidValue(f"{name}= of {entry.id}: there is none here; {_NOT_HERE[name]}.")
@@ -131,7 +136,7 @@ def _rosbridge_address(address: Any) -> str:
     if not host or set(host) & set(" /") or not port.isdecimal() or not 0 < int(port) < 65536:
         raise InvalidValue(f"rs_address must be 'IP:PORT', such as '10.0.0.5:9090', not {address!r}.")
     url = f"ws://{text}"
-    say_once(
+    _say_once(
         "rs_address",
         f"rs_address={text!r} is read as robot={url!r}: the robot is reached through rosbridge (port 9090 unless it "
         "was given another), and not through a robot server of robo-gym's.",
@@ -141,10 +146,10 @@ def _rosbridge_address(address: Any) -> str:
 
 def _say_what_is_live(entry: RoboGymId, given: Mapping[str, Any]) -> None:
     """Of options for a simulation, given with a robot: scripts pass the same to both."""
-    names = first_told("live", [name for name in _SIMULATED if given.get(name)])
+    names = _first_told("live", [name for name in _SIMULATED if given.get(name)])
     if names:
         said = ", ".join(f"{name}={given[name]!r}" for name in names)
-        say_once(
+        _say_once(
             f"live {' '.join(names)}",
             f"{said}: accepted, and without effect. The robot of this {entry.id} is a live one: it has no window here, "
             "and no Server Manager.",
@@ -153,10 +158,10 @@ def _say_what_is_live(entry: RoboGymId, given: Mapping[str, Any]) -> None:
 
 def _say_where_it_runs(given: Mapping[str, Any]) -> None:
     """Of options for what is not there."""
-    names = first_told("simulated", [name for name in (*_MANAGER, "rviz_gui") if given.get(name)])
+    names = _first_told("simulated", [name for name in (*_MANAGER, "rviz_gui") if given.get(name)])
     if names:
         said = ", ".join(f"{name}={given[name]!r}" for name in names)
-        say_once(
+        _say_once(
             " ".join(names),
             f"{said}: accepted, and without effect. The robot is simulated in this process; there is no Server Manager "
             "and no Gazebo, and nothing to be started first.",
@@ -165,8 +170,8 @@ def _say_where_it_runs(given: Mapping[str, Any]) -> None:
 
 def _say_whose_trajectory(entry: RoboGymId, given: Mapping[str, Any]) -> None:
     """Of parity without robo-gym's file, which is not ours to ship."""
-    if given.get("parity") and "trajectory" in option_names(_task(entry)) and given.get("trajectory") is None:
-        say_once(
+    if given.get("parity") and "trajectory" in _task_options(entry) and given.get("trajectory") is None:
+        _say_once(
             "trajectory",
             f"parity=True of {entry.id}: the trajectory is this package's own, up to 0.67 rad from robo-gym's; "
             "trajectory='.../robo_gym/envs/ur/robot_trajectories/trajectory_raad_2022.json' of an installed robo-gym "
@@ -180,7 +185,26 @@ def _window(given: Mapping[str, Any]) -> dict[str, Any]:
     if not names or given.get("render_mode") is not None or given.get("transport") is not None:
         return {}
     if "human" not in render_modes():
-        say_once("no display", f"{names[0]}=True: no window, for there is no display; render_mode='rgb_array' draws.")
+        _say_once("no display", f"{names[0]}=True: no window, for there is no display; render_mode='rgb_array' draws.")
         return {}
-    say_once("gui", f"{names[0]}=True is render_mode='human': a window with the simulated robot.")
+    _say_once("gui", f"{names[0]}=True is render_mode='human': a window with the simulated robot.")
     return {"render_mode": "human"}
+
+
+def _say_once(key: str, text: str) -> None:
+    """Log `text` as a warning, unless something with this `key` was said before."""
+    if key not in _SAID:
+        _SAID.add(key)
+        _LOG.warning("%s", text)
+
+
+def _first_told(topic: str, names: Iterable[str]) -> list[str]:
+    """Those of `names` that are told of for the first time under `topic`."""
+    new = [name for name in names if f"{topic}: {name}" not in _SAID]
+    _SAID.update(f"{topic}: {name}" for name in new)
+    return new
+
+
+def forget() -> None:
+    """Say everything once more."""
+    _SAID.clear()

@@ -1,7 +1,7 @@
 """Wire states of robo-gym's robot servers, read: one state of theirs to a `RobotState` of one robot.
 
-The other way is the task's: ``task.rs_state(state)`` gives one wire state for each row. What a task knows and a robot
-does not (a target) is in the wire state too; `read_mir_target` and `read_object` give it.
+The other way is the task's: ``task.rs_state(state)`` gives one wire state for each environment. What a task
+knows and a robot does not (a target) is in the wire state too; `read_mir_target` and `read_object` give it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import RobotState
 from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS
-from bam_envs.tasks.ur_wire import POSITIONS, VELOCITIES, frame_keys
+from bam_envs.tasks.ur_arm import POSITIONS, VELOCITIES, frame_keys
 
 Array = NDArray[np.float64]
 
@@ -136,6 +136,6 @@ def _take(wire: Mapping[str, float], keys: Sequence[str]) -> Array:
 
 
 def _state(signals: Mapping[str, Array], collision: float, commands: int) -> RobotState:
-    """One row. A wire state has no time stamp and no command."""
-    rows = {name: np.array(values)[None] for name, values in signals.items()}
-    return RobotState(rows, np.zeros(1), np.zeros((1, commands)), {"collision": np.array([collision == 1])})
+    """A wire state has no time stamp and no command."""
+    batch = {name: np.array(values)[None] for name, values in signals.items()}
+    return RobotState(batch, np.zeros(1), np.zeros((1, commands)), {"collision": np.array([collision == 1])})

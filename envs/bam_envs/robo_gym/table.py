@@ -1,6 +1,6 @@
 """The one table of robo-gym's ids: which environment of ours each is, and what robo-gym has otherwise by default.
 
-Pure data: `bam_envs.core.registry` reads it to register the ids.
+`register` adds them, and robo-gym's arithmetic as the flag ``parity`` of our environments; importing this is cheap.
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
+
+from bam_envs.core.registry import ENVIRONMENTS, Alias, register_alias
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 _UR = MappingProxyType({"ur_model": "ur5", "rs_state_to_info": True})
@@ -62,3 +64,22 @@ ROBO_GYM: dict[str, RoboGymId] = {
     for entry in (RoboGymId(stem, env_id, is_live, defaults) for is_live in (False, True))
 }
 """By id, each ``Sim-v0`` followed by its ``Rob-v0``."""
+
+PARITY = {
+    "bam/mir100-navigation-v0": "bam_envs.robo_gym.parity_bases:Mir100NavigationParity",
+    "bam/mir100-avoidance-v0": "bam_envs.robo_gym.parity_bases:Mir100AvoidanceParity",
+    "bam/ur-reach-v0": "bam_envs.robo_gym.parity_arms:UrReachParity",
+    "bam/ur-empty-v0": "bam_envs.robo_gym.parity_arms:UrEmptyParity",
+    "bam/ur-avoidance-v0": "bam_envs.robo_gym.parity_arms:UrAvoidanceParity",
+    "bam/ur-track-v0": "bam_envs.robo_gym.parity_arms:UrTrackParity",
+    "bam/isaac-reach-v0": "bam_envs.robo_gym.parity_arms:IsaacReachParity",
+}
+"""The task that ``parity=True`` makes of each environment of ours."""
+
+
+def register() -> None:
+    """Add robo-gym's ids, and ``parity`` to the environments that they are; idempotent."""
+    for env_id, task in PARITY.items():
+        ENVIRONMENTS[env_id].variants["parity"] = task
+    for entry in ROBO_GYM.values():
+        register_alias(entry.id, Alias(entry.env_id, entry.variant), "bam_envs.robo_gym.making")

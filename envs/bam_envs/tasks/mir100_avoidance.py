@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from bam_envs.core.robot import RobotState, Rows
+from bam_envs.core.robot import EnvIds, RobotState
 from bam_envs.core.task import Array, Flags, Floats, Label
-from bam_envs.robots.mir100 import BACK_RAYS, FOOTPRINT, FRONT_RAYS, SCAN_RANGE
+from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS
 from bam_envs.robots.physics.room import touches
-from bam_envs.tasks.mir100_drive import DriveTask
-from bam_envs.tasks.poses import spread
+from bam_envs.tasks.mir100_navigation import DriveTask, spread
 
 SIDE = (2.1, 3.1)
 """Starts are drawn so far from the middle of the room along y, targets as far on the other side [m]."""
@@ -25,12 +24,8 @@ BOX_DEPTH = 1.0
 """Boxes are drawn at most this far from the middle along y [m]."""
 NEAREST = 0.15
 """A ray shorter than this is a collision [m]."""
-SAFETY_RADIUS = 0.40
-"""With ``parity=True`` a corner of the base nearer than this to the middle of a box is one, too [m]."""
-BEAMS = np.round(np.linspace(0, FRONT_RAYS + BACK_RAYS - 1, 16)).astype(np.int64)
-"""With ``parity=True``, the rays that are observed, out of those of the front and the back scanner."""
 SECTORS = 8
-"""Otherwise the shortest ray is observed of so many sectors of each scanner."""
+"""The shortest ray is observed of so many sectors of each scanner."""
 SIGHT = 3.0
 """What is farther than this is observed as if it were there [m]."""
 _FRONT_STARTS = np.linspace(0, FRONT_RAYS, SECTORS + 1).astype(np.int64)[:-1]
@@ -38,7 +33,6 @@ _BACK_STARTS = np.linspace(0, BACK_RAYS, SECTORS + 1).astype(np.int64)[:-1]
 _OF_BOXES = slice(6, 15)
 """Which of the numbers that are drawn the boxes are made of."""
 _TRIES = 1000
-_CORNERS = np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]]) * np.array(FOOTPRINT) / 2
 
 
 class Mir100AvoidanceTask(DriveTask):
@@ -63,39 +57,28 @@ class Mir100AvoidanceTask(DriveTask):
     Info:
         `distance` of the target [m], `target_coord` (x, y [m], yaw [rad]), at the end `final_status`: "success",
         "collision" or "max_steps_exceeded".
-
-    With ``parity=True`` observation, reward and end are those of robo-gym's `ObstacleAvoidanceMir100`: metres and
-    radians, 16 single rays, the way at a hundred times this reward but none for that of the first step, 100 at
-    success, -200 at a collision; it collides also when a corner comes near the middle of a box, never on a live robot
-    and never by a ray that is not a number, and the episode is terminated after 500 steps as "max_steps_exceeded".
-
-    Args:
-        num_rows: How many robots are scored together.
-        parity: Robo-gym's arithmetic.
-        rs_state_to_info: ``info["rs_state"]`` is the state as robo-gym's robot server would send it.
     """
 
-    parity_success, failure = 100.0, "collision"
+    failure = "collision"
     draws = 15
+    memory: Mapping[str, str] = {**DriveTask.memory, "obstacles": "obstacles"}
 
-    def __init__(self, num_rows: int = 1, *, parity: bool = False, rs_state_to_info: bool = False) -> None:
-        super().__init__(num_rows, parity=parity, rs_state_to_info=rs_state_to_info)
-        self.obstacles = np.zeros((num_rows, len(BOXES), 3))
+    def __init__(self, num_envs: int = 1, **options: Any) -> None:
+        super().__init__(num_envs, **options)
+        self.obstacles = np.zeros((num_envs, len(BOXES), 3))
         """Boxes of a simulated room: x, y [m] and yaw [rad]. Shape: (n, 3, 3)."""
         self._sectors: tuple[RobotState, Array] | None = None
 
     def labels(self) -> tuple[Label, ...]:
         """Those of driving, and ranges."""
-        if self.parity:
-            rays = (Label(f"range_{ray}", f"ray {ray} of both scanners", "m", low=0.0, high=29.0) for ray in BEAMS)
-            return (*super().labels(), *rays)
-        sectors = [(name, sector) for name in ("front", "back") for sector in range(SECTORS)]
+        return (*super().labels(), *self.range_labels())
+
+    def range_labels(self) -> tuple[Label, ...]:
+        """What is observed of the scanners."""
         scale = f"1 - range / {SIGHT:g}, clipped"
         meant = "shortest ray of sector {} of the {} scanner, clockwise end first"
-        return (
-            *super().labels(),
-            *(Label(f"{name}_{sector}", meant.format(sector, name), "m", scale, 0.0) for name, sector in sectors),
-        )
+        sectors = [(name, sector) for name in ("front", "back") for sector in range(SECTORS)]
+        return tuple(Label(f"{name}_{sector}", meant.format(sector, name), "m", scale, 0.0) for name, sector in sectors)
 
     def starts(self, draws: Array) -> Array:
         """On either side. Shape: (k, 3)."""
@@ -117,61 +100,36 @@ class Mir100AvoidanceTask(DriveTask):
                     break
                 draws[k, _OF_BOXES] = rng.random(9)
 
-    def scene(self, rows: Rows, draws: Array) -> dict[str, Array]:
+    def scene(self, env_ids: EnvIds, draws: Array) -> dict[str, Array]:
         """The boxes."""
-        self.obstacles[rows] = _boxes(draws)
-        return {"obstacle_pose": self.obstacles[rows]}
+        self.obstacles[env_ids] = _boxes(draws)
+        return {"obstacle_pose": self.obstacles[env_ids]}
 
     def sectors(self, state: RobotState) -> Array:
         """The shortest ray of each sector [m], worked out once for each state. Shape: (n, 16).
 
-        A ray that is not a number is 0, the shortest there can be; with ``parity=True`` it is no ray at all.
+        A ray that is not a number is 0, the shortest there can be.
         """
         if self._sectors is None or self._sectors[0] is not state:
-            shortest = np.fmin if self.parity else np.minimum
-            front = shortest.reduceat(state.signals["f_scan"], _FRONT_STARTS, axis=1)
-            back = shortest.reduceat(state.signals["b_scan"], _BACK_STARTS, axis=1)
-            both = np.concatenate([front, back], axis=1)
-            self._sectors = (state, np.nan_to_num(both, nan=SCAN_RANGE[1] if self.parity else 0.0))
+            front = np.minimum.reduceat(state.signals["f_scan"], _FRONT_STARTS, axis=1)
+            back = np.minimum.reduceat(state.signals["b_scan"], _BACK_STARTS, axis=1)
+            self._sectors = (state, np.nan_to_num(np.concatenate([front, back], axis=1), nan=0.0))
         return self._sectors[1]
 
     def seen(self, state: RobotState) -> list[Floats]:
-        """Single rays, or the shortest of sectors. Shapes: (n, 16) in two parts, or (n, 32)."""
-        if not self.parity:
-            return [(1.0 - self.sectors(state) / SIGHT).astype(np.float32)]
-        front, back = BEAMS[BEAMS < FRONT_RAYS], BEAMS[BEAMS >= FRONT_RAYS] - FRONT_RAYS
-        rays = (state.signals["f_scan"][:, front], state.signals["b_scan"][:, back])
-        return [np.nan_to_num(one).astype(np.float32) for one in rays]
+        """The shortest rays of sectors. Shape: (n, 16)."""
+        return [(1.0 - self.sectors(state) / SIGHT).astype(np.float32)]
 
     def failed(self, state: RobotState) -> Flags:
         """Whether the base touches something, or nearly does. Shape: (n,)."""
-        if self.parity and not state.truth:
-            return np.zeros(self.num_rows, dtype=bool)
-        near: Flags = self.sectors(state).min(axis=1) < NEAREST
         touching: Any = state.truth.get("collision", False)
-        if self.parity:
-            near &= ~np.isnan(state.signals["f_scan"][:, 0])  # Python's min() never leaves a first number that is none
-            near |= self._corner_near_box(state.signals["base_pose"])
-        failed: Flags = near | touching
+        failed: Flags = (self.sectors(state).min(axis=1) < NEAREST) | touching
         return failed
-
-    def _corner_near_box(self, pose: Array) -> Flags:
-        """Whether a corner is within `SAFETY_RADIUS` of the middle of a box; as if the base's frame were its middle."""
-        cos, sin = np.cos(pose[:, 2].copy())[:, None], np.sin(pose[:, 2].copy())[:, None]
-        x = pose[:, :1] + _CORNERS[:, 0] * cos - _CORNERS[:, 1] * sin
-        y = pose[:, 1:2] + _CORNERS[:, 0] * sin + _CORNERS[:, 1] * cos
-        dx, dy = x[:, :, None] - self.obstacles[:, None, :, 0], y[:, :, None] - self.obstacles[:, None, :, 1]
-        near: Flags = (dx * dx + dy * dy <= SAFETY_RADIUS**2).any(axis=(1, 2))
-        return near
-
-    def state_dict(self) -> dict[str, Any]:
-        """The memory, as plain arrays."""
-        return {**super().state_dict(), "obstacles": self.obstacles.copy()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go to what `state_dict` returned."""
         super().load_state_dict(state)
-        self.obstacles, self._sectors = np.array(state["obstacles"]), None
+        self._sectors = None
 
 
 def _boxes(draws: Array) -> Array:

@@ -1,20 +1,236 @@
-"""Drive a MiR100 to a place on an open floor."""
+"""Drive a MiR100 to a place on an open floor; `DriveTask` is what the MiR100's tasks share: driving to a target.
+
+Poses are x, y [m] and yaw [rad].
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 
-from bam_envs.core.robot import RobotState
-from bam_envs.core.task import Array, Flags
-from bam_envs.tasks.mir100_drive import BOUNDARY, MIN_DISTANCE, DriveTask
-from bam_envs.tasks.poses import spread
+from bam_envs.core.errors import InvalidValue
+from bam_envs.core.robot import EnvIds, Initial, RobotState
+from bam_envs.core.task import Array, Flags, Floats, Label, Score, TaskMemory, as_objects, draw_seeds, labelled_box
+from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS, SCAN_RANGE
 
+FASTEST = np.array([0.5, 0.7])
+"""Speeds of an action of 1: forward [m/s], turning anticlockwise [rad/s]."""
+ARRIVED = 0.2
+"""The base has arrived when it is nearer than this to its target [m]."""
+MAX_STEPS = 500
+"""Steps of an episode."""
+BOUNDARY = 10.0
+"""The floor goes this far from the origin, along x and along y [m]."""
+NEARER, ARRIVING, FAILING, TIME, POWER = 0.5, 2.0, -2.0, 0.005, (0.003, 0.0003)
+"""Rewards of a metre nearer, of success and of failure; costs of a step and of full speed, forward and turning."""
+DISTANCE_SCALE = 4.0
+"""Of the distance that is observed [m]."""
 START, TARGET = 2.0, 1.0
 """Starts and targets are drawn at most this far from the origin, along x and along y [m]."""
+MIN_DISTANCE = 1.0
+"""A target that is drawn is at least this far from the start [m]."""
 CANDIDATES = 64
 """Targets that are drawn; the first is taken that is far enough from the start."""
+START_TOLERANCE = 0.2
+"""A base that is nearer than this to where it is to start is there [m], [rad]."""
+_MEANT = "x, y [m] and yaw [rad]"
+
+
+class DriveTask(TaskMemory):
+    """Drive to within `ARRIVED` of a target; the heading there does not matter.
+
+    Args:
+        num_envs: How many environments are scored together.
+        rs_state_to_info: ``info["rs_state"]`` is the state as robo-gym's robot server would send it.
+    """
+
+    reset_options = ("start_pose", "target_pose")
+    action_labels = (
+        Label("forward", "speed forward", "m/s", f"/ {FASTEST[0]:g}"),
+        Label("turn", "speed of turning anticlockwise", "rad/s", f"/ {FASTEST[1]:g}"),
+    )
+    memory: Mapping[str, str] = {"target": "target", "elapsed": "elapsed", "previous": "_previous"}
+    ends_by_itself = False
+    failure: str
+    """What ``final_status`` says when something went wrong."""
+    draws: int
+    """How many numbers `starts` and `targets` take for each environment."""
+
+    def __init__(self, num_envs: int = 1, *, rs_state_to_info: bool = False) -> None:
+        self.num_envs, self.rs_state_to_info = num_envs, rs_state_to_info
+        self.observation_labels = self.labels()
+        self.action_space: spaces.Box = labelled_box(self.action_labels)
+        self.observation_space: spaces.Box = labelled_box(self.observation_labels)
+        self.target = np.zeros((num_envs, 3))
+        """x, y [m] and yaw [rad]. Shape: (n, 3)."""
+        self.elapsed = np.zeros(num_envs, dtype=np.int64)
+        """Steps since the episode began. Shape: (n,)."""
+        self._previous = np.full(num_envs, np.nan)  # distance one step ago [m]
+        self._draws, self._asked = np.zeros((num_envs, self.draws)), np.full((num_envs, 2, 3), np.nan)
+
+    def labels(self) -> tuple[Label, ...]:
+        """Hook: what each number of an observation means."""
+        return (
+            Label("target_distance", "target from the base", "m", f"/ {DISTANCE_SCALE:g}", 0.0, 6.0),
+            Label("target_bearing", "where the target is, seen from the base", "rad", "/ pi"),
+            Label("linear_velocity", "speed forward", "m/s", f"/ {FASTEST[0]:g}", -2.5, 2.5),
+            Label("angular_velocity", "speed of turning anticlockwise", "rad/s", f"/ {FASTEST[1]:g}", -2.5, 2.5),
+        )
+
+    def starts(self, draws: Array) -> Array:
+        """Hook: start poses out of `draws` from [0, 1). Shapes: (k, draws) -> (k, 3)."""
+        raise NotImplementedError
+
+    def targets(self, draws: Array, start: Array) -> Array:
+        """Hook: targets for bases that stand at `start` (k, 3). Shapes: (k, draws) -> (k, 3)."""
+        raise NotImplementedError
+
+    def make_way(self, start: Array, draws: Array, rngs: Sequence[np.random.Generator]) -> None:
+        """Hook: draw anew, in `draws` (k, draws), what is where bases are to start, at `start` (k, 3)."""
+
+    def scene(self, env_ids: EnvIds, draws: Array) -> dict[str, Array]:
+        """Hook: start values of other signals than the pose."""
+        return {}
+
+    def seen(self, state: RobotState) -> list[Floats]:
+        """Hook: what is observed besides. Shape: (n, ...) each."""
+        return []
+
+    def failed(self, state: RobotState) -> Flags:
+        """Hook: which episodes are over because something went wrong. Shape: (n,)."""
+        raise NotImplementedError
+
+    def sample_initial(
+        self, env_ids: EnvIds, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] | None = None
+    ) -> Initial:
+        """A start pose; the target is chosen when it is known where the base really is."""
+        draws = np.stack([rng.random(self.draws) for rng in rngs])
+        seeds = draw_seeds(rngs)
+        given = [(name, (options or {}).get(name)) for name in self.reset_options]
+        asked = [np.nan if value is None else floor_pose(name, value, BOUNDARY) for name, value in given]
+        for which, pose in enumerate(asked):
+            self._asked[env_ids, which] = pose
+        start = preferred(self._asked[env_ids, 0], self.starts(draws))
+        if given[0][1] is not None:
+            self.make_way(start, draws, rngs)
+        self._draws[env_ids] = draws
+        return Initial({"base_pose": start, **self.scene(env_ids, draws)}, seeds)
+
+    def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
+        """Choose the target from where the base is.
+
+        Raises:
+            InvalidValue: A robot that stays where it is was asked to start elsewhere.
+        """
+        pose = state.signals["base_pose"][env_ids]
+        require_at(self._asked[env_ids, 0], pose)
+        self.target[env_ids] = preferred(self._asked[env_ids, 1], self.targets(self._draws[env_ids], pose))
+        self.elapsed[env_ids] = 0
+        self._previous[env_ids] = self.distance(state)[env_ids]
+
+    def distance(self, state: RobotState) -> Array:
+        """How far the target is [m]. Shape: (n,)."""
+        pose = state.signals["base_pose"]
+        dx, dy = self.target[:, 0] - pose[:, 0], self.target[:, 1] - pose[:, 1]
+        distance: Array = np.sqrt(dx * dx + dy * dy)
+        return distance
+
+    def bearing(self, state: RobotState) -> Array:
+        """Where the target is, seen from the base, from -pi to pi [rad]. Shape: (n,)."""
+        pose = state.signals["base_pose"]
+        dx, dy = self.target[:, 0] - pose[:, 0], self.target[:, 1] - pose[:, 1]
+        bearing: Array = np.mod(np.arctan2(dy, dx) - pose[:, 2] + math.pi, 2 * math.pi) - math.pi
+        return bearing
+
+    def _columns(self, state: RobotState) -> list[Array]:
+        """The first four numbers of an observation. Shape: (n,) each."""
+        v, w = state.signals["base_velocity"].T
+        return [
+            self.distance(state) / DISTANCE_SCALE,
+            self.bearing(state) / math.pi,
+            v / FASTEST[0],
+            w / FASTEST[1],
+        ]
+
+    def observe(self, state: RobotState) -> Floats:
+        """See `observation_labels`. Shape: (n, k) float32."""
+        observation = np.stack(self._columns(state), axis=1).astype(np.float32)
+        observation = np.concatenate([observation, *self.seen(state)], axis=1)
+        return self._bounded(observation)
+
+    def _bounded(self, observation: Floats) -> Floats:
+        clipped: Floats = np.clip(observation, self.observation_space.low, self.observation_space.high)
+        return clipped
+
+    def command(self, action: Floats, state: RobotState) -> Array:
+        """Speeds forward [m/s] and of turning [rad/s]. Shape: (n, 2)."""
+        command: Array = np.clip(action, -1.0, 1.0).astype(np.float64) * FASTEST
+        return command
+
+    def score(self, state: RobotState, action: Floats) -> Score:
+        """Getting nearer is good, time and power cost, arriving or failing has its own reward instead."""
+        distance, failed = self.distance(state), self.failed(state)
+        success = (distance < ARRIVED) & ~failed
+        forward, turn = np.abs(np.clip(action, -1.0, 1.0)).astype(np.float64).T
+        reward = NEARER * (self._previous - distance) - POWER[0] * forward - POWER[1] * turn - TIME
+        reward = np.where(failed, FAILING, np.where(success, ARRIVING, reward))
+        self.elapsed = self.elapsed + 1
+        terminated = failed | success
+        return self._scored(
+            state, distance, reward, terminated, success, failed, (self.elapsed >= MAX_STEPS) & ~terminated
+        )
+
+    def _scored(
+        self,
+        state: RobotState,
+        distance: Array,
+        reward: Array,
+        terminated: Flags,
+        success: Flags,
+        failed: Flags,
+        late: Flags,
+    ) -> Score:
+        self._previous = distance.copy()  # the info keeps its own
+        status = np.where(success, "success", np.where(failed, self.failure, ""))
+        info: dict[str, Any] = {
+            "distance": distance,
+            "final_status": np.where(late, "max_steps_exceeded", status),
+            "target_coord": self.target.copy(),
+        }
+        if self.rs_state_to_info:
+            info["rs_state"] = as_objects(self.rs_state(state))
+        return Score(reward, terminated, success, info)
+
+    def rs_state(self, state: RobotState) -> list[list[float]]:
+        """The states as robo-gym's robot server sends them: 1030 numbers each.
+
+        Target and base (x, y [m], yaw [rad]), speeds [m/s, rad/s], 501 ranges of the front and 511 of the back scanner
+        [m], 1 for a collision, three obstacles (x, y [m], yaw [rad]; zeros where they are not known).
+        """
+        n = self.num_envs
+        obstacles = self._wire_obstacles(state)
+        columns = [
+            self.target,
+            state.signals["base_pose"],
+            state.signals["base_velocity"],
+            state.signals.get("f_scan", np.full((n, FRONT_RAYS), SCAN_RANGE[1])),
+            state.signals.get("b_scan", np.full((n, BACK_RAYS), SCAN_RANGE[1])),
+            state.truth.get("collision", np.zeros(n))[:, None],
+            obstacles if obstacles.shape[1] else np.zeros((n, 9)),
+        ]
+        numbers: list[list[float]] = np.concatenate(columns, axis=1).tolist()
+        return numbers
+
+    def _wire_obstacles(self, state: RobotState) -> Array:
+        return state.truth.get("obstacle_pose", np.zeros((self.num_envs, 0, 3))).reshape(self.num_envs, -1)
+
+    def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
+        """The target."""
+        return [(np.array([self.target[0, 0], self.target[0, 1], 0.0]), (0.1, 0.7, 0.3, 0.6))]
 
 
 class Mir100NavigationTask(DriveTask):
@@ -38,18 +254,9 @@ class Mir100NavigationTask(DriveTask):
     Info:
         `distance` of the target [m], `target_coord` (x, y [m], yaw [rad]), at the end `final_status`: "success",
         "out of boundary" or "max_steps_exceeded".
-
-    With ``parity=True`` observation, reward and end are those of robo-gym's `NoObstacleNavigationMir100`: metres and
-    radians, the way at a hundred times this reward but none for that of the first step, 200 at success, -200 outside,
-    y below -10 m is not noticed, and the episode is terminated after 500 steps as "max_steps_exceeded".
-
-    Args:
-        num_rows: How many robots are scored together.
-        parity: Robo-gym's arithmetic.
-        rs_state_to_info: ``info["rs_state"]`` is the state as robo-gym's robot server would send it.
     """
 
-    parity_success, failure = 200.0, "out of boundary"
+    failure = "out of boundary"
     draws = 3 + 2 * CANDIDATES
 
     def starts(self, draws: Array) -> Array:
@@ -67,6 +274,55 @@ class Mir100NavigationTask(DriveTask):
 
     def failed(self, state: RobotState) -> Flags:
         """Whether the base left the floor. Shape: (n,)."""
-        x, y = state.signals["base_pose"][:, 0], state.signals["base_pose"][:, 1]
-        outside: Flags = (np.abs(x) > BOUNDARY) | ((y > BOUNDARY) if self.parity else (np.abs(y) > BOUNDARY))
+        outside: Flags = (np.abs(state.signals["base_pose"][:, :2]) > BOUNDARY).any(axis=1)
         return outside
+
+
+def spread(draws: Array, low: float, high: float) -> Array:
+    """`draws` from [0, 1) as numbers from `low` to `high`."""
+    return low + draws * (high - low)
+
+
+def floor_pose(name: str, value: Any, boundary: float) -> Array:
+    """The reset option `name` as a pose, with its yaw from -pi to pi. Shape: (3,).
+
+    Args:
+        name: For texts.
+        value: Three numbers.
+        boundary: How far the floor goes from the origin, along x and along y [m].
+
+    Raises:
+        InvalidValue: It is no pose, or not on the floor.
+    """
+    try:
+        pose = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InvalidValue(f"{name} must be three numbers, {_MEANT}, not {value!r}.") from error
+    if pose.shape != (3,) or not np.isfinite(pose).all():
+        raise InvalidValue(f"{name} must be three finite numbers, {_MEANT}, not {pose.tolist()}.")
+    if np.abs(pose[:2]).max() > boundary:
+        raise InvalidValue(f"{name} must be within {boundary:g} m of the origin along x and y, not {pose.tolist()}.")
+    pose[2] = np.mod(pose[2] + math.pi, 2 * math.pi) - math.pi
+    return pose
+
+
+def preferred(asked: Array, drawn: Array) -> Array:
+    """What was asked, and where that is nothing (NaN), what was drawn. Shape: (k, 3)."""
+    return np.where(np.isnan(asked), drawn, asked)
+
+
+def require_at(asked: Array, pose: Array) -> None:
+    """Bases at `pose` (k, 3) are where they were `asked` (k, 3) to start; NaN is anywhere.
+
+    Raises:
+        InvalidValue: One is not, since a live base goes nowhere by itself.
+    """
+    off = asked - pose
+    off[:, 2] = np.mod(off[:, 2] + math.pi, 2 * math.pi) - math.pi
+    wrong = np.flatnonzero((np.abs(off) > START_TOLERANCE).any(axis=1))
+    if len(wrong):
+        there, here = asked[wrong[0]].tolist(), np.round(pose[wrong[0]], 3).tolist()
+        raise InvalidValue(
+            f"start_pose: this robot stays where it is, at {here}, and does not start at {there} (x, y [m], yaw "
+            "[rad]). Drive it there, or leave start_pose out."
+        )

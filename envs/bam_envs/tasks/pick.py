@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
 from bam_envs.core.kinematics import cube_yaw_phase
-from bam_envs.core.robot import Initial, RobotState, Rows
-from bam_envs.core.task import Array, Floats, Label, Score, labelled_box
+from bam_envs.core.robot import EnvIds, Initial, RobotState
+from bam_envs.core.task import Array, Floats, Label, Score, TaskMemory, draw_seeds, labelled_box
 from bam_envs.robots.ur5e import GEOMETRY
 from bam_envs.tasks.tool_control import ACTION_LABELS, HAND_LABELS, WORKSPACE, ToolControl, hand_state
 
@@ -57,7 +57,7 @@ class CubeSense:
         return cube_yaw_phase(self.state.signals["object_quaternion"]) * (axis * axis) ** 2
 
 
-class PickTask:
+class PickTask(TaskMemory):
     """Grasp the cube, lift it by `LIFT` and hold it for `HOLD_STEPS`.
 
     Start:
@@ -81,39 +81,40 @@ class PickTask:
         `distance` of the tool from the cube [m], `lift` of the cube above where it lay [m].
 
     Args:
-        num_rows: How many robots are scored together.
+        num_envs: How many environments are scored together.
     """
 
+    memory: Mapping[str, str] = {"rest_height": "rest_height", "held": "held"}
     action_labels = ACTION_LABELS
     observation_labels: tuple[Label, ...] = HAND_LABELS + OBJECT_LABELS
 
-    def __init__(self, num_rows: int = 1) -> None:
-        self.num_rows = num_rows
+    def __init__(self, num_envs: int = 1) -> None:
+        self.num_envs = num_envs
         self.action_space: spaces.Box = labelled_box(self.action_labels)
         self.observation_space: spaces.Box = labelled_box(self.observation_labels)
-        self.control = ToolControl(num_rows)
-        self.rest_height = np.zeros(num_rows)
+        self.control = ToolControl(num_envs)
+        self.rest_height = np.zeros(num_envs)
         """Height of the object where it lay [m]. Shape: (n,)."""
-        self.held = np.zeros(num_rows, dtype=np.int64)
+        self.held = np.zeros(num_envs, dtype=np.int64)
         """For how many steps the object has been high enough. Shape: (n,)."""
         self._sense: CubeSense | None = None
 
-    def sample_initial(self, rows: Rows, rngs: Sequence[np.random.Generator]) -> Initial:
+    def sample_initial(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> Initial:
         """A tool position above the table, a cube pose on it."""
         draws = np.stack([rng.random(6) for rng in rngs])
-        seeds = np.array([rng.integers(2**63) for rng in rngs], dtype=np.int64)
+        seeds = draw_seeds(rngs)
         tool = START_AREA[0] + draws[:, :3] * (START_AREA[1] - START_AREA[0])
-        cube = np.empty((len(rows), 3))
+        cube = np.empty((len(env_ids), 3))
         cube[:, :2] = CUBE_AREA[0] + draws[:, 3:5] * (CUBE_AREA[1] - CUBE_AREA[0])
         cube[:, 2] = (2 * draws[:, 5] - 1) * np.pi
-        joints = GEOMETRY.reach_down(tool, np.zeros(len(rows)))
+        joints = GEOMETRY.reach_down(tool, np.zeros(len(env_ids)))
         return Initial({"joint_position": joints, "object_pose": cube}, seeds)
 
-    def on_reset(self, rows: Rows, state: RobotState) -> None:
+    def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
         """Note the measured joints and how high the object lies."""
-        self.control.start(rows, state.signals["joint_position"][rows])
-        self.rest_height[rows] = state.signals["object_position"][rows, 2]
-        self.held[rows] = 0
+        self.control.start(env_ids, state.signals["joint_position"][env_ids])
+        self.rest_height[env_ids] = state.signals["object_position"][env_ids, 2]
+        self.held[env_ids] = 0
 
     def sense(self, state: RobotState) -> CubeSense:
         """Tool and cube of `state`, worked out once."""
@@ -176,11 +177,11 @@ class PickTask:
         return []
 
     def state_dict(self) -> dict[str, Any]:
-        """The memory, as plain arrays."""
-        return {"control": self.control.state_dict(), "rest_height": self.rest_height.copy(), "held": self.held.copy()}
+        """A copy of the arrays, and of those of the tool's control."""
+        return {"control": self.control.state_dict(), **super().state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go to what `state_dict` returned."""
+        super().load_state_dict(state)
         self.control.load_state_dict(state["control"])
-        self.rest_height, self.held = np.array(state["rest_height"]), np.array(state["held"])
         self._sense = None

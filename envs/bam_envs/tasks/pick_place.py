@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from bam_envs.core.robot import Initial, RobotState, Rows
+from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.task import Array, Floats, Label, Score
 from bam_envs.robots.ur5e import GRIPPER_OPEN
 from bam_envs.tasks.pick import CUBE_AREA, CUBE_EDGE, NEAR, TABLE_EDGE, CubeSense, PickTask
@@ -61,29 +61,30 @@ class PickPlaceTask(PickTask):
         from where it would lie at the goal [m].
 
     Args:
-        num_rows: How many robots are scored together.
+        num_envs: How many environments are scored together.
     """
 
+    memory: Mapping[str, str] = {**PickTask.memory, "goal": "goal", "picked": "picked"}
     observation_labels = PickTask.observation_labels + GOAL_LABELS
 
-    def __init__(self, num_rows: int = 1) -> None:
-        super().__init__(num_rows)
-        self.goal = np.zeros((num_rows, 2))
+    def __init__(self, num_envs: int = 1) -> None:
+        super().__init__(num_envs)
+        self.goal = np.zeros((num_envs, 2))
         """Goals on the table [m]. Shape: (n, 2)."""
-        self.picked = np.zeros(num_rows, dtype=bool)
+        self.picked = np.zeros(num_envs, dtype=bool)
         """Whether the object has been lifted by `PICKED` in this episode. Shape: (n,)."""
 
-    def sample_initial(self, rows: Rows, rngs: Sequence[np.random.Generator]) -> Initial:
+    def sample_initial(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> Initial:
         """As for picking, and a goal at least `GOAL_DISTANCE` from the cube."""
-        initial = super().sample_initial(rows, rngs)
-        for row, rng, cube in zip(rows, rngs, initial.signals["object_pose"], strict=True):
-            self.goal[row] = sample_goal(rng, cube[:2])
+        initial = super().sample_initial(env_ids, rngs)
+        for env, rng, cube in zip(env_ids, rngs, initial.signals["object_pose"], strict=True):
+            self.goal[env] = sample_goal(rng, cube[:2])
         return initial
 
-    def on_reset(self, rows: Rows, state: RobotState) -> None:
+    def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
         """As for picking; nothing has been picked up yet."""
-        super().on_reset(rows, state)
-        self.picked[rows] = False
+        super().on_reset(env_ids, state)
+        self.picked[env_ids] = False
 
     def observe(self, state: RobotState) -> Floats:
         """See `observation_labels`. Shape: (n, 23) float32."""
@@ -130,15 +131,6 @@ class PickPlaceTask(PickTask):
     def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
         """The goal."""
         return [(np.array([*self.goal[0], 0.0]), (0.1, 0.7, 0.3, 0.6))]
-
-    def state_dict(self) -> dict[str, Any]:
-        """The memory, as plain arrays."""
-        return {**super().state_dict(), "goal": self.goal.copy(), "picked": self.picked.copy()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go to what `state_dict` returned."""
-        super().load_state_dict(state)
-        self.goal, self.picked = np.array(state["goal"]), np.array(state["picked"], dtype=bool)
 
 
 def sample_goal(rng: np.random.Generator, cube: Array) -> Array:

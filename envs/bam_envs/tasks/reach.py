@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from gymnasium import spaces
 
-from bam_envs.core.robot import Initial, RobotState, Rows
-from bam_envs.core.task import Array, Floats, Label, Score, labelled_box
+from bam_envs.core.robot import EnvIds, Initial, RobotState
+from bam_envs.core.task import Array, Floats, Label, Score, TaskMemory, draw_seeds, labelled_box
 from bam_envs.robots.ur5e import GEOMETRY, GRIPPER_OPEN, JOINTS
 from bam_envs.tasks.tool_control import JOINT_STEP, TOOL_STEP
 
@@ -31,7 +30,7 @@ LEASH = 0.15
 _LOW = np.array([-2 * np.pi, -2 * np.pi, -np.pi, -2 * np.pi, -2 * np.pi, -2 * np.pi]) + JOINT_MARGIN
 
 
-class ReachTask:
+class ReachTask(TaskMemory):
     """Bring the tool within `GOAL_RADIUS` of a goal.
 
     Start:
@@ -52,9 +51,10 @@ class ReachTask:
         `distance` of the tool from the goal [m].
 
     Args:
-        num_rows: How many robots are scored together.
+        num_envs: How many environments are scored together.
     """
 
+    memory: Mapping[str, str] = {"goal": "goal"}
     action_labels = tuple(Label(f"d_{joint}", f"turn {joint}", "rad", "/ 0.05") for joint in JOINTS)
     observation_labels = (
         *(Label(joint, "joint position from the home pose", "rad", "- home", -4, 4) for joint in JOINTS),
@@ -64,21 +64,21 @@ class ReachTask:
         *(Label(f"goal_near_d{axis}", f"goal from the tool, {axis}, near", "m", "/ 0.05, clipped") for axis in "xyz"),
     )
 
-    def __init__(self, num_rows: int = 1) -> None:
-        self.num_rows = num_rows
+    def __init__(self, num_envs: int = 1) -> None:
+        self.num_envs = num_envs
         self.action_space: spaces.Box = labelled_box(self.action_labels)
         self.observation_space: spaces.Box = labelled_box(self.observation_labels)
-        self.goal = np.zeros((num_rows, 3))
+        self.goal = np.zeros((num_envs, 3))
         """Goals [m]. Shape: (n, 3)."""
 
-    def sample_initial(self, rows: Rows, rngs: Sequence[np.random.Generator]) -> Initial:
+    def sample_initial(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> Initial:
         """Joint positions about `HOME`; a goal in `GOAL_AREA`."""
         draws = np.stack([rng.random(9) for rng in rngs])
-        seeds = np.array([rng.integers(2**63) for rng in rngs], dtype=np.int64)
-        self.goal[rows] = GOAL_AREA[0] + draws[:, 6:] * (GOAL_AREA[1] - GOAL_AREA[0])
+        seeds = draw_seeds(rngs)
+        self.goal[env_ids] = GOAL_AREA[0] + draws[:, 6:] * (GOAL_AREA[1] - GOAL_AREA[0])
         return Initial({"joint_position": HOME + START_NOISE * (2 * draws[:, :6] - 1)}, seeds)
 
-    def on_reset(self, rows: Rows, state: RobotState) -> None:
+    def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
         """Nothing is kept: commands go on from the one that was really sent last."""
 
     def observe(self, state: RobotState) -> Floats:
@@ -101,7 +101,7 @@ class ReachTask:
         measured, sent = state.signals["joint_position"], state.command[:, :6]
         wanted = sent + np.clip(action, -1.0, 1.0).astype(np.float64) * JOINT_STEP
         wanted = np.clip(np.clip(wanted, measured - LEASH, measured + LEASH), _LOW, -_LOW)
-        return np.concatenate([slow_step(sent, wanted), np.full((self.num_rows, 1), GRIPPER_OPEN)], axis=1)
+        return np.concatenate([slow_step(sent, wanted), np.full((self.num_envs, 1), GRIPPER_OPEN)], axis=1)
 
     def score(self, state: RobotState, action: Floats) -> Score:
         """Nearer is better; arriving is worth staying there."""
@@ -114,14 +114,6 @@ class ReachTask:
     def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
         """The goal."""
         return [(self.goal[0], (0.1, 0.7, 0.3, 0.6))]
-
-    def state_dict(self) -> dict[str, Any]:
-        """The memory, as plain arrays."""
-        return {"goal": self.goal.copy()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go to what `state_dict` returned."""
-        self.goal = np.array(state["goal"])
 
 
 def slow_step(joints: Array, wanted: Array) -> Array:

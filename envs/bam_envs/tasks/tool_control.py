@@ -8,13 +8,12 @@ moves at most `TOOL_STEP` and no joint more than `JOINT_STEP`.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bam_envs.core.robot import RobotState, Rows
-from bam_envs.core.task import Array, Floats, Label
+from bam_envs.core.robot import EnvIds, RobotState
+from bam_envs.core.task import Array, Floats, Label, TaskMemory
 from bam_envs.robots.ur5e import GEOMETRY, GRIPPER_OPEN
 
 TOOL_STEP = 0.0124
@@ -51,29 +50,31 @@ HAND_LABELS = (
 )
 
 
-class ToolControl:
-    """The commanded tool of n rows: its target, its yaw, the joints that were commanded, the gripper."""
+class ToolControl(TaskMemory):
+    """The commanded tool of n environments: its target, its yaw, the joints that were commanded, the gripper."""
 
-    def __init__(self, num_rows: int) -> None:
-        self.target = np.zeros((num_rows, 3))
+    memory: Mapping[str, str] = {"target": "target", "yaw": "yaw", "closed": "closed", "joints": "_joints"}
+
+    def __init__(self, num_envs: int) -> None:
+        self.target = np.zeros((num_envs, 3))
         """Tool target [m]. Shape: (n, 3)."""
-        self.yaw = np.zeros(num_rows)
+        self.yaw = np.zeros(num_envs)
         """Commanded yaw [rad]. Shape: (n,)."""
-        self.closed = np.zeros(num_rows, dtype=bool)
+        self.closed = np.zeros(num_envs, dtype=bool)
         """Whether the gripper was told to close. Shape: (n,)."""
-        self._joints = np.zeros((num_rows, 6))
+        self._joints = np.zeros((num_envs, 6))
 
-    def start(self, rows: Rows, joints: Array) -> None:
-        """Begin at the measured `joints` (k, 6) [rad] of `rows`."""
-        self._go_on(rows, joints)
-        self.closed[rows] = False
+    def start(self, env_ids: EnvIds, joints: Array) -> None:
+        """Begin at the measured `joints` (k, 6) [rad] of these environments."""
+        self._go_on(env_ids, joints)
+        self.closed[env_ids] = False
 
-    def _go_on(self, rows: Rows, joints: Array) -> None:
-        """The next targets begin at `joints` (k, 6) [rad] of `rows`."""
+    def _go_on(self, env_ids: EnvIds, joints: Array) -> None:
+        """The next targets begin at `joints` (k, 6) [rad] of these environments."""
         position, x_axis = GEOMETRY.tool_pose(joints)
         self.target, self.yaw, self._joints = self.target.copy(), self.yaw.copy(), self._joints.copy()
-        self.target[rows], self.yaw[rows] = position, np.arctan2(x_axis[:, 1], x_axis[:, 0])
-        self._joints[rows] = joints
+        self.target[env_ids], self.yaw[env_ids] = position, np.arctan2(x_axis[:, 1], x_axis[:, 0])
+        self._joints[env_ids] = joints
 
     def command(self, action: Floats, tool: Array, sent: Array) -> Array:
         """Joint positions [rad] and gripper width [m] for an action.
@@ -120,16 +121,6 @@ class ToolControl:
         self.target = self.target + travel * share[:, None]
         self.yaw = self.yaw + turn * share
         self._joints = joints
-
-    def state_dict(self) -> dict[str, NDArray[Any]]:
-        """The memory, as plain arrays."""
-        memory = {"target": self.target, "yaw": self.yaw, "closed": self.closed, "joints": self._joints}
-        return {name: array.copy() for name, array in memory.items()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go to what `state_dict` returned."""
-        self.target, self.yaw = np.array(state["target"]), np.array(state["yaw"])
-        self.closed, self._joints = np.array(state["closed"], dtype=bool), np.array(state["joints"])
 
 
 def hand_state(state: RobotState, control: ToolControl, tool: Array, x_axis: Array) -> list[Array]:

@@ -1,19 +1,38 @@
-"""Avoidance: stay at a pose, and out of the way of an obstacle that goes up and down beside it."""
+"""Avoidance: stay at a pose, and out of the way of an obstacle that goes up and down beside it.
+
+`UrObstacleTask` is what this task and `bam_envs.tasks.ur_track` share. Frames are those of robo-gym: the end effector
+is ``tool0``, the elbow ``forearm_link``, places are in ``base_link``.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from bam_envs.core.robot import Initial, RobotState, Rows
-from bam_envs.core.task import Array, Floats, Score
+from bam_envs.core.robot import EnvIds, Initial, RobotState
+from bam_envs.core.task import Array, Flags, Floats, Label, Score
 from bam_envs.robots.physics.obstacles import wave_signals
-from bam_envs.robots.ur import DEFAULT_MODEL, START
-from bam_envs.tasks.ur_obstacle import UrObstacleTask
+from bam_envs.tasks.ur_arm import (
+    FOREARM,
+    UrTask,
+    collisions,
+    in_frame,
+    joint_labels,
+    joint_option,
+    normalised,
+    number_option,
+    spherical,
+    wire_states,
+)
 
+FAR = 2.0
+"""Distance that is 1 in observations [m]."""
+OFFSET = 0.1
+"""Share of the joint limits off the reference that is 1 in observations."""
+COLLISION = -0.1
+"""Reward of a collision; robo-gym's BasicAvoidanceUR has none, and charges this in its other task with an obstacle."""
 POSE = (-1.57, -1.31, -1.31, -2.18, 1.57, 0.0)
 """Joint positions to stay at [rad]; the obstacle's way goes past the flange."""
 NEAREST = 0.30
@@ -22,8 +41,160 @@ RAPID = 0.5
 """Change of an action that costs, in a joint [rad]."""
 SPREAD = 0.6
 """Sum of the shares of their limits that the joints may be off while it is worth something."""
-COLLISION = -0.1
-"""Reward of a collision; robo-gym's own has none, and charges this in its other task with an obstacle."""
+
+
+def obstacle_labels(
+    frame: str,
+    scales: tuple[str, str, str] = (f"/ {FAR:g}, clipped", "/ pi", "/ pi"),
+    lows: tuple[float, float, float] = (0.0, 0.0, -1.0),
+    high: float = 1.0,
+) -> tuple[Label, ...]:
+    """Of the obstacle's spherical coordinates in `frame`."""
+    names = ("distance", "polar", "azimuth")
+    meanings = ("obstacle's distance", "obstacle's angle from z", "obstacle's angle from x about z")
+    lines = zip(names, meanings, ("m", "rad", "rad"), scales, lows, strict=True)
+    return tuple(
+        Label(f"{frame}_{name}", f"{meaning} in the frame {frame}", unit, scale, low, high)
+        for name, meaning, unit, scale, low in lines
+    )
+
+
+class ObstacleSense:
+    """Where the obstacle is, seen from the arm in one state; worked out once for `observe` and `score`."""
+
+    def __init__(self, task: UrObstacleTask, state: RobotState) -> None:
+        self.state = state
+        positions, rotations = task.model.geometry.link_poses(state.signals["joint_position"])
+        self.obstacle = state.signals["object_position"]
+        from_tool = in_frame(self.obstacle, positions[:, -1], rotations[:, -1])
+        from_elbow = in_frame(self.obstacle, positions[:, FOREARM], rotations[:, FOREARM])
+        self.tool, self.elbow = spherical(from_tool), spherical(from_elbow)
+        """Distance [m] and two angles [rad] of the obstacle. Shape: (n, 3) each."""
+        self.nearest: Array = np.minimum(self.tool[:, 0], self.elbow[:, 0])
+        """Distance of the obstacle from flange or elbow, the nearer one [m]. Shape: (n,)."""
+        self.joints = normalised(task.model, state.signals["joint_position"])
+
+
+class UrObstacleTask(UrTask):
+    """An arm that keeps to a reference and away from an obstacle; what it is and what is rewarded is a task's own.
+
+    Args:
+        include_polar_to_elbow: Whether the observation has the obstacle seen from the elbow, or zeros.
+        fixed_object_position: Where the obstacle stays in every episode [m].
+    """
+
+    rate, velocity_scale, max_steps = 20.0, 0.2, 1000
+    reset_options = ("joint_positions", "fixed_object_position")
+    memory: Mapping[str, str] = {"reference": "reference", "steps": "elapsed", "last_action": "_last_action"}
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        include_polar_to_elbow: bool = False,
+        fixed_object_position: Sequence[float] | None = None,
+        **options: Any,
+    ) -> None:
+        self.include_polar_to_elbow = include_polar_to_elbow
+        super().__init__(num_envs, **options)
+        self._place = _place({"fixed_object_position": fixed_object_position}, kind="option")
+        self.reference = np.zeros((num_envs, 6))
+        """Joint positions to keep to [rad]. Shape: (n, 6)."""
+        self._last_action = np.zeros((num_envs, 6))
+        self._sense: ObstacleSense | None = None
+
+    def _action_labels(self) -> tuple[Label, ...]:
+        return self.control.labels("joint target beside the reference", "rad", "1")
+
+    def _observation_labels(self) -> tuple[Label, ...]:
+        return (
+            *obstacle_labels("tool0"),
+            *joint_labels("", "joint position", "rad", "/ joint limit"),
+            *joint_labels(
+                "off_", "joint position from the reference", "rad", f"/ joint limit / {OFFSET:g}, clipped", 2.0
+            ),
+            *obstacle_labels("forearm_link"),
+        )
+
+    def begin(self, env_ids: EnvIds, options: Mapping[str, Any], joints: Array) -> tuple[Array, Array | None]:
+        """Begin an episode at `joints` (6,), or where the options say.
+
+        Returns:
+            Joint positions [rad], shape (k, 6), and where the obstacle stays [m], shape (k, 3), or None if it moves.
+        """
+        start = joint_option(options, "joint_positions", joints.tolist(), self.model)
+        place = _place(options, self._place)
+        self._last_action[env_ids] = 0.0
+        stays = None if place is None else np.tile(place, (len(env_ids), 1))
+        return np.tile(start, (len(env_ids), 1)), stays
+
+    def sense(self, state: RobotState) -> ObstacleSense:
+        """The obstacle in `state`, worked out once."""
+        if self._sense is None or self._sense.state is not state:
+            self._sense = ObstacleSense(self, state)
+        return self._sense
+
+    def offset(self, state: RobotState) -> Array:
+        """Joints from the reference, as shares of their limits. Shape: (n, 6)."""
+        return self.sense(state).joints - normalised(self.model, self.reference)
+
+    def _columns(self, state: RobotState) -> list[Array]:
+        sense, units = self.sense(state), np.array([FAR, np.pi, np.pi])
+        elbow = sense.elbow / units if self.include_polar_to_elbow else np.zeros_like(sense.elbow)
+        return [sense.tool / units, sense.joints, self.offset(state) / OFFSET, elbow]
+
+    def command(self, action: Floats, state: RobotState) -> Array:
+        """One period on the way to the reference plus `action` [rad]; fixed joints keep to it. Shape: (n, 6)."""
+        return self.control.command(self.reference + self.control.full(action), state)
+
+    def effort(self, action: Floats, weight: float, rapid: float) -> Array:
+        """Worth of acting little, and the price of each joint whose action jumps by more than `rapid`. Shape: (n,).
+
+        It also notes the action as the last one.
+        """
+        full = self.control.full(action)
+        jumps = (np.abs(full - self._last_action) > rapid).sum(axis=1)
+        self._last_action = full
+        effort: Array = (weight * (1 - np.einsum("ij,ij->i", full, full) / 6) - 0.2 * jumps) / 1000
+        return effort
+
+    def ends(self, collision: Flags, success: Flags, late: Flags) -> tuple[Flags, Any]:
+        """A collision ends an episode; a success is that its time went by without one."""
+        return collision, np.where(collision, "collision", np.where(success, "success", ""))
+
+    def scored(self, state: RobotState, reward: Array, collision_reward: float | None, **told: Any) -> Score:
+        """Count the step: `reward`, but `collision_reward` at a collision, and the infos of both tasks."""
+        self.elapsed = self.elapsed + 1
+        collision = collisions(state)
+        success = (self.elapsed >= self.max_steps) & ~collision
+        terminated, status = self.ends(collision, success, success)
+        if collision_reward is not None:
+            reward = np.where(collision, collision_reward, reward)
+        sense = self.sense(state)
+        info = self.info(
+            state, final_status=status, target_coord=sense.obstacle.copy(), distance=sense.nearest.copy(), **told
+        )
+        return Score(reward, terminated, success, info)
+
+    def rs_state(self, state: RobotState) -> list[dict[str, float]]:
+        """robo-gym's wire state of each environment: 34 named numbers."""
+        return wire_states(self.model, state, state.signals["object_position"], with_forearm=True)
+
+    def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
+        """The flange at the reference; the robot shows the obstacle."""
+        return [(self.model.geometry.flange_pose(self.reference[:1])[0][0], (0.1, 0.7, 0.3, 0.6))]
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go to what `state_dict` returned."""
+        super().load_state_dict(state)
+        self._sense = None
+
+
+def _place(options: Mapping[str, Any], default: Array | None = None, kind: str = "reset option") -> Array | None:
+    """Where the obstacle stays [m], or None where nothing says so. Shape: (3,)."""
+    if options.get("fixed_object_position") is None:
+        return default
+    return number_option(options, "fixed_object_position", (), 3, kind)
 
 
 class UrAvoidanceTask(UrObstacleTask):
@@ -53,82 +224,28 @@ class UrAvoidanceTask(UrObstacleTask):
     Info:
         `target_coord` of the obstacle [m], its `distance` from flange or elbow, the nearer one [m], `rs_state` where it
         is asked for, and at the end `final_status`: "success" or "collision".
-
-    With ``parity=True`` the pose is robo-gym's [0, -2.5, 1.5, 0, -1.4, 0], the first reward depends on the sum over
-    the observation's last six numbers, as robo-gym's does, a collision costs nothing, and 1000 steps terminate.
-
-    Args:
-        num_rows: How many robots are scored together.
-        ur_model: ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e.
-        parity: robo-gym's arithmetic, with its bugs and without scaling.
-        fix_base: Take the joint out of the action; so do the other five.
-        fix_shoulder: See above.
-        fix_elbow: See above.
-        fix_wrist_1: See above.
-        fix_wrist_2: See above.
-        fix_wrist_3: See above.
-        include_polar_to_elbow: Whether the observation has the obstacle seen from the elbow, or zeros.
-        fixed_object_position: Where the obstacle stays in every episode [m].
-        rs_state_to_info: Whether infos have robo-gym's wire state.
     """
 
-    def __init__(
-        self,
-        num_rows: int = 1,
-        *,
-        ur_model: str = DEFAULT_MODEL,
-        parity: bool = False,
-        fix_base: bool = False,
-        fix_shoulder: bool = False,
-        fix_elbow: bool = False,
-        fix_wrist_1: bool = False,
-        fix_wrist_2: bool = False,
-        fix_wrist_3: bool = True,
-        include_polar_to_elbow: bool = False,
-        fixed_object_position: Sequence[float] | None = None,
-        rs_state_to_info: bool = False,
-    ) -> None:
-        super().__init__(
-            num_rows,
-            (fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3),
-            ur_model=ur_model,
-            parity=parity,
-            include_polar_to_elbow=include_polar_to_elbow,
-            fixed_object_position=fixed_object_position,
-            rs_state_to_info=rs_state_to_info,
-        )
+    pose: tuple[float, ...] = POSE
+    collision_reward: float | None = COLLISION
 
     def sample_initial(
-        self, rows: Rows, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] = MappingProxyType({})
+        self, env_ids: EnvIds, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] | None = None
     ) -> Initial:
         """The pose, and an obstacle that goes up and down or stays."""
         draws = np.stack([rng.random(2) for rng in rngs])
-        seeds = np.array([rng.integers(2**63) for rng in rngs], dtype=np.int64)
-        joints, place = self.begin_rows(rows, options, np.array(START if self.parity else POSE))
-        self.reference[rows] = joints
-        obstacle = wave_signals(draws) if place is None else {"obstacle_position": place}
-        return Initial({"joint_position": joints, **obstacle}, seeds)
-
-    def on_reset(self, rows: Rows, state: RobotState) -> None:
-        """The reference is the pose that was asked for, wherever exactly the arm is."""
+        joints, place = self.begin(env_ids, options or {}, np.array(self.pose))
+        self.reference[env_ids] = joints
+        return self.initial(joints, rngs, **(wave_signals(draws) if place is None else {"obstacle_position": place}))
 
     def score(self, state: RobotState, action: Floats) -> Score:
         """Staying at the pose, acting little and smoothly, away from the obstacle."""
-        sense = self.sense(state)
         reward = self._staying(state) + self.effort(action, weight=1.0, rapid=RAPID)
-        reward = reward - 0.002 * (np.minimum(sense.tool[:, 0], sense.elbow[:, 0]) < NEAREST)
-        collision, arrived = self.ends(state)
-        if not self.parity:
-            reward = np.where(collision, COLLISION, reward)
-        terminated = collision | arrived if self.parity else collision
-        return Score(reward, terminated, arrived, self.info(state, collision, arrived))
+        reward = reward - 0.002 * (self.sense(state).nearest < NEAREST)
+        return self.scored(state, reward, self.collision_reward)
 
     def _staying(self, state: RobotState) -> Array:
         """Worth of being at the pose. Shape: (n,)."""
-        if self.parity:
-            seen = np.abs(self.observe(state).astype(np.float64))
-            off, gate = seen[:, 9:15].sum(axis=1), seen[:, 12:18].sum(axis=1)
-        else:
-            off = gate = np.abs(self.offset(self.sense(state))).sum(axis=1)
-        staying: Array = np.where(gate < SPREAD, (1 - off / SPREAD) / 1000, 0.0)
+        off = np.abs(self.offset(state)).sum(axis=1)
+        staying: Array = np.where(off < SPREAD, (1 - off / SPREAD) / 1000, 0.0)
         return staying

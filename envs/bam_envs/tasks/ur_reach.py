@@ -1,7 +1,4 @@
-"""UR reach: bring the flange of a UR arm to a point; robo-gym's EndEffectorPositioningUR.
-
-Longer than other tasks because it has that environment's options, and its arithmetic beside ours.
-"""
+"""UR reach: bring the flange of a UR arm to a point; robo-gym's EndEffectorPositioningUR."""
 
 from __future__ import annotations
 
@@ -9,37 +6,29 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
-from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue
-from bam_envs.core.robot import Initial, RobotState, Rows
-from bam_envs.core.task import Array, Floats, Label, Score, labelled_box
-from bam_envs.robots.ur import DEFAULT_MODEL, JOINTS, UrModel
-from bam_envs.robots.ur import START as STRAIGHT
-from bam_envs.robots.ur import ur_model as model_called
-from bam_envs.tasks.ur_control import (
-    UrControl,
+from bam_envs.core.robot import EnvIds, Initial, RobotState
+from bam_envs.core.task import Array, Flags, Floats, Label, Score
+from bam_envs.robots.ur import UrModel
+from bam_envs.tasks.ur_arm import (
+    UrTask,
     collisions,
     flag_option,
     in_frame,
+    joint_labels,
     joint_option,
     normalised,
     number_option,
-    spherical,
+    wire_states,
 )
-from bam_envs.tasks.ur_wire import as_objects, wire_states
 
-RATE, VELOCITY_SCALE = 10.0, 0.1
-"""Commands a second [Hz], and share of the fastest speed that the joints go at."""
 START = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)
 """Where an episode starts [rad]."""
 START_OFFSET = np.array([1.5, 0.25, 0.5, 1.0, 0.4, 3.14])
 """With `randomize_start` each joint is at most so far from there [rad]."""
 WRIST_1_RANGE = (-3.48, 0.31)
 """With `restrict_wrist_1` the whole range of its action [rad]: where it does not fold back onto the forearm."""
-MAX_STEPS = 300
-"""Steps of an episode."""
 NEAR = 0.1
 """The flange has arrived within this distance of the target [m]."""
 FAR = 3.0
@@ -47,7 +36,7 @@ FAR = 3.0
 _WRIST_1 = 3
 
 
-class UrReachTask:
+class UrReachTask(UrTask):
     """Bring the flange within 10 cm of a target.
 
     Start:
@@ -74,200 +63,166 @@ class UrReachTask:
     Info:
         `target_coord` [m], `distance` [m], at the end `final_status`: "success", "collision" or "max_steps_exceeded".
 
-    With ``parity=True`` observations are robo-gym's numbers, in its units; the last six are the action before the last
-    one; and after 300 steps an episode is terminated as "max_steps_exceeded".
-
     Args:
-        num_rows: How many robots are scored together.
-        ur_model: ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e.
-        parity: robo-gym's arithmetic.
-        fix_base: The joint stays at its start; it is not in the action. So do the next five.
-        fix_shoulder: See above.
-        fix_elbow: See above.
-        fix_wrist_1: See above.
-        fix_wrist_2: See above.
-        fix_wrist_3: See above; it turns the flange about its own axis.
+        num_envs: How many environments are scored together.
         restrict_wrist_1: The action of wrist 1 means -3.48 to 0.31 rad.
-        rs_state_to_info: Put robo-gym's robot server state into info["rs_state"], a dict of floats.
         ee_distance_threshold: Distance that counts as success [m].
         ee_target_pose: What the reset option of that name is where a reset does not give it. So are the next two.
         randomize_start: See above.
         continue_on_success: See above.
         modular: Observations and infos of robo-gym's EndEffectorPositioning2UR: the last action is that of the joints
-            that move, and never an older one; the distance is `dist_coord` too. With `parity`, wrist 1 starts at 0 rad
-            and its action means its whole range, and targets that are not given are the origin.
+            that move; the distance is `dist_coord` too. With `parity`, wrist 1 starts at 0 rad and its action means its
+            whole range, and targets that are not given are the origin.
     """
 
+    rate, velocity_scale, max_steps = 10.0, 0.1, 300
     reset_options = ("joint_positions", "ee_target_pose", "randomize_start", "continue_on_success")
+    start: tuple[float, ...] = START
+    memory: Mapping[str, str] = {
+        "target": "target",
+        "elapsed": "elapsed",
+        "_held": "_held",
+        "_actions": "_actions",
+        "_continues": "_continues",
+        "_last_end": "_last_end",
+    }
 
     def __init__(
         self,
-        num_rows: int = 1,
+        num_envs: int = 1,
         *,
-        ur_model: str = DEFAULT_MODEL,
-        parity: bool = False,
-        fix_base: bool = False,
-        fix_shoulder: bool = False,
-        fix_elbow: bool = False,
-        fix_wrist_1: bool = False,
-        fix_wrist_2: bool = False,
-        fix_wrist_3: bool = True,
         restrict_wrist_1: bool = True,
-        rs_state_to_info: bool = False,
         ee_distance_threshold: float = NEAR,
         ee_target_pose: Sequence[float] | None = None,
         randomize_start: bool = False,
         continue_on_success: bool = False,
         modular: bool = False,
+        **options: Any,
     ) -> None:
         if not ee_distance_threshold > 0:
             raise InvalidValue(f"ee_distance_threshold must be above 0 m, not {ee_distance_threshold!r}.")
-        self.num_rows, self.model, self.parity, self.ends_by_itself = num_rows, model_called(ur_model), parity, parity
-        fixed = (fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3)
-        self._control = UrControl(self.model, num_rows, RATE, VELOCITY_SCALE, fixed)
-        self._near, self._tells_wire = ee_distance_threshold, rs_state_to_info
-        self._start, self._restrict = (STRAIGHT, False) if modular and parity else (START, restrict_wrist_1)
-        self.action_labels = self._control.labels("where the joint is to be", "rad", "/ its limit")
-        self.modular, self._seen = modular, self._control.free if modular else np.arange(6)  # whose actions are seen
-        told = _parity_labels(modular) if parity else _labels(self.model)
-        self.observation_labels = (*told[:-6], *(told[-6:][joint] for joint in self._seen))
-        self.action_space: spaces.Box = labelled_box(self.action_labels)
-        self.observation_space: spaces.Box = labelled_box(self.observation_labels)
-        self.target = np.zeros((num_rows, 3))
+        self.modular = modular
+        super().__init__(num_envs, **options)
+        self._near, self._restrict = ee_distance_threshold, restrict_wrist_1 and _WRIST_1 in self.control.free
+        self.target = np.zeros((num_envs, 3))
         """Where the flange is to be [m]. Shape: (n, 3)."""
-        self.elapsed = np.zeros(num_rows, dtype=np.int64)
-        """Steps since each episode began. Shape: (n,)."""
-        self._held = np.zeros((num_rows, 6))  # normalised start, where fixed joints stay
-        self._actions = np.zeros((2, num_rows, 6))  # the last one and the one before, of all joints
-        self._standing = {
+        self._held = np.zeros((num_envs, 6))  # normalised start, where fixed joints stay
+        self._actions = np.zeros((2, num_envs, 6))  # the last one and the one before, of all joints
+        self._defaults = {
             "ee_target_pose": ee_target_pose,
             "randomize_start": randomize_start,
             "continue_on_success": continue_on_success,
         }
-        self._target_option(self._standing)
-        self._continues = np.zeros(num_rows, dtype=bool)  # whether the last episode was a success, which ended ...
-        self._last_end = np.tile(START, (num_rows, 1))  # ... here
+        self._given_target(self._defaults)
+        self._continues = np.zeros(num_envs, dtype=bool)  # whether the last episode was a success, which ended ...
+        self._last_end = np.tile(START, (num_envs, 1))  # ... here
+
+    def _observation_labels(self) -> tuple[Label, ...]:
+        size, slow = f"/ {self.model.workspace_radius:g}", f"/ {self.velocity_scale:g} of its fastest"
+        actions = joint_labels("action_", "last action", "rad", "/ its limit")
+        return (
+            *(Label(f"target_d{one}", f"target as the flange sees it, {one}", "m", size, -FAR, FAR) for one in "xyz"),
+            *joint_labels("", "joint position", "rad", "/ its limit"),
+            *joint_labels("speed_", "joint velocity", "rad/s", slow, 3),
+            *(Label(f"target_{one}", f"target, {one}", "m", size, -FAR, FAR) for one in "xyz"),
+            *(Label(f"flange_{one}", f"flange, {one}", "m", size, -FAR, FAR) for one in "xyz"),
+            *(actions[joint] for joint in self._seen_actions()),
+        )
+
+    def _seen_actions(self) -> Any:
+        """The joints whose last action is observed."""
+        return self.control.free if self.modular else range(6)
 
     def sample_initial(
-        self, rows: Rows, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] | None = None
+        self, env_ids: EnvIds, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] | None = None
     ) -> Initial:
         """The start pose, or what the options say; a target in the workspace."""
-        options = self._standing | {name: value for name, value in (options or {}).items() if value is not None}
-        joints = np.tile(joint_option(options, "joint_positions", self._start, self.model), (len(rows), 1))
-        target = self._target_option(options)
-        if target is None and self.modular and self.parity:
-            target = np.zeros(3)  # robo-gym's sampler forgets the place
-        randomize = flag_option(options, "randomize_start")
-        for k, (row, rng) in enumerate(zip(rows, rngs, strict=True)):
+        options = self._defaults | {name: value for name, value in (options or {}).items() if value is not None}
+        joints = np.tile(joint_option(options, "joint_positions", self.start, self.model), (len(env_ids), 1))
+        target, randomize = self._given_target(options), flag_option(options, "randomize_start")
+        for k, (env, rng) in enumerate(zip(env_ids, rngs, strict=True)):
             if randomize:
-                low, high = self.model.joint_limits
-                joints[k] = np.clip(joints[k] + rng.uniform(-1.0, 1.0, 6) * START_OFFSET, low, high)
-            self.target[row] = workspace_point(self.model, rng) if target is None else target
+                joints[k] = np.clip(joints[k] + rng.uniform(-1.0, 1.0, 6) * START_OFFSET, *self.model.joint_limits)
+            self.target[env] = workspace_point(self.model, rng) if target is None else target
         if flag_option(options, "continue_on_success"):
-            joints = np.where(self._continues[rows, None], self._last_end[rows], joints)
-        if self.modular or not self.parity:  # else a success of any earlier episode counts
-            self._continues[rows] = False
-        seeds = np.array([rng.integers(2**63) for rng in rngs], dtype=np.int64)
-        return Initial({"joint_position": joints}, seeds)
+            joints = np.where(self._continues[env_ids, None], self._last_end[env_ids], joints)
+        self._forget_success(env_ids)
+        return self.initial(joints, rngs)
 
-    def _target_option(self, options: Mapping[str, Any]) -> Array | None:
+    def _forget_success(self, env_ids: EnvIds) -> None:
+        self._continues[env_ids] = False
+
+    def _given_target(self, options: Mapping[str, Any]) -> Array | None:
+        """The place that ``ee_target_pose`` gives [m]; None where a place is drawn. Shape: (3,)."""
         if options.get("ee_target_pose") is None:
             return None
         target = number_option(options, "ee_target_pose", (), 6)[:3]
+        self._require_reach(target)
+        return target
+
+    def _require_reach(self, target: Array) -> None:
         shape = self.model.geometry
         reach = abs(shape.a2) + abs(shape.a3) + float(np.linalg.norm([shape.d4, shape.d5, shape.d6])) + self._near
         far = float(np.linalg.norm(target - [0.0, 0.0, shape.d1]))
-        if far > reach and not self.parity:
+        if far > reach:
             raise InvalidValue(
                 f"The reset option ee_target_pose is {far:.3g} m from the shoulder of a {self.model.name}, "
                 f"which reaches {reach:.3g} m."
             )
-        return target
 
-    def on_reset(self, rows: Rows, state: RobotState) -> None:
+    def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
         """Fixed joints stay where they are measured."""
-        self._held[rows] = normalised(self.model, state.signals["joint_position"][rows])
-        self._actions[:, rows], self.elapsed[rows] = 0.0, 0
+        super().on_reset(env_ids, state)
+        self._held[env_ids] = normalised(self.model, state.signals["joint_position"][env_ids])
+        self._actions[:, env_ids] = 0.0
 
-    def observe(self, state: RobotState) -> Floats:
-        """See `observation_labels`. Shape: (n, 27) float32; (n, 21 + free joints) if `modular`."""
+    def _columns(self, state: RobotState) -> list[Array]:
         joints, velocity = state.signals["joint_position"], state.signals["joint_velocity"]
         place, axes = self.model.geometry.flange_pose(joints)
-        seen, shares = in_frame(self.target, place, axes), normalised(self.model, joints)
-        if self.parity:
-            columns = [spherical(seen), shares, velocity, self.target, place]
-            columns.append(self._actions[0 if self.modular else 1][:, self._seen])
-            return np.concatenate(columns, axis=1).astype(np.float32)
-        radius, speed = self.model.workspace_radius, VELOCITY_SCALE * self.model.max_velocity
-        columns = [seen / radius, shares, velocity / speed, self.target / radius, place / radius]
-        columns.append(self._actions[0][:, self._seen])
-        observation = np.concatenate(columns, axis=1).astype(np.float32)
-        return np.clip(observation, self.observation_space.low, self.observation_space.high)
+        radius, speed = self.model.workspace_radius, self.velocity_scale * self.model.max_velocity
+        return [
+            in_frame(self.target, place, axes) / radius,
+            normalised(self.model, joints),
+            velocity / speed,
+            self.target / radius,
+            place / radius,
+            self._actions[0][:, self._seen_actions()],
+        ]
 
     def command(self, action: Floats, state: RobotState) -> Array:
         """Joint positions [rad] on the way to the action's. Shape: (n, 6)."""
-        full = self._control.full(action, self._held)
+        full = self.control.full(action, self._held)
         self._actions = np.stack([full, self._actions[0]])
-        self.elapsed = self.elapsed + 1
-        return self._control.command(self._goal(full), state)
-
-    def _goal(self, full: Array) -> Array:
-        """Where the joints are to be [rad]. Shape: (n, 6)."""
         goal: Array = full * self.model.joint_limits[1]
-        # robo-gym maps a fixed wrist 1 too, and so moves it.
-        if self._restrict and (self.parity or _WRIST_1 in self._control.free):
+        if self._restrict:
             low, high = WRIST_1_RANGE
             goal[:, _WRIST_1] = (full[:, _WRIST_1] + 1.0) * (high - low) / 2.0 + low
-        return goal
+        return self.control.command(goal, state)
 
     def score(self, state: RobotState, action: Floats) -> Score:
-        """Nearer is better; arriving ends it, and so does a collision."""
-        joints = state.signals["joint_position"]
-        offset = self.target - self.model.geometry.tool_position(joints)
-        x, y, z = offset.T
+        """Nearer is better; arriving ends the episode, and so does a collision."""
+        self.elapsed = self.elapsed + 1
+        joints, collision = state.signals["joint_position"], collisions(state)
+        x, y, z = (self.target - self.model.geometry.tool_position(joints)).T
         distance = np.sqrt(x * x + y * y + z * z)
-        collided = collisions(state)
-        success = (distance <= self._near) & ~collided
-        late = self.elapsed >= MAX_STEPS
-        reward = np.where(collided, -1.0, np.where(success, 2.0, -0.005 * distance))
-        ended = np.where(late & (self.parity | ~success), "max_steps_exceeded", np.where(success, "success", ""))
-        status = np.where(collided, "collision", ended)
-        self._note(status == "success", joints)
-        info: dict[str, NDArray[Any]] = {
-            "distance": distance,
-            "final_status": status,
-            "target_coord": self.target.copy(),
-        }
+        success: Flags = (distance <= self._near) & ~collision
+        reward = np.where(collision, -1.0, np.where(success, 2.0, -0.005 * distance))
+        terminated, status = self.ends(collision, success, self.elapsed >= self.max_steps)
+        ended_well = status == "success"
+        self._continues = self._continues | ended_well
+        self._last_end = np.where(ended_well[:, None], joints, self._last_end)
+        info = self.info(state, distance=distance, final_status=status, target_coord=self.target.copy())
         if self.modular:
             info["dist_coord"] = distance.copy()
-        if self._tells_wire:
-            info["rs_state"] = as_objects(self.rs_state(state))
-        return Score(reward, success | collided | (late & self.parity), success, info)
-
-    def _note(self, success: NDArray[np.bool_], joints: Array) -> None:
-        """Remember where a success ended."""
-        self._continues = self._continues | success
-        self._last_end = np.where(success[:, None], joints, self._last_end)
+        return Score(reward, terminated, success, info)
 
     def rs_state(self, state: RobotState) -> list[dict[str, float]]:
-        """robo-gym's robot server state of each row: 27 named numbers."""
+        """robo-gym's wire state of each environment: 27 named numbers."""
         return wire_states(self.model, state, self.target)
 
     def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
         """The target."""
         return [(self.target[0], (0.1, 0.7, 0.3, 0.6))]
-
-    def state_dict(self) -> dict[str, Any]:
-        """The memory, as plain arrays."""
-        return {name: getattr(self, name).copy() for name in _MEMORY}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go to what `state_dict` returned."""
-        for name in _MEMORY:
-            setattr(self, name, np.array(state[name]))
-
-
-_MEMORY = ("target", "elapsed", "_held", "_actions", "_continues", "_last_end")
 
 
 def workspace_point(model: UrModel, rng: np.random.Generator) -> Array:
@@ -279,29 +234,3 @@ def workspace_point(model: UrModel, rng: np.random.Generator) -> Array:
         if across > model.workspace_inner:
             angle = 2 * np.pi * turn
             return np.array([across * np.cos(angle), across * np.sin(angle), radius * height])
-
-
-def _labels(model: UrModel) -> tuple[Label, ...]:
-    size, slow = f"/ {model.workspace_radius:g}", VELOCITY_SCALE
-    return (
-        *(Label(f"target_d{one}", f"target as the flange sees it, {one}", "m", size, -FAR, FAR) for one in "xyz"),
-        *(Label(one, "joint position", "rad", "/ its limit") for one in JOINTS),
-        *(Label(f"speed_{one}", "joint velocity", "rad/s", f"/ {slow:g} of its fastest", -3, 3) for one in JOINTS),
-        *(Label(f"target_{one}", f"target, {one}", "m", size, -FAR, FAR) for one in "xyz"),
-        *(Label(f"flange_{one}", f"flange, {one}", "m", size, -FAR, FAR) for one in "xyz"),
-        *(Label(f"action_{one}", "last action", "rad", "/ its limit") for one in JOINTS),
-    )
-
-
-def _parity_labels(modular: bool) -> tuple[Label, ...]:
-    far, (age, most) = (-np.inf, np.inf), ("last action", 1.0) if modular else ("the action before the last one", 1.01)
-    return (
-        Label("target_r", "target as the flange sees it, distance", "m", "1", *far),
-        Label("target_polar", "target as the flange sees it, angle from its axis", "rad", "1", *far),
-        Label("target_azimuth", "target as the flange sees it, angle about its axis", "rad", "1", *far),
-        *(Label(one, "joint position", "rad", "/ its limit", -1.1, 1.1) for one in JOINTS),
-        *(Label(f"speed_{one}", "joint velocity", "rad/s", "1", *far) for one in JOINTS),
-        *(Label(f"target_{one}", f"target, {one}", "m", "1", *far) for one in "xyz"),
-        *(Label(f"flange_{one}", f"flange, {one}", "m", "1", *far) for one in "xyz"),
-        *(Label(f"action_{one}", age, "rad", "/ its limit", -most, most) for one in JOINTS),
-    )

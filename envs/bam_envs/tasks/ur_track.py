@@ -1,23 +1,35 @@
-"""Track: follow a recorded joint trajectory and make way for an obstacle that flies about."""
+"""Track: follow a recorded joint trajectory and make way for an obstacle that flies about.
+
+The trajectory is segments of waypoints 1/20 s apart, in a JSON file of robo-gym's form:
+``{"trajectory": [[[base, shoulder, elbow, wrist 1, wrist 2, wrist 3], ...], ...]}``: segments, waypoints, joints [rad].
+"""
 
 from __future__ import annotations
 
+import json
+import stat
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
-from types import MappingProxyType
+from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bam_envs.core.robot import Initial, RobotState, Rows
+from bam_envs.core.errors import InvalidValue
+from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.splines import splines_through
-from bam_envs.core.task import Array, Floats, Label, Score
+from bam_envs.core.task import Array, Flags, Floats, Label, Score
 from bam_envs.robots.physics.obstacles import PATH_POINTS
-from bam_envs.robots.ur import DEFAULT_MODEL
-from bam_envs.tasks.joint_trajectory import load_trajectory
-from bam_envs.tasks.ur_control import normalised
-from bam_envs.tasks.ur_obstacle import ObstacleSense, UrObstacleTask, joint_labels
+from bam_envs.tasks.ur_arm import joint_labels, normalised
+from bam_envs.tasks.ur_avoidance import COLLISION, UrObstacleTask
 
+RECORDED = "ur_track.json"
+"""The trajectory that is shipped; ``scripts/make_ur_track.py`` makes it."""
+_MOST_BYTES = 2**24
+"""Size of a file at most: which file it is may come from a stranger's checkpoint."""
 NEAREST = 0.45
 """Distance of the obstacle from flange or elbow that costs [m]."""
 RAPID = 0.4
@@ -28,8 +40,6 @@ ARRIVED = 0.1
 """A waypoint at the end of a segment is reached with every joint within this [rad]."""
 BONUS = 0.05
 """Reward of reaching it."""
-COLLISION = -0.1
-"""Reward of a collision."""
 AREA = np.array([[-1.0, -1.0, 0.1], [1.0, 1.0, 1.0]])
 """Where the points of the obstacle's paths are: lowest and highest x, y, z [m]."""
 AXIS, BASE = 0.2, 0.35
@@ -98,101 +108,77 @@ class UrTrackTask(UrObstacleTask):
         elbow, the nearer one [m], `rs_state` where it is asked for, and at the end `final_status`: "success" or
         "collision".
 
-    With ``parity=True`` nothing is scaled, the end of a segment is worth nothing and is counted one step later, the
-    arm starts at the first waypoint whatever the reset option says, and 1000 steps terminate, as in robo-gym. The
-    trajectory is still this package's own; ``trajectory`` names robo-gym's.
-
     Args:
-        num_rows: How many robots are scored together.
-        ur_model: ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e.
-        parity: robo-gym's arithmetic, with its bugs and without scaling.
-        fix_base: Take the joint out of the action; so do the other five.
-        fix_shoulder: See above.
-        fix_elbow: See above.
-        fix_wrist_1: See above.
-        fix_wrist_2: See above.
-        fix_wrist_3: See above.
         include_polar_to_elbow: Whether the observation has the obstacle seen from the elbow, or zeros.
-        fixed_object_position: Where the obstacle stays in every episode [m].
-        rs_state_to_info: Whether infos have robo-gym's wire state.
-        trajectory: A JSON file with another trajectory, in robo-gym's form; see `bam_envs.tasks.joint_trajectory`.
+        trajectory: A JSON file with another trajectory, in robo-gym's form.
             robo-gym's own, up to 0.67 rad from the default, is ``trajectory_raad_2022.json`` in its package.
         fixed_paths: For tests of policies: the obstacle is on one of 50 paths that are always the same, and faster
-            (40 s once around). Which one is drawn; with ``parity`` they come one after the other.
+            (40 s once around). Which one is drawn; with ``parity=True`` they come one after the other.
     """
+
+    memory: Mapping[str, str] = {
+        **UrObstacleTask.memory,
+        "segment": "segment",
+        "step_in_segment": "step_in_segment",
+        "waits": "waits",
+        "targets_reached": "targets_reached",
+        "episodes": "_episodes",
+    }
 
     def __init__(
         self,
-        num_rows: int = 1,
+        num_envs: int = 1,
         *,
-        ur_model: str = DEFAULT_MODEL,
-        parity: bool = False,
-        fix_base: bool = False,
-        fix_shoulder: bool = False,
-        fix_elbow: bool = False,
-        fix_wrist_1: bool = False,
-        fix_wrist_2: bool = False,
-        fix_wrist_3: bool = True,
         include_polar_to_elbow: bool = True,
-        fixed_object_position: Sequence[float] | None = None,
-        rs_state_to_info: bool = False,
         trajectory: str | None = None,
         fixed_paths: bool = False,
+        **options: Any,
     ) -> None:
-        super().__init__(
-            num_rows,
-            (fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3),
-            ur_model=ur_model,
-            parity=parity,
-            include_polar_to_elbow=include_polar_to_elbow,
-            fixed_object_position=fixed_object_position,
-            rs_state_to_info=rs_state_to_info,
-        )
+        super().__init__(num_envs, include_polar_to_elbow=include_polar_to_elbow, **options)
         self.trajectory = load_trajectory(trajectory, self.model.joint_limits)
         self.fixed_paths = fixed_paths
-        self.segment, self.step_in_segment = np.zeros(num_rows, dtype=np.int64), np.zeros(num_rows, dtype=np.int64)
+        self.segment, self.step_in_segment = np.zeros(num_envs, dtype=np.int64), np.zeros(num_envs, dtype=np.int64)
         """Which segment is followed, and how many steps of it have been. Shape: (n,)."""
-        self.waits = np.zeros(num_rows, dtype=bool)
+        self.waits = np.zeros(num_envs, dtype=bool)
         """Whether the reference is a segment's last waypoint, waiting for the arm. Shape: (n,)."""
-        self.targets_reached = np.zeros(num_rows, dtype=np.int64)
+        self.targets_reached = np.zeros(num_envs, dtype=np.int64)
         """Ends of segments that were reached. Shape: (n,)."""
-        self._episodes = np.zeros(num_rows, dtype=np.int64)
+        self._episodes = np.zeros(num_envs, dtype=np.int64)
 
-    def _labels(self) -> tuple[Label, ...]:
-        bound = 1.1 if self.parity else 1.0
+    def _observation_labels(self) -> tuple[Label, ...]:
+        return (*super()._observation_labels(), *self._waypoint_labels())
+
+    def _waypoint_labels(self, bound: float = 1.0) -> tuple[Label, ...]:
         waits = Label("waits", "1 while the last waypoint of a segment waits for the arm", "1", low=0.0)
-        return (*super()._labels(), *joint_labels("to_", "the waypoint", "/ joint limit", bound), waits)
+        return (*joint_labels("to_", "the waypoint", "rad", "/ joint limit", bound), waits)
 
     def sample_initial(
-        self, rows: Rows, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] = MappingProxyType({})
+        self, env_ids: EnvIds, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] | None = None
     ) -> Initial:
         """The first waypoint, and an obstacle on a path or staying."""
-        self._episodes[rows] += 1
-        self.segment[rows] = self.step_in_segment[rows] = self.targets_reached[rows] = 0
-        self.reference[rows], self.waits[rows] = self.trajectory.waypoints[0, 0], False
-        joints, place = self.begin_rows(rows, options, self.trajectory.waypoints[0, 0])
-        if self.parity:
-            joints = self.reference[rows]
-        obstacle = self._paths(rows, rngs) if place is None else {"obstacle_position": place}
-        seeds = np.array([rng.integers(2**63) for rng in rngs], dtype=np.int64)
-        return Initial({"joint_position": joints, **obstacle}, seeds)
+        self._episodes[env_ids] += 1
+        self.segment[env_ids] = self.step_in_segment[env_ids] = self.targets_reached[env_ids] = 0
+        self.reference[env_ids], self.waits[env_ids] = self.trajectory.waypoints[0, 0], False
+        joints, place = self.begin(env_ids, options or {}, self.trajectory.waypoints[0, 0])
+        obstacle = self._paths(env_ids, rngs) if place is None else {"obstacle_position": place}
+        return self.initial(joints, rngs, **obstacle)
 
-    def _paths(self, rows: Rows, rngs: Sequence[np.random.Generator]) -> dict[str, Array]:
+    def _paths(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> dict[str, Array]:
         if self.fixed_paths:
-            numbers = self._episodes[rows] if self.parity else [rng.integers(FIXED_PATHS) for rng in rngs]
-            paths = [fixed_path(int(number) % FIXED_PATHS) for number in numbers]
+            paths = [fixed_path(number) for number in self._path_numbers(env_ids, rngs)]
             samples = [FIXED_AROUND] * len(paths)
         else:
             samples = [int(rng.uniform(*AROUND)) for rng in rngs]
             paths = [draw_path(rng, around) for rng, around in zip(rngs, samples, strict=True)]
         return {"obstacle_path": np.stack(paths), "obstacle_samples": np.array(samples, dtype=np.float64)}
 
-    def on_reset(self, rows: Rows, state: RobotState) -> None:
-        """The reference is the first waypoint, wherever exactly the arm is."""
+    def _path_numbers(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> list[int]:
+        """Which of the fixed paths the obstacles are on."""
+        return [int(rng.integers(FIXED_PATHS)) for rng in rngs]
 
-    def _columns(self, sense: ObstacleSense) -> list[Array]:
+    def _columns(self, state: RobotState) -> list[Array]:
         waits = self.waits[:, None].astype(np.float64)
-        return [*super()._columns(sense), normalised(self.model, self.reference), waits]
+        return [*super()._columns(state), normalised(self.model, self.reference), waits]
 
     def command(self, action: Floats, state: RobotState) -> Array:
         """One period on the way to the next waypoint plus `action` [rad]. Shape: (n, 6)."""
@@ -202,46 +188,112 @@ class UrTrackTask(UrObstacleTask):
 
     def score(self, state: RobotState, action: Floats) -> Score:
         """Following closely, acting little and smoothly, away from the obstacle."""
-        sense = self.sense(state)
-        offset = self.offset(sense)
-        if self.parity:
-            offset = offset.astype(np.float32).astype(np.float64)  # robo-gym reads it from its observation
-        off = np.abs(offset)
-        near = np.minimum(sense.tool[:, 0], sense.elbow[:, 0]) < NEAREST
-        reward = np.where(off < CLOSE, 1 - off / CLOSE, 0.0).sum(axis=1) / 6000 - 0.002 * near
-        reward = reward + self.effort(action, weight=1.5, rapid=RAPID)
-        counted = self.targets_reached
-        reached = self._advance(state)
-        collision, arrived = self.ends(state)
-        if not self.parity:
-            reward, counted = reward + BONUS * reached, self.targets_reached
-        reward = np.where(collision, COLLISION, reward)
-        info = self.info(state, collision, arrived) | {"targets_reached": counted.copy()}
-        return Score(reward, collision | arrived if self.parity else collision, arrived, info)
+        reward = self._following(state, self.offset(state), action) + BONUS * self._advance(state)
+        return self.scored(state, reward, COLLISION, targets_reached=self.targets_reached.copy())
 
-    def _advance(self, state: RobotState) -> Any:
-        """Go on to the next segment where the arm is at the end of one; which rows. Shape: (n,) bool."""
+    def _following(self, state: RobotState, offset: Array, action: Floats) -> Array:
+        """Reward without that of the end of a segment. Shape: (n,)."""
+        off = np.abs(offset)
+        reward = np.where(off < CLOSE, 1 - off / CLOSE, 0.0).sum(axis=1) / 6000
+        reward = reward - 0.002 * (self.sense(state).nearest < NEAREST)
+        following: Array = reward + self.effort(action, weight=1.5, rapid=RAPID)
+        return following
+
+    def _advance(self, state: RobotState) -> Flags:
+        """Go on to the next segment where the arm is at the end of one; which environments. Shape: (n,)."""
         joints = state.signals["joint_position"]
         near = np.abs(self.reference - joints) <= ARRIVED + 1e-5 * np.abs(joints)  # as NumPy's isclose has it
-        reached = self.waits & near.all(axis=1)
+        reached: Flags = self.waits & near.all(axis=1)
         self.segment = np.where(reached, (self.segment + 1) % len(self.trajectory.lengths), self.segment)
         self.step_in_segment = np.where(reached, 0, self.step_in_segment)
         self.targets_reached = self.targets_reached + reached
         return reached
 
-    def state_dict(self) -> dict[str, Any]:
-        """The memory, as plain arrays."""
-        return super().state_dict() | {
-            "segment": self.segment.copy(),
-            "step_in_segment": self.step_in_segment.copy(),
-            "waits": self.waits.copy(),
-            "targets_reached": self.targets_reached.copy(),
-            "episodes": self._episodes.copy(),
-        }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go to what `state_dict` returned."""
-        super().load_state_dict(state)
-        self.segment, self.step_in_segment = np.array(state["segment"]), np.array(state["step_in_segment"])
-        self.waits, self.targets_reached = np.array(state["waits"]), np.array(state["targets_reached"])
-        self._episodes = np.array(state["episodes"])
+@dataclass(frozen=True)
+class JointTrajectory:
+    """Segments of waypoints; after the last segment comes the first."""
+
+    waypoints: Array
+    """Joint positions [rad]; short segments are filled up with their last waypoint. Shape: (segments, longest, 6)."""
+    lengths: EnvIds
+    """Waypoints of each segment. Shape: (segments,)."""
+
+    def at(self, segment: EnvIds, step: EnvIds) -> tuple[Array, NDArray[np.bool_]]:
+        """Waypoints, and whether they wait at the end of their segment. Shapes: (n,) each -> (n, 6), (n,)."""
+        end = step >= self.lengths[segment]
+        return self.waypoints[segment, np.minimum(step, self.lengths[segment] - 1)], end
+
+
+def load_trajectory(file: str | Path | None, limits: Array) -> JointTrajectory:
+    """The trajectory in `file`, or the shipped one.
+
+    Args:
+        file: A JSON file of robo-gym's form.
+        limits: Lowest and highest joint positions [rad]. Shape: (2, 6).
+
+    Raises:
+        InvalidValue: There is no such file, or no trajectory of six joints inside their limits in it.
+    """
+    if not isinstance(file, (str, Path, type(None))):
+        raise InvalidValue(f"The trajectory must be the path of a JSON file, not {file!r}.")
+    segments = _shipped() if file is None else _read(Path(file).expanduser())
+    for number, segment in enumerate(segments):
+        outside = (segment < limits[0]) | (segment > limits[1])
+        if outside.any():
+            step, joint = np.argwhere(outside)[0]
+            raise InvalidValue(
+                f"Segment {number} of the trajectory has joint {joint} at {segment[step, joint]:g} rad in waypoint "
+                f"{step}; expected {limits[0, joint]:g} to {limits[1, joint]:g}."
+            )
+    longest = max(len(segment) for segment in segments)
+    filled = [np.pad(one, ((0, longest - len(one)), (0, 0)), mode="edge") for one in segments]
+    return JointTrajectory(np.stack(filled), np.array([len(one) for one in segments], dtype=np.int64))
+
+
+@lru_cache(maxsize=1)
+def _shipped() -> list[Array]:
+    text = (resources.files("bam_envs.tasks") / "data" / RECORDED).read_text(encoding="utf-8")
+    return _segments(json.loads(text), RECORDED)
+
+
+def _read(file: Path) -> list[Array]:
+    try:
+        text = _bounded(file)
+    except OSError as error:
+        raise InvalidValue(f"The trajectory {file} cannot be read: {error.strerror}.") from error
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InvalidValue(f"The trajectory {file} is not JSON: {error}.") from error
+    return _segments(content, str(file))
+
+
+def _bounded(file: Path) -> bytes:
+    found = file.stat()
+    if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):  # reading a folder fails by itself
+        raise InvalidValue(f"The trajectory {file} is no plain file; expected one in JSON.")
+    if found.st_size > _MOST_BYTES:
+        raise InvalidValue(f"The trajectory {file} has {found.st_size} bytes, expected at most {_MOST_BYTES}.")
+    return file.read_bytes()
+
+
+def _segments(content: Any, name: str) -> list[Array]:
+    segments = content.get("trajectory") if isinstance(content, dict) else None
+    if not isinstance(segments, list) or not segments:
+        raise InvalidValue(f'The trajectory {name} has no list of segments under the key "trajectory".')
+    return [
+        _segment(waypoints, f"Segment {number} of the trajectory {name}") for number, waypoints in enumerate(segments)
+    ]
+
+
+def _segment(waypoints: Any, what: str) -> Array:
+    try:
+        array = np.array(waypoints, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InvalidValue(f"{what} is not a list of waypoints of six numbers each.") from error
+    if array.ndim != 2 or array.shape[1] != 6 or len(array) == 0:
+        raise InvalidValue(f"{what} must have shape (waypoints, 6), not {array.shape}.")
+    if not np.isfinite(array).all():
+        raise InvalidValue(f"{what} must be finite numbers.")
+    return array

@@ -9,8 +9,8 @@
             return MyRobot(num_robots)
 
     class TestMyTask(TaskContract):
-        def make(self, num_rows):
-            return MyTask(num_rows)
+        def make(self, num_envs):
+            return MyTask(num_envs)
 
     class TestMyTransport(TransportContract):
         def make(self, env):

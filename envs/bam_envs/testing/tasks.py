@@ -33,9 +33,9 @@ class TaskContract:
     steps = 60
     """How long each test runs."""
 
-    def make(self, num_rows: int) -> Task:
-        """Hook: a task for `num_rows` robots."""
-        raise NotImplementedError("Override make(num_rows) to return the task under test.")
+    def make(self, num_envs: int) -> Task:
+        """Hook: a task for `num_envs` robots."""
+        raise NotImplementedError("Override make(num_envs) to return the task under test.")
 
     def make_robot(self, num_robots: int) -> Robot:
         """Hook: robots for the task."""
@@ -46,18 +46,18 @@ class TaskContract:
         return GEOMETRY.tool_position(joints)
 
     @contextmanager
-    def running(self, num_rows: int = 1, seed: int = 0) -> Iterator[tuple[Task, Robot, RobotState]]:
+    def running(self, num_envs: int = 1, seed: int = 0) -> Iterator[tuple[Task, Robot, RobotState]]:
         """A task at the start of an episode, its robot and the state; row i is seeded ``seed + i``."""
-        task, robot = self.make(num_rows), self.make_robot(num_rows)
+        task, robot = self.make(num_envs), self.make_robot(num_envs)
         try:
             robot.connect()
-            yield task, robot, _start(task, robot, np.arange(num_rows), seed)
+            yield task, robot, _start(task, robot, np.arange(num_envs), seed)
         finally:
             robot.close()
 
     def actions(self, task: Task, first: int = 0) -> Iterator[NDArray[np.float32]]:
         """Actions of rows `first` and on. Shape: (n, a) each."""
-        rows = [self.actions_of_row(task, first + row) for row in range(task.num_rows)]
+        rows = [self.actions_of_row(task, first + row) for row in range(task.num_envs)]
         return map(np.stack, zip(*rows, strict=True))
 
     def actions_of_row(self, task: Task, row: int) -> Iterator[NDArray[np.float32]]:
@@ -73,7 +73,7 @@ class TaskContract:
         """One-dimensional float32 boxes; names differ; the limits are those of the labels."""
         task = self.make(2)
         assert isinstance(task, Task), f"{type(task).__name__} lacks a member of the Task protocol"
-        assert task.num_rows == 2
+        assert task.num_envs == 2
         for space, labels in (
             (task.observation_space, task.observation_labels),
             (task.action_space, task.action_labels),
@@ -151,10 +151,10 @@ class TaskContract:
             for together, alone in zip(many, self._record(1, first=row), strict=True):
                 np.testing.assert_array_equal(together[row], alone[0])
 
-    def _record(self, num_rows: int, first: int) -> list[NDArray[Any]]:
-        """Everything that `num_rows` rows say in an episode; row k has the seed and the actions of ``first + k``."""
+    def _record(self, num_envs: int, first: int) -> list[NDArray[Any]]:
+        """Everything that `num_envs` rows say in an episode; row k has the seed and the actions of ``first + k``."""
         said: list[NDArray[Any]] = []
-        with self.running(num_rows, seed=first) as (task, robot, state):
+        with self.running(num_envs, seed=first) as (task, robot, state):
             for action in self.actions(task, first):
                 command = task.command(action, state)
                 state = robot.step(command)
@@ -241,13 +241,13 @@ def _check_command(robot: Robot, command: Array) -> None:
 
 def _check_observation(task: Task, observation: NDArray[np.float32]) -> None:
     assert observation.dtype == np.float32
-    assert observation.shape == (task.num_rows, *task.observation_space.shape)
+    assert observation.shape == (task.num_envs, *task.observation_space.shape)
     for row in observation:
         assert task.observation_space.contains(row), f"not in the space: {row.tolist()}"
 
 
 def _check_score(task: Task, score: Score) -> None:
-    n = task.num_rows
+    n = task.num_envs
     assert score.reward.shape == score.terminated.shape == score.success.shape == (n,)
     assert score.reward.dtype == np.float64
     assert np.isfinite(score.reward).all()

@@ -31,7 +31,7 @@ def test_the_table():
 def test_every_row_makes_what_it_says(env_id):
     entry = ENVIRONMENTS[env_id]
     robot, task = resolve(entry.robot)(2), resolve(entry.task)(2)
-    assert robot.num_robots == task.num_rows == 2
+    assert robot.num_robots == task.num_envs == 2
     assert robot.spec.period == entry.period
 
 

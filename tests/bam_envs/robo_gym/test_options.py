@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue, UnknownName
-from bam_envs.robo_gym import notices, options
+from bam_envs.robo_gym import options
 from bam_envs.robo_gym.table import ROBO_GYM
 
 SIM, ROB = ROBO_GYM["EndEffectorPositioningURSim-v0"], ROBO_GYM["EndEffectorPositioningURRob-v0"]
@@ -16,10 +16,10 @@ DEFAULTS = {"ur_model": "ur5", "rs_state_to_info": True}
 @pytest.fixture(autouse=True)
 def told(caplog):
     """What is said, from a process that has said nothing."""
-    notices.forget()
+    options.forget()
     caplog.set_level(logging.WARNING)
     yield lambda: [record.getMessage() for record in caplog.records]
-    notices.forget()
+    options.forget()
 
 
 def test_defaults_are_robo_gyms_and_say_nothing(told):

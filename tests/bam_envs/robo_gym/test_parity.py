@@ -303,7 +303,7 @@ def test_ends_that_come_together(stem, collided, arrived, last):
     task, theirs = both.env.task, both.theirs
     if last:
         theirs.elapsed_steps = theirs.max_episode_steps - 1
-        (task.elapsed if hasattr(task, "elapsed") else task.steps)[:] = theirs.elapsed_steps
+        task.elapsed[:] = theirs.elapsed_steps
     state = replace(both.env.last_state, truth={"collision": np.array([collided])})
     if arrived and hasattr(task, "target"):
         there = state.signals["base_pose"] if not both.is_arm else task.model.geometry.flange_pose(both.joints)[0]

@@ -55,8 +55,8 @@ import sys, bam_envs
 print(sorted(name for name in sys.modules if name.startswith("bam_envs.")))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    modules = ["bam_envs.core.errors", "bam_envs.core.registry", "bam_envs.robo_gym", "bam_envs.robo_gym.table"]
-    assert done.stdout.strip() == str(modules)
+    modules = [f"bam_envs.core.{name}" for name in ("env_options", "errors", "registry", "wording")]
+    assert done.stdout.strip() == str(["bam_envs.core", *modules, "bam_envs.robo_gym", "bam_envs.robo_gym.table"])
 
 
 def test_two_names_of_one_environment_are_the_same():

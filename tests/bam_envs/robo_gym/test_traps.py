@@ -4,8 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from bam_envs.robo_gym.parity_bases import BEAMS
 from bam_envs.robots.ur import ur_model
-from bam_envs.tasks.mir100_avoidance import BEAMS
 
 STAY = np.zeros(5, np.float32)
 

@@ -13,8 +13,9 @@ from bam_envs.core.kinematics import UR10, quaternions
 from bam_envs.core.robot import RobotState
 from bam_envs.robots.physics.ur import isaac_arm
 from bam_envs.robots.ur import ur_model
-from bam_envs.tasks.isaac_reach import DEFAULT, EE_LINK, TOOL1, IsaacReachTask
+from bam_envs.tasks.isaac_reach import DEFAULT, EE_LINK, TOOL1
 from bam_envs.testing import TaskContract
+from tests.bam_envs.making import make_task
 
 ROW = np.zeros(1, np.int64)
 H = math.sqrt(0.5)
@@ -25,8 +26,8 @@ QUIET = np.zeros((1, 6), np.float32)
 class IsaacReach(TaskContract):
     options = {}  # noqa: RUF012
 
-    def make(self, num_rows):
-        return IsaacReachTask(num_rows, **self.options)
+    def make(self, num_envs):
+        return make_task("bam/isaac-reach-v0", num_envs, **self.options)
 
     def make_robot(self, num_robots):
         return isaac_arm(num_robots)
@@ -62,7 +63,7 @@ class TestIsaacReachParity(IsaacReach):
 
 
 def began(options=None, **arguments):
-    task = IsaacReachTask(**arguments)
+    task = make_task("bam/isaac-reach-v0", **arguments)
     task.initial = task.sample_initial(ROW, [np.random.default_rng(0)], options or {})
     return task
 
@@ -116,7 +117,7 @@ def test_with_parity_the_frame_is_robo_gyms():
 
 
 def test_targets():
-    task = IsaacReachTask(200)
+    task = make_task("bam/isaac-reach-v0", 200)
     task.sample_initial(np.arange(200), [np.random.default_rng(seed) for seed in range(200)])
     for axis, low, high in ((0, 0.35, 0.65), (1, -0.2, 0.2), (2, 0.15, 0.5)):
         values = task.target[:, axis]
@@ -179,7 +180,7 @@ def test_an_arrival_in_the_last_step():
     """robo-gym pays for it, and says that the time is over."""
     for parity, status in ((False, "success"), (True, "max_steps_exceeded")):
         task = began({"ee_target_pose": facing(DEFAULT, parity=parity)}, parity=parity)
-        task.steps[:] = 599
+        task.elapsed[:] = 599
         score = task.score(state(DEFAULT), QUIET)
         assert (score.reward[0], score.terminated[0], score.success[0]) == (2.0, True, True)
         assert score.info["final_status"][0] == status
@@ -223,7 +224,7 @@ def test_it_goes_on_from_where_it_ended():
             ({}, {"collision": True}, DEFAULT),
             ({"continue_except_collision": False}, {}, DEFAULT),
         ):
-            task = IsaacReachTask(parity=parity, **options)
+            task = make_task("bam/isaac-reach-v0", parity=parity, **options)
             first = task.sample_initial(ROW, [rng], {"ee_target_pose": facing(ended, parity=parity)}).signals[
                 "joint_position"
             ]
@@ -234,7 +235,7 @@ def test_it_goes_on_from_where_it_ended():
 
 
 def test_it_does_not_go_on_from_an_episode_that_was_broken_off():
-    task, rng = IsaacReachTask(), np.random.default_rng(0)
+    task, rng = make_task("bam/isaac-reach-v0"), np.random.default_rng(0)
     task.sample_initial(ROW, [rng], {"ee_target_pose": facing(DEFAULT, 0.1)})
     task.score(state(np.array(DEFAULT) + 0.1), QUIET)
     np.testing.assert_array_equal(task.sample_initial(ROW, [rng]).signals["joint_position"][0], DEFAULT)
@@ -256,11 +257,11 @@ def test_a_seed_and_an_option_say_where_it_starts(make):
 
 
 def test_saved_memory_goes_on_from_where_it_ended():
-    task, rng = IsaacReachTask(), np.random.default_rng(0)
+    task, rng = make_task("bam/isaac-reach-v0"), np.random.default_rng(0)
     ended = np.array(DEFAULT) + 0.1
     task.sample_initial(ROW, [rng], {"ee_target_pose": facing(ended)})
     task.score(state(ended), QUIET)
-    other = IsaacReachTask()
+    other = make_task("bam/isaac-reach-v0")
     other.load_state_dict(task.state_dict())
     np.testing.assert_array_equal(
         other.sample_initial(ROW, [np.random.default_rng(1)]).signals["joint_position"][0], ended
@@ -278,10 +279,10 @@ def test_options():
             began(options)
         assert str(caught.value).startswith(text)
     with pytest.raises(InvalidValue) as caught:
-        IsaacReachTask(isaac_scale=0.0)
+        make_task("bam/isaac-reach-v0", isaac_scale=0.0)
     assert str(caught.value) == "isaac_scale must be a joint angle above 0 rad, not 0.0."
     with pytest.raises(UnknownName, match="Did you mean 'ur10'"):
-        IsaacReachTask(ur_model="ur100")
+        make_task("bam/isaac-reach-v0", ur_model="ur100")
 
 
 def test_wire_states():
@@ -327,19 +328,22 @@ def test_what_counts_as_success():
         ({"ee_rotation_threshold": 0.2}, True),
         ({"ee_rotation_threshold": 0.09}, False),
     ):
-        task = IsaacReachTask(**options)
+        task = make_task("bam/isaac-reach-v0", **options)
         task.sample_initial(ROW, [np.random.default_rng(0)], given)
         assert task.score(state(near), QUIET).success[0] == success
     for options, success in (({}, False), ({"ee_distance_threshold": 0.11}, True)):
-        task = IsaacReachTask(**options)
+        task = make_task("bam/isaac-reach-v0", **options)
         task.sample_initial(ROW, [np.random.default_rng(0)], {"ee_target_pose": facing(DEFAULT, 0.1)})
         assert task.score(state(np.array(DEFAULT)), QUIET).success[0] == success
     with pytest.raises(InvalidValue, match="ee_rotation_threshold must be above 0 rad, not 0"):
-        IsaacReachTask(ee_rotation_threshold=0)
+        make_task("bam/isaac-reach-v0", ee_rotation_threshold=0)
 
 
 def test_a_target_may_stand():
-    task, pose = IsaacReachTask(2, ee_target_pose=[0.5, 0.1, 0.3, 0.0, math.pi / 2, 1.0]), [0.4, 0.0, 0.2, 0, 0, 0]
+    task, pose = (
+        make_task("bam/isaac-reach-v0", 2, ee_target_pose=[0.5, 0.1, 0.3, 0.0, math.pi / 2, 1.0]),
+        [0.4, 0.0, 0.2, 0, 0, 0],
+    )
     rows, rngs = np.arange(2), [np.random.default_rng(seed) for seed in (0, 1)]
     task.sample_initial(rows, rngs)
     np.testing.assert_array_equal(task.target, [[0.5, 0.1, 0.3]] * 2)
@@ -348,4 +352,4 @@ def test_a_target_may_stand():
     task.sample_initial(rows, rngs, {"ee_target_pose": None})
     np.testing.assert_array_equal(task.target, [[0.5, 0.1, 0.3]] * 2)
     with pytest.raises(InvalidValue, match="ee_target_pose must be 6 finite numbers"):
-        IsaacReachTask(ee_target_pose=[1, 2, 3])
+        make_task("bam/isaac-reach-v0", ee_target_pose=[1, 2, 3])

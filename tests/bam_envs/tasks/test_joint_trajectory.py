@@ -11,7 +11,7 @@ import pytest
 from bam_envs.core.errors import InvalidValue
 from bam_envs.robots.physics.contacts import ArmContacts
 from bam_envs.robots.ur import UR_MODELS, ur_model
-from bam_envs.tasks.joint_trajectory import load_trajectory
+from bam_envs.tasks.ur_track import load_trajectory
 
 ROOT = Path(__file__).parents[3]
 LIMITS = ur_model("ur5").joint_limits

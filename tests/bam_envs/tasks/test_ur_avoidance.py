@@ -12,8 +12,9 @@ from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot import RobotState
 from bam_envs.robots.physics.ur import obstacle_arm
 from bam_envs.robots.ur import START, ur_model
-from bam_envs.tasks.ur_avoidance import POSE, UrAvoidanceTask
+from bam_envs.tasks.ur_avoidance import POSE
 from bam_envs.testing import TaskContract
+from tests.bam_envs.making import make_task
 
 ROW = np.zeros(1, np.int64)
 UR5 = ur_model("ur5").geometry
@@ -25,8 +26,8 @@ LIMITS = np.array([2 * math.pi, 2 * math.pi, math.pi, 2 * math.pi, 2 * math.pi, 
 class Avoidance(TaskContract):
     options = {}  # noqa: RUF012
 
-    def make(self, num_rows):
-        return UrAvoidanceTask(num_rows, **self.options)
+    def make(self, num_envs):
+        return make_task("bam/ur-avoidance-v0", num_envs, **self.options)
 
     def make_robot(self, num_robots):
         return obstacle_arm(num_robots, ur_model=self.options.get("ur_model", "ur5"))
@@ -54,7 +55,7 @@ class TestAvoidanceOfAStillObstacle(Avoidance):
 
 def began(options=None, **arguments):
     """A task at the start of an episode, and what it began with."""
-    task = UrAvoidanceTask(**arguments)
+    task = make_task("bam/ur-avoidance-v0", **arguments)
     initial = task.sample_initial(ROW, [np.random.default_rng(0)], options or {})
     return task, initial
 
@@ -83,7 +84,7 @@ def test_where_it_starts():
 
 
 def test_how_the_obstacle_is_drawn():
-    task = UrAvoidanceTask(200)
+    task = make_task("bam/ur-avoidance-v0", 200)
     initial = task.sample_initial(np.arange(200), [np.random.default_rng(seed) for seed in range(200)])
     amplitude, frequency = initial.signals["obstacle_wave"].T
     middle = initial.signals["obstacle_position"]
@@ -221,7 +222,7 @@ def test_fixed_joints_go_back_to_the_pose():
 
 
 def test_options():
-    assert UrAvoidanceTask(fix_wrist_3=False).action_space.shape == (6,)
+    assert make_task("bam/ur-avoidance-v0", fix_wrist_3=False).action_space.shape == (6,)
     for options, text in (
         ({"joint_positions": [0.0] * 5}, "The reset option joint_positions must be 6 finite numbers, not [0.0, "),
         (
@@ -234,11 +235,13 @@ def test_options():
             began(options)
         assert str(caught.value).startswith(text)
     with pytest.raises(InvalidValue, match="At least one of the six joints must be free"):
-        UrAvoidanceTask(fix_base=True, fix_shoulder=True, fix_elbow=True, fix_wrist_1=True, fix_wrist_2=True)
+        make_task(
+            "bam/ur-avoidance-v0", fix_base=True, fix_shoulder=True, fix_elbow=True, fix_wrist_1=True, fix_wrist_2=True
+        )
     with pytest.raises(UnknownName, match="Did you mean 'ur5'"):
-        UrAvoidanceTask(ur_model="urr5")
+        make_task("bam/ur-avoidance-v0", ur_model="urr5")
     with pytest.raises(InvalidValue, match=r"^The option fixed_object_position must be 3 finite numbers, not 'here'"):
-        UrAvoidanceTask(fixed_object_position="here")
+        make_task("bam/ur-avoidance-v0", fixed_object_position="here")
 
 
 def test_wire_states():

@@ -6,8 +6,7 @@ import pytest
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import RobotState
 from bam_envs.robots.ur import UR_MODELS
-from bam_envs.tasks.ur_control import (
-    FIX_OPTIONS,
+from bam_envs.tasks.ur_arm import (
     UrControl,
     collisions,
     flag_option,
@@ -73,7 +72,6 @@ def test_commands_stay_inside_the_limits():
 def test_fixed_joints_are_not_in_the_action():
     control = UrControl(UR5, 2, 10.0, 0.1, (True, False, False, False, False, True))
     assert control.free.tolist() == [1, 2, 3, 4]
-    assert control.fixed.tolist() == [0, 5]
     action = np.array([[0.1, 0.2, -0.3, 7.0], [0, 0, 0, -7.0]], np.float32)
     held = np.full((2, 6), 0.5)
     expected = np.array([[0.5, 0.1, 0.2, -0.3, 1.0, 0.5], [0.5, 0, 0, 0, -1.0, 0.5]])
@@ -88,7 +86,6 @@ def test_not_all_joints_can_be_fixed():
     assert str(caught.value) == (
         "At least one of the six joints must be free to move: set one of the fix_ options False."
     )
-    assert list(FIX_OPTIONS.values()) == [False] * 5 + [True]
 
 
 def test_joints_as_shares_of_their_limits():

@@ -7,7 +7,8 @@ from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot import RobotState
 from bam_envs.robots.ur import START as STRAIGHT
 from bam_envs.robots.ur import UR_MODELS
-from bam_envs.tasks.ur_reach import START, UrReachTask, workspace_point
+from bam_envs.tasks.ur_reach import START, workspace_point
+from tests.bam_envs.making import make_task
 
 UR5 = UR_MODELS["ur5"]
 LIMITS = np.array([2 * np.pi, 2 * np.pi, np.pi, 2 * np.pi, 2 * np.pi, 2 * np.pi])
@@ -31,7 +32,7 @@ def state_at(joints, collision=False):
 
 
 def begun(parity=False, target=None, **options):
-    task = UrReachTask(parity=parity, **options)
+    task = make_task("bam/ur-reach-v0", parity=parity, **options)
     task.sample_initial(np.arange(1), [np.random.default_rng(0)])
     task.target[0] = above([0, 0, 0.4]) if target is None else target
     task.on_reset(np.arange(1), state_at(START))
@@ -172,7 +173,7 @@ def test_a_success_in_the_last_step_is_told_as_robo_gym_tells_it():
 def test_the_threshold_can_be_another():
     assert begun(target=above([0, 0, 0.29]), ee_distance_threshold=0.3).score(state_at(START), ONES[None]).success[0]
     with pytest.raises(InvalidValue) as caught:
-        UrReachTask(ee_distance_threshold=0)
+        make_task("bam/ur-reach-v0", ee_distance_threshold=0)
     assert str(caught.value) == "ee_distance_threshold must be above 0 m, not 0."
 
 
@@ -338,7 +339,7 @@ def test_modular_observations_end_with_the_last_action_of_the_joints_that_move(m
 def test_wrist_1_of_the_modular_environment():
     """Of robo-gym's it starts at 0, and an action reaches the whole of its range."""
     for parity, start, end in ((False, START, -3.48), (True, STRAIGHT, -2 * np.pi)):
-        task = UrReachTask(modular=True, parity=parity)
+        task = make_task("bam/ur-reach-v0", modular=True, parity=parity)
         begun = task.sample_initial(np.arange(1), [np.random.default_rng(0)]).signals["joint_position"]
         np.testing.assert_array_equal(begun, [start])
         near = end + 0.01
@@ -347,12 +348,12 @@ def test_wrist_1_of_the_modular_environment():
 
 
 def test_modular_targets_are_the_origin_in_parity():
-    task = UrReachTask(modular=True, parity=True)
+    task = make_task("bam/ur-reach-v0", modular=True, parity=True)
     task.sample_initial(np.arange(1), [np.random.default_rng(0)])
     assert task.target.tolist() == [[0.0, 0.0, 0.0]]
     task.sample_initial(np.arange(1), [np.random.default_rng(0)], {"ee_target_pose": far_pose()})
     np.testing.assert_array_equal(task.target[0], far_pose()[:3])
-    task = UrReachTask(modular=True)
+    task = make_task("bam/ur-reach-v0", modular=True)
     task.sample_initial(np.arange(1), [np.random.default_rng(0)])
     np.testing.assert_array_equal(task.target[0], workspace_point(UR5, np.random.default_rng(0)))
 
@@ -360,7 +361,7 @@ def test_modular_targets_are_the_origin_in_parity():
 def test_reset_options_may_stand():
     """RLlib and vectors of environments reset without options."""
     rows, rngs = np.arange(2), [np.random.default_rng(seed) for seed in (0, 1)]
-    task = UrReachTask(2, ee_target_pose=tuple(far_pose()), randomize_start=True)
+    task = make_task("bam/ur-reach-v0", 2, ee_target_pose=tuple(far_pose()), randomize_start=True)
     joints = task.sample_initial(rows, rngs).signals["joint_position"]
     np.testing.assert_array_equal(task.target, [far_pose()[:3]] * 2)
     assert (joints[0] != joints[1]).all()
@@ -369,11 +370,11 @@ def test_reset_options_may_stand():
     ]
     np.testing.assert_array_equal(joints, [START] * 2)
     np.testing.assert_array_equal(task.target, [far_pose()[:3]] * 2)
-    goes_on = UrReachTask(continue_on_success=True)
+    goes_on = make_task("bam/ur-reach-v0", continue_on_success=True)
     goes_on.sample_initial(np.arange(1), rngs[:1])
     joints = np.array(START) + 0.1
     goes_on.target[0] = UR5.geometry.tool_position(joints[None])[0]
     goes_on.score(state_at(joints), ONES[None])
     np.testing.assert_array_equal(goes_on.sample_initial(np.arange(1), rngs[:1]).signals["joint_position"][0], joints)
     with pytest.raises(InvalidValue, match=r"ee_target_pose must be 6 finite numbers, not \[1\]"):
-        UrReachTask(ee_target_pose=[1])
+        make_task("bam/ur-reach-v0", ee_target_pose=[1])

@@ -13,9 +13,9 @@ from bam_envs.core.robot import RobotState
 from bam_envs.core.splines import splines_through
 from bam_envs.robots.physics.ur import obstacle_arm
 from bam_envs.robots.ur import ur_model
-from bam_envs.tasks.ur_track import UrTrackTask
 from bam_envs.testing import TaskContract
 from bam_envs.testing.assertions import assert_same_tree
+from tests.bam_envs.making import make_task
 
 ROW = np.zeros(1, np.int64)
 UR5 = ur_model("ur5").geometry
@@ -29,8 +29,8 @@ SECOND = [[0.02, -1.5, -1.0, 0.0, 0.5, 0.0], [0.5, -1.5, -1.0, 0.0, 0.5, 0.0]]
 class Track(TaskContract):
     options = {}  # noqa: RUF012
 
-    def make(self, num_rows):
-        return UrTrackTask(num_rows, **self.options)
+    def make(self, num_envs):
+        return make_task("bam/ur-track-v0", num_envs, **self.options)
 
     def make_robot(self, num_robots):
         return obstacle_arm(num_robots)
@@ -58,7 +58,7 @@ def began(tmp_path):
     path.write_text(json.dumps({"trajectory": [FIRST, SECOND]}))
 
     def begin(options=None, **arguments):
-        task = UrTrackTask(trajectory=str(path), **arguments)
+        task = make_task("bam/ur-track-v0", trajectory=str(path), **arguments)
         task.initial = task.sample_initial(ROW, [np.random.default_rng(0)], options or {})
         return task
 
@@ -207,7 +207,7 @@ def test_what_is_seen(began, parity):
 
 def test_paths_of_the_obstacle():
     """Closed, 80 to 120 s around, away from the base and its axis."""
-    task = UrTrackTask(30)
+    task = make_task("bam/ur-track-v0", 30)
     signals = task.sample_initial(np.arange(30), [np.random.default_rng(seed) for seed in range(30)]).signals
     points, samples = signals["obstacle_path"], signals["obstacle_samples"]
     assert (samples >= 8000).all()
@@ -225,19 +225,19 @@ def test_paths_of_the_obstacle():
 
 
 def test_fixed_paths_come_one_after_the_other_with_parity():
-    task = UrTrackTask(parity=True, fixed_paths=True)
+    task = make_task("bam/ur-track-v0", parity=True, fixed_paths=True)
     rngs = [np.random.default_rng(seed) for seed in range(52)]
     begun = [task.sample_initial(ROW, [rng]).signals for rng in rngs]
     assert {float(one["obstacle_samples"][0]) for one in begun} == {4000.0}
     paths = [one["obstacle_path"].tobytes() for one in begun]
     assert len(set(paths)) == 50
     assert paths[:2] == paths[50:]
-    again = UrTrackTask(parity=True, fixed_paths=True)
+    again = make_task("bam/ur-track-v0", parity=True, fixed_paths=True)
     assert again.sample_initial(ROW, [np.random.default_rng(99)]).signals["obstacle_path"].tobytes() == paths[0]
 
 
 def test_fixed_paths_are_drawn_from_fifty():
-    task, drawn = UrTrackTask(fixed_paths=True), set()
+    task, drawn = make_task("bam/ur-track-v0", fixed_paths=True), set()
     for seed in range(300):
         drawn.add(task.sample_initial(ROW, [np.random.default_rng(seed)]).signals["obstacle_path"].tobytes())
     assert 45 <= len(drawn) <= 50
@@ -245,7 +245,7 @@ def test_fixed_paths_are_drawn_from_fifty():
 
 def test_a_trajectory_that_is_none(tmp_path):
     with pytest.raises(InvalidValue, match="cannot be read: No such file or directory"):
-        UrTrackTask(trajectory=str(tmp_path / "none.json"))
+        make_task("bam/ur-track-v0", trajectory=str(tmp_path / "none.json"))
 
 
 def test_the_arm_can_follow_it(make):

@@ -6,8 +6,9 @@ import pickle
 import numpy as np
 
 from bam_envs.core.robot import RobotState
+from bam_envs.core.task import as_objects
 from bam_envs.robots.ur import UR_MODELS
-from bam_envs.tasks.ur_wire import as_objects, wire_states
+from bam_envs.tasks.ur_arm import wire_states
 
 UR5 = UR_MODELS["ur5"]
 JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")

@@ -21,7 +21,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import iterate
 
 from bam_envs.core.errors import InvalidValue, NotInCommand, RemoteError, ResetNeeded
-from bam_envs.core.registry import OTHER_NAMES
+from bam_envs.core.registry import ALIASES
 from bam_envs.core.spaces import space_to_json
 from bam_envs.core.timing import Pacer
 from bam_envs.remote.batches import join_observations, split_infos
@@ -95,7 +95,7 @@ def _bare(name: str) -> str:
 
 @cache
 def _other_names() -> dict[str, str]:
-    return {_spelt(other): _spelt(ours) for other, ours in OTHER_NAMES.items()}
+    return {_spelt(env_id): _spelt(alias.variant or alias.env_id) for env_id, alias in ALIASES.items()}
 
 
 def _spelt(name: str) -> str:

@@ -1,6 +1,6 @@
 """Universal Robots arms without dynamics: in a period the joints reach their set points, no faster than they can.
 
-What makes an arm slow is in its commands (`bam_envs.tasks.ur_control`), so that a live arm is as slow. Contacts are
+What makes an arm slow is in its commands (`bam_envs.tasks.ur_arm`), so that a live arm is as slow. Contacts are
 looked for, and nothing stops at them: they are told in ``state.truth["collision"]``, until the next reset.
 """
 

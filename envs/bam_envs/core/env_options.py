@@ -1,0 +1,59 @@
+"""The options of an environment, checked before it is made: names with the closest match, and kinds of values.
+
+They are the arguments of its task's constructor. A text where a flag is meant would be True whatever it says,
+``parity="false"`` too.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterable, Mapping
+from numbers import Real
+from typing import Any
+
+import numpy as np
+
+from bam_envs.core.errors import InvalidValue, UnknownName
+
+
+def constructor_options(task: type) -> dict[str, Any]:
+    """The options of a task's class with their defaults; those of its base classes where it passes them on."""
+    options: dict[str, Any] = {}
+    for kind in task.__mro__:
+        if "__init__" in vars(kind):
+            parameters = inspect.signature(vars(kind)["__init__"]).parameters
+            given = {name: one.default for name, one in parameters.items() if one.kind is one.KEYWORD_ONLY}
+            options = {**given, **options}
+            if not any(one.kind is one.VAR_KEYWORD for one in parameters.values()):
+                break
+    return options
+
+
+def in_our_words(name: str) -> str:
+    """The name of an option with robo-gym's name of a joint for ROS's: ``fix_shoulder_pan`` is ``fix_base``."""
+    return name.replace("shoulder_pan", "base").replace("shoulder_lift", "shoulder")
+
+
+def require_known(env_id: str, options: Mapping[str, Any], given: Iterable[str], others: Iterable[str]) -> None:
+    """Refuse an option that is none of `options`; `others` exist too, and may be the closest match.
+
+    Raises:
+        UnknownName: It carries the closest match.
+    """
+    for name in given:
+        if name not in options:
+            raise UnknownName(f"argument of {env_id}", name, {*options, *others}, meant=in_our_words(name))
+
+
+def require_kinds(env_id: str, options: Mapping[str, Any], given: Mapping[str, Any]) -> None:
+    """Refuse a value of another kind than its default in `options`; what is none of them is left alone.
+
+    Raises:
+        InvalidValue: A flag is neither True nor False, or a number is none.
+    """
+    for name, value in given.items():
+        default = options.get(name)
+        if isinstance(default, bool) and not isinstance(value, (bool, np.bool_)):
+            raise InvalidValue(f"{name}= of {env_id} must be True or False, not {value!r}.")
+        if isinstance(default, float) and (not isinstance(value, Real) or isinstance(value, bool)):
+            raise InvalidValue(f"{name}= of {env_id} must be a number, not {value!r}.")

@@ -1,0 +1,243 @@
+"""robo-gym's arithmetic of the UR arms' tasks, to the last constant, oddities included: nothing is scaled."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from bam_envs.core.errors import ProtocolError
+from bam_envs.core.robot import EnvIds, Initial, RobotState
+from bam_envs.core.task import Array, Flags, Floats, Label, Score
+from bam_envs.robots.ur import JOINTS, START
+from bam_envs.tasks.isaac_reach import TOOL1, IsaacReachTask
+from bam_envs.tasks.ur_arm import UrTask, in_frame, joint_labels, normalised, spherical
+from bam_envs.tasks.ur_avoidance import SPREAD, UrAvoidanceTask, UrObstacleTask, obstacle_labels
+from bam_envs.tasks.ur_empty import UrEmptyTask
+from bam_envs.tasks.ur_reach import UrReachTask
+from bam_envs.tasks.ur_track import COLLISION, FIXED_PATHS, UrTrackTask
+
+_INF = np.inf
+_UNSCALED = ("1", "1", "1")
+
+
+class UrParity(UrTask):
+    """The last step of an episode terminates it, whatever else happened then but a collision."""
+
+    ends_by_itself = True
+
+    def observe(self, state: RobotState) -> Floats:
+        """See `observation_labels`; nothing is cut to the space. Shape: (n, k) float32."""
+        return np.concatenate(self._columns(state), axis=1).astype(np.float32)
+
+    def ends(self, collision: Flags, success: Flags, late: Flags) -> tuple[Flags, Any]:
+        """Collision, success and the last step end an episode. Shapes: (n,)."""
+        status = np.where(late, "max_steps_exceeded", np.where(success, "success", ""))
+        return collision | success | late, np.where(collision, "collision", status)
+
+
+class UrEmptyParity(UrEmptyTask):
+    """robo-gym's EmptyEnvironmentUR.
+
+    With ``parity=True`` joint velocities are in rad/s, and after 300 steps an episode is terminated as "success".
+    """
+
+    ends_by_itself = True
+
+    def _observation_labels(self) -> tuple[Label, ...]:
+        return (
+            *joint_labels("", "joint position", "rad", "/ its limit", 1.1),
+            *joint_labels("speed_", "joint velocity", "rad/s", "1", _INF),
+        )
+
+    def _columns(self, state: RobotState) -> list[Array]:
+        return [normalised(self.model, state.signals["joint_position"]), state.signals["joint_velocity"]]
+
+    def score(self, state: RobotState, action: Floats) -> Score:
+        """Three hundred steps without a collision are a success."""
+        score = super().score(state, action)
+        score.success = (self.elapsed >= self.max_steps) & ~score.terminated
+        score.info["final_status"] = np.where(score.success, "success", score.info["final_status"])
+        score.terminated = score.terminated | score.success
+        return score
+
+
+class UrReachParity(UrParity, UrReachTask):
+    """robo-gym's EndEffectorPositioningUR.
+
+    With ``parity=True`` observations are robo-gym's numbers, in its units; the last six are the action before the
+    last one; and after 300 steps an episode is terminated as "max_steps_exceeded".
+    """
+
+    def __init__(
+        self, num_envs: int = 1, *, restrict_wrist_1: bool = True, modular: bool = False, **options: Any
+    ) -> None:
+        super().__init__(num_envs, restrict_wrist_1=restrict_wrist_1, modular=modular, **options)
+        self._restrict = restrict_wrist_1 and not modular  # robo-gym maps a fixed wrist 1 too, and so moves it
+        if modular:
+            self.start = START
+
+    def _observation_labels(self) -> tuple[Label, ...]:
+        age, most = ("last action", 1.0) if self.modular else ("the action before the last one", 1.01)
+        actions = joint_labels("action_", age, "rad", "/ its limit", most)
+        return (
+            Label("target_r", "target as the flange sees it, distance", "m", "1", -_INF, _INF),
+            Label("target_polar", "target as the flange sees it, angle from its axis", "rad", "1", -_INF, _INF),
+            Label("target_azimuth", "target as the flange sees it, angle about its axis", "rad", "1", -_INF, _INF),
+            *joint_labels("", "joint position", "rad", "/ its limit", 1.1),
+            *joint_labels("speed_", "joint velocity", "rad/s", "1", _INF),
+            *(Label(f"target_{one}", f"target, {one}", "m", "1", -_INF, _INF) for one in "xyz"),
+            *(Label(f"flange_{one}", f"flange, {one}", "m", "1", -_INF, _INF) for one in "xyz"),
+            *(actions[joint] for joint in self._seen_actions()),
+        )
+
+    def _columns(self, state: RobotState) -> list[Array]:
+        joints, velocity = state.signals["joint_position"], state.signals["joint_velocity"]
+        place, axes = self.model.geometry.flange_pose(joints)
+        seen, shares = spherical(in_frame(self.target, place, axes)), normalised(self.model, joints)
+        actions = self._actions[0 if self.modular else 1][:, self._seen_actions()]
+        return [seen, shares, velocity, self.target, place, actions]
+
+    def _given_target(self, options: Mapping[str, Any]) -> Array | None:
+        target = super()._given_target(options)
+        return np.zeros(3) if target is None and self.modular else target  # robo-gym's sampler forgets the place
+
+    def _require_reach(self, target: Array) -> None:
+        """Any target will do."""
+
+    def _forget_success(self, env_ids: EnvIds) -> None:
+        if self.modular:  # else a success of any earlier episode counts
+            super()._forget_success(env_ids)
+
+
+class IsaacReachParity(UrParity, IsaacReachTask):
+    """robo-gym's IsaacReachUR.
+
+    With ``parity=True`` nothing is scaled, an action is in units of 0.5 rad and as large as the joints' limits let
+    it be, 600 steps terminate as "max_steps_exceeded", and the frame is robo-gym's ``tool1``, which is ``ee_link``
+    turned by 90 degrees about x. Observations and actions are then those of Isaac Lab's policies.
+    """
+
+    yaw, frame = 3.14, TOOL1
+
+    def _action_scale(self, isaac_scale: float) -> float:
+        return isaac_scale
+
+    def _action_labels(self) -> tuple[Label, ...]:
+        low, high = (self.model.joint_limits - self._default) / self.scale
+        ends, unit = zip(JOINTS, low.tolist(), high.tolist(), strict=True), f"/ {self.scale:g}"
+        return tuple(Label(joint, "joint target from the default pose", "rad", unit, *both) for joint, *both in ends)
+
+    def _observation_labels(self) -> tuple[Label, ...]:
+        low, high = 1.2 * self.model.joint_limits - self._default  # a joint may be a tenth of its range beyond it
+        ends = zip(JOINTS, low.tolist(), high.tolist(), strict=True)
+        return (
+            *(Label(joint, "joint position from the default pose", "rad", "1", *both) for joint, *both in ends),
+            *(Label(f"{joint}_speed", "joint velocity", "rad/s", "1", -_INF, _INF) for joint in JOINTS),
+            *(Label(f"target_{axis}", f"target, {axis}", "m", "1", -_INF, _INF) for axis in "xyz"),
+            *self._pose_and_action_labels(),
+        )
+
+    def _columns(self, state: RobotState) -> list[Array]:
+        joints, speeds = state.signals["joint_position"] - self._default, state.signals["joint_velocity"]
+        return [joints, speeds, self.target, self.quaternion[:, [3, 0, 1, 2]], self._last_action]
+
+
+class UrObstacleParity(UrObstacleTask):
+    """Nothing is scaled, no observation is outside its space, and 1000 steps terminate."""
+
+    ends_by_itself = True
+
+    def _observation_labels(self) -> tuple[Label, ...]:
+        far = _INF if self.include_polar_to_elbow else 0.0
+        return (
+            *obstacle_labels("tool0", _UNSCALED, (-_INF, -_INF, -_INF), _INF),
+            *joint_labels("", "joint position", "rad", "/ joint limit", 1.1),
+            *joint_labels("off_", "joint position from the reference", "rad", "/ joint limit", 1.1),
+            *obstacle_labels("forearm_link", _UNSCALED, (-far, -far, -far), far),
+        )
+
+    def observe(self, state: RobotState) -> Floats:
+        """See `observation_labels`. Shape: (n, k) float32."""
+        observation = np.concatenate(self._columns(state), axis=1).astype(np.float32)
+        return require_inside(observation, self.observation_space, self.observation_labels)
+
+    def _columns(self, state: RobotState) -> list[Array]:
+        sense = self.sense(state)
+        elbow = sense.elbow if self.include_polar_to_elbow else np.zeros_like(sense.elbow)
+        return [sense.tool, sense.joints, self.offset(state), elbow]
+
+    def ends(self, collision: Flags, success: Flags, late: Flags) -> tuple[Flags, Any]:
+        """A collision and the last step end an episode. Shapes: (n,)."""
+        terminated, status = super().ends(collision, success, late)
+        return terminated | success, status
+
+
+class UrAvoidanceParity(UrObstacleParity, UrAvoidanceTask):
+    """robo-gym's BasicAvoidanceUR.
+
+    With ``parity=True`` the pose is robo-gym's [0, -2.5, 1.5, 0, -1.4, 0], the first reward depends on the sum over
+    the observation's last six numbers, as robo-gym's does, a collision costs nothing, and 1000 steps terminate.
+    """
+
+    pose, collision_reward = START, None
+
+    def _staying(self, state: RobotState) -> Array:
+        """Its gate is a wrong slice: the last three offsets and the obstacle seen from the elbow. Shape: (n,)."""
+        seen = np.abs(self.observe(state).astype(np.float64))
+        off, gate = seen[:, 9:15].sum(axis=1), seen[:, 12:18].sum(axis=1)
+        staying: Array = np.where(gate < SPREAD, (1 - off / SPREAD) / 1000, 0.0)
+        return staying
+
+
+class UrTrackParity(UrObstacleParity, UrTrackTask):
+    """robo-gym's AvoidanceRaad2022UR.
+
+    With ``parity=True`` nothing is scaled, the end of a segment is worth nothing and is counted one step later, the
+    arm starts at the first waypoint whatever the reset option says, and 1000 steps terminate, as in robo-gym. The
+    trajectory is still this package's own; ``trajectory`` names robo-gym's.
+    """
+
+    def _observation_labels(self) -> tuple[Label, ...]:
+        return (*super()._observation_labels(), *self._waypoint_labels(1.1))
+
+    def _columns(self, state: RobotState) -> list[Array]:
+        waits = self.waits[:, None].astype(np.float64)
+        return [*super()._columns(state), normalised(self.model, self.reference), waits]
+
+    def sample_initial(
+        self, env_ids: EnvIds, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] | None = None
+    ) -> Initial:
+        """The first waypoint, and an obstacle on a path or staying."""
+        initial = super().sample_initial(env_ids, rngs, options)
+        return Initial({**initial.signals, "joint_position": self.reference[env_ids]}, initial.seeds)
+
+    def _path_numbers(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> list[int]:
+        """One after the other."""
+        return [int(number) % FIXED_PATHS for number in self._episodes[env_ids]]
+
+    def score(self, state: RobotState, action: Floats) -> Score:
+        """Following closely, acting little and smoothly, away from the obstacle."""
+        offset = self.offset(state).astype(np.float32).astype(np.float64)  # robo-gym reads it from its observation
+        reward, counted = self._following(state, offset, action), self.targets_reached
+        self._advance(state)
+        return self.scored(state, reward, COLLISION, targets_reached=counted.copy())
+
+
+def require_inside(observation: Floats, space: spaces.Box, labels: Sequence[Label]) -> Floats:
+    """`observation` (n, k), if all of it is in `space`; robo-gym has no observation outside.
+
+    Raises:
+        ProtocolError: Names the first number that is not; robo-gym raises ``InvalidStateError``.
+    """
+    outside = ~((observation >= space.low) & (observation <= space.high))  # also what is not a number
+    if outside.any():
+        env, column = np.argwhere(outside)[0]
+        label, value = labels[column], observation[env, column]
+        raise ProtocolError(
+            f"{label.name} is {value:.6g} {label.unit}, expected {label.low:.6g} to {label.high:.6g}, as in robo-gym: "
+            "with parity=True there is no observation outside its space; leave parity out, or look at the sensor."
+        )
+    return observation

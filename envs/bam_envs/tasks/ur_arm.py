@@ -1,0 +1,300 @@
+"""What the tasks of UR arms share: their options, how an arm is sent to joint targets, and robo-gym's wire state.
+
+robo-gym's trajectory controller moves an arm so: a target c is the one point of a trajectory that takes
+T = max(max_i |c_i - q_i| / (s vmax_i), 0.5 s), and the next one takes its place after 1 / rate. In one period the
+joints go (c - q) / (rate T): the fastest at s vmax at most, all of them in proportion, and slower and slower within
+half a second of the target. Here q is where the controller has got to, the last command that was sent; a live arm
+follows it a little later. So simulated and live arms get the same set points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from bam_envs.core.errors import InvalidValue
+from bam_envs.core.kinematics import LINKS, quaternions
+from bam_envs.core.robot import EnvIds, Initial, RobotState
+from bam_envs.core.task import Array, Flags, Floats, Label, TaskMemory, as_objects, draw_seeds, labelled_box
+from bam_envs.robots.ur import DEFAULT_MODEL, JOINTS, UrModel
+from bam_envs.robots.ur import ur_model as model_called
+
+SHORTEST = 0.5
+"""Shortest time that a trajectory takes [s]."""
+LEASH = 0.2
+"""An arm that is measured farther than this from what it was told last [rad] was halted or held: it begins there."""
+FOREARM = LINKS.index("forearm_link")
+WIRE_JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
+"""robo-gym's names of the joints."""
+POSITIONS = tuple(f"{joint}_joint_position" for joint in WIRE_JOINTS)
+VELOCITIES = tuple(f"{joint}_joint_velocity" for joint in WIRE_JOINTS)
+
+
+class UrTask(TaskMemory):
+    """A task of UR arms: it has the arm's options, steps it counts, and infos.
+
+    Args:
+        num_envs: How many environments are scored together.
+        ur_model: ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e.
+        fix_base: Take the joint out of the action: it stays where the task wants it. So do the next five.
+        fix_shoulder: See above.
+        fix_elbow: See above.
+        fix_wrist_1: See above.
+        fix_wrist_2: See above.
+        fix_wrist_3: See above; it turns the flange about its own axis.
+        rs_state_to_info: Put robo-gym's robot server state into info["rs_state"], a dict of floats.
+    """
+
+    reset_options: tuple[str, ...] = ("joint_positions",)
+    rate: float
+    """Commands a second [Hz]."""
+    velocity_scale: float
+    """Share of the fastest speed that the joints go at."""
+    max_steps: int
+    """Steps of an episode."""
+    ends_by_itself = False
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        ur_model: str = DEFAULT_MODEL,
+        fix_base: bool = False,
+        fix_shoulder: bool = False,
+        fix_elbow: bool = False,
+        fix_wrist_1: bool = False,
+        fix_wrist_2: bool = False,
+        fix_wrist_3: bool = True,
+        rs_state_to_info: bool = False,
+    ) -> None:
+        fixed = (fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3)
+        self.num_envs, self.model, self.rs_state_to_info = num_envs, model_called(ur_model), rs_state_to_info
+        self.control = UrControl(self.model, num_envs, self.rate, self.velocity_scale, fixed)
+        self.action_labels = self._action_labels()
+        self.observation_labels = self._observation_labels()
+        self.action_space: spaces.Box = labelled_box(self.action_labels)
+        self.observation_space: spaces.Box = labelled_box(self.observation_labels)
+        self.elapsed = np.zeros(num_envs, dtype=np.int64)
+        """Steps since each episode began. Shape: (n,)."""
+
+    def _action_labels(self) -> tuple[Label, ...]:
+        return self.control.labels("where the joint is to be", "rad", "/ its limit")
+
+    def _observation_labels(self) -> tuple[Label, ...]:
+        raise NotImplementedError
+
+    def _columns(self, state: RobotState) -> list[Array]:
+        """The numbers of an observation, before they are cut to their space. Shape: (n, k) each."""
+        raise NotImplementedError
+
+    def observe(self, state: RobotState) -> Floats:
+        """See `observation_labels`. Shape: (n, k) float32."""
+        observation = np.concatenate(self._columns(state), axis=1).astype(np.float32)
+        return np.clip(observation, self.observation_space.low, self.observation_space.high)
+
+    def initial(self, joints: Array, rngs: Sequence[np.random.Generator], **signals: Array) -> Initial:
+        """Start at `joints` (k, 6) [rad]; each generator draws the seed of its robot now."""
+        return Initial({"joint_position": joints, **signals}, draw_seeds(rngs))
+
+    def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
+        """The steps are counted anew."""
+        self.elapsed[env_ids] = 0
+
+    def ends(self, collision: Flags, success: Flags, late: Flags) -> tuple[Flags, Any]:
+        """Which episodes are over, and what `final_status` says: here, success and collision end one. Shapes: (n,)."""
+        status = np.where(success, "success", np.where(late, "max_steps_exceeded", ""))
+        return collision | success, np.where(collision, "collision", status)
+
+    def info(self, state: RobotState, **told: Any) -> dict[str, Any]:
+        """Infos: what is `told`, and robo-gym's wire state where it is asked for."""
+        return told | ({"rs_state": as_objects(self.rs_state(state))} if self.rs_state_to_info else {})
+
+    def rs_state(self, state: RobotState) -> list[dict[str, float]]:
+        """robo-gym's wire state of each environment."""
+        return wire_states(self.model, state)
+
+    def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
+        """Nothing to draw beyond the scene."""
+        return []
+
+
+class UrControl:
+    """Actions and commands of n arms.
+
+    Args:
+        model: Which arm.
+        num_envs: How many.
+        rate: Commands a second [Hz].
+        velocity_scale: Share of the fastest speed that joints go at.
+        fixed: Which joints are not in the action; six of them.
+
+    Raises:
+        InvalidValue: All joints are fixed.
+    """
+
+    def __init__(
+        self, model: UrModel, num_envs: int, rate: float, velocity_scale: float, fixed: Sequence[bool] = (False,) * 6
+    ) -> None:
+        if all(fixed):
+            raise InvalidValue(
+                "At least one of the six joints must be free to move: set one of the fix_ options False."
+            )
+        self.model, self.num_envs = model, num_envs
+        self.free = np.flatnonzero(~np.array(fixed, dtype=bool))
+        """Places of the joints that are in the action."""
+        self._rate, self._speed = rate, velocity_scale * model.max_velocity
+        self._low, self._high = model.joint_limits
+
+    def labels(self, meaning: str, unit: str, scale: str) -> tuple[Label, ...]:
+        """One label for each free joint."""
+        return tuple(Label(JOINTS[joint], meaning, unit, scale) for joint in self.free)
+
+    def full(self, action: Floats, held: Array | float = 0.0) -> Array:
+        """The action of all joints, cut to [-1, 1].
+
+        Args:
+            action: Of the free joints. Shape: (n, a).
+            held: Of the fixed ones, in the action's units. Shape: (n, 6) or a number.
+
+        Returns:
+            Shape: (n, 6).
+        """
+        full = np.empty((self.num_envs, 6))
+        full[:] = held
+        full[:, self.free] = np.clip(action, -1.0, 1.0)
+        return full
+
+    def command(self, target: Array, state: RobotState) -> Array:
+        """The set points one period on the way to `target`.
+
+        Args:
+            target: Joint positions [rad]. Shape: (n, 6).
+            state: What is measured now, and what was sent last.
+
+        Returns:
+            Joint positions [rad]. Shape: (n, 6).
+        """
+        measured, sent = state.signals["joint_position"], state.command
+        joints = np.where(np.abs(sent - measured).max(axis=1, keepdims=True) <= LEASH, sent, measured)
+        way = target - joints
+        duration = np.maximum((np.abs(way) / self._speed).max(axis=1), SHORTEST)
+        step = way * ((1.0 / self._rate) / duration)[:, None]
+        command: Array = np.clip(joints + step, self._low, self._high)
+        return command
+
+
+def collisions(state: RobotState) -> Flags:
+    """Which arms have touched something; none where nobody knows, as of a live robot. Shape: (n,)."""
+    told: Any = state.truth.get("collision")
+    touched: Flags = np.zeros(len(state.stamp), dtype=bool) if told is None else told
+    return touched
+
+
+def normalised(model: UrModel, joints: Array) -> Array:
+    """Joint positions [rad] as shares of their limits, in [-1, 1]. Shape: (n, 6)."""
+    shares: Array = np.clip(joints / model.joint_limits[1], -1.0, 1.0)  # limits are the same both ways
+    return shares
+
+
+def spherical(vector: Array) -> Array:
+    """Length, angle from z in [0, pi], and angle from x about z in [-pi, pi]. Shape: (n, 3) -> (n, 3)."""
+    x, y, z = vector[:, 0], vector[:, 1], vector[:, 2]
+    length = np.sqrt(x * x + y * y + z * z)
+    cosine = np.divide(z, length, out=np.ones_like(z), where=length > 0)
+    return np.stack([length, np.arccos(np.clip(cosine, -1.0, 1.0)), np.arctan2(y, x)], axis=1)
+
+
+def in_frame(point: Array, position: Array, rotation: Array) -> Array:
+    """`point` as a frame at `position` with the axes `rotation` sees it. Shapes: (n, 3), (n, 3), (n, 3, 3)."""
+    offset = (point - position)[:, :, None]
+    # Written out: the sum for one environment does not depend on how many there are.
+    seen: Array = rotation[:, 0] * offset[:, 0] + rotation[:, 1] * offset[:, 1] + rotation[:, 2] * offset[:, 2]
+    return seen
+
+
+def joint_labels(prefix: str, meaning: str, unit: str, scale: str, bound: float = 1.0) -> tuple[Label, ...]:
+    """One label for each of the six joints."""
+    return tuple(Label(f"{prefix}{joint}", meaning, unit, scale, -bound, bound) for joint in JOINTS)
+
+
+def joint_option(options: Mapping[str, Any], name: str, default: Sequence[float], model: UrModel) -> Array:
+    """Joint positions [rad] that a reset option gives, else `default`. Shape: (6,).
+
+    Raises:
+        InvalidValue: They are not six finite numbers inside the joint limits.
+    """
+    joints = number_option(options, name, default, 6)
+    low, high = model.joint_limits
+    for label, value, least, most in zip(JOINTS, joints, low, high, strict=True):
+        if not least <= value <= most:
+            raise InvalidValue(
+                f"The reset option {name} has {label} at {value:g} rad, outside {least:.4g} to {most:.4g} rad."
+            )
+    return joints
+
+
+def number_option(
+    options: Mapping[str, Any], name: str, default: Sequence[float], size: int, kind: str = "reset option"
+) -> Array:
+    """The numbers that an option of `kind` gives, else `default`. Shape: (size,).
+
+    Raises:
+        InvalidValue: They are not `size` finite numbers.
+    """
+    given = options.get(name)
+    if given is None:
+        return np.array(default, dtype=np.float64)
+    try:
+        numbers = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.array(np.nan)
+    if numbers.shape != (size,) or not np.isfinite(numbers).all():
+        raise InvalidValue(f"The {kind} {name} must be {size} finite numbers, not {given!r}.")
+    return numbers
+
+
+def flag_option(options: Mapping[str, Any], name: str) -> bool:
+    """Whether a reset option is given and True.
+
+    Raises:
+        InvalidValue: It is neither True nor False.
+    """
+    given = options.get(name)
+    if given is None or isinstance(given, (bool, np.bool_)):
+        return bool(given)
+    raise InvalidValue(f"The reset option {name} must be True or False, not {given!r}.")
+
+
+def frame_keys(frame: str) -> tuple[str, ...]:
+    """Seven keys of a frame's pose: translation x, y, z, rotation x, y, z, w."""
+    return (
+        *(f"{frame}_to_ref_translation_{axis}" for axis in "xyz"),
+        *(f"{frame}_to_ref_rotation_{axis}" for axis in "xyzw"),
+    )
+
+
+def wire_states(
+    model: UrModel, state: RobotState, object_position: Array | None = None, *, with_forearm: bool = False
+) -> list[dict[str, float]]:
+    """The states under robo-gym's names, a dict for each: 20 keys, 7 more with an object, 7 more with the forearm.
+
+    Args:
+        model: Which arm.
+        state: What was measured.
+        object_position: Where the target or obstacle is [m]; its orientation is that of ``base_link``. Shape: (n, 3).
+        with_forearm: Whether the pose of ``forearm_link`` is in it.
+    """
+    joints = state.signals["joint_position"]
+    keys, columns = [*POSITIONS, *VELOCITIES], [joints, state.signals["joint_velocity"]]
+    if object_position is not None:
+        keys += frame_keys("object_0")
+        columns += [object_position, np.tile([0.0, 0.0, 0.0, 1.0], (len(joints), 1))]
+    positions, rotations = model.geometry.link_poses(joints)
+    for frame, link in (("ee", -1), ("forearm", FOREARM)) if with_forearm else (("ee", -1),):
+        keys += frame_keys(frame)
+        columns += [positions[:, link], quaternions(rotations[:, link])]
+    numbers = np.concatenate([*columns, collisions(state)[:, None].astype(np.float64)], axis=1)
+    return [dict(zip([*keys, "in_collision"], row, strict=True)) for row in numbers.tolist()]
