@@ -104,7 +104,7 @@ PLACES = {"target_coord": (3,), "target_rot": (4,)}
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 @pytest.mark.parametrize("wire", [False, True])
 def test_infos_are_plain_and_can_be_pickled(make, env_id, wire):
-    env = make(env_id, rs_state_to_info=True) if wire and ENVIRONMENTS[env_id].parity else make(env_id)
+    env = make(env_id, rs_state_to_info=True) if wire and ENVIRONMENTS[env_id].variants else make(env_id)
     _, info = env.reset(seed=0)
     assert info == {"is_success": False}
     *_, info = env.step(env.action_space.sample())
@@ -116,7 +116,7 @@ def test_infos_are_plain_and_can_be_pickled(make, env_id, wire):
     assert_same_tree(pickle.loads(pickle.dumps(info)), info, "info")
     plain = {name: value for name, value in info.items() if name not in PLACES}
     assert json.loads(json.dumps(plain)) == plain
-    assert ("rs_state" in plain) == (wire and ENVIRONMENTS[env_id].parity)
+    assert ("rs_state" in plain) == (wire and bool(ENVIRONMENTS[env_id].variants))
 
 
 def finished(env, policy, seed):

@@ -42,7 +42,7 @@ def steps_of(env_id):
     return (260, {}) if env_id in SCRIPTED else (110, {"max_episode_steps": 50})
 
 
-PARITY = [(env_id, {"parity": True, "rs_state_to_info": True}) for env_id, one in ENVIRONMENTS.items() if one.parity]
+PARITY = [(env_id, {"parity": True, "rs_state_to_info": True}) for env_id, one in ENVIRONMENTS.items() if one.variants]
 KINDS = [*((env_id, {"randomize": value}) for env_id in ENVIRONMENTS for value in (False, True)), *PARITY]
 IDS = [f"{env_id}-{'-'.join(name for name, value in options.items() if value)}" for env_id, options in KINDS]
 

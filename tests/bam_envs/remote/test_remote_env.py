@@ -47,7 +47,7 @@ def test_gymnasiums_checker_passes(make, through, env_id):
 @THROUGH
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_same_seed_and_actions_give_the_same_bit_for_bit(make, actions_of, through, env_id):
-    options = {"rs_state_to_info": True} if ENVIRONMENTS[env_id].parity else {}
+    options = {"rs_state_to_info": True} if ENVIRONMENTS[env_id].variants else {}
     alone, there = (make(env_id, max_episode_steps=20, **options) for _ in range(2))
     with through(there) as transport:
         env = RemoteEnv(transport)

@@ -120,7 +120,7 @@ def test_several_rows_have_no_topics(serve, transport):
 @pytest.mark.parametrize("kind", [RosbridgeTransport, TcpTransport])
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_the_environment_is_the_one_in_process_bit_for_bit(serve, transport, make, actions_of, env_id, kind):
-    options = {"rs_state_to_info": True} if ENVIRONMENTS[env_id].parity else {}
+    options = {"rs_state_to_info": True} if ENVIRONMENTS[env_id].variants else {}
     local = make(env_id, **options)
     served = serve(env=gym.make(env_id, disable_env_checker=True, **options), fast=True, tcp=0)
     remote = transport(kind, served.bus.url if kind is RosbridgeTransport else served.tcp.url)
