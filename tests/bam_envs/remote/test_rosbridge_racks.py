@@ -147,7 +147,7 @@ def test_other_seeds_of_its_arms_are_refused(arms, seed):
     with pytest.raises(InvalidValue) as caught:
         envs.reset(seed=seed)
     assert str(caught.value) == (
-        f"The 2 rows of Pick begin together, from one seed s that stands for s, s + 1, …; not from {seed}."
+        f"The 2 environments of Pick begin together, from one seed s that stands for s, s + 1, …; not from {seed}."
     )
     assert there.requests == []
 
@@ -157,7 +157,7 @@ def test_the_arms_of_a_rack_begin_together(arms):
     envs.reset()
     with pytest.raises(InvalidValue) as caught:
         envs.reset(options={"reset_mask": np.array([True, False])})
-    assert str(caught.value) == "The 2 rows of Pick begin together; reset_mask must hold all of them or none."
+    assert str(caught.value) == "The 2 environments of Pick begin together; reset_mask must hold all of them or none."
     assert len(there.requests) == 1
 
 

@@ -13,6 +13,7 @@ from msgspec.msgpack import Ext
 from msgspec.msgpack import encode as packed
 
 from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, NotInCommand, ProtocolError, UnknownName
+from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.local_transport import FakeEnv
 from bam_envs.remote.serve.tcp_server import TcpServer
@@ -157,13 +158,18 @@ def test_command_can_be_taken_by_an_operator(env):
             each.close()
 
 
-def test_a_silent_client_keeps_command_while_its_connection_is_there(server, client, env):
-    one, two = client(), client()
-    one.connect(), two.connect()
-    one.reset()
-    server.server.lease._clock = lambda: 1e9
-    with pytest.raises(NotInCommand):
-        two.reset()
+def test_a_silent_client_keeps_command_while_its_connection_is_there(env):
+    now = [0.0]
+    with (
+        TcpServer(EnvServer(env, lease=CommandLease(2.0, lambda: now[0]))) as server,
+        contextlib.closing(TcpTransport(server.url)) as one,
+        contextlib.closing(TcpTransport(server.url)) as two,
+    ):
+        one.connect(), two.connect()
+        one.reset()
+        now[0] = 1e9
+        with pytest.raises(NotInCommand):
+            two.reset()
 
 
 def test_connections_that_say_nothing_keep_nobody_out(server, client):
@@ -407,7 +413,7 @@ def fuzzed(rng, number):
     return [kind, ["s1", 1, number, sent, sent + 10], *[junk(rng) for _ in range(count)]]
 
 
-def test_ten_thousand_random_messages_change_nothing(client):
+def test_random_messages_change_nothing(client):
     rng = random.Random(1)
     space = spaces.Dict(
         {
@@ -419,11 +425,11 @@ def test_ten_thousand_random_messages_change_nothing(client):
     )
     with TcpServer(EnvServer(MirrorEnv(space))) as server:
         number = 0
-        while number < 10_000:
+        while number < 3_000:
             one = Stranger(server)
             try:
                 one.hello()
-                while number < 10_000:
+                while number < 3_000:
                     number += 1
                     answer = one.ask(fuzzed(rng, number))
                     assert isinstance(answer, list)
