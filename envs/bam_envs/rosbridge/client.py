@@ -27,7 +27,7 @@ from bam_envs.ros.interfaces import normal_name
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller, Handler, Listener, Message
 from bam_envs.rosbridge.client_connection import Connection, ServerClock, bare_reason, tell_all
 from bam_envs.rosbridge.declarations import Declarations
-from bam_envs.rosbridge.encoding import encode_frame
+from bam_envs.rosbridge.encoding import dump_json
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.threads import LoopThread, Workers
 
@@ -205,7 +205,7 @@ class RosbridgeLink:
         connection = self._require_up()
         for topic, _ in messages:
             self._declarations.require_advertised(topic)
-        self._send(connection, *(encode_frame({"op": "publish", "topic": one, "msg": msg}) for one, msg in messages))
+        self._send(connection, *(dump_json({"op": "publish", "topic": one, "msg": msg}) for one, msg in messages))
 
     def subscribe(
         self,
@@ -271,7 +271,7 @@ class RosbridgeLink:
         connection, identity, begun = self._require_up(), f"call:{next(self._numbers)}", time.monotonic()
         # Servers that know the field `timeout` end the call then, and not after a shorter time of their own.
         request = {"op": "call_service", "id": identity, "service": service, "args": args, "timeout": timeout}
-        frame = encode_frame({**request, "type": normal_name(kind)} if kind else request)
+        frame = dump_json({**request, "type": normal_name(kind)} if kind else request)
         answer: Future[dict[str, Any]] = Future()
         try:
             self._post(answer, lambda: connection.ask(identity, frame, answer))
@@ -348,7 +348,7 @@ class RosbridgeLink:
         with self._declaring:
             request = declare()
             if request is not None:
-                self._thread.post(partial(self._tell, request, encode_frame(request)))
+                self._thread.post(partial(self._tell, request, dump_json(request)))
 
     def _require_up(self) -> Connection:
         self._require_process()
@@ -434,7 +434,7 @@ class RosbridgeLink:
         await connection.open(timeout, self._clock)
         try:
             for request in self._declarations.greeting():
-                frame = connection.announced[request["id"]] = encode_frame(request)
+                frame = connection.announced[request["id"]] = dump_json(request)
                 connection.send(frame)
             self._require_open()
         except BamEnvsError as error:
@@ -456,7 +456,7 @@ class RosbridgeLink:
         connection, self._up = self._up, None
         if connection is not None:
             try:
-                connection.send(*map(encode_frame, self._declarations.farewell()))
+                connection.send(*map(dump_json, self._declarations.farewell()))
             except LinkLost as error:
                 _LOG.debug("no farewell: %s", error)
             await connection.close()
@@ -499,7 +499,7 @@ class RosbridgeLink:
         if self._answering >= _MOST_ANSWERING:
             refusal = f"{_MOST_ANSWERING} requests are being answered already"
         if handler is None or refusal:
-            connection.send(encode_frame({**response, "values": refusal, "result": False}))
+            connection.send(dump_json({**response, "values": refusal, "result": False}))
             return
         self._answering += 1
         self._workers.submit(partial(self._run_handler, connection, handler, request, response))
@@ -510,12 +510,12 @@ class RosbridgeLink:
         args = request.get("args")
         try:
             values = dict(handler(args if isinstance(args, Mapping) else {}, UNKNOWN_CALLER))
-            frame = encode_frame({**response, "values": values, "result": True})
+            frame = dump_json({**response, "values": values, "result": True})
         except BamEnvsError as error:
-            frame = encode_frame({**response, "values": str(error), "result": False})
+            frame = dump_json({**response, "values": str(error), "result": False})
         except Exception as error:  # handlers are foreign code, and the caller waits for an answer in every case
             _LOG.exception("%s: the handler failed", response["service"])
-            frame = encode_frame({**response, "values": f"{type(error).__name__}: {error}", "result": False})
+            frame = dump_json({**response, "values": f"{type(error).__name__}: {error}", "result": False})
         self._thread.post(self._note_answered)
         try:
             self._send(connection, frame)

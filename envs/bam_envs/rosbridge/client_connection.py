@@ -23,7 +23,7 @@ from websockets.protocol import State
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NoServer, ProtocolError, RemoteError
 from bam_envs.rosbridge.dialing import CLOSE_WITHIN, open_socket, silent_bridge
-from bam_envs.rosbridge.encoding import decode_server_frame, encode_frame
+from bam_envs.rosbridge.encoding import decode_server_frame, dump_json
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.fragments import Fragments
 
@@ -157,7 +157,7 @@ class Connection:
         request = {"op": "call_service", "id": identity, "service": "/rosapi/get_time", "type": "rosapi/GetTime"}
         answer: Future[dict[str, Any]] = Future()
         try:
-            self.ask(identity, encode_frame({**request, "args": {}}), answer)
+            self.ask(identity, dump_json({**request, "args": {}}), answer)
             values = (await asyncio.wrap_future(answer)).get("values")
         except RemoteError:
             return None

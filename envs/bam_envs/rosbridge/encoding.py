@@ -76,6 +76,21 @@ def decode_server_frame(data: bytes) -> dict[str, Any]:
     return decode_cbor(data) if b"\x80" <= data[:1] <= b"\xbf" else _object(data, MOST_ITEMS_OF_A_SERVER, _PATIENT)
 
 
+def load_json(text: object, what: str, most_items: int = MOST_ITEMS_OF_A_SERVER) -> dict[str, Any]:
+    """The object that `text` is in JSON, with finite numbers and at most `most_items` values in it.
+
+    Raises:
+        ProtocolError: It is something else; `what` names it.
+    """
+    if not isinstance(text, str):
+        raise ProtocolError(f"{what} must be a string with a JSON object, not {type(text).__name__}.")
+    try:
+        return _object(text, most_items, _FINITE)
+    except ProtocolError as error:
+        reason = str(error).removeprefix("Message: ").rstrip(".")
+        raise ProtocolError(f"{what} must be a JSON object: {reason}.") from error
+
+
 def require_bounded(data: bytes, most_items: int = MOST_ITEMS) -> None:
     """Refuse JSON that is too much work, from a few passes over its bytes in C.
 
@@ -157,22 +172,17 @@ def _untag(value: Any) -> Any:
 # ---- encoding
 
 
-def encode_frame(message: Mapping[str, Any]) -> str:
-    """A message of a client as JSON in ASCII; `bytes` in it become base64.
+def dump_json(value: Any, what: str = "message") -> str:
+    """`value` as JSON in ASCII; `bytes` in it become base64.
 
     Raises:
-        InvalidValue: A number in it is not finite, or something is not plain; names the place.
+        InvalidValue: A number in it is not finite, or something is not plain: names the place in `what`.
     """
     try:
-        return encode_json(message)
+        return _ENCODER.encode(value)
     except (TypeError, ValueError, RecursionError) as error:
-        require_plain(message, "message")
-        raise InvalidValue(f"message: expected plain values, found something else: {error}.") from error
-
-
-def encode_json(message: Mapping[str, Any]) -> str:
-    """A message as JSON in ASCII; `bytes` in it as base64. It must be finite."""
-    return _ENCODER.encode(message)
+        require_plain(value, what)
+        raise InvalidValue(f"{what}: expected plain values, found something else: {error}.") from error
 
 
 def encode_png(text: str) -> str:
@@ -217,10 +227,18 @@ def _typed_field(one: Field, value: Any) -> Any:
 
 def _base64(value: object) -> str:
     if not isinstance(value, bytes):
-        raise InvalidValue(f"Message: expected plain values, found {brief(value)}.")
+        raise TypeError(f"{type(value).__name__} is not plain")
     return base64.b64encode(value).decode("ascii")
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{text} is not a finite number")
+    return number
 
 
 _ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False, check_circular=False, default=_base64)
 # json.loads and json.dumps with options would make one for each message.
 _STRICT, _PATIENT = json.JSONDecoder(), json.JSONDecoder(parse_constant=lambda _: None)
+_FINITE = json.JSONDecoder(parse_constant=_finite, parse_float=_finite)

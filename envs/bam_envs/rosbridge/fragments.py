@@ -9,7 +9,7 @@ from typing import Any
 
 from bam_envs.core.errors import ProtocolError
 from bam_envs.core.wording import brief
-from bam_envs.rosbridge.encoding import encode_json
+from bam_envs.rosbridge.encoding import dump_json
 
 LONGEST_ID = 256
 """Most characters of an id: it is kept, and repeated, for as long as what it names is unfinished."""
@@ -31,7 +31,7 @@ def split(text: str, size: int, name: str) -> list[str]:
     size = max(size, math.ceil(len(text) / _MOST_FRAGMENTS))
     starts = range(0, len(text), size)
     return [
-        encode_json({"op": "fragment", "id": name, "data": text[at : at + size], "num": num, "total": len(starts)})
+        dump_json({"op": "fragment", "id": name, "data": text[at : at + size], "num": num, "total": len(starts)})
         for num, at in enumerate(starts)
     ]
 

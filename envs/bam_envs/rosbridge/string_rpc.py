@@ -21,9 +21,8 @@ from typing import Any, Generic, TypeVar
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, ProtocolError, RemoteError
 from bam_envs.ros.freshness import FreshnessCheck, Tagger, read_tag
 from bam_envs.rosbridge.bus import Bus, Caller, Handler, Message
-from bam_envs.rosbridge.encoding import MOST_ITEMS
+from bam_envs.rosbridge.encoding import MOST_ITEMS, dump_json, load_json
 from bam_envs.rosbridge.sessions import Sessions
-from bam_envs.rosbridge.strict_json import dump_json, load_json
 
 _log = logging.getLogger(__name__)
 _STRING = "std_msgs/String"

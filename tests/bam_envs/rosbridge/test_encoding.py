@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
-from bam_envs.rosbridge.encoding import decode_frame, encode_cbor, encode_json, encode_png
+from bam_envs.rosbridge.encoding import decode_frame, dump_json, encode_cbor, encode_png, load_json
 from bam_envs.rosbridge.fragments import Fragments, split
 
 DEEP = "Message: expected at most 32 lists and objects in one another, found more."
@@ -68,11 +68,9 @@ def test_numbers_that_are_not_finite_are_for_others_to_refuse():
 
 
 def test_json_is_ascii_and_finite():
-    assert encode_json({"a": "é", "b": b"\x00\xff", "c": [1.5, None]}) == '{"a":"\\u00e9","b":"AP8=","c":[1.5,null]}'
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        encode_json({"a": float("nan")})
-    with pytest.raises(InvalidValue, match=r"^Message: expected plain values, found <object object at "):
-        encode_json({"a": object()})
+    assert dump_json({"a": "é", "b": b"\x00\xff", "c": [1.5, None]}) == '{"a":"\\u00e9","b":"AP8=","c":[1.5,null]}'
+    with pytest.raises(InvalidValue, match=r"^message\.a: expected a plain value, found <object object at "):
+        dump_json({"a": object()})
 
 
 @pytest.mark.parametrize("length", [0, 1, 2, 3, 4, 11, 12, 13, 1000])
@@ -176,3 +174,36 @@ def test_unfinished_messages_have_a_most():
         fragments.add({**GOOD, "id": name}, 0.0)
     with pytest.raises(ProtocolError, match=r"^Fragments of 2 messages are unfinished; send one to its end first\.$"):
         fragments.add({**GOOD, "id": "c"}, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("{", "must be a JSON object: "),
+        ("[1]", "must be a JSON object: expected an object, found [1]"),
+        ('{"a": NaN}', "NaN is not a finite number"),
+        ('{"a": -Infinity}', "-Infinity is not a finite number"),
+        ('{"a": 1e400}', "1e400 is not a finite number"),
+        ("[" * 100_000, "must be a JSON object: "),
+        (None, "must be a string with a JSON object, not NoneType"),
+    ],
+)
+def test_json_that_is_not_strict(text, reason):
+    with pytest.raises(ProtocolError) as error:
+        load_json(text, "A message")
+    assert str(error.value).startswith("A message ")
+    assert reason in str(error.value)
+
+
+def test_json_keeps_every_bit_of_a_number():
+    assert load_json(dump_json({"a": [0.1, 1e-310, 2**60]}, "x"), "x") == {"a": [0.1, 1e-310, 2**60]}
+
+
+def test_bytes_are_base64():
+    assert dump_json({"data": b"\0\1"}, "x") == '{"data":"AAE="}'
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), {1}, object()])
+def test_what_json_has_no_word_for(value):
+    with pytest.raises(InvalidValue, match=r"^A thing\[0\]: expected "):
+        dump_json([value], "A thing")

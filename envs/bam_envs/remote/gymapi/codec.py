@@ -36,7 +36,7 @@ from bam_envs.remote.gymapi.versions import JUNE_22, Version
 from bam_envs.remote.transport import EnvSpecMessage, Info
 from bam_envs.remote.values import exact, pack, tree_from_json, tree_to_json
 from bam_envs.ros.images import FORMATS, color_message, depth_message, read_color_message, read_depth_message
-from bam_envs.rosbridge.strict_json import dump_json, load_json
+from bam_envs.rosbridge.encoding import dump_json, load_json
 
 Trees = dict[str, Any]
 Values = dict[Path, Any]

@@ -23,7 +23,7 @@ from bam_envs.remote.transport import Info, Seed
 from bam_envs.remote.values import plain_info, tree_from_json, tree_to_json
 from bam_envs.ros.freshness import Tag, read_tag
 from bam_envs.ros.interfaces import complete, complete_known, request_type, response_type
-from bam_envs.rosbridge.strict_json import dump_json, load_json
+from bam_envs.rosbridge.encoding import dump_json, load_json
 
 KIND = "bam_msgs/GymAPI"
 PREFIX = "bam:"

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from bam_envs.rosbridge.encoding import encode_cbor, encode_json, encode_png
+from bam_envs.rosbridge.encoding import dump_json, encode_cbor, encode_png
 from bam_envs.rosbridge.fragments import split
 
 _NUMBERS = itertools.count(1)
@@ -57,9 +57,9 @@ def pack(
     wire = wire or Wire()
     if wire.compression == "cbor":
         return Packet((encode_cbor(message, kind),), text=False, stream=stream)
-    text = encode_json(message)
+    text = dump_json(message)
     if wire.compression == "png":
-        text = encode_json({"op": "png", "data": encode_png(text)})
+        text = dump_json({"op": "png", "data": encode_png(text)})
     whole = len(text) <= wire.fragment_size
     parts = [text] if whole else split(text, wire.fragment_size, f"fragment:{next(_NUMBERS)}")
     return Packet(tuple(part.encode("ascii") for part in parts), text=True, stream=stream)
