@@ -128,8 +128,6 @@ def test_a_reply_that_is_no_json_is_an_error_over_there(pair):
 def test_only_plain_finite_values_are_sent(pair, value):
     rpc, bus, _ = pair(lambda payload: {})
     with pytest.raises(InvalidValue, match=r"A request to /bam/scene\.payload\.x: expected a (plain|finite) "):
-        InvalidValue, match=r"A request to /bam/scene\.payload\.x: expected a (plain value|finite number), found "
-    ):
         rpc.call({"x": value}, 5)
     assert bus.sent == []
 
