@@ -24,8 +24,8 @@ from bam_envs.robo_gym.options import constructor_options, require_values
 from bam_envs.robo_gym.table import ROBO_GYM
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import WHERE
+from bam_train.env_location import HERE, Place
 from bam_train.errors import CheckpointMismatch, SettingsError
-from bam_train.place import HERE, Place
 
 _OWN = ("bam_envs", "bam_train", "gymnasium")
 

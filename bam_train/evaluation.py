@@ -20,7 +20,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from bam_envs.core.validation import NonNegativeInt, PositiveInt, check
 from bam_train.environments import is_batched, make_rows
 from bam_train.errors import SettingsError
-from bam_train.finite import FiniteRows
+from bam_train.finite_envs import FiniteRows
 from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, VecGymAgent, Workspace
 from bam_train.loop.gym.gym_observations import names
 from bam_train.loop.video_agent import VideoAgent

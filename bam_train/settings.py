@@ -21,7 +21,7 @@ from msgspec import Meta
 from bam_train.errors import SettingsError
 
 if TYPE_CHECKING:
-    from bam_train.place import Place
+    from bam_train.env_location import Place
 
 tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 
@@ -111,7 +111,7 @@ class TrainSettings:
     @property
     def place(self) -> Place:
         """Where the environment runs."""
-        from bam_train.place import Place
+        from bam_train.env_location import Place
 
         return Place(transport=tuple(self.transport), ca_file=self.ca_file, token_file=self.token_file)
 

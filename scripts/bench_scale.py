@@ -98,7 +98,7 @@ def rllib_settings(options: argparse.Namespace, runners: int) -> dict[str, Any]:
 def measure(name: str, settings: dict[str, Any], options: argparse.Namespace) -> Result:
     """Train for the iterations asked for, and time each from its first step to its last update."""
     from bam_train.trainers import load_trainer
-    from bam_train.trainers.resolve import resolve
+    from bam_train.trainers.resolve_settings import resolve
 
     total = options.batch * (options.warm_up + options.iterations)
     complete = resolve({"env": options.env, "algo": "ppo", "steps": total, "eval_every": total, **settings})

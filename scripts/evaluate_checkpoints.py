@@ -22,7 +22,7 @@ from bam_train.errors import BamTrainError
 from bam_train.evaluation import FIRST_SEED, EvaluationReport, evaluate
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import differences, file_stem
-from bam_train.trainers.resolve import resolve
+from bam_train.trainers.resolve_settings import resolve
 
 FOLDER = Path(__file__).resolve().parents[1] / "checkpoints"
 HEADER = ("checkpoint", "command", "seed", "steps", "wall time", "success", "size")

@@ -300,27 +300,15 @@ def flag(kind: type, field: dataclasses.Field[Any]) -> str:
 
 def algorithms(trainer: str = "sb3") -> str:
     """The table of a trainer's algorithms."""
-    if trainer == "rllib":
-        return rllib_algorithms()
-    from bam_train.trainers.sb3.sb3_algorithms import ALGORITHMS
+    from bam_train.trainers.algorithms import ALGORITHMS
 
     rows = []
-    for row in ALGORITHMS.values():
-        memory = "fresh rollouts" if row.on_policy else "replay buffer"
+    for row in ALGORITHMS[trainer].values():
+        memory = "recorded episodes" if row.offline else "fresh rollouts" if row.on_policy else "replay buffer"
         policy = f"{memory}, recurrent policy" if row.recurrent else memory
         rows.append([f"`{row.name}`", f"`{row.reference.replace(':', '.')}`", ", ".join(row.actions), policy])
-    return table(["--algo", "class", "action spaces", "learns from"], rows)
-
-
-def rllib_algorithms() -> str:
-    """The table of RLlib's algorithms."""
-    from bam_train.trainers.rllib_algorithms import ALGORITHMS
-
-    rows = []
-    for row in ALGORITHMS.values():
-        memory = "recorded episodes" if row.offline else "fresh rollouts" if row.on_policy else "replay buffer"
-        rows.append([f"`{row.name}`", f"`{row.reference.replace(':', '.')}`", ", ".join(row.actions), memory])
-    return table(["--algo", "configuration", "action spaces", "learns from"], rows)
+    kind = "configuration" if trainer == "rllib" else "class"
+    return table(["--algo", kind, "action spaces", "learns from"], rows)
 
 
 def robo_gym() -> str:

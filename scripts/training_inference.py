@@ -24,9 +24,9 @@ from bam_train.cli.program import guarded
 from bam_train.evaluation import FIRST_SEED
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers import load_trainer
+from bam_train.trainers.base import Progress
 from bam_train.trainers.best_checkpoint import choose_output
-from bam_train.trainers.resolve import resolve
-from bam_train.trainers.trainer import Progress
+from bam_train.trainers.resolve_settings import resolve
 
 
 @dataclass(frozen=True)

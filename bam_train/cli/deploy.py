@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from bam_train.cli.flags import DeployConfig
     from bam_train.deploy.deployment import Watcher
     from bam_train.deploy.journal import Journal
-    from bam_train.place import Place
+    from bam_train.env_location import Place
 
 
 def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
@@ -97,11 +97,11 @@ def checked_place(config: DeployConfig) -> Place:
     Raises:
         SettingsError: Flags that exclude each other, or nothing to show.
     """
+    from bam_train.env_location import Place, addresses
     from bam_train.errors import SettingsError
-    from bam_train.place import Place, addresses
 
-    files = (None if path is None else str(path) for path in (config.ca_file, config.token_file))
-    place = Place(config.robot, addresses(config.transport), config.profile, *files, config.timeout)
+    ca_file, token_file = (None if path is None else str(path) for path in (config.ca_file, config.token_file))
+    place = Place(config.robot, addresses(config.transport), config.profile, ca_file, token_file, config.timeout)
     if config.rate is not None and config.fast:
         raise SettingsError("--fast does not wait for deadlines, so --rate has no meaning with it; give one of the two")
     if config.transport is not None and not place.transport:

@@ -116,7 +116,7 @@ def require_place(env_id: str, robot: str | None, render: bool) -> None:
     """
     if robot is not None:
         from bam_envs.live.building import require_robot_address
-        from bam_train.place import Place
+        from bam_train.env_location import Place
 
         require_robot_address(robot)
         Place(robot).robot_kwargs(env_id, {})
@@ -179,8 +179,8 @@ def open_env(
         CheckpointMismatch: The environment is another than the checkpoint was trained in.
         SettingsError: It cannot be made or shown, or nobody says that the real robot may move.
     """
+    from bam_train.env_location import Place
     from bam_train.environments import environment_of, make_env, require_fit
-    from bam_train.place import Place
 
     place = Place(robot=robot)
     env_id, own = environment_of(checkpoint)

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.flags import TrainConfig
     from bam_train.settings import TrainSettings
+    from bam_train.trainers.base import Trainer
     from bam_train.trainers.best_checkpoint import Output
     from bam_train.trainers.checkpoint_copies import Copies
-    from bam_train.trainers.run import TrainingRun
     from bam_train.trainers.run_folder import RunFolder
-    from bam_train.trainers.trainer import Trainer
+    from bam_train.trainers.training_run import TrainingRun
 
 _STARTED = time.monotonic()
 
@@ -43,9 +43,9 @@ def train(config: TrainConfig) -> int:
 
 
 def _settings(config: TrainConfig, checkpoint: Checkpoint | None) -> TrainSettings:
-    from bam_train.place import addresses
+    from bam_train.env_location import addresses
     from bam_train.settings import NAMES, merge, read_assignments, read_config
-    from bam_train.trainers.resolve import resolve, resolve_resumed
+    from bam_train.trainers.resolve_settings import resolve, resolve_resumed
 
     file = {} if config.config is None else read_config(config.config)
     flags = {name: getattr(config, name) for name in NAMES if getattr(config, name) is not None}
@@ -100,7 +100,7 @@ def _title(settings: TrainSettings, checkpoint: Checkpoint | None) -> str:
 def _run(trainer: Trainer, folder: RunFolder, output: Output, copies: Copies | None, title: str) -> int:
     """Train to the end and say how it went; returns the exit status."""
     from bam_train.cli.train_display import make_display, summarise
-    from bam_train.trainers.run import TrainingRun
+    from bam_train.trainers.training_run import TrainingRun
 
     display = make_display(title)
     run = TrainingRun(trainer, folder, output.path, display, output.best, copies=copies)
@@ -145,7 +145,7 @@ def stopped_by_signals(run: TrainingRun) -> Iterator[list[int]]:
 
 def _quit(run: TrainingRun, number: int) -> None:
     """End the process here, wherever it is: an exception might be caught, or wait for threads."""
-    from bam_train.trainers.at_quit import before_quitting
+    from bam_train.trainers.quit_callbacks import before_quitting
 
     kept = f"the last checkpoint on the disk is {run.last}" if run.last else "no checkpoint had been saved yet"
     _write(f"bam-train: quit at once; {kept}\n")

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
     from bam_train.evaluation import EvaluationReport
     from bam_train.settings import TrainSettings
-    from bam_train.trainers.run import Outcome
+    from bam_train.trainers.base import Progress, Statistics
     from bam_train.trainers.run_folder import RunFolder
-    from bam_train.trainers.trainer import Progress, Statistics
+    from bam_train.trainers.training_run import Outcome
 
 LINE_EVERY = 1.0
 """Seconds between two plain lines about training at least."""

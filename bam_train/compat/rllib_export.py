@@ -44,8 +44,9 @@ from bam_train.policy import FrozenPolicy
 from bam_train.policy.array_specs import array_spec, observation_arrays
 from bam_train.policy.golden_check import TOLERANCE, worst_difference
 from bam_train.settings import TrainSettings
-from bam_train.trainers.freezing.golden import pack
-from bam_train.trainers.manifest import origin
+from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
+from bam_train.trainers.frozen_network import pack
+from bam_train.trainers.manifest_fields import origin
 from bam_train.trainers.rllib.rllib_freezing import (
     AnySpace,
     FrozenModule,
@@ -56,7 +57,6 @@ from bam_train.trainers.rllib.rllib_freezing import (
     golden,
     leaf_spaces,
 )
-from bam_train.trainers.rllib_algorithms import ALGORITHMS
 
 EXPORTED = "exported"
 """Setting of the manifest that says where an exported checkpoint comes from; a run's own has none of this name."""
@@ -231,8 +231,8 @@ def _algorithm(found: _Policy, asked: str | None) -> str:
     """Name of the algorithm; the directory of a policy alone only says whose network it has."""
     own = found.parts.algorithm if re.fullmatch(r"\w{1,40}", found.parts.algorithm, re.ASCII) else ""
     asked = None if asked is None else asked.lower()  # PPO, as RLlib says it
-    if asked is not None and asked not in ALGORITHMS:
-        raise UnknownName("algorithm", asked, ALGORITHMS)
+    if asked is not None and asked not in RLLIB_ALGORITHMS:
+        raise UnknownName("algorithm", asked, RLLIB_ALGORITHMS)
     if asked is None and not own:
         raise CheckpointMismatch(found.directory.given, "does not say which algorithm trained it; give --algo NAME")
     known = found.restored is None or found.restored.whole

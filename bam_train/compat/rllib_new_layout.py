@@ -12,6 +12,7 @@ from typing import Any
 from bam_train.compat.rllib_directory import ARGUMENTS, Directory
 from bam_train.errors import AlteredCheckpoint, SettingsError
 from bam_train.settings import TrainSettings
+from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
 from bam_train.trainers.rllib.rllib_freezing import (
     POLICY_ID,
     PolicyParts,
@@ -19,7 +20,6 @@ from bam_train.trainers.rllib.rllib_freezing import (
     parts_of,
     require_layout_only,
 )
-from bam_train.trainers.rllib_algorithms import ALGORITHMS
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def training_settings(
     from bam_train.trainers.rllib import hyperparameters
     from bam_train.trainers.rllib.config import is_plain
 
-    algorithm = ALGORITHMS.get(parts.algorithm)
+    algorithm = RLLIB_ALGORITHMS.get(parts.algorithm)
     own_module = type(restored.module).__module__.startswith("ray.rllib.algorithms.")
     if not restored.whole or algorithm is None or algorithm.offline or directory.name != POLICY_ID or not own_module:
         raise SettingsError("it is no whole algorithm with one policy of RLlib's own that learns in an environment")

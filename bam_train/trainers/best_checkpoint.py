@@ -14,9 +14,9 @@ from bam_train.checkpoint import Checkpoint, next_free_path
 from bam_train.checkpoint.manifest import AGAIN
 from bam_train.errors import AlteredCheckpoint, CheckpointError, OutputError, SettingsError
 from bam_train.settings import TrainSettings, file_stem, read_config
-from bam_train.trainers.resolve import CHANGEABLE
-from bam_train.trainers.run import Best
+from bam_train.trainers.resolve_settings import CHANGEABLE
 from bam_train.trainers.run_folder import require_writable
+from bam_train.trainers.training_run import Best
 
 NOTES = "bam/resume/notes.json"
 FOLDER = Path("checkpoints")

@@ -16,6 +16,7 @@ from ray.rllib.utils.error import UnsupportedSpaceException
 from bam_train.environments import is_batched
 from bam_train.errors import BamTrainError, SettingsError
 from bam_train.settings import TrainSettings
+from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
 from bam_train.trainers.rllib import hyperparameters
 from bam_train.trainers.rllib.cluster import faults
 from bam_train.trainers.rllib.cluster.cluster import fault_tolerance, learners
@@ -23,7 +24,6 @@ from bam_train.trainers.rllib.registration import register_foreign
 from bam_train.trainers.rllib.sampling.env_runner import RobotEnvRunner, log_end
 from bam_train.trainers.rllib.sampling.filters import MeanStdFilter
 from bam_train.trainers.rllib.sampling.rows import End
-from bam_train.trainers.rllib_algorithms import ALGORITHMS
 
 STEPS_AT_LEAST = 200
 """Steps of an iteration of an algorithm that updates after every few: its overhead is then small."""
@@ -38,7 +38,7 @@ def make_config(settings: TrainSettings, observation_space: Space[Any], action_s
         action_space: The environment's own.
         seed: Of weights, exploration and environments.
     """
-    algorithm, values = ALGORITHMS[settings.algo], settings.hyperparameters
+    algorithm, values = RLLIB_ALGORITHMS[settings.algo], settings.hyperparameters
     number, gpus_each = learners(settings)
     config = algorithm.load()()
     config.framework("torch").rl_module(model_config=dict(values["model_config"]))
@@ -92,7 +92,7 @@ def is_plain(space: Space[Any]) -> bool:
 
 def _least_steps(settings: TrainSettings) -> int:
     """How long an iteration is at least; on-policy algorithms say so themselves, offline ones take no step."""
-    algorithm = ALGORITHMS[settings.algo]
+    algorithm = RLLIB_ALGORITHMS[settings.algo]
     if algorithm.on_policy or algorithm.offline:
         return 0
     return min(STEPS_AT_LEAST, settings.eval_every or STEPS_AT_LEAST)

@@ -24,9 +24,9 @@ from ray.rllib.utils.replay_buffers import EpisodeReplayBuffer, PrioritizedEpiso
 from bam_envs.core.wording import brief, did_you_mean
 from bam_train.errors import SettingsError
 from bam_train.settings import NAMES
+from bam_train.trainers.algorithms import Algorithm
 from bam_train.trainers.library_arguments import fit, fits
 from bam_train.trainers.rllib.ranges import check_ranges
-from bam_train.trainers.rllib_algorithms import Algorithm
 
 ELSEWHERE = {
     "train_batch_size": "train_batch_size_per_learner",

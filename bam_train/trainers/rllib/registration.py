@@ -16,8 +16,8 @@ import gymnasium as gym
 import bam_envs  # noqa: F401 - registers our environments with Gymnasium
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.registry import ENVIRONMENTS
-from bam_train.finite import FiniteEnv
-from bam_train.trainers.from_zero import from_zero
+from bam_train.finite_envs import FiniteEnv
+from bam_train.trainers.zero_based_spaces import from_zero
 
 try:
     from ray.tune.registry import register_env

@@ -22,11 +22,20 @@ from numpy.typing import NDArray
 from torch import nn
 
 from bam_train.errors import PolicyError, SettingsError
-from bam_train.trainers.freezing.golden import affordable, clearest, draw_array, pack
-from bam_train.trainers.freezing.layers import Choice, Layer, OneHot, to, zeros
-from bam_train.trainers.freezing.onnx_export import onnx_file
-from bam_train.trainers.from_zero import less_start
+from bam_train.trainers.frozen_network import (
+    Choice,
+    Layer,
+    OneHot,
+    affordable,
+    clearest,
+    draw_array,
+    onnx_file,
+    pack,
+    to,
+    zeros,
+)
 from bam_train.trainers.rllib.state_pickles import unpacked_array
+from bam_train.trainers.zero_based_spaces import less_start
 
 Array = NDArray[Any]
 AnySpace = spaces.Space[Any]

@@ -31,8 +31,10 @@ from bam_train.environments import control_period, make_env, require_fit
 from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
-from bam_train.trainers.manifest import manifest
-from bam_train.trainers.resolve import own_settings
+from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
+from bam_train.trainers.base import OnProgress, Progress, Statistics
+from bam_train.trainers.manifest_fields import manifest
+from bam_train.trainers.resolve_settings import own_settings
 from bam_train.trainers.rllib import hyperparameters, state
 from bam_train.trainers.rllib.cluster.cluster import cluster
 from bam_train.trainers.rllib.cluster.fault_tolerance import RunnerWatch
@@ -40,8 +42,6 @@ from bam_train.trainers.rllib.config import envs_each, make_config, refusals
 from bam_train.trainers.rllib.rllib_freezing import PolicyParts, RLlibPolicy, freeze, golden, parts_of
 from bam_train.trainers.rllib.sampling.env_runner import ENDS
 from bam_train.trainers.rllib.tensorboard import TensorBoard
-from bam_train.trainers.rllib_algorithms import ALGORITHMS
-from bam_train.trainers.trainer import OnProgress, Progress, Statistics
 
 _FINITE = "expected finite numbers: try a smaller lr"
 _EPISODES = 100
@@ -91,7 +91,7 @@ class RLlibTrainer:
     @classmethod
     def complete(cls, settings: TrainSettings) -> TrainSettings:
         """Check the algorithm's own settings and fill in its defaults."""
-        algorithm = ALGORITHMS[settings.algo]
+        algorithm = RLLIB_ALGORITHMS[settings.algo]
         _require_fitting(settings)
         seen = Seen.of(settings)
         algorithm.require_actions(settings.env, type(seen.action_space).__name__)
@@ -171,7 +171,7 @@ class RLlibTrainer:
             self._tensorboard.write(self._metrics() | self._means(), self.steps)
 
     def _count(self) -> int:
-        if ALGORITHMS[self.settings.algo].offline:
+        if RLLIB_ALGORITHMS[self.settings.algo].offline:
             return int(self._learned("num_module_steps_trained_lifetime"))
         return int(self._result.get("env_runners", {}).get("num_env_steps_sampled_lifetime", self._steps))
 
@@ -311,9 +311,9 @@ def _require_fitting(settings: TrainSettings) -> None:
             f"device: rllib learns on the CPU, or on as many GPUs as --num-gpus says; found {settings.device!r}. "
             "Leave --device out, and give --num-gpus 1"
         )
-    offline = ALGORITHMS[settings.algo].offline
+    offline = RLLIB_ALGORITHMS[settings.algo].offline
     if settings.data is not None and not offline:
-        names = ", ".join(sorted(row.name for row in ALGORITHMS.values() if row.offline))
+        names = ", ".join(sorted(row.name for row in RLLIB_ALGORITHMS.values() if row.offline))
         raise SettingsError(f"data: {settings.algo} learns in the environment; leave it out, or use one of: {names}")
     if offline:
         _require_offline(settings)
@@ -356,7 +356,7 @@ def _shares(settings: TrainSettings) -> list[str]:
 
 def _not_saved(settings: TrainSettings) -> list[str]:
     """What a resumed run begins anew."""
-    algorithm = ALGORITHMS[settings.algo]
+    algorithm = RLLIB_ALGORITHMS[settings.algo]
     if algorithm.offline:
         return []
     lost = "running episodes" if algorithm.on_policy else "running episodes and replay buffers"

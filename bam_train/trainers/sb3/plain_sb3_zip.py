@@ -17,8 +17,8 @@ from bam_train.checkpoint.zip_members import open_zip
 from bam_train.environments import make_env
 from bam_train.errors import CheckpointMismatch, NotACheckpoint
 from bam_train.policy import FrozenPolicy
-from bam_train.trainers.from_zero import from_zero
-from bam_train.trainers.sb3.sb3_algorithms import ALGORITHMS
+from bam_train.trainers.algorithms import SB3_ALGORITHMS
+from bam_train.trainers.zero_based_spaces import from_zero
 
 # What SB3's load lets out for a file of another algorithm or another version, then what it does for a damaged one.
 _MISFIT = (ValueError, TypeError, KeyError, AttributeError, RuntimeError, AssertionError, ImportError)
@@ -51,7 +51,7 @@ def load_trusted(path: Path, algo: str, env_id: str, env_kwargs: Mapping[str, An
 
     Args:
         path: The zip.
-        algo: A name of `ALGORITHMS`.
+        algo: A name of `SB3_ALGORITHMS`.
         env_id: The environment it was trained on.
         env_kwargs: Its keyword arguments.
 
@@ -60,7 +60,7 @@ def load_trusted(path: Path, algo: str, env_id: str, env_kwargs: Mapping[str, An
     """
     from bam_train.trainers.sb3.sb3_freezing import freeze
 
-    algorithm = ALGORITHMS[algo].load()
+    algorithm = SB3_ALGORITHMS[algo].load()
     env = make_env(env_id, env_kwargs)
     try:
         model = algorithm.load(path, env=from_zero(env), device="cpu")

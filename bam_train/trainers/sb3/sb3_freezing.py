@@ -24,8 +24,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from bam_train.errors import PolicyError
-from bam_train.trainers.freezing.layers import Choice, Layer, OneHot, to, zeros
-from bam_train.trainers.freezing.onnx_export import onnx_file
+from bam_train.trainers.frozen_network import Choice, Layer, OneHot, onnx_file, to, zeros
 
 _KINDS = "Box, Discrete, MultiDiscrete or MultiBinary"
 

@@ -12,9 +12,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize, VecTransposeImage, unwrap_vec_wrapper
 from torch import nn
 
-from bam_train.trainers.freezing.golden import affordable, clearest, draw_array, pack
-from bam_train.trainers.from_zero import less_start, plus_start
+from bam_train.trainers.frozen_network import affordable, clearest, draw_array, pack
 from bam_train.trainers.sb3.sb3_freezing import FrozenModule, leaves
+from bam_train.trainers.zero_based_spaces import less_start, plus_start
 
 
 def golden(

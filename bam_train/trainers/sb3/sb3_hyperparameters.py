@@ -26,8 +26,8 @@ from bam_envs.core.validation import Finite, Fraction, NonNegative, Positive, Po
 from bam_envs.core.wording import did_you_mean
 from bam_train.errors import SettingsError
 from bam_train.settings import NAMES
+from bam_train.trainers.algorithms import Algorithm
 from bam_train.trainers.library_arguments import fit, linear_start, ranges
-from bam_train.trainers.sb3.sb3_algorithms import Algorithm
 
 ELSEWHERE = {
     "self": None,

@@ -18,11 +18,11 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeI
 from bam_train.environments import control_period
 from bam_train.errors import SettingsError
 from bam_train.settings import TrainSettings
-from bam_train.trainers.from_zero import FromZero
+from bam_train.trainers.algorithms import SB3_ALGORITHMS
 from bam_train.trainers.sb3 import sb3_hyperparameters as hyperparameters
-from bam_train.trainers.sb3.sb3_algorithms import ALGORITHMS
 from bam_train.trainers.sb3.sb3_freezing import leaves
 from bam_train.trainers.sb3.sb3_vec_env import RowsVecEnv
+from bam_train.trainers.zero_based_spaces import FromZero
 
 
 def make_model(settings: TrainSettings, venv: VecEnv) -> Any:
@@ -31,7 +31,7 @@ def make_model(settings: TrainSettings, venv: VecEnv) -> Any:
     arguments = hyperparameters.build(settings.hyperparameters, venv.action_space)
     policy = arguments.pop("policy")
     device = _device(settings.device, policy)
-    return ALGORITHMS[settings.algo].load()(policy, env, seed=settings.seed, device=device, verbose=0, **arguments)
+    return SB3_ALGORITHMS[settings.algo].load()(policy, env, seed=settings.seed, device=device, verbose=0, **arguments)
 
 
 def _normalised(venv: VecEnv, given: bool | dict[str, Any]) -> VecNormalize:

@@ -26,18 +26,18 @@ from bam_train.environments import make_env, make_rows, require_fit
 from bam_train.errors import TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
-from bam_train.trainers.manifest import manifest
-from bam_train.trainers.resolve import own_settings
+from bam_train.trainers.algorithms import SB3_ALGORITHMS
+from bam_train.trainers.base import OnProgress, Progress, Statistics
+from bam_train.trainers.manifest_fields import manifest
+from bam_train.trainers.resolve_settings import own_settings
 from bam_train.trainers.sb3 import sb3_hyperparameters as hyperparameters
 from bam_train.trainers.sb3 import sb3_resume as resume
-from bam_train.trainers.sb3.sb3_algorithms import ALGORITHMS
 from bam_train.trainers.sb3.sb3_freezing import freeze
 from bam_train.trainers.sb3.sb3_golden import golden
 from bam_train.trainers.sb3.sb3_model import library_notices, make_model, meaning, one_env, refusals, sb3_members
 from bam_train.trainers.sb3.sb3_state import all_finite, refused_distribution, undisturbed
 from bam_train.trainers.sb3.sb3_tensorboard import ForgivingTensorBoard
 from bam_train.trainers.sb3.sb3_vec_env import RowsVecEnv, make_training_env
-from bam_train.trainers.trainer import OnProgress, Progress, Statistics
 
 _FINITE = "expected finite numbers: try a smaller learning_rate"
 
@@ -71,7 +71,7 @@ class SB3Trainer:
     @classmethod
     def complete(cls, settings: TrainSettings) -> TrainSettings:
         """Check the algorithm's own settings and fill in its defaults."""
-        algorithm = ALGORITHMS[settings.algo]
+        algorithm = SB3_ALGORITHMS[settings.algo]
         num_envs, observation_space, action_space = _look(settings)
         algorithm.require_actions(settings.env, type(action_space).__name__)
         values = hyperparameters.complete(algorithm, settings.hyperparameters, observation_space)
@@ -147,7 +147,7 @@ class SB3Trainer:
 
     def _log_interval(self) -> int:
         """Rollouts (on-policy) or episodes between two entries of the log."""
-        if ALGORITHMS[self.settings.algo].on_policy:
+        if SB3_ALGORITHMS[self.settings.algo].on_policy:
             return int(max(1, 2048 // (self.model.n_steps * self.settings.num_envs)))
         return max(4, self.settings.num_envs)
 
@@ -163,7 +163,7 @@ class SB3Trainer:
     def _between(self) -> None:
         self._reported = self.steps
         self._require_finite_losses()
-        if ALGORITHMS[self.settings.algo].on_policy:
+        if SB3_ALGORITHMS[self.settings.algo].on_policy:
             self._require_finite_weights()
         if not self._on_progress(Progress(self.steps, self._total, self._statistics)):
             raise _Stop

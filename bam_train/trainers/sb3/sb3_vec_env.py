@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from bam_train.env_location import HERE, Place
 from bam_train.environments import is_batched, make_env, make_rows
 from bam_train.errors import SettingsError
-from bam_train.finite import FiniteEnv, FiniteRows
-from bam_train.place import HERE, Place
-from bam_train.trainers.from_zero import from_zero
+from bam_train.finite_envs import FiniteEnv, FiniteRows
+from bam_train.trainers.zero_based_spaces import from_zero
 
 Observations = Any
 """An array (n, …), or a mapping of them."""

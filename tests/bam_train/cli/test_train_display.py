@@ -9,7 +9,7 @@ import pytest
 
 from bam_train.cli.train_display import PlainDisplay, evaluation_line, make_display
 from bam_train.evaluation import EvaluationReport
-from bam_train.trainers.trainer import Progress, Statistics
+from bam_train.trainers.base import Progress, Statistics
 
 
 def statistics(success):

@@ -25,7 +25,7 @@ import ray.rllib  # sets up its loggers
 
 from bam_train.errors import TrainingFailed
 from bam_train.settings import TrainSettings
-from bam_train.trainers.at_quit import at_quit
+from bam_train.trainers.quit_callbacks import at_quit
 from bam_train.trainers.rllib.cluster.address import find, reach
 from bam_train.trainers.rllib.cluster.descendants import Descendants
 from bam_train.trainers.rllib.cluster.fault_tolerance import fault_tolerance

@@ -31,7 +31,7 @@ from ray.rllib.utils.spaces.space_utils import clip_action, unsquash_action
 
 from bam_train.environments import is_batched, make_rows
 from bam_train.errors import SettingsError
-from bam_train.finite import FiniteRows
+from bam_train.finite_envs import FiniteRows
 from bam_train.trainers.rllib.cluster.faults import FaultReporting
 from bam_train.trainers.rllib.sampling.filters import MeanStdFilter
 from bam_train.trainers.rllib.sampling.rows import End, Rollout, Running

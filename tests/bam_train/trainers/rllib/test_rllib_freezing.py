@@ -18,8 +18,8 @@ from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import safetensors_file
 from bam_train.errors import PolicyError
 from bam_train.policy import FrozenPolicy
+from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
 from bam_train.trainers.rllib.rllib_freezing import RLlibPolicy, draw, freeze, golden, one_by_one, parts_of
-from bam_train.trainers.rllib_algorithms import ALGORITHMS
 
 NUMBERS = Box(-np.array([1, 2, 3], np.float32), np.array([1, 2, 3], np.float32))
 ARM = Box(-np.array([2, 3], np.float32), np.array([1, 5], np.float32))
@@ -39,7 +39,7 @@ class Live:
 
     def __init__(self, algo="ppo", seen=NUMBERS, acts=ARM, pieces=(), training=None, spec=None, **model):
         self.spaces = (seen, acts)
-        config = ALGORITHMS[algo].load()().environment(observation_space=seen, action_space=acts)
+        config = RLLIB_ALGORITHMS[algo].load()().environment(observation_space=seen, action_space=acts)
         if spec is None:
             config.rl_module(model_config=DefaultModelConfig(**{"fcnet_hiddens": [16, 16], **model}))
         else:
@@ -100,12 +100,12 @@ def require_same(live, n=300):
         assert not np.array_equal(found, expected.round(2))
 
 
-@pytest.mark.parametrize("algo", [name for name, row in ALGORITHMS.items() if "Box" in row.actions])
+@pytest.mark.parametrize("algo", [name for name, row in RLLIB_ALGORITHMS.items() if "Box" in row.actions])
 def test_continuous_actions(algo):
     require_same(Live(algo))
 
 
-@pytest.mark.parametrize("algo", [name for name, row in ALGORITHMS.items() if "Discrete" in row.actions])
+@pytest.mark.parametrize("algo", [name for name, row in RLLIB_ALGORITHMS.items() if "Discrete" in row.actions])
 def test_discrete_actions(algo):
     require_same(Live(algo, acts=Discrete(4), head_fcnet_hiddens=[8]))
 

@@ -15,7 +15,7 @@ pytest.importorskip("ray")
 from bam_train.checkpoint import Checkpoint, write_checkpoint
 from bam_train.errors import AlteredCheckpoint
 from bam_train.settings import TrainSettings
-from bam_train.trainers.resolve import resolve, resolve_resumed
+from bam_train.trainers.resolve_settings import resolve, resolve_resumed
 from bam_train.trainers.rllib import state
 from bam_train.trainers.rllib.cluster.cluster import cluster
 from bam_train.trainers.rllib.learner_extras import extras_of

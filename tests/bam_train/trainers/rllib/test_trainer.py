@@ -19,12 +19,12 @@ from bam_train.compat.rllib_export import export
 from bam_train.errors import BamTrainError, CheckpointMismatch, EnvironmentFailed, SettingsError
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
-from bam_train.trainers.resolve import resolve, resolve_resumed
+from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
+from bam_train.trainers.resolve_settings import resolve, resolve_resumed
 from bam_train.trainers.rllib import hyperparameters, registration, state
 from bam_train.trainers.rllib.cluster.cluster import cluster
 from bam_train.trainers.rllib.config import envs_each
 from bam_train.trainers.rllib.trainer import RLlibTrainer
-from bam_train.trainers.rllib_algorithms import ALGORITHMS
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*:DeprecationWarning:ray")  # Ray's own, of its data library
 
@@ -367,15 +367,15 @@ def test_settings_of_rllib_are_refused_with_sb3():
     ],
 )
 def test_settings_that_look_odd_and_are_not(algo, given):
-    values = hyperparameters.complete(ALGORITHMS[algo], given)
+    values = hyperparameters.complete(RLLIB_ALGORITHMS[algo], given)
     for name in given.keys() - {"model_config", "replay_buffer_config"}:
         assert values[name] == given[name]
 
 
-@pytest.mark.parametrize("name", sorted(ALGORITHMS))
+@pytest.mark.parametrize("name", sorted(RLLIB_ALGORITHMS))
 def test_complete_settings_stay_as_they_are(name):
-    values = hyperparameters.complete(ALGORITHMS[name], {})
-    assert hyperparameters.complete(ALGORITHMS[name], values) == values
+    values = hyperparameters.complete(RLLIB_ALGORITHMS[name], {})
+    assert hyperparameters.complete(RLLIB_ALGORITHMS[name], values) == values
 
 
 def test_the_preset_belongs_to_its_trainer():

@@ -12,18 +12,18 @@ import torch
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 
 from bam_train.errors import SettingsError
-from bam_train.trainers.sb3.sb3_algorithms import ALGORITHMS
+from bam_train.trainers.algorithms import SB3_ALGORITHMS
 from bam_train.trainers.sb3.sb3_hyperparameters import build, complete, complete_normalize, default_policy
 
 NUMBERS = gym.spaces.Box(-1, 1, (3,))
 IMAGE = gym.spaces.Box(0, 255, (36, 36, 3), np.uint8)
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
+@pytest.mark.parametrize("name", SB3_ALGORITHMS)
 def test_defaults_are_json_and_complete_twice_is_once(name):
-    values = complete(ALGORITHMS[name], {}, NUMBERS)
+    values = complete(SB3_ALGORITHMS[name], {}, NUMBERS)
     assert json.loads(json.dumps(values)) == values
-    assert complete(ALGORITHMS[name], values, NUMBERS) == values
+    assert complete(SB3_ALGORITHMS[name], values, NUMBERS) == values
     assert not {"env", "seed", "device", "verbose", "tensorboard_log"} & values.keys()
 
 
@@ -39,7 +39,7 @@ def test_defaults_are_json_and_complete_twice_is_once(name):
     ],
 )
 def test_the_policy_fits_what_is_observed(name, space, policy):
-    assert default_policy(ALGORITHMS[name], space) == policy
+    assert default_policy(SB3_ALGORITHMS[name], space) == policy
 
 
 @pytest.mark.parametrize(
@@ -76,13 +76,13 @@ def test_the_policy_fits_what_is_observed(name, space, policy):
 )
 def test_what_does_not_fit_is_one_line(name, given, message):
     with pytest.raises(SettingsError) as caught:
-        complete(ALGORITHMS[name], given, NUMBERS)
+        complete(SB3_ALGORITHMS[name], given, NUMBERS)
     assert str(caught.value) == message
 
 
 def test_build_makes_objects_and_changes_nothing():
     given = {"learning_rate": "lin_3e-4", "policy_kwargs": {"activation_fn": "Tanh", "net_arch": [8]}}
-    values = complete(ALGORITHMS["ppo"], given, NUMBERS)
+    values = complete(SB3_ALGORITHMS["ppo"], given, NUMBERS)
     before = copy.deepcopy(values)
     arguments = build(values, gym.spaces.Discrete(2))
     assert values == before
@@ -94,11 +94,11 @@ def test_build_makes_objects_and_changes_nothing():
 
 def test_build_makes_tuples_and_noise():
     given = {"train_freq": [2, "episode"], "action_noise": "normal_0.25"}
-    arguments = build(complete(ALGORITHMS["td3"], given, NUMBERS), gym.spaces.Box(-1, 1, (2,)))
+    arguments = build(complete(SB3_ALGORITHMS["td3"], given, NUMBERS), gym.spaces.Box(-1, 1, (2,)))
     assert arguments["train_freq"] == (2, "episode")
     assert isinstance(arguments["action_noise"], NormalActionNoise)
     assert arguments["action_noise"]._sigma.tolist() == [0.25, 0.25]
-    noisy = complete(ALGORITHMS["td3"], {"action_noise": "ornstein-uhlenbeck_0.1"}, NUMBERS)
+    noisy = complete(SB3_ALGORITHMS["td3"], {"action_noise": "ornstein-uhlenbeck_0.1"}, NUMBERS)
     assert isinstance(build(noisy, gym.spaces.Box(-1, 1, (2,)))["action_noise"], OrnsteinUhlenbeckActionNoise)
 
 
@@ -117,12 +117,12 @@ def test_normalize():
 )
 def test_an_algorithm_that_does_not_fit_the_actions(name, kind):
     with pytest.raises(SettingsError, match=rf"^{name} does not fit Some-v0: it takes .* actions, found {kind}\. "):
-        ALGORITHMS[name].require_actions("Some-v0", kind)
+        SB3_ALGORITHMS[name].require_actions("Some-v0", kind)
 
 
 def test_the_line_about_actions_names_what_fits():
     with pytest.raises(SettingsError) as caught:
-        ALGORITHMS["dqn"].require_actions("bam/pick-v0", "Box")
+        SB3_ALGORITHMS["dqn"].require_actions("bam/pick-v0", "Box")
     assert str(caught.value) == (
         "dqn does not fit bam/pick-v0: it takes Discrete actions, found Box. "
         "Use one of: a2c, crossq, ddpg, ppo, recurrent-ppo, sac, td3, tqc, trpo."
@@ -147,10 +147,10 @@ def test_the_line_about_actions_names_what_fits():
 )
 def test_numbers_that_cannot_be(name, given, line):
     with pytest.raises(SettingsError) as caught:
-        complete(ALGORITHMS[name], given, NUMBERS)
+        complete(SB3_ALGORITHMS[name], given, NUMBERS)
     assert str(caught.value) == line
 
 
 def test_schedules_and_auto_are_in_range():
-    values = complete(ALGORITHMS["sac"], {"learning_rate": "lin_1e-3", "ent_coef": "auto_0.1"}, NUMBERS)
+    values = complete(SB3_ALGORITHMS["sac"], {"learning_rate": "lin_1e-3", "ent_coef": "auto_0.1"}, NUMBERS)
     assert (values["learning_rate"], values["ent_coef"]) == ("lin_1e-3", "auto_0.1")

@@ -16,7 +16,7 @@ from ray.cluster_utils import Cluster
 
 from bam_train.checkpoint import Checkpoint
 from bam_train.errors import ProcessesLost, SettingsError
-from bam_train.trainers.resolve import resolve
+from bam_train.trainers.resolve_settings import resolve
 from bam_train.trainers.rllib.cluster.cluster import loopback_only
 from bam_train.trainers.rllib.trainer import RLlibTrainer
 

@@ -5,7 +5,7 @@ import numpy as np
 from gymnasium import spaces
 
 from bam_train.environments import make_env
-from bam_train.trainers.from_zero import from_zero
+from bam_train.trainers.zero_based_spaces import from_zero
 
 
 class Parts(gym.Env):

@@ -2,8 +2,8 @@
 
 import pytest
 
+from bam_train.env_location import HERE, Place, addresses
 from bam_train.errors import SettingsError
-from bam_train.place import HERE, Place, addresses
 
 
 def test_the_simulation_is_here():

@@ -18,8 +18,8 @@ from bam_train.trainers import load_trainer, require_algorithm
 from bam_train.trainers import presets as presets_module
 from bam_train.trainers.best_checkpoint import choose_output
 from bam_train.trainers.presets import list_presets, read_preset
-from bam_train.trainers.resolve import resolve, resolve_resumed
-from bam_train.trainers.run import Best
+from bam_train.trainers.resolve_settings import resolve, resolve_resumed
+from bam_train.trainers.training_run import Best
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def preset(monkeypatch):
     """One preset, of CartPole-v1 and ppo."""
     values = {"steps": 7000, "num_envs": 4, "hyperparameters": {"gamma": 0.9, "policy_kwargs": {"net_arch": [8]}}}
     monkeypatch.setattr(
-        "bam_train.trainers.resolve.read_preset",
+        "bam_train.trainers.resolve_settings.read_preset",
         lambda env, algo, trainer: values if (env, algo, trainer) == ("CartPole-v1", "ppo", "sb3") else {},
     )
 
@@ -112,11 +112,10 @@ def test_the_tables_agree():
 @pytest.mark.parametrize("name", list_presets())
 def test_every_preset_is_complete_and_of_an_environment_of_ours(name):
     from bam_envs.core.registry import ENVIRONMENTS
+    from bam_train.trainers.algorithms import ALGORITHMS
     from bam_train.trainers.presets import preset_name
-    from bam_train.trainers.rllib_algorithms import ALGORITHMS as OF_RLLIB
-    from bam_train.trainers.sb3.sb3_algorithms import ALGORITHMS as OF_SB3
 
-    runs = [("sb3", algo) for algo in OF_SB3] + [("rllib", algo) for algo in OF_RLLIB]
+    runs = [(trainer, algo) for trainer, table in ALGORITHMS.items() for algo in table]
     found = [(env, *run) for env in ENVIRONMENTS for run in runs if preset_name(env, run[1], run[0]) == name]
     assert len(found) == 1
     env, trainer, algo = found[0]

@@ -12,10 +12,10 @@ from bam_envs.core.errors import LinkLost
 from bam_train.errors import EnvironmentFailed, OutputError, ProcessesLost, TrainingFailed
 from bam_train.evaluation import EvaluationReport, wilson_interval
 from bam_train.settings import TrainSettings
-from bam_train.trainers import run as run_module
-from bam_train.trainers.run import Best, TrainingRun
+from bam_train.trainers import training_run as run_module
+from bam_train.trainers.base import Progress, Statistics
 from bam_train.trainers.run_folder import RunFolder
-from bam_train.trainers.trainer import Progress, Statistics
+from bam_train.trainers.training_run import Best, TrainingRun
 
 STATISTICS = Statistics(episodes=3, return_mean=1.5, length_mean=4.0, success_rate=None, metrics={"train/loss": 0.25})
 

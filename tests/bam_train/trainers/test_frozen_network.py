@@ -8,7 +8,7 @@ import torch
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
 from bam_train.checkpoint import safetensors_file
-from bam_train.trainers.freezing.golden import affordable, clearest, draw_array, pack
+from bam_train.trainers.frozen_network import affordable, clearest, draw_array, pack
 
 
 def test_large_arrays_are_few():

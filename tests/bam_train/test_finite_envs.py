@@ -12,7 +12,7 @@ import pytest
 from bam_train.environments import make_rows
 from bam_train.errors import EnvironmentFailed
 from bam_train.evaluation import evaluate
-from bam_train.finite import FiniteEnv, FiniteRows
+from bam_train.finite_envs import FiniteEnv, FiniteRows
 from bam_train.trainers.sb3.sb3_vec_env import make_training_env
 
 CASES = [

@@ -10,9 +10,9 @@ from bam_train.errors import CheckpointMismatch
 from bam_train.evaluation import evaluate
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
-from bam_train.trainers.from_zero import FromZero
 from bam_train.trainers.sb3.plain_sb3_zip import load_trusted
 from bam_train.trainers.sb3.sb3_trainer import SB3Trainer
+from bam_train.trainers.zero_based_spaces import FromZero
 
 ID = "test/Shifted-v0"
 

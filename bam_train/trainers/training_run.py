@@ -21,9 +21,9 @@ from bam_envs.core.errors import RobotFault
 from bam_train.errors import EnvironmentFailed, OutputError, ProcessesLost, TrainingFailed
 from bam_train.evaluation import BatchPolicy, EvaluationReport, evaluate
 from bam_train.settings import TrainSettings
+from bam_train.trainers.base import Progress, Statistics, Trainer
 from bam_train.trainers.checkpoint_copies import Copies
 from bam_train.trainers.run_folder import RunFolder, unwritable
-from bam_train.trainers.trainer import Progress, Statistics, Trainer
 
 SAVE_EVERY = 30.0
 """Seconds between two saves at least, unless an evaluation comes first."""

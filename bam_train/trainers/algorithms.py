@@ -1,0 +1,140 @@
+"""The trainers and their algorithms, as tables: reading them imports no learning library."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from bam_envs.core.errors import MissingExtra
+from bam_envs.core.wording import did_you_mean
+from bam_train.errors import SettingsError
+
+if TYPE_CHECKING:
+    from bam_train.trainers.base import Trainer
+
+TRAINERS: dict[str, str] = {
+    "rllib": "bam_train.trainers.rllib.trainer:RLlibTrainer",
+    "sb3": "bam_train.trainers.sb3.sb3_trainer:SB3Trainer",
+}
+"""Name of a trainer to its ``"module:Class"``."""
+
+EXTRAS: dict[str, str] = {"rllib": "rllib", "sb3": "train"}
+"""Name of a trainer to the extra of bam-train that brings all it needs."""
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """One algorithm of a library."""
+
+    name: str
+    """As ``--algo`` takes it."""
+    reference: str
+    """``"module:Class"`` of the algorithm in stable-baselines3 or sb3-contrib, of its configuration in RLlib."""
+    actions: tuple[str, ...]
+    """Kinds of action space that it can learn on."""
+    on_policy: bool = False
+    """Whether it learns from fresh rollouts; the others keep a replay buffer or recorded episodes."""
+    recurrent: bool = False
+    """Whether its policy has a memory."""
+    offline: bool = False
+    """Whether it learns from recorded episodes, and takes no step in an environment."""
+
+    def load(self) -> Any:
+        """The class; imports its library."""
+        return _resolve(self.reference)
+
+    def require_actions(self, env: str, kind: str) -> None:
+        """Refuse an action space that this algorithm cannot learn on.
+
+        Args:
+            env: Environment id, as the error names it.
+            kind: Class name of its action space.
+
+        Raises:
+            SettingsError: Names the algorithms of the same trainer that can, from the same source of episodes.
+        """
+        if kind in self.actions:
+            return
+        table = next(table for table in ALGORITHMS.values() if self in table.values())
+        others = [one for one in table.values() if one.offline == self.offline and kind in one.actions]
+        fitting = ", ".join(sorted(one.name for one in others))
+        remedy = f"Use one of: {fitting}." if fitting else "No algorithm here does."
+        raise SettingsError(
+            f"{self.name} does not fit {env}: it takes {' or '.join(self.actions)} actions, found {kind}. {remedy}"
+        )
+
+
+_BOX = ("Box",)
+_DISCRETE = ("Discrete",)
+_CHOICES = ("Box", "Discrete", "MultiDiscrete")
+ANY = (*_CHOICES, "MultiBinary")
+
+_SB3 = (
+    Algorithm("ppo", "stable_baselines3:PPO", ANY, on_policy=True),
+    Algorithm("a2c", "stable_baselines3:A2C", ANY, on_policy=True),
+    Algorithm("sac", "stable_baselines3:SAC", _BOX),
+    Algorithm("td3", "stable_baselines3:TD3", _BOX),
+    Algorithm("ddpg", "stable_baselines3:DDPG", _BOX),
+    Algorithm("dqn", "stable_baselines3:DQN", _DISCRETE),
+    Algorithm("tqc", "sb3_contrib:TQC", _BOX),
+    Algorithm("trpo", "sb3_contrib:TRPO", ANY, on_policy=True),
+    Algorithm("qrdqn", "sb3_contrib:QRDQN", _DISCRETE),
+    Algorithm("crossq", "sb3_contrib:CrossQ", _BOX),
+    Algorithm("recurrent-ppo", "sb3_contrib:RecurrentPPO", ANY, on_policy=True, recurrent=True),
+)
+_RLLIB = (
+    Algorithm("ppo", "ray.rllib.algorithms.ppo:PPOConfig", _CHOICES, on_policy=True),
+    Algorithm("appo", "ray.rllib.algorithms.appo:APPOConfig", _CHOICES, on_policy=True),
+    Algorithm("impala", "ray.rllib.algorithms.impala:IMPALAConfig", _CHOICES, on_policy=True),
+    Algorithm("sac", "ray.rllib.algorithms.sac:SACConfig", ("Box", "Discrete")),
+    Algorithm("tqc", "ray.rllib.algorithms.tqc:TQCConfig", _BOX),
+    Algorithm("dqn", "ray.rllib.algorithms.dqn:DQNConfig", _DISCRETE),
+    Algorithm("bc", "ray.rllib.algorithms.bc:BCConfig", _CHOICES, offline=True),
+    Algorithm("marwil", "ray.rllib.algorithms.marwil:MARWILConfig", _CHOICES, offline=True),
+    Algorithm("cql", "ray.rllib.algorithms.cql:CQLConfig", _BOX, offline=True),
+    Algorithm("iql", "ray.rllib.algorithms.iql:IQLConfig", _BOX, offline=True),
+)
+SB3_ALGORITHMS = {one.name: one for one in _SB3}
+RLLIB_ALGORITHMS = {one.name: one for one in _RLLIB}
+ALGORITHMS = {"rllib": RLLIB_ALGORITHMS, "sb3": SB3_ALGORITHMS}
+"""Name of a trainer to its algorithms by name."""
+
+
+def load_trainer(name: str) -> type[Trainer]:
+    """The class of a trainer; this imports its library.
+
+    Raises:
+        SettingsError: No trainer has this name.
+        MissingExtra: A package that its library needs is not installed.
+    """
+    if name not in TRAINERS:
+        raise SettingsError(f"Unknown trainer {name!r}. {did_you_mean(name, TRAINERS)}")
+    try:
+        trainer: type[Trainer] = _resolve(TRAINERS[name])
+    except ModuleNotFoundError as error:
+        raise MissingExtra(str(error.name).partition(".")[0], EXTRAS[name], f"The {name} trainer") from error
+    return trainer
+
+
+def require_algorithm(trainer: str, algorithm: str) -> None:
+    """Refuse an algorithm that the trainer does not have.
+
+    Raises:
+        SettingsError: Carries the closest match, or the other trainer that has it.
+    """
+    if trainer not in ALGORITHMS:
+        raise SettingsError(f"Unknown trainer {trainer!r}. {did_you_mean(trainer, ALGORITHMS)}")
+    table = ALGORITHMS[trainer]
+    if algorithm not in table:
+        others = [name for name, theirs in ALGORITHMS.items() if algorithm in theirs]
+        if others:
+            hint = f"It is one of {others[0]}'s; those of {trainer} are: {', '.join(sorted(table))}."
+        else:
+            hint = did_you_mean(algorithm, table)
+        raise SettingsError(f"Unknown algorithm {algorithm!r}. {hint}")
+
+
+def _resolve(reference: str) -> Any:
+    module, _, name = reference.partition(":")
+    return getattr(importlib.import_module(module), name)
