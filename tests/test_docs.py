@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from bam_envs.core.registry import ENVIRONMENTS
-from bam_envs.robots.physics.imperfection import Ranges
+from bam_envs.robots.physics.domain_randomization import Ranges
 from bam_envs.tasks import (
     isaac_reach,
     mir100_avoidance,

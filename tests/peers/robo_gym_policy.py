@@ -14,8 +14,8 @@ import numpy as np
 
 import bam_envs  # noqa: F401 - registers the ids, before robo-gym could
 from bam_envs.core.robot import Initial
-from bam_envs.robots.physics.mir100 import open_floor
-from bam_envs.robots.physics.ur import reach_arm
+from bam_envs.robots.physics.kinematic_arm import reach_arm
+from bam_envs.robots.physics.kinematic_base import open_floor
 from bam_envs.robots.ur import ur_model
 from bam_envs.tasks.ur_arm import POSITIONS, UrControl, wire_states
 from bam_envs.tasks.ur_reach import RATE, VELOCITY_SCALE

@@ -16,7 +16,7 @@ _MODULES = {
     "RosbridgeRobot": "bam_envs.live.rosbridge_robot",
     "SafeRobot": "bam_envs.safety.gate",
     "SignalSpec": "bam_envs.core.robot",
-    "SimulatedBase": "bam_envs.robots.physics.mir100",
+    "SimulatedBase": "bam_envs.robots.physics.kinematic_base",
     "live_robot": "bam_envs.live.building",
     "load_profile": "bam_envs.robots.profiles.profile",
 }

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from bam_envs.core.kinematics import LINKS, UR5E, cube_yaw_phase, quaternions
-from bam_envs.robots.physics.physics import MODELS
+from bam_envs.robots.physics.mujoco_batch import MODELS
 from bam_envs.robots.ur import UR_MODELS
 from bam_envs.robots.ur5e import GEOMETRY
 

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.robot import Robot, RobotState
 from bam_envs.robots.fake import FakeRobot
-from bam_envs.robots.physics.arm import SimulatedArm
+from bam_envs.robots.physics.mujoco_arm import SimulatedArm
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.testing import RobotContract
 

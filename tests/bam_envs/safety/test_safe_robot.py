@@ -22,7 +22,7 @@ from bam_envs.core.errors import (
 )
 from bam_envs.core.robot import Initial, Robot, RobotState
 from bam_envs.robots.fake import FakeRobot
-from bam_envs.robots.physics.mir100 import SimulatedBase
+from bam_envs.robots.physics.kinematic_base import SimulatedBase
 from bam_envs.robots.ur5e import GEOMETRY
 from bam_envs.safety.arm_guards import JointSpeed
 from bam_envs.safety.gate import ClearedCommand, SafeRobot

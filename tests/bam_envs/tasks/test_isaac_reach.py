@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.kinematics import UR10, quaternions
 from bam_envs.core.robot import RobotState
-from bam_envs.robots.physics.ur import isaac_arm
+from bam_envs.robots.physics.kinematic_arm import isaac_arm
 from bam_envs.robots.ur import ur_model
 from bam_envs.tasks.isaac_reach import DEFAULT, EE_LINK, TOOL1
 from bam_envs.testing import TaskContract

@@ -10,7 +10,7 @@ from gymnasium.utils.env_checker import check_env
 
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot import RobotState
-from bam_envs.robots.physics.ur import obstacle_arm
+from bam_envs.robots.physics.kinematic_arm import obstacle_arm
 from bam_envs.robots.ur import START, ur_model
 from bam_envs.tasks.ur_avoidance import POSE
 from bam_envs.testing import TaskContract

@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import RobotState
 from bam_envs.core.splines import splines_through
-from bam_envs.robots.physics.ur import obstacle_arm
+from bam_envs.robots.physics.kinematic_arm import obstacle_arm
 from bam_envs.robots.ur import ur_model
 from bam_envs.testing import TaskContract
 from bam_envs.testing.assertions import assert_same_tree

@@ -10,7 +10,7 @@ from bam_envs.core.errors import LinkLost, RobotFault, SafetyStop, StaleState
 from bam_envs.core.robot_env import RobotEnv
 from bam_envs.core.timing import Pacer
 from bam_envs.robots.fake import FakeRobot
-from bam_envs.robots.physics.arm import SimulatedArm
+from bam_envs.robots.physics.mujoco_arm import SimulatedArm
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.reach import ReachTask

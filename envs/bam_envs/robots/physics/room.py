@@ -1,21 +1,33 @@
-"""Where a simulated base drives: a rectangle of walls or none, and boxes; whether the base touches them."""
+"""Where a simulated base drives: a rectangle of walls or none, and boxes; what the base touches, and its lasers see.
+
+Rays are cast in float32, many bases at a time, and written into scratch arrays that stay in the cache: so a base with
+its 1012 rays takes about 10 µs.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.robots.mir100 import FOOTPRINT, FOOTPRINT_AHEAD
+from bam_envs.robots.mir100 import FOOTPRINT, FOOTPRINT_AHEAD, SCAN_RANGE, SCAN_RAYS, SCAN_SPAN
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
+Seeds = NDArray[np.uint64]
 BOX_EDGE = 0.5
 """Edge of a box [m]."""
 NOWHERE = (1000.0, 1000.0, 0.0)
 """Pose of a box that is not there: out of everybody's sight [m, m, rad]."""
 _HALF = (FOOTPRINT[0] / 2, FOOTPRINT[1] / 2)
+NOISE = 0.01
+"""Standard deviation of a measured range [m]."""
+_CHUNK = 64
+_TAPE = 1 << 17
+_ONE, _HALF_EDGE = np.float32(1.0), np.float32(BOX_EDGE / 2)
 
 
 @dataclass(frozen=True)
@@ -72,3 +84,153 @@ def _overlaps(x: Array, y: Array, cos: Array, sin: Array, box_x: Array, box_y: A
     apart |= np.abs(dx * box_cos + dy * box_sin) > half + _HALF[0] * turn_cos + _HALF[1] * turn_sin
     apart |= np.abs(dy * box_cos - dx * box_sin) > half + _HALF[0] * turn_sin + _HALF[1] * turn_cos
     return ~apart
+
+
+class LaserScanner:
+    """One scanner at the same place of every base.
+
+    Args:
+        mount: Where it is in the base's frame: x, y [m], yaw [rad].
+        masked: Rays that the base's own body hides, at the beginning and at the end; they are left out.
+    """
+
+    def __init__(self, mount: tuple[float, float, float], masked: tuple[int, int]) -> None:
+        self._mount = mount
+        bearing = np.linspace(*SCAN_SPAN, SCAN_RAYS)[masked[0] : SCAN_RAYS - masked[1]]
+        self.rays = len(bearing)
+        """How many rays there are."""
+        self._directions: tuple[Floats, Floats] = (_float32(np.cos(bearing)), _float32(np.sin(bearing)))
+        self._scratch = np.empty((6, _CHUNK, self.rays), np.float32)
+        self._hits = np.empty((_CHUNK, self.rays), bool)
+
+    def cast(self, pose: Array, room: Room | None, boxes: Array) -> Floats:
+        """How far each ray goes before it meets something [m]; infinite if it never does.
+
+        Args:
+            pose: Of the bases: x, y [m], yaw [rad]. Shape: (n, 3).
+            room: The walls; None for none.
+            boxes: Of each base: x, y [m], yaw [rad]. Shape: (n, b, 3).
+
+        Returns:
+            Shape: (n, rays).
+        """
+        eye, heading = self._eyes(pose)
+        ranges = np.empty((len(pose), self.rays), np.float32)
+        with np.errstate(divide="ignore", invalid="ignore"):  # rays along an axis
+            for start in range(0, len(pose), _CHUNK):
+                rows = slice(start, start + _CHUNK)
+                out = ranges[rows]
+                self._to_walls(eye[rows], heading[rows], room, out)
+                for box in range(boxes.shape[1]):
+                    self._to_box(eye[rows], heading[rows], boxes[rows, box], out)
+        return ranges
+
+    def _eyes(self, pose: Array) -> tuple[Array, Array]:
+        """Where the scanners are [m] and look to [rad]. Shapes: (n, 2), (n,)."""
+        x, y, yaw = np.ascontiguousarray(pose.T)
+        (ahead, left, turned), cos, sin = self._mount, np.cos(yaw), np.sin(yaw)
+        return np.stack([x + ahead * cos - left * sin, y + ahead * sin + left * cos], axis=1), yaw + turned
+
+    def _slopes(self, turn: Array, scratch: Floats) -> tuple[Floats, Floats]:
+        """1 / x and 1 / y of each ray's direction, after a turn (k,) [rad]. Shape: (k, rays) each."""
+        (cos_ray, sin_ray), (x, y, product) = self._directions, scratch
+        cos, sin = _column(np.cos(turn)), _column(np.sin(turn))
+        np.multiply(cos_ray, cos, out=x)
+        np.multiply(sin_ray, sin, out=product)
+        x -= product
+        np.multiply(cos_ray, sin, out=y)
+        np.multiply(sin_ray, cos, out=product)
+        y += product
+        return np.divide(_ONE, x, out=x), np.divide(_ONE, y, out=y)
+
+    def _to_walls(self, eye: Array, heading: Array, room: Room | None, out: Floats) -> None:
+        """Write the ranges from inside the room to its walls into `out` (k, rays)."""
+        if room is None:
+            out[:] = np.inf
+            return
+        scratch = self._scratch[:, : len(out)]
+        slopes, (one, other) = self._slopes(heading, scratch[:3]), scratch[3:5]
+        for axis, target in ((0, out), (1, other)):
+            np.multiply(slopes[axis], _column(room.high[axis] - eye[:, axis]), out=target)
+            np.multiply(slopes[axis], _column(room.low[axis] - eye[:, axis]), out=one)
+            np.maximum(target, one, out=target)  # the wall behind has a negative range
+        np.minimum(out, other, out=out)
+
+    def _to_box(self, eye: Array, heading: Array, box: Array, out: Floats) -> None:
+        """Shorten `out` (k, rays) where a box (k, 3) is in the way.
+
+        In the box's frame a ray is between two parallel sides from `near` to `far`; it meets the box if it is between
+        both pairs at once.
+        """
+        yaw = box[:, 2].copy()
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        dx, dy = box[:, 0] - eye[:, 0], box[:, 1] - eye[:, 1]
+        scratch = self._scratch[:, : len(out)]
+        slopes, (near, far, spare) = self._slopes(heading - yaw, scratch[:3]), scratch[3:]
+        nears, fars = (near, scratch[2]), (far, spare)
+        for slope, middle, first, last in zip(
+            slopes, (dx * cos + dy * sin, dy * cos - dx * sin), nears, fars, strict=True
+        ):
+            # `slope` is used up: it becomes the range to the farther side
+            np.multiply(slope, _column(middle) - _HALF_EDGE, out=first)
+            np.multiply(slope, _column(middle) + _HALF_EDGE, out=slope)
+            np.maximum(first, slope, out=last)
+            np.minimum(first, slope, out=first)
+        np.maximum(near, scratch[2], out=near)
+        np.maximum(near, np.float32(0.0), out=near)
+        np.minimum(far, spare, out=far)
+        hits = np.less_equal(near, far, out=self._hits[: len(out)])
+        np.minimum(out, near, out=out, where=hits)
+
+
+def _float32(values: Array) -> Floats:
+    return values.astype(np.float32)
+
+
+def _column(values: Array) -> Floats:
+    """As float32, one a row. Shape: (k,) -> (k, 1)."""
+    return values.astype(np.float32)[:, None]
+
+
+def measured(ranges: Floats, deviates: Floats) -> Array:
+    """What a scanner says of true `ranges` (n, rays) [m], with `deviates` (n, rays) on them: inside `SCAN_RANGE`."""
+    ranges = ranges + deviates
+    np.fmax(ranges, np.float32(SCAN_RANGE[0]), out=ranges)  # what is not a number is as near as can be
+    clipped: Array = np.minimum(ranges, np.float32(SCAN_RANGE[1]), out=ranges).astype(np.float64)
+    return clipped
+
+
+def noise(seeds: Seeds, count: Seeds, rays: int) -> Floats:
+    """Normal deviates of mean 0 and standard deviation `NOISE` [m].
+
+    Each scan is a stretch of one long tape that begins where the row's seed and the number of the scan say: so no
+    row has a generator of its own to keep, and a scan costs a copy.
+
+    Args:
+        seeds: Of the rows. Shape: (n,).
+        count: Number of the scan in each row's episode. Shape: (n,).
+        rays: How many are wanted; at most the 1012 of both scanners.
+
+    Returns:
+        Shape: (n, rays).
+    """
+    starts = mixed(seeds + mixed(count)) % np.uint64(_TAPE)
+    deviates: Floats = np.lib.stride_tricks.sliding_window_view(_tape(), rays)[starts.astype(np.int64)]
+    return deviates
+
+
+@lru_cache(maxsize=1)
+def _tape() -> Floats:
+    """Deviates for every beginning. Shape: (_TAPE + 2 * SCAN_RAYS,)."""
+    deviates = np.random.Generator(np.random.PCG64(100)).standard_normal(_TAPE + 2 * SCAN_RAYS, dtype=np.float32)
+    tape: Floats = deviates * np.float32(NOISE)
+    return tape
+
+
+def mixed(values: Seeds) -> Seeds:
+    """Numbers that look drawn at random, one of each value: splitmix64 (Steele, Lea and Flood, OOPSLA 2014)."""
+    z = values + np.uint64(0x9E3779B97F4A7C15)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    mixture: Seeds = z ^ (z >> np.uint64(31))
+    return mixture

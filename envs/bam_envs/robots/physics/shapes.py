@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from bam_envs.robots.physics.pictures import ShapeRenderer
+    from bam_envs.robots.physics.rendering import ShapeRenderer
 
 Array = NDArray[np.float64]
 Colour = tuple[float, float, float, float]
@@ -72,7 +72,7 @@ class Drawn:
             mode: ``"rgb_array"`` or ``"human"``.
             marks: Spheres to draw: position (3,) [m] and colour.
         """
-        from bam_envs.robots.physics.pictures import ShapeRenderer
+        from bam_envs.robots.physics.rendering import ShapeRenderer
 
         if self._renderer is None:
             self._renderer = ShapeRenderer(mode, floor=self.floor, mark_radius=self.mark_radius)

@@ -12,9 +12,9 @@ from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.robot_service import CommandSlot, Order, RobotService
 from bam_envs.remote.serve.served_robot import ServedRobot
 from bam_envs.robots.fake import FakeRobot
-from bam_envs.robots.physics.arm import SimulatedArm
-from bam_envs.robots.physics.mir100 import SimulatedBase
-from bam_envs.robots.physics.ur import reach_arm
+from bam_envs.robots.physics.kinematic_arm import reach_arm
+from bam_envs.robots.physics.kinematic_base import SimulatedBase
+from bam_envs.robots.physics.mujoco_arm import SimulatedArm
 from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.ros.codec import RobotInfo, encode_command, read_info
 from bam_envs.ros.freshness import Tagger, read_echo

@@ -8,7 +8,7 @@ from bam_envs.core.robot import Initial
 from bam_envs.core.timing import Ticker
 from bam_envs.remote.serve.served_robot import PARTS, ServedRobot
 from bam_envs.robots.fake import FakeRobot
-from bam_envs.robots.physics.arm import SimulatedArm
+from bam_envs.robots.physics.mujoco_arm import SimulatedArm
 
 HOME = np.array([[0.0, -1.2, 1.6, -2.0, -1.57, 0.0]])
 ROWS = np.zeros(1, dtype=np.int64)

@@ -5,12 +5,12 @@ import pytest
 
 from bam_envs.core.robot import Initial
 from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS
-from bam_envs.robots.physics import mir100_picture
-from bam_envs.robots.physics.mir100 import lab, open_floor
+from bam_envs.robots.physics import kinematic_base
+from bam_envs.robots.physics.kinematic_arm import obstacle_arm, reach_arm
+from bam_envs.robots.physics.kinematic_base import lab, open_floor
 from bam_envs.robots.physics.rendering import RenderingUnavailable
 from bam_envs.robots.physics.room import LAB
 from bam_envs.robots.physics.shapes import BLUE, RED, Drawn
-from bam_envs.robots.physics.ur import obstacle_arm, reach_arm
 
 GREEN = (0.0, 1.0, 0.0, 1.0)
 READY = {"joint_position": np.array([[0.0, -2.5, 1.5, 0.0, -1.4, 0.0]])}
@@ -68,9 +68,9 @@ def test_the_target_is_marked(connected):
 
 
 def test_the_camera_goes_along_once_the_base_is_far():
-    assert mir100_picture.view_of(np.array([2.0, -2.0, 1.0]), None).target == (0.0, 0.0, 0.0)
-    assert mir100_picture.view_of(np.array([7.0, -4.0, 1.0]), None).target == (4.5, -1.5, 0.0)
-    assert mir100_picture.view_of(np.array([2.0, -3.0, 1.0]), LAB).target == (0.0, 0.0, 0.0)
+    assert kinematic_base.view_of(np.array([2.0, -2.0, 1.0]), None).target == (0.0, 0.0, 0.0)
+    assert kinematic_base.view_of(np.array([7.0, -4.0, 1.0]), None).target == (4.5, -1.5, 0.0)
+    assert kinematic_base.view_of(np.array([2.0, -3.0, 1.0]), LAB).target == (0.0, 0.0, 0.0)
 
 
 def test_walls_boxes_and_scans_are_seen(connected):
@@ -88,18 +88,18 @@ def test_walls_boxes_and_scans_are_seen(connected):
 
 
 def test_walls_enclose_what_is_free():
-    walls = mir100_picture.wall_shapes(LAB)
+    walls = kinematic_base.wall_shapes(LAB)
     insides = [
         shape.position[axis] + side * shape.size[axis] / 2
         for shape, axis, side in zip(walls, (0, 1, 0, 1), (1, 1, -1, -1), strict=True)
     ]
     np.testing.assert_allclose(insides, [*LAB.low, *LAB.high])
-    assert mir100_picture.wall_shapes(None) == []
+    assert kinematic_base.wall_shapes(None) == []
 
 
 def test_rays_that_meet_nothing_are_not_drawn():
     far = np.full(FRONT_RAYS, 29.0), np.full(BACK_RAYS, 29.0)
-    assert mir100_picture.scan_shapes(np.zeros(3), *far) == []
+    assert kinematic_base.scan_shapes(np.zeros(3), *far) == []
 
 
 @pytest.mark.parametrize("model", ["ur3", "ur5", "ur10"])

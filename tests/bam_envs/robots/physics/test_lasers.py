@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from bam_envs.robots.mir100 import BACK_MASKED, BACK_MOUNT, BACK_RAYS, FRONT_MASKED, FRONT_MOUNT, FRONT_RAYS
-from bam_envs.robots.physics.lasers import NOISE, LaserScanner, measured, mixed, noise
-from bam_envs.robots.physics.room import LAB, Room
+from bam_envs.robots.physics.room import LAB, NOISE, LaserScanner, Room, measured, mixed, noise
 
 FRONT, BACK = LaserScanner(FRONT_MOUNT, FRONT_MASKED), LaserScanner(BACK_MOUNT, BACK_MASKED)
 FORWARDS = 150  # -135 + (30 + 150) / 2 = -45 degrees in a scanner that looks to +45

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from bam_envs.robots.physics.pictures import ShapeRenderer
-from bam_envs.robots.physics.rendering import MOST_GEOMS, RenderingUnavailable
+from bam_envs.robots.physics.rendering import MOST_GEOMS, RenderingUnavailable, ShapeRenderer
 from bam_envs.robots.physics.shapes import BLUE, RED, Shape, View, turned
 
 ABOVE = View((0.0, 0.0, 0.0), 4.0, 90.0, -90.0)

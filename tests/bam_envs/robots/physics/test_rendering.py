@@ -10,7 +10,7 @@ import pytest
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.robots.physics import rendering
-from bam_envs.robots.physics.physics import Physics
+from bam_envs.robots.physics.mujoco_batch import Physics
 from bam_envs.robots.physics.rendering import RenderingUnavailable, SceneRenderer, find_backend
 
 

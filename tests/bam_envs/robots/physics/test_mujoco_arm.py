@@ -5,7 +5,7 @@ import pytest
 
 from bam_envs.core.errors import InvalidValue, ResetNeeded
 from bam_envs.core.robot import Initial, Robot
-from bam_envs.robots.physics.arm import SimulatedArm, arm_scene, cube_scene
+from bam_envs.robots.physics.mujoco_arm import SimulatedArm, arm_scene, cube_scene
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.testing import ARM_HOME
 

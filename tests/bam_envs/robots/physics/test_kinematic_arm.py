@@ -5,7 +5,7 @@ import pytest
 
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot import Initial, Robot
-from bam_envs.robots.physics.ur import KinematicArm, empty_arm, isaac_arm, obstacle_arm, reach_arm
+from bam_envs.robots.physics.kinematic_arm import KinematicArm, empty_arm, isaac_arm, obstacle_arm, reach_arm
 from bam_envs.robots.ur import START, UR_MODELS
 from bam_envs.testing import RobotContract
 from bam_envs.testing.assertions import assert_same_state, assert_same_tree

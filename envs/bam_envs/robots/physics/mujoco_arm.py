@@ -14,8 +14,8 @@ from bam_envs.core.robot import Initial, RobotState, Rows, checked_command
 from bam_envs.robots.ur5e import COMMAND, GRIPPER_OPEN, GRIPPER_SPEED, arm_spec
 
 if TYPE_CHECKING:
-    from bam_envs.robots.physics.imperfection import Imperfection
-    from bam_envs.robots.physics.physics import Physics
+    from bam_envs.robots.physics.domain_randomization import Imperfection
+    from bam_envs.robots.physics.mujoco_batch import Physics
     from bam_envs.robots.physics.rendering import SceneRenderer
 
 Array = NDArray[np.float64]
@@ -60,8 +60,8 @@ class SimulatedArm:
         """Build the physics."""
         if self._physics is not None:
             return
-        from bam_envs.robots.physics.imperfection import Imperfection
-        from bam_envs.robots.physics.physics import Physics
+        from bam_envs.robots.physics.domain_randomization import Imperfection
+        from bam_envs.robots.physics.mujoco_batch import Physics
 
         self._physics = Physics(self._scene, self.num_robots, varied=self.randomize)
         self._imperfection = Imperfection(self._physics) if self.randomize else None

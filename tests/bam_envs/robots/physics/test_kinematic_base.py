@@ -8,7 +8,7 @@ import pytest
 from bam_envs.core.errors import InvalidValue, ResetNeeded
 from bam_envs.core.robot import Initial
 from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS
-from bam_envs.robots.physics.mir100 import SimulatedBase, lab, open_floor
+from bam_envs.robots.physics.kinematic_base import SimulatedBase, lab, open_floor
 from bam_envs.testing import RobotContract
 
 BOXES = np.array([[-2.0, 0.0, 0.3], [0.0, 2.0, 1.0], [2.0, -1.5, 0.0]])

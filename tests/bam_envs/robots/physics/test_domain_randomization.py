@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from bam_envs.robots.physics.imperfection import TAPE, Imperfection, Ranges
-from bam_envs.robots.physics.physics import Physics
+from bam_envs.robots.physics.domain_randomization import TAPE, Imperfection, Ranges
+from bam_envs.robots.physics.mujoco_batch import Physics
 
 NONE = {
     "mass": (1.0, 1.0),

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, ResetNeeded
 from bam_envs.core.robot import Initial, RobotState, Rows, checked_command
-from bam_envs.robots.physics.contacts import GROUND, ArmContacts
-from bam_envs.robots.physics.obstacles import Obstacles
-from bam_envs.robots.physics.shapes import Drawn, Shape, View
+from bam_envs.robots.physics.contacts import GROUND, TABLE, ArmContacts, Capsules
+from bam_envs.robots.physics.obstacles import RADIUS, Obstacles
+from bam_envs.robots.physics.shapes import BLUE, GREY, RED, WOOD, Drawn, Shape, View
 from bam_envs.robots.ur import DEFAULT_MODEL, START, UrModel, ur_spec
 from bam_envs.robots.ur import ur_model as model_called
 from bam_envs.robots.ur5e import TOOL_LENGTH
@@ -150,12 +150,10 @@ class KinematicArm(Drawn):
 
     def picture(self) -> tuple[list[Shape], View]:
         """The arm of row 0, its table and its ball."""
-        from bam_envs.robots.physics import ur_picture as draw
-
-        shapes = [draw.table_shape(), *draw.arm_shapes(self._contacts.capsules(self._position[:1]))]
+        shapes = [table_shape(), *arm_shapes(self._contacts.capsules(self._position[:1]))]
         if self._obstacles is not None:
-            shapes.append(draw.ball_shape(self._obstacles.position(self._stamp)[0]))
-        return shapes, draw.view_of(self.model.workspace_radius)
+            shapes.append(ball_shape(self._obstacles.position(self._stamp)[0]))
+        return shapes, view_of(self.model.workspace_radius)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the future of the simulated robots depends on."""
@@ -195,3 +193,28 @@ def obstacle_arm(num_robots: int = 1, *, randomize: bool = False, ur_model: str 
 def isaac_arm(num_robots: int = 1, *, randomize: bool = False, ur_model: str = "ur10") -> KinematicArm:
     """The arm at 30 Hz."""
     return KinematicArm(num_robots, model_called(ur_model), 1 / 30, randomize=randomize)
+
+
+def view_of(reach: float) -> View:
+    """From the front, so far away that an arm of `reach` [m] fits."""
+    return View((0.0, 0.1 * reach, 0.35 * reach), max(1.6, 2.6 * reach), 140.0, -25.0)
+
+
+def table_shape() -> Shape:
+    """The table that the arm stands on."""
+    x, y, z = (TABLE[1] - TABLE[0]).tolist()
+    return Shape("box", TABLE.mean(axis=0), (x, y, z), WOOD)
+
+
+def arm_shapes(arms: Capsules) -> list[Shape]:
+    """The tubes of the first arm; those around joints are blue."""
+    shapes = []
+    for link, (start, end, radius) in enumerate(zip(arms.start[0], arms.end[0], arms.radius, strict=True)):
+        colour = GREY if link in (2, 3) else BLUE
+        shapes.append(Shape("capsule", start, (float(radius),), colour, to=end))
+    return shapes
+
+
+def ball_shape(position: Array) -> Shape:
+    """The obstacle at `position` (3,) [m]."""
+    return Shape("sphere", position, (RADIUS,), RED)

@@ -7,8 +7,8 @@ import pytest
 
 from bam_envs.core.errors import MissingExtra, PhysicsDiverged
 from bam_envs.core.robot import Initial
-from bam_envs.robots.physics.arm import SimulatedArm
-from bam_envs.robots.physics.physics import Physics
+from bam_envs.robots.physics.mujoco_arm import SimulatedArm
+from bam_envs.robots.physics.mujoco_batch import Physics
 from bam_envs.testing import ARM_HOME
 
 SCENE = "ur5e_cube.xml"

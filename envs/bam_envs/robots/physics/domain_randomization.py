@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.robot import Rows
-from bam_envs.robots.physics.physics import Physics
+from bam_envs.robots.physics.mujoco_batch import Physics
 
 Array = NDArray[np.float64]
 ARM_COORDINATES = 8
