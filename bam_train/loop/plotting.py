@@ -61,7 +61,7 @@ def plot(workspace: Workspace, *names: str, batch: int | Sequence[int] | None = 
 
 
 def to_dataframe(workspace: Workspace, *names: str) -> DataFrame:
-    """The variables as a table with one row for each time and batch column, indexed by ``("time", "batch")``.
+    """The variables as a table with one line for each time and batch column, indexed by ``("time", "batch")``.
 
     A scalar variable is one column of its name, a vector ``name[0]``, ``name[1]``, …, a matrix ``name[0,0]``, ….
     Where a variable is shorter than another, numbers with a fraction are NaN; bool and integers are NA, in pandas'

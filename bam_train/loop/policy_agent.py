@@ -19,9 +19,9 @@ class PolicyAgent(Agent):
     leave out the last state (``include_last_state=False``) a recurrent policy forgets one step late.
 
     Args:
-        policy: Has ``reset(rows=None)`` and ``act_batch(observations)``, or ``act(observation)`` with `single`.
+        policy: Has ``reset(env_ids=None)`` and ``act_batch(observations)``, or ``act(observation)`` with `single`.
         observation_names: The variables that make up its observation; of a Dict ``env/env_obs/<key>`` each.
-        single: The batch is one row, and the policy's `act` takes it without a batch axis.
+        single: The batch is one environment, and the policy's `act` takes it without a batch axis.
         output_string: The variable of the action.
         input_prefix: What the environment's variables begin with.
         name: What `get_by_name` finds.
@@ -50,51 +50,38 @@ class PolicyAgent(Agent):
 
         Args:
             t: The time.
-            seed: Of the episode, or of each row's, for an error's text.
+            seed: Of the episode, or of each environment's, for an error message.
             kwargs: Not used.
 
         Raises:
             PolicyError: An action that is not finite.
         """
-        self._begin(t)
-        action = self._act(t)
-        if not self.get((self._done, t)).all():  # once all have ended, nobody does what it says
-            require_finite(action, f"at step {t} of {_episode(seed)}")
-        self.set((self.output, t), action[None] if self.single else action)
-
-    def _begin(self, t: int) -> None:
-        """Forget the rows whose episode begins at t."""
-        steps = self.get((self._timestep, t))
-        if not steps.all():
-            rows = np.flatnonzero(steps == 0)
-            if len(rows) == len(steps):
-                self.policy.reset()
-            else:
-                self.policy.reset(rows)
-
-    def _act(self, t: int) -> NDArray[Any]:
+        self._forget(t)
         values = [self.get((name, t)) for name in self.names]
         if self.single:
             values = [value[0].copy() for value in values]  # the policy may keep it
         observation = values[0] if self._keys is None else dict(zip(self._keys, values, strict=True))
-        return np.asarray(self.policy.act(observation) if self.single else self.policy.act_batch(observation))
+        action = np.asarray(self.policy.act(observation) if self.single else self.policy.act_batch(observation))
+        if not self.get((self._done, t)).all():  # once all have ended, the action is not used
+            _require_finite(action, seed, t)
+        self.set((self.output, t), action[None] if self.single else action)
+
+    def _forget(self, t: int) -> None:
+        """Forget the state of the environments whose episode begins at t."""
+        steps = self.get((self._timestep, t))
+        if not steps.all():
+            env_ids = np.flatnonzero(steps == 0)
+            self.policy.reset(*(() if len(env_ids) == len(steps) else (env_ids,)))
 
 
-def _episode(seed: int | Sequence[int] | None) -> str:
-    if seed is None:
-        return "the episode"
-    return f"the episode with seed {seed}" if isinstance(seed, int) else f"the episodes from seed {seed[0]} on"
-
-
-def require_finite(action: Any, when: str) -> None:
-    """Refuse an action that is not finite, naming the first such number.
-
-    Raises:
-        PolicyError: One of the numbers is NaN or infinite.
-    """
-    numbers = np.asarray(action)
-    if numbers.dtype.kind == "f" and not np.isfinite(numbers).all():
-        index = tuple(int(i) for i in np.argwhere(~np.isfinite(numbers))[0])
+def _require_finite(action: NDArray[Any], seed: int | Sequence[int] | None, t: int) -> None:
+    """Refuse an action that is not finite, naming the first such number."""
+    if action.dtype.kind == "f" and not np.isfinite(action).all():
+        index = tuple(int(i) for i in np.argwhere(~np.isfinite(action))[0])
+        which = "the episode" if seed is None else f"the episode with seed {seed}"
+        if isinstance(seed, Sequence):
+            which = f"the episodes from seed {seed[0]} on"
         raise PolicyError(
-            f"action{list(index)} is {numbers[index]} {when}; expected finite numbers: the policy is broken"
+            f"action{list(index)} is {action[index]} at step {t} of {which}; "
+            f"expected finite numbers: the policy is broken"
         )

@@ -122,14 +122,7 @@ class _ProcessAgent(Agent):
 
 
 class RemoteAgent(_ProcessAgent):
-    """Runs an agent in another process, on a shared workspace, without gradients.
-
-    Args:
-        agent: What to run there; its weights move into shared memory.
-        name: What `get_by_name` finds.
-        verbose: Kept as an attribute.
-        start_method: "spawn", "forkserver" or "fork".
-    """
+    """Runs an agent in another process, on a shared workspace, without gradients."""
 
     _sent: Workspace | None = None
 
@@ -312,11 +305,6 @@ class AsynchronousAgent(_ProcessAgent):
         while agent.is_running():
             ...
         workspace = agent.get_workspace()
-
-    Args:
-        agent: What to run there; its weights move into shared memory.
-        verbose: Kept as an attribute.
-        start_method: "spawn", "forkserver" or "fork".
     """
 
     def __init__(self, agent: Agent, verbose: bool = False, *, start_method: str = "spawn") -> None:

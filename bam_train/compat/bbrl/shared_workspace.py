@@ -48,22 +48,11 @@ class _SharedVariable(Variable):
         self._whole[t] = value
 
     def set(self, t: int, value: Any) -> None:
-        """Copy `value` (B x ...) to time t, from any device.
-
-        Raises:
-            ValueMismatch: Another shape, dtype or kind.
-            WorkspaceError: t is beyond the end.
-            TimeNotWritten: t is negative beyond the first.
-        """
+        """Copy `value` (B x ...) to time t, from any device."""
         super().set(t, value.detach().to(self.device) if isinstance(value, torch.Tensor) else value)
 
     def set_full(self, value: Any) -> None:
-        """Copy T x B x ... onto the first T times; later ones stay.
-
-        Raises:
-            ValueMismatch: Another shape, dtype or kind.
-            WorkspaceError: It is longer than the variable.
-        """
+        """Copy T x B x ... onto the first T times; later ones stay."""
         self._check_full(value)
         for what, ours, theirs in (
             ("shape of one time", tuple(self.shape), tuple(value.shape[1:])),
@@ -112,19 +101,11 @@ class SharedWorkspace(Workspace):
         return SharedWorkspace({name: type(one)(name, one.memory[:, begin:end]) for name, one in variables.items()})
 
     def remove_variable(self, name: str) -> None:
-        """Refused: other processes use it.
-
-        Raises:
-            WorkspaceError: Always.
-        """
+        """Refused: other processes use it."""
         raise WorkspaceError(f"{name!r} cannot be removed from a shared workspace.")
 
     def clear(self, name: str | None = None) -> None:
-        """Refused: other processes use it.
-
-        Raises:
-            WorkspaceError: Always.
-        """
+        """Refused: other processes use it."""
         raise WorkspaceError("A shared workspace cannot be cleared: its variables and its length are fixed.")
 
     def _new(self, name: str, value: Any, where: str) -> Any:

@@ -70,6 +70,8 @@ class GymAgent(Agent, ABC):
     default_seed = 42
     envs: Any
     num_envs: int
+    observation_space: Space[Any]
+    action_space: Space[Any]
 
     def __new__(cls, *args: Any, arrays: str = "torch", **kwargs: Any) -> Self:
         """See `Agent`; with tensors it is an `nn.Module` also where nobody has imported torch yet."""
@@ -97,8 +99,6 @@ class GymAgent(Agent, ABC):
         self.input, self.output = input_string, output_string
         self.reward_at_t, self.include_last_state = reward_at_t, include_last_state
         self.arrays, self.info_keys = arrays, tuple(info_keys)
-        self.observation_space: Space[Any] | None = None
-        self.action_space: Space[Any] | None = None
         self._seed, self._nb_reset = seed, 1
         self._stepper: Stepper | None = None
         self._floats = np.dtype(np.float32 if arrays == "torch" else np.float64)
@@ -192,7 +192,7 @@ class GymAgent(Agent, ABC):
     def _written(self) -> tuple[str, ...]:
         """The names of all variables that it writes."""
         infos = [name for key in self.info_keys for name in (f"info/{key}", f"info/_{key}")]
-        return tuple(self.output + name for name in (*names(self.get_observation_space()), *NUMBERS, *infos))
+        return tuple(self.output + name for name in (*names(self.observation_space), *NUMBERS, *infos))
 
     # -- seeds -----------------------------------------------------------------------------------------------------
 
@@ -235,23 +235,11 @@ class GymAgent(Agent, ABC):
     # -- spaces ----------------------------------------------------------------------------------------------------
 
     def get_observation_space(self) -> Space[Any]:
-        """The observation space of one environment.
-
-        Raises:
-            LoopError: It has none yet.
-        """
-        if self.observation_space is None:
-            raise LoopError(f"{agent_name(self)} has no observation space.")
+        """The observation space of one environment."""
         return self.observation_space
 
     def get_action_space(self) -> Space[Any]:
-        """The action space of one environment.
-
-        Raises:
-            LoopError: It has none yet.
-        """
-        if self.action_space is None:
-            raise LoopError(f"{agent_name(self)} has no action space.")
+        """The action space of one environment."""
         return self.action_space
 
     def get_obs_and_actions_sizes(self) -> tuple[Any, Any]:
@@ -260,7 +248,7 @@ class GymAgent(Agent, ABC):
         Raises:
             LoopError: A space has no size, such as a dict.
         """
-        return _size(self.get_observation_space()), _size(self.get_action_space())
+        return _size(self.observation_space), _size(self.action_space)
 
     def is_continuous_action(self) -> bool:
         """Whether the action space is a Box."""

@@ -1,11 +1,11 @@
 """Advantages, temporal differences and returns of recorded steps.
 
-T is time, B the batch. ``reward[t + 1]`` and ``critic[t + 1]`` follow from ``action[t]``: the row of a workspace at t
-holds the reward of the action before it.
+T is time, B the batch. ``reward[t + 1]`` and ``critic[t + 1]`` follow from ``action[t]``: a workspace holds at t the
+reward of the action before it.
 
 Differences from BBRL's `bbrl.utils.functional`: shapes that differ are refused, where BBRL's broadcasts (N and N x 1
-give N x N without a word); `gae` takes log2(T) operations on whole tensors instead of T on rows, gives no rows from no
-rows, and keeps float64.
+give N x N without a word); `gae` takes log2(T) operations on whole tensors instead of T on single
+times, gives nothing from nothing, and keeps float64.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def gae(
         delta[t]     = reward[t] + discount_factor * must_bootstrap[t] * next_critic[t] - critic[t]
         advantage[t] = delta[t] + discount_factor * gae_coef * must_bootstrap[t] * advantage[t + 1]
 
-    The sum ends where `must_bootstrap` is False and at the last row. The first axis is time: give T x B. A flat batch
+    The sum ends where `must_bootstrap` is False and at the last time. The first axis is time: give T x B. A flat batch
     of N transitions (`get_transitions` of one environment) is right as well; of several environments it is not, because
     neighbours in such a batch belong to different environments (except with ``gae_coef=0``).
 
@@ -88,7 +88,7 @@ def temporal_difference(
         discount_factor: Gamma.
 
     Returns:
-        T x B; the last row is 0.
+        T x B; the last time is 0.
 
     Raises:
         ValueMismatch: The shapes do not fit.
@@ -96,7 +96,7 @@ def temporal_difference(
     _require_shapes("temporal_difference", critic.shape, reward=reward)
     must_bootstrap = _flags("temporal_difference", critic, must_bootstrap)
     target = reward[1:] + discount_factor * critic[1:].detach() * must_bootstrap.to(critic.dtype)
-    return _with_last_row(target - critic[:-1])
+    return _with_last_zero(target - critic[:-1])
 
 
 def doubleqlearning_temporal_difference(
@@ -123,7 +123,7 @@ def doubleqlearning_temporal_difference(
         discount_factor: Gamma.
 
     Returns:
-        T x B; the last row is 0.
+        T x B; the last time is 0.
 
     Raises:
         ValueMismatch: The shapes do not fit.
@@ -134,7 +134,7 @@ def doubleqlearning_temporal_difference(
     must_bootstrap = _flags(name, reward, must_bootstrap)
     best = _of_action(q_target, q.argmax(-1)).detach()
     target = reward[1:] + discount_factor * best[1:] * must_bootstrap.to(best.dtype)
-    return _with_last_row(target - _of_action(q, action)[:-1])
+    return _with_last_zero(target - _of_action(q, action)[:-1])
 
 
 def cumulated_reward(reward: torch.Tensor, done: torch.Tensor) -> float:
@@ -165,8 +165,8 @@ def _of_action(q: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
     return q.gather(-1, action.long().unsqueeze(-1)).squeeze(-1)
 
 
-def _with_last_row(differences: torch.Tensor) -> torch.Tensor:
-    """A row of zeros below: the last time has no next one."""
+def _with_last_zero(differences: torch.Tensor) -> torch.Tensor:
+    """With zeros at the last time, which has no next one."""
     return torch.cat([differences, differences.new_zeros((1, *differences.shape[1:]))])
 
 

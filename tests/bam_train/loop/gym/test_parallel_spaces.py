@@ -237,15 +237,6 @@ def test_sizes_and_kinds(toys):
         agent_of(toys, {}, NESTED).get_obs_and_actions_sizes()
 
 
-def test_an_agent_without_spaces(toys):
-    agent = ParallelGymAgent(toys.Counting, 1)
-    agent.observation_space = agent.action_space = None
-    with pytest.raises(LoopError, match=r"^ParallelGymAgent has no observation space\.$"):
-        agent.get_observation_space()
-    with pytest.raises(LoopError, match=r"^ParallelGymAgent has no action space\.$"):
-        agent.get_action_space()
-
-
 def test_ghost_params_say_where_observations_go(toys):
     agent = ParallelGymAgent(toys.Counting, 1)
     assert agent.ghost_params.shape == (0,)
