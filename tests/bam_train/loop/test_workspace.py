@@ -1,7 +1,9 @@
 """Reading and writing: one time, all times, what a workspace says about itself."""
 
 import copy
+import gc
 import pickle
+import weakref
 from collections import OrderedDict
 
 import pytest
@@ -242,3 +244,18 @@ def test_values_one_number_each(kind):
 
 def test_is_not_shared(kind):
     assert counted(kind, "x").is_shared is False
+
+
+@pytest.mark.parametrize("window", [None, 3])
+def test_a_workspace_is_freed_at_once(kind, window):
+    """A workspace an epoch is the usual form: they must not wait for the garbage collector. A window's may."""
+    gc.collect()
+    gc.disable()
+    try:
+        workspace = Workspace(window=window)
+        workspace.set("a", 0, kind([1.0]))
+        reference = weakref.ref(workspace)
+        del workspace
+        assert (reference() is None) == (window is None)
+    finally:
+        gc.enable()

@@ -35,14 +35,6 @@ def test_a_value_is_the_object_that_was_set(weight):
     assert ws["y"].data_ptr() == value.data_ptr()
 
 
-def test_one_time(ws, weight):
-    assert gradient(weight, ws.get("x", 2).sum()) == [2.0, 2.0]
-
-
-def test_a_full_read(ws, weight):
-    assert gradient(weight, ws["x"].sum()) == [3.0, 3.0]
-
-
 def test_reading_all_and_going_on_writing(ws, weight):
     early = ws["x"].sum()
     ws.set("x", 3, 3 * weight)
@@ -95,6 +87,7 @@ def test_a_stored_value_may_be_changed_in_place(weight):
 @pytest.mark.parametrize(
     ("operation", "expected"),
     [
+        (lambda ws: ws, [3.0, 3.0]),
         (lambda ws: ws.subtime(1, 3), [3.0, 3.0]),
         (lambda ws: ws.get_time_truncated_workspace(2, 3), [2.0, 2.0]),
         (lambda ws: ws.contiguous(), [3.0, 3.0]),
@@ -109,10 +102,6 @@ def test_a_stored_value_may_be_changed_in_place(weight):
 )
 def test_pieces_keep_the_graph(ws, weight, operation, expected):
     assert gradient(weight, operation(ws)["x"].sum()) == expected
-
-
-def test_get_time_truncated_keeps_the_graph(ws, weight):
-    assert gradient(weight, ws.get_time_truncated("x", 1, 2).sum()) == [1.0, 1.0]
 
 
 def test_copy_time_keeps_the_graph(ws, weight):
