@@ -1,4 +1,4 @@
-"""What has to be said of a rack that does not describe its environment."""
+"""What the user says of a rack that does not describe its environment."""
 
 from __future__ import annotations
 

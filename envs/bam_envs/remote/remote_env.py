@@ -30,7 +30,7 @@ _CLASSES = {
 
 
 class RemoteEnv(Described, gym.Env[Any, Any]):
-    """One environment behind a transport. Spaces, period and labels are those of the other end.
+    """One environment behind a transport, with the spaces, period and labels of the other end.
 
     It connects when something of the other end is first needed. `LinkLost` and the other faults of the transport go
     through: a lost link is no end of an episode. The next `reset` connects again. It is closed when Python ends.

@@ -79,7 +79,7 @@ class RclpyBus:
             raise
 
     def _spinning(self, name: str, executor: Any) -> Any:
-        """A new node, whose callbacks `executor` runs."""
+        """Create a node whose callbacks `executor` runs."""
         import rclpy
 
         node = rclpy.create_node(name, context=self._context, start_parameter_services=False)
@@ -91,7 +91,7 @@ class RclpyBus:
         return node
 
     def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
-        """Say that `topic` of type `kind` will be published; a latched one repeats its last message to newcomers."""
+        """Advertise `topic` of type `kind`; a latched one repeats its last message to new subscribers."""
         from rclpy.qos import DurabilityPolicy, QoSProfile
 
         durability = DurabilityPolicy.TRANSIENT_LOCAL if latch else DurabilityPolicy.VOLATILE
@@ -141,7 +141,7 @@ class RclpyBus:
                 self._node.destroy_subscription(subscription)
 
     def serve(self, service: str, kind: str, handler: Handler) -> None:
-        """Answer `service`, always: ROS has no failed responses, and a client would wait for ever for a missing one.
+        """Answer `service`, also when the handler fails: ROS has no failed responses, and a client waits for ever.
 
         Where the handler failed, the response is as ROS makes it, with the error's text where the type has room for it.
         A service whose type is in no package here is not offered; see `refused`.
@@ -266,7 +266,7 @@ def _end_workers(executor: Any) -> None:
 
 
 def _with_text(response: Any, text: str) -> Any:
-    """`response` with `text` in the field for people that many types have."""
+    """`response` with `text` in its field `message`, which many types have."""
     if "message" in response.get_fields_and_field_types():
         response.message = text
     return response

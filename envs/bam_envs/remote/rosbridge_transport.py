@@ -36,7 +36,7 @@ from bam_envs.rosbridge.sessions import is_over, read_session
 from bam_envs.rosbridge.string_rpc import StringRpc
 
 _QUESTIONS = 3
-"""How often it is asked who it is: a ROS 2 bridge makes a client for each call, and the answer is lost where it comes
+"""How often the description is asked for: a ROS 2 bridge makes a client for each call, and the answer is lost where it comes
 before the two ends have found each other."""
 _CLOSE_TIMEOUT = 1.0  # [s]; a server that is gone must not hold up `close`
 
@@ -44,8 +44,8 @@ _CLOSE_TIMEOUT = 1.0  # [s]; a server that is gone must not hold up `close`
 class RosbridgeTransport:
     """Carries an environment through rosbridge. One request at a time; `close` may be called from any thread.
 
-    A bam-train server describes its environment when it is asked. Another rack does not: then the spaces must be
-    given, and nothing is asked that it may not know.
+    A server of bam-train describes its environment. Another rack does not: then the spaces must be given, and it is
+    asked nothing that it may not know.
 
     Args:
         url: ``ws://host:port/namespace`` or ``wss://…``; the namespace may be left out.
@@ -110,7 +110,7 @@ class RosbridgeTransport:
             return self._connect().spec
 
     def reset(self, seed: Seed = None, options: Info | None = None) -> tuple[Any, Any]:
-        """Begin an episode; waits for a link that dropped as long as connecting may take."""
+        """Begin an episode; waits for a link that dropped, at most as long as connecting may take."""
         with self._lock:
             there = self._connect()
             self._known_epoch = None
@@ -200,7 +200,7 @@ class RosbridgeTransport:
         self._rpc = StringRpc(self._link, self._base, tagger)
 
     def _described(self) -> EnvCodec:
-        """What is there on this connection; it must be what was there on the one before."""
+        """The environment on this connection, which must be that of the connection before."""
         epoch, before = self._link.epoch, self._there
         there = self._rack.codec(self.env_id) if self._rack.is_described else self._asked()
         if before is not None and spec_to_json(before.spec) != spec_to_json(there.spec):
@@ -209,7 +209,7 @@ class RosbridgeTransport:
         return there
 
     def _asked(self) -> EnvCodec:
-        """What is there, by its own words; an answer that says nothing of it is that of somebody else's rack."""
+        """Ask the server for its description; an answer without one is that of another rack."""
         try:
             response = self._introduction()
         except RemoteError as error:  # no such service, or a rack that fails at what it does not know
@@ -224,7 +224,7 @@ class RosbridgeTransport:
         return EnvCodec(spec_from_json(spec))
 
     def _introduction(self, questions: int = _QUESTIONS) -> GymResponse:
-        """What it answers when it is asked who it is; asked again while nothing comes, for that moves nothing."""
+        """Ask for the description, again while no answer comes: that moves nothing."""
         try:
             limit = max(self.endpoint.connect_timeout, 1.0) / _QUESTIONS
             return self._exchange(RequestType.NONE, None, timeout=limit)
@@ -257,7 +257,7 @@ class RosbridgeTransport:
         return service_name(self._link.namespace) if self.channel == "service" else f"{self._base}/request"
 
     def _ask(self, kind: RequestType, **fields: Any) -> GymResponse:
-        """A success. Whatever else comes but a refusal, the state over there is unknown until the next reset."""
+        """Send a request and return its success; after an error that is no refusal, a reset is needed."""
         epoch = self._known_epoch if kind is RequestType.STEP else self._link.epoch
         try:
             response = self._exchange(kind, epoch, **fields)

@@ -41,11 +41,11 @@ class TcpTransport:
 
     Args:
         url: ``tcp://host:port``.
-        env_id: The environment that is wanted; "" for whatever is served.
+        env_id: The environment that is wanted; "" for the one that is served.
         timeout: Longest time for a request [s].
         connect_timeout: Longest time to connect [s].
         token: The server's shared secret, if it has one. Nothing is encrypted.
-        name: What other clients are told of this one; computer and process by default.
+        name: The name of this client that others are told; computer and process by default.
         take: Take command from the client that has it.
 
     Raises:
@@ -120,7 +120,7 @@ class TcpTransport:
         return self._frames is not None and self._pid == os.getpid()
 
     def _connected(self) -> EnvSpecMessage:
-        """What is there, over a link that is up."""
+        """Connect if the link is down; the environment there."""
         if self._closed:
             raise LinkLost(f"{self.url}: this transport is closed; make a new one.")
         if self._spec is not None and self._is_up():
@@ -141,7 +141,7 @@ class TcpTransport:
         return spec
 
     def _forget_parent(self) -> None:
-        """After a fork: the link and the session are the parent's, which must not notice."""
+        """After a fork, forget the link and the session of the parent, and leave them open."""
         frames, self._frames = self._frames, None
         if frames is not None:
             frames.abandon()
@@ -181,7 +181,7 @@ class TcpTransport:
         return tag_message(self._tagger.next(self._epoch, limit))
 
     def _ask(self, request: Request) -> Tree:
-        """The content of the answer to `request`. After anything else than an answer the link is down."""
+        """Send a request and return the content of its answer; after any other outcome the link is down."""
         frames, limit = self._frames, request.tag.lifetime
         if frames is None:
             raise LinkLost(f"{self.url}: the link is down.")

@@ -1,7 +1,7 @@
 """The requests and responses of bam_msgs/GymAPI, the service of a BAM robot rack; pure functions on dicts.
 
 A field that is missing has the default of its type, a field that is unknown is ignored, and one of the wrong kind is
-an error that names it. What the message type has no field for travels where it has text: a `Tag` and the seed 0 in
+an error that names it. What has no field of its own travels in fields of text: a `Tag` and the seed 0 in
 ``header.frame_id``; options, seeds of several environments and exact actions in ``prefix`` of an action; exact
 observations and infos in ``info``, under ``bam``.
 """
@@ -27,7 +27,7 @@ from bam_envs.rosbridge.encoding import dump_json, load_json
 
 KIND = "bam_msgs/GymAPI"
 PREFIX = "bam:"
-"""Begins the text in ``prefix`` of an action that is ours."""
+"""How our text in ``prefix`` of an action begins."""
 MAX_SEED = 2**31 - 1
 """Largest seed that the field holds on every rack."""
 Message = Mapping[str, Any]
@@ -78,7 +78,7 @@ class GymRequest:
     client_id: str = ""
     """Who asks, for people."""
     env_name: str = ""
-    """Which environment; empty for the one that is there."""
+    """The environment that is meant; empty for the one that is there."""
     actions: tuple[Message, ...] = ()
     """GymAction of each environment."""
     seed: Seed = None
@@ -100,11 +100,11 @@ class GymResponse:
     feedback: tuple[Message, ...]
     """Complete GymFeedback of each environment."""
     infos: tuple[Info, ...]
-    """What each feedback's info says to people and programs."""
+    """The info of each feedback."""
     exact: tuple[Info, ...]
-    """What it says to us, under ``bam``; empty dicts from everybody else's servers."""
+    """The part of each info under ``bam``; empty dicts from servers that are not ours."""
     version: Version | None = None
-    """The version of the messages that the sender speaks; None if that does not show."""
+    """The version of the messages that the server uses; None if that does not show."""
 
     @property
     def ours(self) -> bool:
@@ -175,7 +175,7 @@ def read_request(message: object) -> GymRequest:
 
     Raises:
         InvalidValue: A field is of the wrong kind: its name, what was expected, what was found.
-        ProtocolError: The words beside the fields cannot be read.
+        ProtocolError: The text in ``prefix`` cannot be read.
     """
     whole = complete_known(request_type(KIND), message)
     header = whole["header"]
@@ -350,7 +350,7 @@ def _source(feedback: Sequence[Message], at: int) -> int:
 
 
 def write_info(info: Mapping[str, Any], bam: Mapping[str, Any]) -> str:
-    """`info` as JSON: what anybody can read, and under ``bam`` what only comes back exactly from there."""
+    """`info` as JSON: plain values for every reader, and under ``bam`` the exact ones."""
     plain: Info = {}
     precise: Info = {}
     for key, value in info.items():
@@ -366,7 +366,7 @@ def write_info(info: Mapping[str, Any], bam: Mapping[str, Any]) -> str:
 
 
 def _for_people(value: Any) -> Any:
-    """A tree for people: arrays as lists, None for what is too long or has no word in JSON."""
+    """A tree as plain JSON: arrays as lists, None for what is too long or not in JSON."""
     if isinstance(value, (np.generic, np.ndarray)):
         return _for_people(value.tolist()) if value.size <= _MOST_READABLE else None
     if isinstance(value, float):

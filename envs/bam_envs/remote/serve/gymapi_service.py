@@ -123,7 +123,7 @@ class GymApiService:
         return write_failure(failure, time.monotonic() - begun, self._stamp(), version)
 
     def _once(self, request: GymRequest, version: Version, caller: Caller, begun: float, published: bool) -> Feedback:
-        """The feedback; that of before if the request came before."""
+        """The feedback; a request that came before gets the same again."""
         tag = request.tag
         if tag is None:
             return self._perform(request, version, caller, None)
@@ -175,7 +175,7 @@ class GymApiService:
         return stamp(self._clock())
 
     def _client(self, request: GymRequest, caller: Caller, published: bool) -> str:
-        """Name of who asks, by which a client is known again when it comes back on another connection.
+        """The name of the client, the same when it comes back on another connection.
 
         The session in the tag of a service call is known to nobody else, so others are never told of it.
         """
@@ -184,7 +184,7 @@ class GymApiService:
         return f"{name}#{mark}" if mark else name
 
     def _remember(self, client: str, caller: Caller) -> None:
-        """On which connection `client` began its episode, to know who leaves when that ends."""
+        """Record the connection on which `client` began its episode: it leaves when that ends."""
         if caller.name:
             with self._lock:
                 self._connections[client] = caller.name
@@ -199,7 +199,7 @@ class GymApiService:
             clients = [client for client, name in self._connections.items() if name == caller.name]
             for client in clients:
                 del self._connections[client]
-        # Elsewhere: it waits for a step that is under way, and this is the thread of the network.
+        # In another thread: it waits for a step that runs, and this is the thread of the network.
         with suppress(RuntimeError):  # closed meanwhile
             self._leaving.submit(self._let_go, clients)
 
@@ -213,5 +213,5 @@ def _name(request: GymRequest) -> str:
 
 
 def _shown(request: GymRequest, caller: Caller) -> str:
-    """What others are told of who asks."""
+    """The name of the client that others are told."""
     return f"{_name(request)} ({caller.address})" if caller.address else _name(request)

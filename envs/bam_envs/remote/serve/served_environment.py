@@ -1,4 +1,4 @@
-"""Everything that `bam-serve` runs beside an environment: its robot's topics, its services, and what carries them."""
+"""Everything that `bam-serve` runs: an environment, the topics of its robot, its services, and what carries them."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class ServedEnvironment:
     Args:
         env: The environment; it is closed at the end.
         options: Where and how.
-        tell: Called with a line for people whenever command changes hands, or a link comes and goes.
+        tell: Called with a line for people when command changes hands, and when a link is lost.
 
     Raises:
         InvalidValue: Options that exclude each other.
@@ -186,7 +186,7 @@ class ServedEnvironment:
         return frozenset(refused)
 
     def _offered(self, profile: RobotProfile | None, refused: frozenset[str]) -> str:
-        """What is of use in spite of what is `refused`.
+        """What is offered, without what is `refused`, in words.
 
         Raises:
             RemoteError: Nothing, and it is served nowhere else.
