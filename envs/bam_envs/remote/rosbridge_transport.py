@@ -36,8 +36,8 @@ from bam_envs.rosbridge.sessions import is_over, read_session
 from bam_envs.rosbridge.string_rpc import StringRpc
 
 _QUESTIONS = 3
-"""How often the description is asked for: a ROS 2 bridge makes a client for each call, and the answer is lost where it comes
-before the two ends have found each other."""
+"""Times that the description is asked for: a ROS 2 bridge makes a client for each call, and the answer is lost where it
+comes before the two ends have found each other."""
 _CLOSE_TIMEOUT = 1.0  # [s]; a server that is gone must not hold up `close`
 
 
