@@ -1,8 +1,8 @@
 """Seeded evaluation of a policy: success, return and length over a fixed list of episodes; and videos of some.
 
-Episode k starts from ``reset(seed=seed + k)`` however many rows run side by side. Rows are run in waves, each a run of
-one `TemporalAgent` (environment, policy) until all rows have ended: every row plays one episode, and what a row does
-after its end is not counted (it keeps stepping only because others are not done).
+Episode k starts from ``reset(seed=seed + k)`` however many environments run side by side. They are run in waves, each a
+run of one `TemporalAgent` (environment, policy) until all have ended: every environment plays one episode, and what it
+does after its end is not counted (it keeps stepping only because others are not done).
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ FIRST_SEED = 1_000_000
 _Z95 = 1.959963984540054
 """97.5 % quantile of the normal distribution, for a two-sided 95 % interval."""
 
-_MOST_ROWS = {True: 64, False: 16}
-"""Rows stepped side by side at most: batched physics (True) and one Python environment a row (False)."""
+_MOST_ENVS = {True: 64, False: 16}
+"""Most environments stepped side by side: batched physics (True), Python environments one after the other (False)."""
 
 OnProgress = Callable[[int, int], None]
 """Called with the episodes done and the episodes wanted."""
@@ -144,9 +144,9 @@ def evaluate(
         env_kwargs: Its keyword arguments.
         episodes: How many episodes count; at least 1.
         seed: Seed of the first episode; episode k gets ``seed + k``.
-        num_envs: Rows stepped side by side; by default as many as is quick and not more than `episodes`.
+        num_envs: Environments stepped side by side; by default as many as is quick and not more than `episodes`.
         env: A vector environment made by `make_rows` to use instead of making one; it is left open.
-        on_progress: Called after every wave of rows.
+        on_progress: Called after every wave of environments.
 
     Raises:
         SettingsError: `episodes`, `seed` or `num_envs` out of range.
@@ -156,28 +156,28 @@ def evaluate(
     check(seed, NonNegativeInt, "seed", SettingsError)
     check(episodes, PositiveInt, "episodes", SettingsError)
     check(num_envs, PositiveInt | None, "num_envs", SettingsError)
-    with _rows(env_id, env_kwargs, num_envs, episodes, env) as rows:
+    with _batch(env_id, env_kwargs, num_envs, episodes, env) as batch:
         done: list[Episode] = []
         while len(done) < episodes:
-            done += play_wave(rows, policy, seed + len(done), min(rows.num_envs, episodes - len(done)))
+            done += play_wave(batch, policy, seed + len(done), min(batch.num_envs, episodes - len(done)))
             if on_progress is not None:
                 on_progress(len(done), episodes)
     return summarise(env_id, done)
 
 
 def play_wave(env: VectorEnv[Any, Any, Any], policy: BatchPolicy, seed: int, count: int) -> list[Episode]:
-    """One episode in each of the first `count` rows; row i is seeded ``seed + i``.
+    """One episode in each of the first `count` environments; environment i is seeded ``seed + i``.
 
-    The surplus rows of a last, smaller wave run too (a vector environment steps all rows) and are ignored.
+    The surplus environments of a last, smaller wave run too (a vector environment steps all) and are ignored.
     """
-    rows = _Rows(lambda: env, auto_reset=False, arrays="numpy", info_keys=("is_success",))
+    batch = _Batch(lambda: env, auto_reset=False, arrays="numpy", info_keys=("is_success",))
     acting = PolicyAgent(policy, [f"env/{name}" for name in names(env.single_observation_space)])
     workspace = Workspace(window=2)
     seeds = [seed + i for i in range(env.num_envs)]
-    loop = TemporalAgent(Agents(rows, _Wave(count), acting))
+    loop = TemporalAgent(Agents(batch, _Wave(count), acting))
     loop(workspace, t=0, stop_variable="wave/done", seed=seeds)
     last = {name: workspace.get(name, -1) for name in workspace}
-    return [_episode(last, seed, row) for row in range(count)]
+    return [_episode(last, seed, index) for index in range(count)]
 
 
 def record_video(env: gym.Env[Any, Any], policy: Any, add: Callable[[Frame], Any], *, episodes: int, seed: int) -> int:
@@ -200,7 +200,7 @@ def record_video(env: gym.Env[Any, Any], policy: Any, add: Callable[[Frame], Any
     return video.count
 
 
-class _Rows(VecGymAgent):
+class _Batch(VecGymAgent):
     """An environment that is somebody else's: an exception does not close it."""
 
     def close(self) -> None:
@@ -208,7 +208,7 @@ class _Rows(VecGymAgent):
 
 
 class _Wave(Agent):
-    """Writes ``wave/done`` (B,): the rows that have ended, and those that do not count."""
+    """Writes ``wave/done`` (B,): the environments that have ended, and those that do not count."""
 
     reads = ("env/done",)
     writes = ("wave/done",)
@@ -223,11 +223,11 @@ class _Wave(Agent):
         self.set(("wave/done", t), done)
 
 
-def _episode(last: Mapping[str, Any], seed: int, row: int) -> Episode:
-    """The episode of `row`, from the variables at its end, which repeat until all have ended."""
-    says = "env/info/is_success" in last and last["env/info/_is_success"][row]
-    success = bool(last["env/info/is_success"][row]) if says else None
-    return Episode(seed + row, float(last["env/cumulated_reward"][row]), int(last["env/timestep"][row]), success)
+def _episode(last: Mapping[str, Any], seed: int, index: int) -> Episode:
+    """The episode of environment `index`, from the variables at its end, which repeat until all have ended."""
+    says = "env/info/is_success" in last and last["env/info/_is_success"][index]
+    success = bool(last["env/info/is_success"][index]) if says else None
+    return Episode(seed + index, float(last["env/cumulated_reward"][index]), int(last["env/timestep"][index]), success)
 
 
 def _finite(value: float) -> float | None:
@@ -235,7 +235,7 @@ def _finite(value: float) -> float | None:
 
 
 @contextmanager
-def _rows(
+def _batch(
     env_id: str,
     env_kwargs: Mapping[str, Any] | None,
     num_envs: int | None,
@@ -248,14 +248,14 @@ def _rows(
             raise SettingsError(f"env: expected autoreset mode SAME_STEP, found {env.metadata.get('autoreset_mode')}")
         yield FiniteRows(env, env_id)
         return
-    own = FiniteRows(make_rows(env_id, env_kwargs, num_envs or default_rows(env_id, episodes)), env_id)
+    own = FiniteRows(make_rows(env_id, env_kwargs, num_envs or default_num_envs(env_id, episodes)), env_id)
     try:
         yield own
     finally:
         own.close()
 
 
-def default_rows(env_id: str, episodes: int) -> int:
-    """Rows that share `episodes` in the fewest waves, evenly: 100 episodes of ours are two waves of 50."""
-    most = _MOST_ROWS[is_batched(env_id)]
+def default_num_envs(env_id: str, episodes: int) -> int:
+    """Environments that share `episodes` in the fewest waves, evenly: 100 episodes of ours are two waves of 50."""
+    most = _MOST_ENVS[is_batched(env_id)]
     return math.ceil(episodes / math.ceil(episodes / most))

@@ -21,12 +21,12 @@ class FiniteEnv(gym.Wrapper[Any, Any, Any, Any]):
     Args:
         env: The environment.
         env_id: How errors name it.
-        row: Which of several it is; None if it is alone.
+        which: Which of several it is; None if it is alone.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], env_id: str, row: int | None = None) -> None:
+    def __init__(self, env: gym.Env[Any, Any], env_id: str, which: int | None = None) -> None:
         super().__init__(env)
-        self._name, self._row, self._steps = env_id, row, 0
+        self._name, self._index, self._steps = env_id, which, 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode."""
@@ -46,11 +46,11 @@ class FiniteEnv(gym.Wrapper[Any, Any, Any, Any]):
     def _require(self, signal: str, value: Any) -> None:
         found = _not_finite(signal, value)
         if found is not None:
-            raise _failed(self, self._name, *found, self._steps, self._row)
+            raise _failed(self, self._name, *found, self._steps, self._index)
 
 
 class FiniteRows(VectorWrapper):
-    """A vector environment whose observations and rewards are finite; its rows restart in the same step.
+    """A vector environment whose observations and rewards are finite; its environments restart in the same step.
 
     Args:
         envs: The environment.
@@ -75,41 +75,41 @@ class FiniteRows(VectorWrapper):
         """Nothing: the environment, which others may use too, closes itself."""
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode on every row, or on those of ``options["reset_mask"]``."""
+        """Begin an episode in every environment, or in those of ``options["reset_mask"]``."""
         observations, infos = self.env.reset(seed=seed, options=options)
         self.episode_steps[(options or {}).get("reset_mask", slice(None))] = 0
         self._require("observation", observations)
         return observations, infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step every row; what ended rows observed last is looked at too."""
+        """Step every environment; what ended ones observed last is looked at too."""
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         self.episode_steps += 1
         self._require("reward", rewards)
         ended = np.flatnonzero(terminated | truncated).tolist()
         if ended:
-            for row in ended if "final_obs" in infos else ():
-                self._require("observation", _row_of(infos["final_obs"], row), row)
+            for which in ended if "final_obs" in infos else ():
+                self._require("observation", _of(infos["final_obs"], which), which)
             self.episode_steps[ended] = 0
         self._require("observation", observations)
         return observations, rewards, terminated, truncated, infos
 
-    def _require(self, signal: str, values: Any, row: int | None = None) -> None:
-        """Refuse a number of all rows, or of one."""
+    def _require(self, signal: str, values: Any, which: int | None = None) -> None:
+        """Refuse a number of all environments, or of one."""
         found = _not_finite(signal, values)
         if found is None:
             return
         name, index, number = found
-        if row is None:
-            row, *index = index
-        raise _failed(self, self._name, name, index, number, int(self.episode_steps[row]), row)
+        if which is None:
+            which, *index = index
+        raise _failed(self, self._name, name, index, number, int(self.episode_steps[which]), which)
 
 
-def _row_of(observations: Any, row: int) -> Any:
-    """One row of a batch, which is a mapping of arrays, or an array, of objects too."""
+def _of(observations: Any, which: int) -> Any:
+    """One environment of a batch, which is a mapping of arrays, or an array, of objects too."""
     if isinstance(observations, Mapping):
-        return {key: _row_of(one, row) for key, one in observations.items()}
-    return observations[row]
+        return {key: _of(one, which) for key, one in observations.items()}
+    return observations[which]
 
 
 def _not_finite(name: str, value: Any) -> tuple[str, list[int], float] | None:
@@ -125,15 +125,15 @@ def _not_finite(name: str, value: Any) -> tuple[str, list[int], float] | None:
 
 
 def _failed(
-    env: Any, env_id: str, name: str, index: list[int], number: float, steps: int, row: int | None
+    env: Any, env_id: str, name: str, index: list[int], number: float, steps: int, which: int | None
 ) -> EnvironmentFailed:
     """The error for a number; a label of the environment's own names it, if there is one."""
     describe = getattr(env.unwrapped, "describe", None)
     labels = describe().get(name, ()) if describe else ()
     label = f" {labels[index[0]]['name']!r}" if len(index) == 1 and index[0] < len(labels) else ""
     where = label or (str(index) if index else "")
-    which = "" if row is None else f" in environment {row}"
+    one = "" if which is None else f" in environment {which}"
     return EnvironmentFailed(
-        f"{env_id}: {name}{where} is {number} at step {steps} of an episode{which}; "
+        f"{env_id}: {name}{where} is {number} at step {steps} of an episode{one}; "
         "expected finite numbers: correct the environment"
     )

@@ -242,9 +242,9 @@ class TrainingRun:
     def _evaluate(self) -> None:
         """Evaluate the frozen policy; the best is kept."""
         steps = self._evaluated_at = self.trainer.steps
-        with self.trainer.undisturbed(), self.trainer.evaluation_rows() as rows:
+        with self.trainer.undisturbed(), self.trainer.evaluation_rows() as envs:
             last = steps >= self.settings.steps
-            report, self._reached = judge(self.trainer.freeze(), self.settings, last=last, rows=rows)
+            report, self._reached = judge(self.trainer.freeze(), self.settings, last=last, envs=envs)
         if report.success_rate is None and self.settings.until_success is not None and self._report is None:
             self.watcher.note(f"{self.settings.env} reports no is_success, so --until-success has no effect")
         self._report = report
@@ -359,7 +359,7 @@ def judge(
     policy: BatchPolicy,
     settings: TrainSettings,
     last: bool = False,
-    rows: VectorEnv[Any, Any, Any] | None = None,
+    envs: VectorEnv[Any, Any, Any] | None = None,
 ) -> tuple[EvaluationReport, bool]:
     """Evaluate a policy; towards ``until_success`` in up to three parts.
 
@@ -370,31 +370,31 @@ def judge(
         policy: What acts.
         settings: Of the run; episode k is seeded JUDGE_SEED + seed + k.
         last: Whether this is the run's last evaluation, which is never cut short.
-        rows: Environments to evaluate on, left open; by default some are made.
+        envs: Environments to evaluate on, left open; by default some are made.
 
     Returns:
         The report (the worse of two), and whether ``until_success`` was reached.
     """
     episodes, wanted = settings.eval_episodes, settings.until_success
     if wanted is None:
-        return _episodes(policy, settings, 0, episodes, rows), False
+        return _episodes(policy, settings, 0, episodes, envs), False
     if not last:
-        look = _episodes(policy, settings, 0, math.ceil(episodes / 4), rows)
+        look = _episodes(policy, settings, 0, math.ceil(episodes / 4), envs)
         if _failures(look) > (1 - wanted) * episodes + 1e-9:
             return look, False
-    report = _episodes(policy, settings, 0, episodes, rows)
+    report = _episodes(policy, settings, 0, episodes, envs)
     if report.success_rate is None or report.success_rate < wanted:
         return report, False
-    again = _episodes(policy, settings, episodes, episodes, rows)
+    again = _episodes(policy, settings, episodes, episodes, envs)
     worse = min(report, again, key=lambda one: one.success_rate or 0.0)
     return worse, again.success_rate is not None and again.success_rate >= wanted
 
 
 def _episodes(
-    policy: BatchPolicy, settings: TrainSettings, skip: int, count: int, rows: VectorEnv[Any, Any, Any] | None
+    policy: BatchPolicy, settings: TrainSettings, skip: int, count: int, envs: VectorEnv[Any, Any, Any] | None
 ) -> EvaluationReport:
     seed = JUDGE_SEED + settings.seed + skip
-    return evaluate(policy, settings.env, settings.env_kwargs, episodes=count, seed=seed, env=rows)
+    return evaluate(policy, settings.env, settings.env_kwargs, episodes=count, seed=seed, env=envs)
 
 
 def _failures(report: EvaluationReport) -> int:

@@ -9,7 +9,7 @@ from bam_train.environments import make_rows
 from bam_train.errors import PolicyError, SettingsError
 from bam_train.evaluation import (
     Episode,
-    default_rows,
+    default_num_envs,
     evaluate,
     play_wave,
     summarise,
@@ -159,7 +159,7 @@ def test_returns_that_are_not_finite_are_none():
     [("bam/pick-v0", 100, 50), ("bam/pick-v0", 64, 64), ("bam/pick-v0", 3, 3), ("CartPole-v1", 100, 15)],
 )
 def test_rows_share_the_episodes_evenly(env_id, episodes, rows):
-    assert default_rows(env_id, episodes) == rows
+    assert default_num_envs(env_id, episodes) == rows
 
 
 def test_same_seeds_same_numbers_on_gymnasium():

@@ -72,8 +72,8 @@ def test_a_signal_of_ours_has_a_name(monkeypatch):
     still = np.zeros((2, *first.action_space.shape), np.float32)
     first.step(still)
     second.load_state_dict(first.state_dict())
-    label = second.rows.describe()["observation"][2]["name"]
-    task, seen = second.rows.task, np.zeros((2, *second.observation_space.shape), np.float32)
+    label = second.batch.describe()["observation"][2]["name"]
+    task, seen = second.batch.task, np.zeros((2, *second.observation_space.shape), np.float32)
     seen[1, 2] = np.inf
     monkeypatch.setattr(task, "observe", lambda state: seen)
     text = failure(lambda: second.step(still))

@@ -21,7 +21,7 @@ from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import SB3_ALGORITHMS
 from bam_train.trainers.sb3 import sb3_hyperparameters as hyperparameters
 from bam_train.trainers.sb3.sb3_freezing import leaves
-from bam_train.trainers.sb3.sb3_vec_env import RowsVecEnv
+from bam_train.trainers.sb3.sb3_vec_env import BatchVecEnv
 from bam_train.trainers.zero_based_spaces import FromZero
 
 
@@ -88,8 +88,8 @@ def library_notices() -> Iterator[list[str]]:
 
 def one_env(venv: VecEnv) -> Any:
     """What stands behind `venv`: our vector environment, or the first of the others."""
-    if isinstance(venv, RowsVecEnv):
-        return venv.rows
+    if isinstance(venv, BatchVecEnv):
+        return venv.batch
     env = venv.envs[0]
     while isinstance(env, (Monitor, FromZero)):
         env = env.env

@@ -16,7 +16,7 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.nested_state import pack, unpack
 from bam_train.errors import AlteredCheckpoint, FormatError
 from bam_train.trainers.sb3 import sb3_state as state
-from bam_train.trainers.sb3.sb3_vec_env import RowsVecEnv
+from bam_train.trainers.sb3.sb3_vec_env import BatchVecEnv
 
 MODEL, STATE, REPLAY, NOTES = "bam/resume/model", "bam/resume/state", "bam/resume/replay", "bam/resume/notes.json"
 
@@ -118,7 +118,7 @@ def _load_episodes(model: Any, venv: VecEnv, tree: Mapping[str, Any] | None) -> 
 
 def _can_be_saved(venv: VecEnv) -> bool:
     """Whether running episodes can."""
-    return isinstance(venv, RowsVecEnv) and venv.can_be_saved
+    return isinstance(venv, BatchVecEnv) and venv.can_be_saved
 
 
 def _read(checkpoint: Checkpoint, name: str) -> Any:

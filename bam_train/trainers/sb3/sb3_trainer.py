@@ -37,7 +37,7 @@ from bam_train.trainers.sb3.sb3_golden import golden
 from bam_train.trainers.sb3.sb3_model import library_notices, make_model, meaning, one_env, refusals, sb3_members
 from bam_train.trainers.sb3.sb3_state import all_finite, refused_distribution, undisturbed
 from bam_train.trainers.sb3.sb3_tensorboard import ForgivingTensorBoard
-from bam_train.trainers.sb3.sb3_vec_env import RowsVecEnv, make_training_env
+from bam_train.trainers.sb3.sb3_vec_env import BatchVecEnv, make_training_env
 
 _FINITE = "expected finite numbers: try a smaller learning_rate"
 
@@ -215,7 +215,7 @@ class SB3Trainer:
     def _spaces(self) -> tuple[Any, Any]:
         """The environment's own, before normalisation, image transposition and counting from 0."""
         env = one_env(self.venv)
-        if isinstance(self.venv, RowsVecEnv):
+        if isinstance(self.venv, BatchVecEnv):
             return env.single_observation_space, env.single_action_space
         return env.observation_space, env.action_space
 
@@ -235,7 +235,7 @@ class SB3Trainer:
 
     @contextlib.contextmanager
     def evaluation_rows(self) -> Iterator[VectorEnv[Any, Any, Any] | None]:
-        """The rows that training uses, where there can be no others; its running episodes end there."""
+        """The environments that training uses, where there can be no others; its running episodes end there."""
         if not self.settings.transport:
             yield None
             return

@@ -1,4 +1,4 @@
-"""Environments as stable-baselines3 takes them: `RowsVecEnv` over our batched ones, `DummyVecEnv` over all others."""
+"""Environments as stable-baselines3 takes them: `BatchVecEnv` over our batched ones, `DummyVecEnv` over all others."""
 
 from __future__ import annotations
 
@@ -31,36 +31,36 @@ def make_training_env(env_id: str, env_kwargs: Mapping[str, Any], num_envs: int,
         SettingsError: The environment cannot be made.
     """
     if is_batched(env_id) or place.transport:
-        return RowsVecEnv(make_rows(env_id, env_kwargs, num_envs, place), env_id)
+        return BatchVecEnv(make_rows(env_id, env_kwargs, num_envs, place), env_id)
 
-    def make_one(row: int) -> Monitor:
-        return Monitor(from_zero(FiniteEnv(make_env(env_id, env_kwargs), env_id, row)))
+    def make_one(index: int) -> Monitor:
+        return Monitor(from_zero(FiniteEnv(make_env(env_id, env_kwargs), env_id, index)))
 
-    return DummyVecEnv([functools.partial(make_one, row) for row in range(num_envs)])
+    return DummyVecEnv([functools.partial(make_one, index) for index in range(num_envs)])
 
 
-class RowsVecEnv(VecEnv):  # type: ignore[misc]
-    """A Gymnasium vector environment whose rows restart in the same step, as a stable-baselines3 `VecEnv`.
+class BatchVecEnv(VecEnv):  # type: ignore[misc]
+    """A Gymnasium vector environment whose environments restart in the same step, as a stable-baselines3 `VecEnv`.
 
     Args:
-        rows: The environment.
+        batch: The environment.
         env_id: How errors name it; None for the name of its class.
 
     Raises:
         EnvironmentFailed: From `reset` and `step_wait`, if an observation or a reward is NaN or infinite.
-        SettingsError: Its rows do not restart in the same step, or its actions count from another number than 0.
+        SettingsError: They do not restart in the same step, or actions count from another number than 0.
     """
 
-    def __init__(self, rows: VectorEnv[Any, Any, Any], env_id: str | None = None) -> None:
-        mode = rows.metadata.get("autoreset_mode")
+    def __init__(self, batch: VectorEnv[Any, Any, Any], env_id: str | None = None) -> None:
+        mode = batch.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
-            raise SettingsError(f"{rows}: expected autoreset mode SAME_STEP, found {mode}")
-        start = getattr(rows.single_action_space, "start", 0)
+            raise SettingsError(f"{batch}: expected autoreset mode SAME_STEP, found {mode}")
+        start = getattr(batch.single_action_space, "start", 0)
         if np.any(start):
-            raise SettingsError(f"{rows}: expected actions that count from 0, found {rows.single_action_space}")
-        self.rows = FiniteRows(rows, env_id)
-        super().__init__(rows.num_envs, rows.single_observation_space, rows.single_action_space)
-        self._dict = isinstance(rows.single_observation_space, spaces.Dict)
+            raise SettingsError(f"{batch}: expected actions that count from 0, found {batch.single_action_space}")
+        self.batch = FiniteRows(batch, env_id)
+        super().__init__(batch.num_envs, batch.single_observation_space, batch.single_action_space)
+        self._dict = isinstance(batch.single_observation_space, spaces.Dict)
         self._returns = np.zeros(self.num_envs)
         self._lengths = np.zeros(self.num_envs, dtype=np.int64)
         self._started = time.monotonic()
@@ -70,19 +70,19 @@ class RowsVecEnv(VecEnv):  # type: ignore[misc]
     @property
     def can_be_saved(self) -> bool:
         """Whether running episodes can be saved and gone on with; those of a robot elsewhere cannot."""
-        return hasattr(self.rows, "state_dict")
+        return hasattr(self.batch, "state_dict")
 
     def reset(self) -> Observations:
-        """Begin an episode on every row, with the seeds that `seed` left."""
+        """Begin an episode on every environment, with the seeds that `seed` left."""
         seeds: Any = None if all(seed is None for seed in self._seeds) else list(self._seeds)
-        observations, _ = self.rows.reset(seed=seeds)
+        observations, _ = self.batch.reset(seed=seeds)
         self._reset_seeds()
         self._returns[:], self._lengths[:] = 0, 0
         self._interrupted = None
         return self._own(observations)
 
     def interrupt(self, last: Observations) -> None:
-        """Somebody else used the rows: at the next step the running episodes are truncated, and new ones begin.
+        """Somebody else used the environments: at the next step the running episodes are truncated, and new ones begin.
 
         Args:
             last: What was observed last in the running episodes; None if there are none.
@@ -94,16 +94,16 @@ class RowsVecEnv(VecEnv):  # type: ignore[misc]
         self._actions = actions
 
     def step_wait(self) -> tuple[Observations, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """Step all rows. Shapes: observations (n, …), rewards (n,) float32, done (n,) bool, n infos."""
+        """Step all environments. Shapes: observations (n, …), rewards (n,) float32, done (n,) bool, n infos."""
         if self._interrupted is not None:
             return self._begin_anew()
-        observations, rewards, terminated, truncated, extra = self.rows.step(self._actions)
+        observations, rewards, terminated, truncated, extra = self.batch.step(self._actions)
         done = terminated | truncated
         self._returns += rewards
         self._lengths += 1
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        for row in np.flatnonzero(done):
-            infos[row] = self._end(int(row), bool(terminated[row]), extra)
+        for index in np.flatnonzero(done):
+            infos[index] = self._end(int(index), bool(terminated[index]), extra)
         return self._own(observations), np.asarray(rewards, dtype=np.float32), done, infos
 
     def _begin_anew(self) -> tuple[Observations, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
@@ -111,25 +111,26 @@ class RowsVecEnv(VecEnv):  # type: ignore[misc]
         last = self._interrupted
         observations = self.reset()
         infos = [
-            {"terminal_observation": self._row(last, row), "TimeLimit.truncated": True} for row in range(self.num_envs)
+            {"terminal_observation": self._of(last, index), "TimeLimit.truncated": True}
+            for index in range(self.num_envs)
         ]
         return observations, np.zeros(self.num_envs, np.float32), np.ones(self.num_envs, dtype=bool), infos
 
-    def _end(self, row: int, terminated: bool, extra: Mapping[str, Any]) -> dict[str, Any]:
-        """The info of a row whose episode ended, in the words of stable-baselines3; its sums begin again."""
+    def _end(self, index: int, terminated: bool, extra: Mapping[str, Any]) -> dict[str, Any]:
+        """The info of an environment whose episode ended, in the words of stable-baselines3; its sums begin again."""
         info = {
-            "terminal_observation": self._row(extra["final_obs"], row),
+            "terminal_observation": self._of(extra["final_obs"], index),
             "TimeLimit.truncated": not terminated,
             "episode": {
-                "r": float(self._returns[row]),
-                "l": int(self._lengths[row]),
+                "r": float(self._returns[index]),
+                "l": int(self._lengths[index]),
                 "t": round(time.monotonic() - self._started, 6),
             },
         }
         success = extra["final_info"].get("is_success")
         if success is not None:
-            info["is_success"] = bool(success[row])
-        self._returns[row], self._lengths[row] = 0, 0
+            info["is_success"] = bool(success[index])
+        self._returns[index], self._lengths[index] = 0, 0
         return info
 
     def _own(self, observations: Observations) -> Observations:
@@ -138,44 +139,44 @@ class RowsVecEnv(VecEnv):  # type: ignore[misc]
             return {key: np.array(value) for key, value in observations.items()}
         return np.array(observations)
 
-    def _row(self, observations: Observations, row: int) -> Any:
+    def _of(self, observations: Observations, index: int) -> Any:
         if self._dict:
-            return {key: np.array(value[row]) for key, value in observations.items()}
-        return np.array(observations[row])
+            return {key: np.array(value[index]) for key, value in observations.items()}
+        return np.array(observations[index])
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything the rows' future depends on, as arrays and plain values."""
-        rows: Any = self.rows
-        return {"rows": rows.state_dict(), "returns": self._returns.copy(), "lengths": self._lengths.copy()}
+        """Everything their future depends on, as arrays and plain values."""
+        batch: Any = self.batch
+        return {"rows": batch.state_dict(), "returns": self._returns.copy(), "lengths": self._lengths.copy()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go to what `state_dict` returned."""
-        rows: Any = self.rows
-        rows.reset()  # builds what a first episode needs before it is overwritten
-        rows.load_state_dict(state["rows"])
+        batch: Any = self.batch
+        batch.reset()  # builds what a first episode needs before it is overwritten
+        batch.load_state_dict(state["rows"])
         self._returns, self._lengths = np.array(state["returns"]), np.array(state["lengths"])
-        self.rows.episode_steps = self._lengths.copy()
+        self.batch.episode_steps = self._lengths.copy()
 
     def close(self) -> None:
         """Let go of the simulation."""
-        self.rows.close()
+        self.batch.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute of the vector environment, once for each row asked for."""
-        value = getattr(self.rows, attr_name)
+        """An attribute of the vector environment, once for each environment asked for."""
+        value = getattr(self.batch, attr_name)
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of the vector environment; it has one for all rows."""
-        setattr(self.rows, attr_name, value)
+        """Set an attribute of the vector environment; it has one for all environments."""
+        setattr(self.batch, attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Call a method of the vector environment once; its result for each row asked for."""
-        value = getattr(self.rows, method_name)(*method_args, **method_kwargs)
+        """Call a method of the vector environment once; its result for each environment asked for."""
+        value = getattr(self.batch, method_name)(*method_args, **method_kwargs)
         return [value for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """No row has a wrapper of its own."""
+        """No environment has a wrapper of its own."""
         return [False for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:

@@ -100,7 +100,7 @@ def walk(monkeypatch):
     def make(env_id, env_kwargs, num_envs, place):
         if place.transport:
             return real(env_id, env_kwargs, num_envs, place)
-        return vec_env.RowsVecEnv(Walk(num_envs, **env_kwargs))
+        return vec_env.BatchVecEnv(Walk(num_envs, **env_kwargs))
 
     monkeypatch.setattr(trainer_module, "make_training_env", make)
     gym.register("test/Walk-v0", entry_point=OneWalk)

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from bam_train.errors import SettingsError
-from bam_train.trainers.sb3.sb3_vec_env import RowsVecEnv, make_training_env
+from bam_train.trainers.sb3.sb3_vec_env import BatchVecEnv, make_training_env
 
 
 def right(venv):
@@ -24,7 +24,7 @@ def play(venv, steps):
 
 
 def test_the_end_of_an_episode_in_the_words_of_stable_baselines3(rows):
-    venv = RowsVecEnv(rows(2))
+    venv = BatchVecEnv(rows(2))
     venv.seed(3)
     first = venv.reset()
     starts = [np.random.default_rng(3 + row).uniform(-0.5, 0.5) for row in range(2)]
@@ -45,7 +45,7 @@ def test_the_end_of_an_episode_in_the_words_of_stable_baselines3(rows):
 
 
 def test_the_time_limit_is_a_truncation(rows):
-    venv = RowsVecEnv(rows(1))
+    venv = BatchVecEnv(rows(1))
     venv.reset()
     results = [venv.step(np.zeros((1, 1), np.float32)) for _ in range(12)]
     assert [bool(result[2][0]) for result in results] == [False] * 11 + [True]
@@ -55,7 +55,7 @@ def test_the_time_limit_is_a_truncation(rows):
 
 
 def test_types_and_copies(rows):
-    venv = RowsVecEnv(rows(3))
+    venv = BatchVecEnv(rows(3))
     observations = [venv.reset()]
     observation, reward, done, infos = venv.step(right(venv))
     observations.append(observation)
@@ -66,7 +66,7 @@ def test_types_and_copies(rows):
 
 
 def test_a_seed_is_used_once(rows):
-    venv = RowsVecEnv(rows(2))
+    venv = BatchVecEnv(rows(2))
     venv.seed(5)
     first, second = venv.reset(), venv.reset()
     venv.seed(5)
@@ -75,7 +75,7 @@ def test_a_seed_is_used_once(rows):
 
 
 def test_a_saved_state_goes_on_exactly(rows):
-    venv, other = RowsVecEnv(rows(3)), RowsVecEnv(rows(3))
+    venv, other = BatchVecEnv(rows(3)), BatchVecEnv(rows(3))
     venv.seed(1)
     venv.reset()
     play(venv, 2)
@@ -101,9 +101,9 @@ def test_dictionaries_of_observations_are_copied_by_key(rows):
 
     plain = Keyed._observe
     Keyed._observe = lambda self: {"x": plain(self)["x"].copy()}
-    venv = RowsVecEnv(Keyed())
+    venv = BatchVecEnv(Keyed())
     observations = venv.reset()
-    venv.rows.elapsed[:] = 5
+    venv.batch.elapsed[:] = 5
     found, _, _, infos = venv.step(right(venv))
     assert observations["x"].shape == found["x"].shape == (2, 2)
     assert infos == [{}, {}]
@@ -113,11 +113,11 @@ def test_rows_must_restart_in_the_same_step(rows):
     env = rows(1)
     env.metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}
     with pytest.raises(SettingsError, match=r"expected autoreset mode SAME_STEP, found AutoresetMode\.NEXT_STEP"):
-        RowsVecEnv(env)
+        BatchVecEnv(env)
 
 
 def test_one_value_for_all_rows(rows):
-    venv = RowsVecEnv(rows(3))
+    venv = BatchVecEnv(rows(3))
     assert venv.get_attr("num_envs") == [3, 3, 3]
     venv.set_attr("mark", 7)
     assert venv.get_attr("mark", indices=[1]) == [7]
@@ -145,7 +145,7 @@ def test_adapting_64_rows_costs_tens_of_microseconds(rows):
     env = Still(64)
     n = np.zeros(64)
     env.result = (np.zeros((64, 30), np.float32), n, n.astype(bool), n.astype(bool), {})
-    venv = RowsVecEnv(env)
+    venv = BatchVecEnv(env)
     actions = np.zeros((64, 1), np.float32)
     times = []
     for _ in range(300):
@@ -156,13 +156,13 @@ def test_adapting_64_rows_costs_tens_of_microseconds(rows):
 
 
 def test_rows_that_somebody_else_used_begin_anew(rows):
-    venv = RowsVecEnv(rows(2))
+    venv = BatchVecEnv(rows(2))
     venv.seed(3)
     first = venv.reset()
     venv.step(right(venv))
     last = venv.step(right(venv))[0]
     assert venv.can_be_saved
-    venv.rows.reset(seed=[100, 101])  # an evaluation
+    venv.batch.reset(seed=[100, 101])  # an evaluation
     venv.interrupt(last)
     venv.seed(3)
     observations, rewards, done, infos = venv.step(right(venv))
@@ -179,4 +179,4 @@ def test_actions_that_count_from_another_number_are_refused(rows):
     some = rows(1)
     some.single_action_space = gym.spaces.Discrete(3, start=1)
     with pytest.raises(SettingsError, match=r"expected actions that count from 0, found Discrete\(3, start=1\)$"):
-        RowsVecEnv(some)
+        BatchVecEnv(some)
