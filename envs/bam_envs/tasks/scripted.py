@@ -1,6 +1,6 @@
 """Hand-written policies that solve MuJoCo's tasks from their observations alone: they can be done, and here is how.
 
-They keep no memory, so they act on rows of any length in any order, like a frozen policy.
+They keep no memory, so they act on any number of observations in any order, like a frozen policy.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class ScriptedPolicy(Protocol):
         """Actions for n observations."""
 
     def reset(self, rows: Sequence[int] | None = None) -> None:
-        """Forget what was seen of `rows`."""
+        """Forget what was seen of these environments."""
 
 
 class Columns:
@@ -82,7 +82,7 @@ def numeric_jacobian(joints: Array) -> Array:
 
 
 class Sight:
-    """What an observation says of hand and object, in SI units; n rows."""
+    """What an observation says of hand and object, in SI units, in n environments."""
 
     def __init__(self, columns: Columns, observations: Floats) -> None:
         def take(*names: str) -> Array:

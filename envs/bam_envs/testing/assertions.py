@@ -49,17 +49,17 @@ def in_thread(act: Callable[[], None]) -> None:
 
 
 def assert_same_state(one: RobotState, two: RobotState) -> None:
-    """All rows are equal, number by number."""
-    assert_same_rows(one, two, list(range(len(one.stamp))))
+    """All environments are equal, number by number."""
+    assert_same_environments(one, two, list(range(len(one.stamp))))
 
 
-def assert_same_rows(one: RobotState, two: RobotState, rows: list[int]) -> None:
-    """`rows` are equal, number by number."""
+def assert_same_environments(one: RobotState, two: RobotState, env_ids: list[int]) -> None:
+    """These environments are equal, number by number."""
     assert list(one.signals) == list(two.signals)
     for name, array in one.signals.items():
-        np.testing.assert_array_equal(array[rows], two.signals[name][rows], err_msg=name)
-    np.testing.assert_array_equal(one.stamp[rows], two.stamp[rows], err_msg="stamp")
-    np.testing.assert_array_equal(one.command[rows], two.command[rows], err_msg="command")
+        np.testing.assert_array_equal(array[env_ids], two.signals[name][env_ids], err_msg=name)
+    np.testing.assert_array_equal(one.stamp[env_ids], two.stamp[env_ids], err_msg="stamp")
+    np.testing.assert_array_equal(one.command[env_ids], two.command[env_ids], err_msg="command")
 
 
 def assert_same_tree(one: Any, two: Any, name: str = "state_dict") -> None:

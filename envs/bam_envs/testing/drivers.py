@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue
-from bam_envs.core.robot import Initial, Robot, RobotSpec, RobotState, Rows
+from bam_envs.core.robot import EnvIds, Initial, Robot, RobotSpec, RobotState
 from bam_envs.safety.gate import ClearedCommand
 from bam_envs.safety.guard import is_base
 
@@ -83,7 +83,7 @@ class DrivenRobot:
         self._state = self.robot.reset(np.zeros(1, np.int64), initial)
         self._told = self._state.command.copy()
 
-    def reset(self, rows: Rows, initial: Initial) -> RobotState:
+    def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
         """Measure; the arm is at rest, its object where `initial` says, and nothing else moves."""
         place: Any = getattr(self.robot, "place_object", None)
         if place is not None:

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue
-from bam_envs.core.robot import Initial, Robot, RobotSpec, RobotState, Rows, SignalSpec
-from bam_envs.testing.assertions import assert_same_rows, assert_same_state, in_thread, no_io, raised
+from bam_envs.core.robot import EnvIds, Initial, Robot, RobotSpec, RobotState, SignalSpec
+from bam_envs.testing.assertions import assert_same_environments, assert_same_state, in_thread, no_io, raised
 
 Array = NDArray[np.float64]
 ARM_HOME = np.array([-0.27, -1.54, 1.89, -1.93, -1.57, -1.84])
@@ -37,11 +37,11 @@ class RobotContract:
         """Hook: a robot that is not connected."""
         raise NotImplementedError("Override make(num_robots) to return the robot under test.")
 
-    def initial(self, robot: Robot, rows: Rows) -> Initial:
+    def initial(self, robot: Robot, env_ids: EnvIds) -> Initial:
         """Hook: where an episode may start."""
-        seeds = np.arange(len(rows), dtype=np.int64)
-        pose = np.tile([0.5, 0.1, 0.3], (len(rows), 1))
-        return Initial({"joint_position": np.tile(ARM_HOME, (len(rows), 1)), "object_pose": pose}, seeds)
+        seeds = np.arange(len(env_ids), dtype=np.int64)
+        pose = np.tile([0.5, 0.1, 0.3], (len(env_ids), 1))
+        return Initial({"joint_position": np.tile(ARM_HOME, (len(env_ids), 1)), "object_pose": pose}, seeds)
 
     def measured(self, state: RobotState) -> Array:
         """Hook: what was measured of the first k numbers of the command. Shape: (n, k)."""
@@ -62,8 +62,8 @@ class RobotContract:
         robot = self.make(num_robots)
         try:
             robot.connect()
-            rows = np.arange(num_robots)
-            yield robot, robot.reset(rows, self.initial(robot, rows))
+            env_ids = np.arange(num_robots)
+            yield robot, robot.reset(env_ids, self.initial(robot, env_ids))
         finally:
             robot.close()
 
@@ -91,7 +91,7 @@ class RobotContract:
         error = raised(BamEnvsError, lambda: robot.step(np.zeros((1, len(robot.spec.command.labels)))))
         assert str(error), "the error has no text"
 
-    def test_connect_twice_is_once_and_moves_nothing(self) -> None:
+    def test_connect_is_idempotent_and_moves_nothing(self) -> None:
         """A robot that was connected again is where it was."""
         with self.running() as (robot, before):
             robot.connect()
@@ -100,7 +100,7 @@ class RobotContract:
             assert moved <= self.still, f"connect() moved it by {moved}"
 
     def test_states_are_what_the_spec_says(self) -> None:
-        """Names in the spec's order, shape (n, k), finite float64, one stamp and one command a row."""
+        """Names in the spec's order, shape (n, k), finite float64, one stamp and one command for each."""
         for n in self.sizes:
             with self.running(n) as (robot, state):
                 _check_state(robot, state)
@@ -138,7 +138,7 @@ class RobotContract:
             robot.step(self.stay(state))
 
     def test_command_that_is_not_finite_is_not_sent(self) -> None:
-        """An error that names the row; or, where the robot says so, it holds and the state tells what was sent."""
+        """An error that names the robot; or, where it says so, it holds and the state tells what was sent."""
         n = self.sizes[-1]
         with self.running(n) as (robot, state):
             for bad in (math.nan, math.inf, -math.inf):
@@ -165,18 +165,18 @@ class RobotContract:
             assert_same_state(second, kept[1])
             np.testing.assert_array_equal(command, sent)
 
-    def test_rows_are_independent(self) -> None:
-        """Moving and resetting row 1 leaves rows 0 and 2 exactly as they would be."""
+    def test_environments_are_independent(self) -> None:
+        """Moving and resetting robot 1 leaves robots 0 and 2 exactly as they would be."""
         if 3 not in self.sizes:
             raise SkipTest("these robots are not stepped three at a time")
         with self.running(3) as (robot, state), self.running(3) as (other, same):
             command = self.stay(state)
             command[1] = self.move(robot, state)[1]
             state, same = robot.step(command), other.step(self.stay(same))
-            assert_same_rows(state, same, [0, 2])
+            assert_same_environments(state, same, [0, 2])
             state = robot.reset(np.array([1]), self.initial(robot, np.array([1])))
-            assert_same_rows(state, same, [0, 2])
-            assert_same_rows(robot.step(self.stay(state)), other.step(self.stay(same)), [0, 2])
+            assert_same_environments(state, same, [0, 2])
+            assert_same_environments(robot.step(self.stay(state)), other.step(self.stay(same)), [0, 2])
 
     def test_halt_never_raises(self) -> None:
         """Before `connect`, twice, from another thread, after `close`."""

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from bam_envs.core.robot import Robot, RobotState, Rows
+from bam_envs.core.robot import EnvIds, Robot, RobotState
 from bam_envs.core.task import Score, Task
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.ur5e import GEOMETRY
@@ -47,7 +47,7 @@ class TaskContract:
 
     @contextmanager
     def running(self, num_envs: int = 1, seed: int = 0) -> Iterator[tuple[Task, Robot, RobotState]]:
-        """A task at the start of an episode, its robot and the state; row i is seeded ``seed + i``."""
+        """A task at the start of an episode, its robot and the state; environment i is seeded ``seed + i``."""
         task, robot = self.make(num_envs), self.make_robot(num_envs)
         try:
             robot.connect()
@@ -56,13 +56,13 @@ class TaskContract:
             robot.close()
 
     def actions(self, task: Task, first: int = 0) -> Iterator[NDArray[np.float32]]:
-        """Actions of rows `first` and on. Shape: (n, a) each."""
-        rows = [self.actions_of_row(task, first + row) for row in range(task.num_envs)]
-        return map(np.stack, zip(*rows, strict=True))
+        """Actions of the environments from `first` on. Shape: (n, a) each."""
+        parts = [self.actions_of_row(task, first + env) for env in range(task.num_envs)]
+        return map(np.stack, zip(*parts, strict=True))
 
-    def actions_of_row(self, task: Task, row: int) -> Iterator[NDArray[np.float32]]:
+    def actions_of_row(self, task: Task, env: int) -> Iterator[NDArray[np.float32]]:
         """Random actions, to the limit or inside, each kept for ten steps to get somewhere. Shape: (a,) each."""
-        rng = np.random.default_rng(row)
+        rng = np.random.default_rng(env)
         for step in range(self.steps):
             if step % 10 == 0:
                 action = rng.uniform(-1, 1, task.action_space.shape).astype(np.float32)
@@ -88,7 +88,7 @@ class TaskContract:
         assert (task.action_space.high == 1).all()
 
     def test_observations_are_in_their_space(self) -> None:
-        """Float32, one row a robot, finite, inside the limits."""
+        """Float32, one observation a robot, finite, inside the limits."""
         with self.running(3) as (task, robot, state):
             for action in self.actions(task):
                 _check_observation(task, task.observe(state))
@@ -144,15 +144,15 @@ class TaskContract:
                 np.testing.assert_array_equal(command, sent)
                 state = after
 
-    def test_row_of_many_is_the_row_alone(self) -> None:
-        """Observation, command and score of row i are bit for bit those of a single task with its seed."""
+    def test_one_of_many_is_the_one_alone(self) -> None:
+        """Observation, command and score of environment i are bit for bit those of a single task with its seed."""
         many = self._record(3, first=0)
-        for row in range(3):
-            for together, alone in zip(many, self._record(1, first=row), strict=True):
-                np.testing.assert_array_equal(together[row], alone[0])
+        for env in range(3):
+            for together, alone in zip(many, self._record(1, first=env), strict=True):
+                np.testing.assert_array_equal(together[env], alone[0])
 
     def _record(self, num_envs: int, first: int) -> list[NDArray[Any]]:
-        """Everything that `num_envs` rows say in an episode; row k has the seed and the actions of ``first + k``."""
+        """Everything said in an episode; environment k has the seed and the actions of ``first + k``."""
         said: list[NDArray[Any]] = []
         with self.running(num_envs, seed=first) as (task, robot, state):
             for action in self.actions(task, first):
@@ -162,8 +162,8 @@ class TaskContract:
                 said += [command, task.observe(state), score.reward, score.terminated, score.success]
         return said
 
-    def test_beginning_one_row_leaves_the_others(self) -> None:
-        """A new episode of row 1 changes nothing of rows 0 and 2."""
+    def test_resetting_one_leaves_the_others(self) -> None:
+        """A new episode of environment 1 changes nothing of 0 and 2."""
         with self.running(3) as (task, robot, state):
             for action in self.actions(task):
                 state = robot.step(task.command(action, state))
@@ -171,7 +171,7 @@ class TaskContract:
             state = _start(task, robot, np.array([1]), seed=9)
             np.testing.assert_array_equal(task.observe(state)[[0, 2]], before[[0, 2]])
 
-    def test_begin_follows_the_generators(self) -> None:
+    def test_seeds_decide(self) -> None:
         """The same seeds begin the same episodes."""
         with self.running(2, seed=5) as (task, _, state), self.running(2, seed=5) as (other, _, same):
             np.testing.assert_array_equal(task.observe(state), other.observe(same))
@@ -205,7 +205,7 @@ class TaskContract:
             _start(task, robot, np.array([1]), seed=9)
             assert_same_tree(saved, kept)
 
-    def test_given_away_is_given_away(self) -> None:
+    def test_handed_out_is_left_alone(self) -> None:
         """Beginning another episode does not reach into observations and scores of the one before."""
         with self.running(2) as (task, robot, state):
             for action in self.actions(task):
@@ -224,10 +224,12 @@ class TaskContract:
                 assert len(colour) == 4
 
 
-def _start(task: Task, robot: Robot, rows: Rows, seed: int) -> RobotState:
-    """Begin an episode on `rows`; row k of them is seeded ``seed + k``."""
-    state = robot.reset(rows, task.sample_initial(rows, [np.random.default_rng(seed + k) for k in range(len(rows))]))
-    task.on_reset(rows, state)
+def _start(task: Task, robot: Robot, env_ids: EnvIds, seed: int) -> RobotState:
+    """Begin an episode in these environments; the k-th of them is seeded ``seed + k``."""
+    state = robot.reset(
+        env_ids, task.sample_initial(env_ids, [np.random.default_rng(seed + k) for k in range(len(env_ids))])
+    )
+    task.on_reset(env_ids, state)
     return state
 
 
@@ -242,8 +244,8 @@ def _check_command(robot: Robot, command: Array) -> None:
 def _check_observation(task: Task, observation: NDArray[np.float32]) -> None:
     assert observation.dtype == np.float32
     assert observation.shape == (task.num_envs, *task.observation_space.shape)
-    for row in observation:
-        assert task.observation_space.contains(row), f"not in the space: {row.tolist()}"
+    for env in observation:
+        assert task.observation_space.contains(env), f"not in the space: {env.tolist()}"
 
 
 def _check_score(task: Task, score: Score) -> None:

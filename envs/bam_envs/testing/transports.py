@@ -123,7 +123,7 @@ class TransportContract:
             env.close()  # type: ignore[no-untyped-call]
 
     def test_it_is_a_transport_and_says_what_is_there(self) -> None:
-        """Spaces of the environment, one row; connecting twice is once and moves nothing."""
+        """Spaces of the environment; `connect` is idempotent and moves nothing."""
         env = MirrorEnv(_TREE)
         with self.serving(env) as transport:
             assert isinstance(transport, Transport), f"{type(transport).__name__} lacks a member of Transport"
@@ -243,9 +243,9 @@ class TransportContract:
                 assert_same_value(one[0], two[0], "observation")
                 assert one[1:4] == two[1:4]
 
-    def test_rows_are_those_of_gymnasium(self) -> None:
+    def test_vectors_are_those_of_gymnasium(self) -> None:
         """`RemoteVectorEnv` over a vector environment gives what that gives, automatic resets included."""
-        alone, there = _rows(3), _rows(3)
+        alone, there = _environments(3), _environments(3)
         with self.serving(there) as transport:
             envs = RemoteVectorEnv(transport, 3)
             assert_same_value(envs.reset(seed=4)[0], alone.reset(seed=4)[0], "the first observation")
@@ -258,8 +258,8 @@ class TransportContract:
         alone.close()
 
 
-def _rows(number: int) -> SyncVectorEnv:
-    """Rows whose episodes end after two steps."""
+def _environments(number: int) -> SyncVectorEnv:
+    """Environments whose episodes end after two steps."""
     makers = [lambda: MirrorEnv(_box(-1, 1, (2,), np.float32), episode_steps=2)] * number
     return SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
 

@@ -1,8 +1,8 @@
 """What differs between a simulated robot and a real one, drawn anew for each episode: domain randomisation.
 
-Everything a row draws follows from one seed, so an episode can be repeated exactly. The noise of a whole episode is
-drawn at its start (a tape of `TAPE` steps, read in a circle), which costs one call of the generator an episode
-instead of one a row and step.
+Everything that an environment draws follows from one seed, so an episode can be repeated exactly. The noise of a whole
+episode is drawn at its start (a tape of `TAPE` steps, read in a circle), which costs one call of the generator for each
+episode instead of one for each step.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.core.robot import Rows
+from bam_envs.core.robot import EnvIds
 from bam_envs.robots.physics.mujoco_batch import Physics
 
 Array = NDArray[np.float64]
@@ -46,42 +46,42 @@ class Ranges:
 
 
 class Imperfection:
-    """Varied models, late commands and a noisy tracker for the rows of one `Physics`."""
+    """Varied models, late commands and a noisy tracker for the environments of one `Physics`."""
 
     def __init__(self, physics: Physics, ranges: Ranges | None = None) -> None:
         self.ranges = ranges or Ranges()
         self._physics = physics
-        rows, nu = physics.rows, physics.model.nu
-        self.seeds = np.zeros(rows, dtype=np.int64)
-        self.delay = np.zeros(rows, dtype=np.int64)
-        self.step_count = np.zeros(rows, dtype=np.int64)
-        self._noise = np.zeros((rows, TAPE, 4))
-        self._dropped = np.zeros((rows, TAPE), dtype=bool)
-        self._sent = np.zeros((rows, self.ranges.max_delay + 1, nu))
-        self.seen = np.zeros((rows, 7))
+        num_envs, nu = physics.num_envs, physics.model.nu
+        self.seeds = np.zeros(num_envs, dtype=np.int64)
+        self.delay = np.zeros(num_envs, dtype=np.int64)
+        self.step_count = np.zeros(num_envs, dtype=np.int64)
+        self._noise = np.zeros((num_envs, TAPE, 4))
+        self._dropped = np.zeros((num_envs, TAPE), dtype=bool)
+        self._sent = np.zeros((num_envs, self.ranges.max_delay + 1, nu))
+        self.seen = np.zeros((num_envs, 7))
         """Object poses as the tracker says. Shape: (n, 7)."""
         self._has_object = physics.model.nq > ARM_COORDINATES
 
-    def reset(self, row: int, seed: int, command: Array) -> None:
-        """Draw the differences of one row for a new episode; `command` (m,) is what the robot holds at its start."""
+    def reset(self, env: int, seed: int, command: Array) -> None:
+        """Draw the differences of a new episode; `command` (m,) is what the robot holds at its start."""
         rng = np.random.default_rng(seed)
-        self.seeds[row], self.step_count[row] = seed, 0
-        self.delay[row] = rng.integers(self.ranges.max_delay + 1)
-        self._vary(row, rng)
-        self._noise[row] = rng.standard_normal((TAPE, 4))
-        self._dropped[row] = rng.random(TAPE) < self.ranges.drop
-        self._dropped[row, 0] = False
-        self._sent[row] = command
+        self.seeds[env], self.step_count[env] = seed, 0
+        self.delay[env] = rng.integers(self.ranges.max_delay + 1)
+        self._vary(env, rng)
+        self._noise[env] = rng.standard_normal((TAPE, 4))
+        self._dropped[env] = rng.random(TAPE) < self.ranges.drop
+        self._dropped[env, 0] = False
+        self._sent[env] = command
 
-    def _vary(self, row: int, rng: np.random.Generator) -> None:
-        ranges, nominal, model = self.ranges, self._physics.model, self._physics.model_of(row)
+    def _vary(self, env: int, rng: np.random.Generator) -> None:
+        ranges, nominal, model = self.ranges, self._physics.model, self._physics.model_of(env)
         gain = rng.uniform(*ranges.gain, size=model.nu)
         model.actuator_gainprm[:, 0] = nominal.actuator_gainprm[:, 0] * gain
         model.actuator_biasprm[:, 1:3] = nominal.actuator_biasprm[:, 1:3] * gain[:, None]
         mass, friction, size = (rng.uniform(*span) for span in (ranges.mass, ranges.friction, ranges.size))
         if self._has_object:
             self._vary_object(model, nominal, mass, friction, size)
-            self._physics.recompute(row)
+            self._physics.recompute(env)
 
     @staticmethod
     def _vary_object(model: Any, nominal: Any, mass: float, friction: float, size: float) -> None:
@@ -106,17 +106,17 @@ class Imperfection:
         """Drop the commands that are on their way; `command` (n, m) is what the robots hold."""
         self._sent = np.repeat(command[:, None], self._sent.shape[1], axis=1)
 
-    def look(self, rows: Rows, pose: Array) -> None:
-        """Let the tracker see the objects of `rows` at `pose` (k, 7): position [m] and quaternion, w first."""
-        now = self.step_count[rows] % TAPE
-        noise = self._noise[rows, now]
+    def look(self, env_ids: EnvIds, pose: Array) -> None:
+        """Let the tracker see these environments' objects at `pose` (k, 7): position [m] and quaternion, w first."""
+        now = self.step_count[env_ids] % TAPE
+        noise = self._noise[env_ids, now]
         half = 0.5 * self.ranges.angle_noise * noise[:, 3]
         w, x, y, z = pose[:, 3:].T
         c, s = np.cos(half), np.sin(half)
         turned = np.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], axis=1)  # Rz(angle) * q
         fresh = np.concatenate([pose[:, :3] + self.ranges.position_noise * noise[:, :3], turned], axis=1)
-        self.seen[rows] = np.where(self._dropped[rows, now][:, None], self.seen[rows], fresh)
-        self.step_count[rows] += 1
+        self.seen[env_ids] = np.where(self._dropped[env_ids, now][:, None], self.seen[env_ids], fresh)
+        self.step_count[env_ids] += 1
 
     def state_dict(self) -> dict[str, Array | NDArray[np.int64]]:
         """What `load_state_dict` needs to go on exactly; the draws themselves follow from the seeds."""
@@ -128,8 +128,8 @@ class Imperfection:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Draw each row again from its seed, then go to where it was."""
-        for row, seed in enumerate(state["seeds"]):
-            self.reset(row, int(seed), self._sent[row, 0])
+        """Draw each environment again from its seed, then go to where it was."""
+        for env, seed in enumerate(state["seeds"]):
+            self.reset(env, int(seed), self._sent[env, 0])
         self.step_count = np.asarray(state["step_count"]).copy()
         self._sent, self.seen = np.asarray(state["sent"]).copy(), np.asarray(state["seen"]).copy()

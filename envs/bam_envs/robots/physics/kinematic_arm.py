@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, ResetNeeded
-from bam_envs.core.robot import Initial, RobotState, Rows, checked_command
+from bam_envs.core.robot import EnvIds, Initial, RobotState, checked_command
 from bam_envs.robots.physics.contacts import GROUND, TABLE, ArmContacts, Capsules
 from bam_envs.robots.physics.obstacles import RADIUS, Obstacles
 from bam_envs.robots.physics.shapes import BLUE, GREY, RED, WOOD, Drawn, Shape, View
@@ -74,21 +74,21 @@ class KinematicArm(Drawn):
         """Position of the pads of a gripper [m], were there one. Shape: (n, 6) [rad] -> (n, 3)."""
         return self._tool.tool_position(q)
 
-    def reset(self, rows: Rows, initial: Initial) -> RobotState:
-        """Set `rows` to the initial joint positions, at rest, and begin the way of their obstacles."""
+    def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
+        """Set these environments to the initial joint positions, at rest, and begin the way of their obstacles."""
         self._require_link()
         self._position, self._velocity = self._position.copy(), self._velocity.copy()  # states of before keep theirs
         self._stamp, self._command = self._stamp.copy(), self._command.copy()
         self._collided = self._collided.copy()
-        self._position[rows] = initial.signals["joint_position"]
-        self._velocity[rows], self._stamp[rows] = 0.0, 0.0
-        self._command[rows] = self._position[rows]
+        self._position[env_ids] = initial.signals["joint_position"]
+        self._velocity[env_ids], self._stamp[env_ids] = 0.0, 0.0
+        self._command[env_ids] = self._position[env_ids]
         if self.randomize:
             draws = [np.random.default_rng(int(seed)).random() for seed in initial.seeds]
-            self._share[rows, 0] = 1.0 - (1.0 - LEAST_SHARE) * np.array(draws)
+            self._share[env_ids, 0] = 1.0 - (1.0 - LEAST_SHARE) * np.array(draws)
         if self._obstacles is not None:
-            self._obstacles.begin(rows, initial.signals, initial.seeds)
-        self._collided[rows] = self._touching()[rows]
+            self._obstacles.begin(env_ids, initial.signals, initial.seeds)
+        self._collided[env_ids] = self._touching()[env_ids]
         return self._measure()
 
     def step(self, command: Array) -> RobotState:
@@ -149,7 +149,7 @@ class KinematicArm(Drawn):
         self._connected = False
 
     def picture(self) -> tuple[list[Shape], View]:
-        """The arm of row 0, its table and its ball."""
+        """The arm of environment 0, its table and its ball."""
         shapes = [table_shape(), *arm_shapes(self._contacts.capsules(self._position[:1]))]
         if self._obstacles is not None:
             shapes.append(ball_shape(self._obstacles.position(self._stamp)[0]))

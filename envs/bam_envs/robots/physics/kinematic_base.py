@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, ResetNeeded
-from bam_envs.core.robot import Initial, RobotState, Rows, checked_command
+from bam_envs.core.robot import EnvIds, Initial, RobotState, checked_command
 from bam_envs.robots.mir100 import (
     BACK_MASKED,
     BACK_MOUNT,
@@ -95,8 +95,8 @@ class SimulatedBase(Drawn):
         """There is nothing to connect to; commands are taken from now on."""
         self._connected = True
 
-    def reset(self, rows: Rows, initial: Initial) -> RobotState:
-        """Put `rows` at rest at ``base_pose`` (k, 3), and their boxes at ``obstacle_pose`` (k, b, 3).
+    def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
+        """Put these environments at rest at ``base_pose`` (k, 3), and their boxes at ``obstacle_pose`` (k, b, 3).
 
         Poses are x, y [m] and yaw [rad]. Without them the base is at the origin, and the boxes are nowhere.
 
@@ -104,17 +104,17 @@ class SimulatedBase(Drawn):
             InvalidValue: A base would touch a wall or a box there.
         """
         self._require_link()
-        pose = initial.signals.get("base_pose", np.zeros((len(rows), 3)))
-        boxes = initial.signals.get("obstacle_pose", np.tile(np.array(NOWHERE), (len(rows), self.boxes.shape[1], 1)))
+        pose = initial.signals.get("base_pose", np.zeros((len(env_ids), 3)))
+        boxes = initial.signals.get("obstacle_pose", np.tile(np.array(NOWHERE), (len(env_ids), self.boxes.shape[1], 1)))
         self._require_free(pose, boxes)
         self._own()
-        self.pose[rows], self.boxes[rows] = pose, boxes
-        self._velocity[rows], self._stamp[rows], self._command[rows] = 0.0, 0.0, 0.0
-        self._collision[rows], self._scans[rows] = False, 0
-        self._seeds[rows] = mixed(initial.seeds.astype(np.uint64))
+        self.pose[env_ids], self.boxes[env_ids] = pose, boxes
+        self._velocity[env_ids], self._stamp[env_ids], self._command[env_ids] = 0.0, 0.0, 0.0
+        self._collision[env_ids], self._scans[env_ids] = False, 0
+        self._seeds[env_ids] = mixed(initial.seeds.astype(np.uint64))
         if self.randomize:
-            self._gain[rows] = 1.0 + GAIN_SPREAD * _uniform(self._seeds[rows], 2)
-        self._scan(rows)
+            self._gain[env_ids] = 1.0 + GAIN_SPREAD * _uniform(self._seeds[env_ids], 2)
+        self._scan(env_ids)
         return self._state()
 
     def _own(self) -> None:
@@ -170,13 +170,13 @@ class SimulatedBase(Drawn):
             self._collision = self._collision | stuck
         self.pose = pose
 
-    def _scan(self, rows: Rows) -> None:
-        """Measure what the scanners of `rows` see."""
+    def _scan(self, env_ids: EnvIds) -> None:
+        """Measure what the scanners of these environments see."""
         if not self._seen.shape[1]:
             return
-        pose, boxes = self.pose[rows], self.boxes[rows]
+        pose, boxes = self.pose[env_ids], self.boxes[env_ids]
         true = np.concatenate([scanner.cast(pose, self.room, boxes) for scanner in self._scanners], axis=1)
-        self._seen[rows] = measured(true, noise(self._seeds[rows], self._scans[rows], true.shape[1]))
+        self._seen[env_ids] = measured(true, noise(self._seeds[env_ids], self._scans[env_ids], true.shape[1]))
 
     def _state(self) -> RobotState:
         signals = {"base_pose": self.pose, "base_velocity": self._velocity}
@@ -200,7 +200,7 @@ class SimulatedBase(Drawn):
         self._connected = False
 
     def picture(self) -> tuple[list[Shape], View]:
-        """The base of row 0, its room and boxes, and what its lasers see."""
+        """The base of environment 0, its room and boxes, and what its lasers see."""
         pose, seen = self.pose[0], self._seen[0]
         scans = scan_shapes(pose, seen[:FRONT_RAYS], seen[FRONT_RAYS:]) if len(seen) else []
         shapes = [*base_shapes(pose), *wall_shapes(self.room), *box_shapes(self.boxes[0]), *scans]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, PhysicsDiverged, ResetNeeded
-from bam_envs.core.robot import Initial, RobotState, Rows, checked_command
+from bam_envs.core.robot import EnvIds, Initial, RobotState, checked_command
 from bam_envs.robots.ur5e import COMMAND, GRIPPER_OPEN, GRIPPER_SPEED, arm_spec
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ class SimulatedArm:
         self._physics: Physics | None = None
         self._imperfection: Imperfection | None = None
         self._renderer: SceneRenderer | None = None
-        self._all_rows = np.arange(num_robots)
+        self._all = np.arange(num_robots)
         self._setpoint = np.zeros((num_robots, 7))
         self._command = np.zeros((num_robots, 7))
         self._ramp = (np.arange(1, PHYSICS_STEPS + 1) / PHYSICS_STEPS)[None, :, None]
@@ -79,22 +79,22 @@ class SimulatedArm:
         setpoint: Array = self._setpoint.copy()
         return setpoint
 
-    def reset(self, rows: Rows, initial: Initial) -> RobotState:
-        """Set `rows` to the initial joint positions and object pose, at rest, the gripper open."""
+    def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
+        """Set these environments to the initial joint positions and object pose, at rest, the gripper open."""
         physics, signals = self.physics, initial.signals
         physics.state = physics.state.copy()  # states handed out earlier are views of the old array
-        physics.time[rows], physics.qvel[rows] = 0.0, 0.0
-        physics.qpos[rows, :6] = signals["joint_position"]
-        physics.qpos[rows, 6:8] = GRIPPER_OPEN / 2
-        self._setpoint[rows, :6], self._setpoint[rows, 6] = signals["joint_position"], GRIPPER_OPEN
+        physics.time[env_ids], physics.qvel[env_ids] = 0.0, 0.0
+        physics.qpos[env_ids, :6] = signals["joint_position"]
+        physics.qpos[env_ids, 6:8] = GRIPPER_OPEN / 2
+        self._setpoint[env_ids, :6], self._setpoint[env_ids, 6] = signals["joint_position"], GRIPPER_OPEN
         self._command = self._command.copy()  # so does the command
-        self._command[rows] = self._setpoint[rows]
+        self._command[env_ids] = self._setpoint[env_ids]
         if self._imperfection is not None:
-            for row, seed in zip(rows, initial.seeds, strict=True):
-                self._imperfection.reset(int(row), int(seed), self._setpoint[row])
+            for env, seed in zip(env_ids, initial.seeds, strict=True):
+                self._imperfection.reset(int(env), int(seed), self._setpoint[env])
         if self._with_object:
-            self._lay_object(rows, signals["object_pose"])
-        return self._measure(rows)
+            self._lay_object(env_ids, signals["object_pose"])
+        return self._measure(env_ids)
 
     def place_object(self, pose: Array | None, seeds: NDArray[np.int64]) -> RobotState:
         """Put the object elsewhere, draw a new episode's differences; all is at rest, and the arms stay where they are.
@@ -112,22 +112,22 @@ class SimulatedArm:
         if pose is not None and not self._with_object:
             raise InvalidValue(f"The robot {self.spec.name!r} has no object that could be placed.")
         if self._imperfection is not None:
-            for row, seed in enumerate(seeds):
-                self._imperfection.reset(row, int(seed), self._command[row])
+            for env, seed in enumerate(seeds):
+                self._imperfection.reset(env, int(seed), self._command[env])
         physics.state = physics.state.copy()  # states handed out earlier are views of the old array
         physics.qvel[:, : 8 if pose is None else None] = 0.0
         if pose is not None:
-            self._lay_object(self._all_rows, pose)
-        return self._measure(self._all_rows)
+            self._lay_object(self._all, pose)
+        return self._measure(self._all)
 
-    def _lay_object(self, rows: Rows, pose: Array) -> None:
+    def _lay_object(self, env_ids: EnvIds, pose: Array) -> None:
         """Put the object flat on the table at x, y [m] and yaw [rad] of `pose` (k, 3)."""
         physics = self.physics
         qpos = physics.qpos
-        qpos[rows, 8:10] = pose[:, :2]
+        qpos[env_ids, 8:10] = pose[:, :2]
         geom = physics.model.geom("object").id
-        qpos[rows, 10] = [physics.model_of(int(row)).geom_size[geom, 2] for row in rows]
-        qpos[rows, 11], qpos[rows, 12:14], qpos[rows, 14] = np.cos(pose[:, 2] / 2), 0.0, np.sin(pose[:, 2] / 2)
+        qpos[env_ids, 10] = [physics.model_of(int(env)).geom_size[geom, 2] for env in env_ids]
+        qpos[env_ids, 11], qpos[env_ids, 12:14], qpos[env_ids, 14] = np.cos(pose[:, 2] / 2), 0.0, np.sin(pose[:, 2] / 2)
 
     def step(self, command: Array) -> RobotState:
         """Send `command` (n, 7): six joint positions [rad] and the gripper's width [m]; one period later, measure."""
@@ -170,7 +170,7 @@ class SimulatedArm:
             self.physics.step(start[:, None] + travel[:, None] * ramp)
             self._setpoint = here = start + travel * ramp[:, -1]
             last = ramp[0, -1, 0] == 1.0
-            yield self._measure(self._all_rows if last else self._all_rows[:0])
+            yield self._measure(self._all if last else self._all[:0])
 
     def _gripper_travel(self, width: Array) -> Array:
         """How far the gripper's set point goes towards `width` (n,) [m]: at its speed, and near the fingers."""
@@ -179,13 +179,13 @@ class SimulatedArm:
         travel: Array = np.clip(setpoint, measured - GRIPPER_LEASH, measured + GRIPPER_LEASH) - self._setpoint[:, 6]
         return travel
 
-    def _measure(self, fresh: Rows) -> RobotState:
-        """The state of all rows; a noisy tracker looks again at the `fresh` ones only."""
+    def _measure(self, fresh: EnvIds) -> RobotState:
+        """The state of all environments; a noisy tracker looks again at the `fresh` ones only."""
         physics = self.physics
         qpos, qvel = physics.qpos, physics.qvel
         if not np.isfinite(physics.state.sum()):
-            rows = np.flatnonzero(~np.isfinite(physics.state).all(axis=1)).tolist()
-            raise PhysicsDiverged(f"The simulated state of rows {rows} is not finite. Reset these rows.")
+            env_ids = np.flatnonzero(~np.isfinite(physics.state).all(axis=1)).tolist()
+            raise PhysicsDiverged(f"The simulated state of environments {env_ids} is not finite. Reset them.")
         signals = {
             "joint_position": qpos[:, :6],
             "joint_velocity": qvel[:, :6],
@@ -222,7 +222,7 @@ class SimulatedArm:
     def render(
         self, mode: str, marks: list[tuple[Array, tuple[float, float, float, float]]]
     ) -> NDArray[np.uint8] | None:
-        """Show row 0: an image (480, 640, 3) for ``rgb_array``, a window for ``human``.
+        """Show environment 0: an image (480, 640, 3) for ``rgb_array``, a window for ``human``.
 
         Args:
             mode: ``"rgb_array"`` or ``"human"``.
@@ -249,7 +249,7 @@ class SimulatedArm:
             self._imperfection.load_state_dict(state["imperfection"])
         self.physics.state = np.array(state["physics"])
         self._setpoint, self._command = np.array(state["setpoint"]), np.array(state["command"])
-        return self._measure(self._all_rows[:0])
+        return self._measure(self._all[:0])
 
 
 def cube_scene(num_robots: int = 1, *, randomize: bool = False) -> SimulatedArm:

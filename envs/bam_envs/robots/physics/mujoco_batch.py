@@ -1,8 +1,8 @@
-"""Batched MuJoCo physics: n rows of one model, or of n varied copies of it, stepped on all cores.
+"""Batched MuJoCo physics: n environments of one model, or of n varied copies of it, stepped on all cores.
 
-The whole physical state is one array of shape (n, nstate): it can be set, saved and restored row by row, and a row's
-future depends on its own state and controls only (`mujoco.rollout` starts the solver from zero at each call). So row
-i of many equals one alone, bit for bit.
+The whole physical state is one array of shape (n, nstate), which can be set, saved and restored in parts. The future of
+an environment depends on its own state and controls only (`mujoco.rollout` starts the solver from zero at each call):
+one of many equals one alone, bit for bit.
 """
 
 from __future__ import annotations
@@ -26,24 +26,26 @@ MODELS = Path(__file__).parent / "models"
 
 
 class Physics:
-    """Rows of one MJCF model.
+    """Environments of one MJCF model.
 
     Args:
         scene: File name of a model in ``models/``.
-        rows: How many rows are stepped together.
-        varied: Whether each row has a model of its own, to be changed with `model_of`.
+        num_envs: How many are stepped together.
+        varied: Whether each environment has a model of its own, to be changed with `model_of`.
     """
 
-    def __init__(self, scene: str, rows: int, *, varied: bool = False) -> None:
+    def __init__(self, scene: str, num_envs: int, *, varied: bool = False) -> None:
         self.model: Any = mujoco.MjModel.from_xml_path(str(MODELS / scene))
-        self.rows = rows
-        self._models = [copy.copy(self.model) if varied else self.model for _ in range(rows)]
-        threads = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, rows)
+        self.num_envs = num_envs
+        self._models = [copy.copy(self.model) if varied else self.model for _ in range(num_envs)]
+        threads = min(
+            len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, num_envs
+        )
         self._threads = threads
-        self._chunk = max(1, rows // (4 * threads))
+        self._chunk = max(1, num_envs // (4 * threads))
         self._start()
         self._buffers: dict[int, tuple[Array, Array]] = {}
-        self.state: Array = np.tile(self._default_state(), (rows, 1))
+        self.state: Array = np.tile(self._default_state(), (num_envs, 1))
         """Time, joint positions, joint velocities. Shape: (n, 1 + nq + nv)."""
 
     def _start(self) -> None:
@@ -72,16 +74,16 @@ class Physics:
         """Generalised velocities. Shape: (n, nv). A view."""
         return self.state[:, 1 + self.model.nq : 1 + self.model.nq + self.model.nv]
 
-    def model_of(self, row: int) -> Any:
-        """The model of `row`; its own where rows are varied."""
-        return self._models[row]
+    def model_of(self, env: int) -> Any:
+        """The model of `env`; its own where models are varied."""
+        return self._models[env]
 
-    def recompute(self, row: int) -> None:
-        """Bring what MuJoCo derives from masses and sizes up to date after `model_of(row)` was changed."""
-        mujoco.mj_setConst(self.model_of(row), self._scratch)
+    def recompute(self, env: int) -> None:
+        """Bring what MuJoCo derives from masses and sizes up to date after `model_of(env)` was changed."""
+        mujoco.mj_setConst(self.model_of(env), self._scratch)
 
     def step(self, control: Array) -> None:
-        """Advance all rows by ``control.shape[1]`` physics steps.
+        """Advance all environments by ``control.shape[1]`` physics steps.
 
         Args:
             control: Actuator set points for each physics step. Shape: (n, steps, nu).
@@ -104,21 +106,21 @@ class Physics:
 
     @staticmethod
     def _mark_diverged(state: Array, time: Array) -> None:
-        """Fill rows that did not get to `time` (n,) [s] with NaN: MuJoCo puts a diverged row back to its default."""
+        """Fill what did not get to `time` (n,) [s] with NaN: MuJoCo puts a diverged state back to its default."""
         late = ~(np.abs(state[:, 0] - time) < 1e-6)  # also where time is NaN
         if late.any():
             state[late] = np.nan
 
     def _output(self, steps: int) -> tuple[Array, Array]:
         if steps not in self._buffers:
-            states = np.empty((self.rows, steps, self.state.shape[1]))
-            self._buffers[steps] = states, np.empty((self.rows, steps, self.model.nsensordata))
+            states = np.empty((self.num_envs, steps, self.state.shape[1]))
+            self._buffers[steps] = states, np.empty((self.num_envs, steps, self.model.nsensordata))
         return self._buffers[steps]
 
-    def data_of(self, row: int) -> Any:
-        """An `MjData` with the state of `row` and all that follows from it; overwritten by the next call."""
-        mujoco.mj_setState(self.model_of(row), self._scratch, np.ascontiguousarray(self.state[row]), FULL)
-        mujoco.mj_forward(self.model_of(row), self._scratch)
+    def data_of(self, env: int) -> Any:
+        """An `MjData` with the state of `env` and all that follows from it; overwritten by the next call."""
+        mujoco.mj_setState(self.model_of(env), self._scratch, np.ascontiguousarray(self.state[env]), FULL)
+        mujoco.mj_forward(self.model_of(env), self._scratch)
         return self._scratch
 
     def __getstate__(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Where a moving obstacle is: still, up and down, or along a closed path; one a row, from the row's own signals.
+"""Where a moving obstacle is: still, up and down, or along a closed path; one in each environment.
 
 An obstacle jumps from sample to sample 100 times a second, as robo-gym's does. Positions are in ``base_link`` [m].
 """
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue
-from bam_envs.core.robot import Rows
+from bam_envs.core.robot import EnvIds
 from bam_envs.core.splines import Splines, splines_through
 
 Array = NDArray[np.float64]
@@ -33,7 +33,7 @@ RADIUS = 0.025
 
 
 def wave_signals(draws: Array) -> dict[str, Array]:
-    """Start signals of obstacles that go up and down; `draws` are two numbers in [0, 1) a row. Shape: (k, 2)."""
+    """Start signals of obstacles that go up and down; `draws` are numbers from 0 to 1. Shape: (k, 2)."""
     amplitude = WAVE_AMPLITUDE[0] + draws[:, 0] * (WAVE_AMPLITUDE[1] - WAVE_AMPLITUDE[0])
     middle = WAVE_MIDDLE[0] + draws[:, 1] * (WAVE_MIDDLE[1] - WAVE_MIDDLE[0])
     place = np.stack([np.full(len(draws), WAVE_X), np.full(len(draws), WAVE_Y), middle], axis=1)
@@ -44,32 +44,32 @@ def wave_signals(draws: Array) -> dict[str, Array]:
 
 
 class Obstacles:
-    """One obstacle a row.
+    """One obstacle in each environment.
 
-    The start signals of k rows say how theirs move:
+    The start signals of k environments say how theirs move:
 
     - ``obstacle_position`` (k, 3): where it stays, or the middle of its wave [m].
     - ``obstacle_wave`` (k, 2): how far up and down from there [m], and how often [Hz]; it starts at the bottom.
     - ``obstacle_path`` (k, 10, 3) and ``obstacle_samples`` (k,): a closed path along a cubic spline through these
       points [m], and how many hundredths of a second it takes once around.
 
-    Without any of them the wave is drawn from the row's seed.
+    Without any of them the wave is drawn from the environment's seed.
 
     Args:
-        num_rows: How many.
+        num_envs: How many.
     """
 
-    def __init__(self, num_rows: int) -> None:
-        self.num_rows = num_rows
-        self._place = np.tile([0.0, 0.0, 1.9], (num_rows, 1))  # out of the way until an episode begins
-        self._wave = np.zeros((num_rows, 2))
-        self._points = np.zeros((num_rows, PATH_POINTS, 3))
-        self._knots = np.tile(np.linspace(0.0, 1.0, PATH_POINTS), (num_rows, 1))
-        self._coefficients = np.zeros((num_rows, PATH_POINTS - 1, 4, 3))
-        self._samples = np.zeros(num_rows, dtype=np.int64)
+    def __init__(self, num_envs: int) -> None:
+        self.num_envs = num_envs
+        self._place = np.tile([0.0, 0.0, 1.9], (num_envs, 1))  # out of the way until an episode begins
+        self._wave = np.zeros((num_envs, 2))
+        self._points = np.zeros((num_envs, PATH_POINTS, 3))
+        self._knots = np.tile(np.linspace(0.0, 1.0, PATH_POINTS), (num_envs, 1))
+        self._coefficients = np.zeros((num_envs, PATH_POINTS - 1, 4, 3))
+        self._samples = np.zeros(num_envs, dtype=np.int64)
 
-    def begin(self, rows: Rows, signals: Mapping[str, Array], seeds: NDArray[np.int64]) -> None:
-        """The obstacles of `rows` (k,) start anew, as the ``obstacle_*`` of `signals` say.
+    def begin(self, env_ids: EnvIds, signals: Mapping[str, Array], seeds: NDArray[np.int64]) -> None:
+        """The obstacles of these environments start anew, as the ``obstacle_*`` of `signals` say.
 
         Raises:
             InvalidValue: A path without its number of samples, or of other than ten points.
@@ -77,23 +77,23 @@ class Obstacles:
         given = {name: value for name, value in signals.items() if name.startswith("obstacle_")}
         if not given:
             given = wave_signals(np.stack([np.random.default_rng(seed).random(2) for seed in seeds]))
-        self._samples[rows] = 0
-        self._wave[rows] = given.get("obstacle_wave", np.zeros(2))
+        self._samples[env_ids] = 0
+        self._wave[env_ids] = given.get("obstacle_wave", np.zeros(2))
         if "obstacle_path" in given:
-            self._follow(rows, given["obstacle_path"], given.get("obstacle_samples"))
+            self._follow(env_ids, given["obstacle_path"], given.get("obstacle_samples"))
         else:
-            self._place[rows] = given["obstacle_position"]
+            self._place[env_ids] = given["obstacle_position"]
 
-    def _follow(self, rows: Rows, points: Array, samples: Array | None) -> None:
-        """Put `rows` on the paths through `points` (k, 10, 3)."""
+    def _follow(self, env_ids: EnvIds, points: Array, samples: Array | None) -> None:
+        """Put these environments on the paths through `points` (k, 10, 3)."""
         if samples is None or points.shape[1:] != (PATH_POINTS, 3):
             raise InvalidValue(
                 f"A path has {PATH_POINTS} points of x, y, z and obstacle_samples; this has shape {points.shape[1:]}"
                 f"{' and no samples' if samples is None else ''}."
             )
         path = splines_through(points)
-        self._points[rows], self._samples[rows] = points, samples
-        self._knots[rows], self._coefficients[rows] = path.knots, path.coefficients
+        self._points[env_ids], self._samples[env_ids] = points, samples
+        self._knots[env_ids], self._coefficients[env_ids] = path.knots, path.coefficients
 
     def position(self, time: Array) -> Array:
         """Where the obstacles are `time` seconds after their episode began. Shape: (n,) -> (n, 3)."""
@@ -105,9 +105,9 @@ class Obstacles:
             place[follows] = self._on_path(follows, sample[follows])
         return place
 
-    def _on_path(self, rows: NDArray[np.bool_], sample: Array) -> Array:
-        count = self._samples[rows]
-        path = Splines(self._knots[rows], self._coefficients[rows])
+    def _on_path(self, env_ids: NDArray[np.bool_], sample: Array) -> Array:
+        count = self._samples[env_ids]
+        path = Splines(self._knots[env_ids], self._coefficients[env_ids])
         places: Array = path.at((sample % count / (count - 1))[:, None])[:, 0]
         return places
 
@@ -124,9 +124,9 @@ class Obstacles:
         """Go to what `state_dict` returned."""
         self._place, self._wave = np.array(state["place"]), np.array(state["wave"])
         self._points, self._samples = np.array(state["points"]), np.array(state["samples"])
-        rows = np.flatnonzero(self._samples)
-        if len(rows):
-            self._follow(rows, self._points[rows], self._samples[rows].astype(np.float64))
+        env_ids = np.flatnonzero(self._samples)
+        if len(env_ids):
+            self._follow(env_ids, self._points[env_ids], self._samples[env_ids].astype(np.float64))
 
 
 def _triangle(sample: Array, frequency: Array) -> Array:

@@ -118,11 +118,11 @@ class LaserScanner:
         ranges = np.empty((len(pose), self.rays), np.float32)
         with np.errstate(divide="ignore", invalid="ignore"):  # rays along an axis
             for start in range(0, len(pose), _CHUNK):
-                rows = slice(start, start + _CHUNK)
-                out = ranges[rows]
-                self._to_walls(eye[rows], heading[rows], room, out)
+                chunk = slice(start, start + _CHUNK)
+                out = ranges[chunk]
+                self._to_walls(eye[chunk], heading[chunk], room, out)
                 for box in range(boxes.shape[1]):
-                    self._to_box(eye[rows], heading[rows], boxes[rows, box], out)
+                    self._to_box(eye[chunk], heading[chunk], boxes[chunk, box], out)
         return ranges
 
     def _eyes(self, pose: Array) -> tuple[Array, Array]:
@@ -188,7 +188,7 @@ def _float32(values: Array) -> Floats:
 
 
 def _column(values: Array) -> Floats:
-    """As float32, one a row. Shape: (k,) -> (k, 1)."""
+    """As a column of float32. Shape: (k,) -> (k, 1)."""
     return values.astype(np.float32)[:, None]
 
 
@@ -203,12 +203,12 @@ def measured(ranges: Floats, deviates: Floats) -> Array:
 def noise(seeds: Seeds, count: Seeds, rays: int) -> Floats:
     """Normal deviates of mean 0 and standard deviation `NOISE` [m].
 
-    Each scan is a stretch of one long tape that begins where the row's seed and the number of the scan say: so no
+    Each scan is a stretch of one long tape that begins where the seed and the number of the scan say: so no
     row has a generator of its own to keep, and a scan costs a copy.
 
     Args:
-        seeds: Of the rows. Shape: (n,).
-        count: Number of the scan in each row's episode. Shape: (n,).
+        seeds: Of the bases. Shape: (n,).
+        count: Number of the scan in each episode. Shape: (n,).
         rays: How many are wanted; at most the 1012 of both scanners.
 
     Returns:

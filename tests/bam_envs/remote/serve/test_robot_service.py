@@ -524,7 +524,7 @@ def test_a_real_robot_has_no_scene(serve, bus):
 
 class Failing(FakeRobot):
     def step(self, command):
-        raise PhysicsDiverged("The simulated state of rows [0] is not finite. Reset these rows.")
+        raise PhysicsDiverged("The simulated state of environments [0] is not finite. Reset them.")
 
 
 def test_a_robot_that_failed_takes_no_commands_until_a_reset(serve, bus, caplog):
@@ -534,7 +534,8 @@ def test_a_robot_that_failed_takes_no_commands_until_a_reset(serve, bus, caplog)
     while service.robot.fault is None:
         assert time.monotonic() < deadline
     assert service.send(command(0.1)) == (
-        "RemoteError: ur5e failed, and needs a reset: The simulated state of rows [0] is not finite. Reset these rows."
+        "RemoteError: ur5e failed, and needs a reset: "
+        "The simulated state of environments [0] is not finite. Reset them."
     )
     service.robot.reset(np.zeros(1, dtype=np.int64), initial())
     service.service.clock.stop()

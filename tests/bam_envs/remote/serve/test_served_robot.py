@@ -231,7 +231,7 @@ def test_a_clock_that_stands_still_is_an_error(serve):
 
 class Failing(FakeRobot):
     def step(self, command):
-        raise PhysicsDiverged("The simulated state of rows [0] is not finite. Reset these rows.")
+        raise PhysicsDiverged("The simulated state of environments [0] is not finite. Reset them.")
 
     def slices(self, command, parts):
         yield self.step(command)
@@ -247,7 +247,7 @@ def test_a_fault_stays_until_a_reset(serve, realtime):
     else:
         with pytest.raises(PhysicsDiverged, match="not finite"):
             served.step(command())
-    assert str(served.fault) == "The simulated state of rows [0] is not finite. Reset these rows."
+    assert str(served.fault) == "The simulated state of environments [0] is not finite. Reset them."
     served.reset(ROWS, initial())
     assert served.fault is None
 

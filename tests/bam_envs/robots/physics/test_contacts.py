@@ -27,20 +27,20 @@ def segments(number, seed, size=1.0):
 
 
 def test_distances_of_segments():
-    start, end, other_start, other_end = segments(200, 0)
+    start, end, other_start, other_end = segments(50, 0)
     end[:20] = start[:20]  # a point
     other_end[10:40] = other_start[10:40] + (end - start)[10:40]  # side by side
     found = np.sqrt(segment_distance2(start, end, other_start, other_end))
-    for row in range(200):
+    for row in range(50):
         one, two = points_along(start[row], end[row]), points_along(other_start[row], other_end[row])
         nearest = np.linalg.norm(one[:, None] - two[None], axis=2).min()
         assert nearest - 0.012 <= found[row] <= nearest + 1e-9
 
 
 def test_distances_from_the_table():
-    start, end, _, _ = segments(300, 1)
+    start, end, _, _ = segments(100, 1)
     found = np.sqrt(box_distance2(start, end))
-    for row in range(300):
+    for row in range(100):
         points = points_along(start[row], end[row], 2000)
         nearest = np.linalg.norm(points - np.clip(points, TABLE[0], TABLE[1]), axis=1).min()
         assert nearest - 2e-3 <= found[row] <= nearest + 1e-5

@@ -39,7 +39,7 @@ def drawn():
 
 def factors(physics, read):
     nominal = read(physics.model)
-    return np.array([read(physics.model_of(row)) / nominal for row in range(physics.rows)])
+    return np.array([read(physics.model_of(row)) / nominal for row in range(physics.num_envs)])
 
 
 def assert_spread(values, low, high):

@@ -72,7 +72,7 @@ def test_a_row_that_diverges_is_noticed(bad, tmp_path, monkeypatch):
     arm.physics.qvel[1] = bad
     with pytest.raises(PhysicsDiverged) as caught:
         arm.step(command)
-    assert str(caught.value) == "The simulated state of rows [1] is not finite. Reset these rows."
+    assert str(caught.value) == "The simulated state of environments [1] is not finite. Reset them."
     with pytest.raises(PhysicsDiverged):
         arm.step(command)
     initial = Initial({"joint_position": ARM_HOME[None], "object_pose": np.zeros((1, 3)) + 0.4}, np.zeros(1, np.int64))

@@ -22,7 +22,7 @@ def begun(signals, rows=1):
 
 
 def at(obstacles, time):
-    return obstacles.position(np.full(obstacles.num_rows, float(time)))
+    return obstacles.position(np.full(obstacles.num_envs, float(time)))
 
 
 def test_one_that_stays():
