@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import SafetyStop
 from bam_envs.core.registry import ENVIRONMENTS
-from bam_envs.core.robot import Initial, RobotState, Rows
+from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.robot_env import RobotEnv
 from bam_envs.robots.physics.mujoco_arm import PHYSICS_STEPS, SimulatedArm
 from bam_envs.robots.profiles.profile import load_profile
@@ -84,9 +84,9 @@ class DrivenArm(SimulatedArm):
         """What was commanded by then, were it on time, moving linearly within a period [rad]."""
         self._rng = np.random.default_rng(0)
 
-    def reset(self, rows: Rows, initial: Initial) -> RobotState:
+    def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
         """Begin at rest."""
-        state = super().reset(rows, initial)
+        state = super().reset(env_ids, initial)
         self.positions, self.targets = [], []
         self._from = self._to = self._wanted = self._smooth = self._setpoint[0, :6].copy()
         self._velocity, self._begun, self._now = np.zeros(6), -np.inf, 0.0

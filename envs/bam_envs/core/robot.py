@@ -14,7 +14,6 @@ from bam_envs.core.errors import InvalidValue
 Array = NDArray[np.float64]
 EnvIds = NDArray[np.int64]
 """Which of the n environments that are stepped together. Shape: (k,)."""
-Rows = EnvIds
 
 
 @dataclass(frozen=True)
@@ -84,7 +83,7 @@ class RobotState:
 
 @dataclass(frozen=True)
 class Initial:
-    """Where an episode starts, for k rows.
+    """Where an episode starts, in k environments.
 
     A simulated robot is set to it; a live one goes to ``signals["joint_position"]`` slowly, and its object is
     where it is.
@@ -93,7 +92,7 @@ class Initial:
     signals: Mapping[str, Array]
     """Start values of signals. Shape: (k, ...)."""
     seeds: NDArray[np.int64]
-    """Seeds for what the robot itself draws (noise, masses), one a row. Shape: (k,)."""
+    """Seeds for what the robot itself draws (noise, masses), one for each environment. Shape: (k,)."""
 
 
 def checked_command(command: Array, shape: tuple[int, int]) -> Array:
@@ -107,8 +106,8 @@ def checked_command(command: Array, shape: tuple[int, int]) -> Array:
         raise InvalidValue(f"The command must have shape {shape}, not {array.shape}.")
     finite = np.isfinite(array)
     if not finite.all():
-        rows = np.flatnonzero(~finite.all(axis=1)).tolist()
-        raise InvalidValue(f"The command must be finite numbers; those of rows {rows} are not.")
+        env_ids = np.flatnonzero(~finite.all(axis=1)).tolist()
+        raise InvalidValue(f"The command must be finite numbers; those of environments {env_ids} are not.")
     return array
 
 
@@ -125,10 +124,10 @@ class Robot(Protocol):
         """How many are stepped together."""
 
     def connect(self) -> None:
-        """Make the robot ready for `reset`. Moves nothing; doing it twice is once."""
+        """Make the robot ready for `reset`. Moves nothing; idempotent."""
 
-    def reset(self, rows: Rows, initial: Initial) -> RobotState:
-        """Bring `rows` to `initial` and return the state of all rows."""
+    def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
+        """Bring these environments to `initial` and return the state of all of them."""
 
     def step(self, command: Array) -> RobotState:
         """Send `command` (n, m), SI units, and return the state one period later."""
@@ -137,4 +136,4 @@ class Robot(Protocol):
         """Stop moving and keep the link. From any thread, as often as one likes; never raises."""
 
     def close(self) -> None:
-        """Halt, then drop the link. As often as one likes."""
+        """Halt, then drop the link. Idempotent."""

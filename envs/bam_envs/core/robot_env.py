@@ -22,7 +22,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, ResetNeeded, UnknownName
-from bam_envs.core.robot import Robot, RobotState, Rows
+from bam_envs.core.robot import EnvIds, Robot, RobotState
 from bam_envs.core.task import Label, Score, Task
 from bam_envs.core.wording import brief
 
@@ -76,7 +76,7 @@ class _RobotAndTask:
         """What every number of observation, action, state and command means."""
         return describe(self.robot, self.task)
 
-    def _begin(self, env_ids: Rows, rngs: Sequence[np.random.Generator], options: Mapping[str, Any]) -> RobotState:
+    def _begin(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator], options: Mapping[str, Any]) -> RobotState:
         """Begin a new episode in the environments `env_ids`; the state of all."""
         sample: Any = self.task.sample_initial
         initial = sample(env_ids, rngs, options) if options else sample(env_ids, rngs)
@@ -275,7 +275,7 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[NDArray[np.float32], ND
             raise InvalidValue(f"seed must be one number or {self.num_envs} of them, not {len(seeds)}.")
         return seeds
 
-    def _reset(self, env_ids: Rows, options: Mapping[str, Any]) -> NDArray[np.float32]:
+    def _reset(self, env_ids: EnvIds, options: Mapping[str, Any]) -> NDArray[np.float32]:
         self.state = self._begin(env_ids, [self._rngs[i] for i in env_ids], options)
         self.elapsed[env_ids] = 0
         return self.task.observe(self.state)

@@ -29,7 +29,7 @@ from bam_envs.core.errors import (
     ResetNeeded,
     StaleState,
 )
-from bam_envs.core.robot import Initial, RobotSpec, RobotState, Rows
+from bam_envs.core.robot import EnvIds, Initial, RobotSpec, RobotState
 from bam_envs.core.timing import Pacer
 from bam_envs.live.bringup import (
     TIMEOUT,
@@ -240,7 +240,7 @@ class RosbridgeRobot:
                     self._refusals.append(error)
                 self._state.mailbox.wake()
 
-    def reset(self, rows: Rows, initial: Initial) -> RobotState:
+    def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
         """A fresh state. Nothing real moves; a simulated robot is at rest, its object where `initial` says.
 
         After the link has dropped and is back, this makes the robot usable again.

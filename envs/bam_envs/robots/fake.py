@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import ResetNeeded
-from bam_envs.core.robot import Initial, RobotState, Rows, checked_command
+from bam_envs.core.robot import EnvIds, Initial, RobotState, checked_command
 from bam_envs.robots.ur5e import GRIPPER_OPEN, arm_spec
 
 Array = NDArray[np.float64]
@@ -48,23 +48,23 @@ class FakeRobot:
         """Take commands from now on."""
         self._connected = True
 
-    def reset(self, rows: Rows, initial: Initial) -> RobotState:
-        """Set `rows` to the initial joint positions and object pose, at rest, the gripper open."""
+    def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
+        """Set these environments to the initial joint positions and object pose, at rest, the gripper open."""
         self._require_link()
         self._position, self._object = self._position.copy(), self._object.copy()
         self._velocity, self._stamp = self._velocity.copy(), self._stamp.copy()
-        self._position[rows, :6], self._position[rows, 6] = initial.signals["joint_position"], GRIPPER_OPEN
-        self._velocity[rows], self._stamp[rows] = 0.0, 0.0
+        self._position[env_ids, :6], self._position[env_ids, 6] = initial.signals["joint_position"], GRIPPER_OPEN
+        self._velocity[env_ids], self._stamp[env_ids] = 0.0, 0.0
         self._command = self._command.copy()
-        self._command[rows] = self._position[rows]
+        self._command[env_ids] = self._position[env_ids]
         if "object_pose" in initial.signals:
-            self._place_object(rows, initial.signals["object_pose"])
+            self._place_object(env_ids, initial.signals["object_pose"])
         return self._measure()
 
-    def _place_object(self, rows: Rows, pose: Array) -> None:
+    def _place_object(self, env_ids: EnvIds, pose: Array) -> None:
         """Put the object at x, y [m] and yaw [rad] of `pose` (k, 3)."""
-        self._object[rows, :2], self._object[rows, 2] = pose[:, :2], OBJECT_HEIGHT
-        self._object[rows, 3], self._object[rows, 6] = np.cos(pose[:, 2] / 2), np.sin(pose[:, 2] / 2)
+        self._object[env_ids, :2], self._object[env_ids, 2] = pose[:, :2], OBJECT_HEIGHT
+        self._object[env_ids, 3], self._object[env_ids, 6] = np.cos(pose[:, 2] / 2), np.sin(pose[:, 2] / 2)
 
     def step(self, command: Array) -> RobotState:
         """Send `command` (n, 7): six joint positions [rad] and the gripper's width [m]; one period later, measure."""

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, ResetNeeded, RobotFault, SafetyStop, StaleState, StartNotReached
-from bam_envs.core.robot import Initial, Robot, RobotSpec, RobotState, Rows
+from bam_envs.core.robot import EnvIds, Initial, Robot, RobotSpec, RobotState
 from bam_envs.safety.following import Following
 from bam_envs.safety.guard import (
     Guard,
@@ -495,7 +495,7 @@ class SafeRobot(metaclass=Sealed):
         self._stopped, self._bad, self._last, self._sent_at, self._before = None, 0, None, None, None
         self._forgive()
 
-    def reset(self, rows: Rows, initial: Initial) -> RobotState:
+    def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
         """Bring the robot to `initial`; a live arm opens its gripper and goes to its start pose slowly.
 
         Raises:
@@ -510,10 +510,10 @@ class SafeRobot(metaclass=Sealed):
         else:
             self.halt()
         self._forgive()
-        state = self._take(self._robot.reset(rows, initial))
+        state = self._take(self._robot.reset(env_ids, initial))
         if start is not None and not start.is_near(self._measured()):
             self._approach(start)
-            state = self._take(self._robot.reset(rows, initial))  # put back what the arm may have pushed
+            state = self._take(self._robot.reset(env_ids, initial))  # put back what the arm may have pushed
             self._forgive()
         self._restart_guards()
         begin = self._begin_at(self._pause())

@@ -148,7 +148,7 @@ class RobotContract:
                     assert np.isfinite(robot.step(command).command).all()
                 else:
                     error = raised(InvalidValue, lambda command=command: robot.step(command))  # type: ignore[misc]
-                    assert str(error) == f"The command must be finite numbers; those of rows [{n - 1}] are not."
+                    assert str(error) == f"The command must be finite numbers; those of environments [{n - 1}] are not."
                 robot.step(self.stay(state))
 
     def test_states_and_commands_are_left_alone(self) -> None:

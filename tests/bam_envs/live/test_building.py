@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue, LinkLost, ProtocolError, UnknownName
-from bam_envs.core.robot import Initial, Robot, RobotState, Rows
+from bam_envs.core.robot import EnvIds, Initial, Robot, RobotState
 from bam_envs.live.building import live_robot, profile_limits
 from bam_envs.live.rosbridge_robot import RosbridgeRobot
 from bam_envs.remote.serve.command_lease import CommandLease
@@ -85,7 +85,7 @@ class TestLiveBase(LiveContract):
     def served(self):
         return SimulatedBase(1)
 
-    def initial(self, robot: Robot, rows: Rows) -> Initial:
+    def initial(self, robot: Robot, env_ids: EnvIds) -> Initial:
         return Initial({}, np.zeros(1, np.int64))
 
     def measured(self, state: RobotState) -> np.ndarray:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import RemoteError, ResetNeeded, RobotFault
-from bam_envs.core.robot import Initial, Robot, RobotState, Rows, checked_command
+from bam_envs.core.robot import EnvIds, Initial, Robot, RobotState, checked_command
 
 Array = NDArray[np.float64]
 
@@ -82,12 +82,12 @@ class ServedRobot:
         with self._changed:
             self._robot.connect()
 
-    def reset(self, rows: Rows, initial: Initial) -> RobotState:
+    def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
         """Bring the robot to `initial`; ends what was being executed, and clears a fault."""
         with self._changed:
             self._drop_parts()
             self.fault = None
-            self.state = self._robot.reset(rows, initial)
+            self.state = self._robot.reset(env_ids, initial)
             self._target, self._resting, self._expires = self.state.command.copy(), True, -math.inf
             return self.state
 
