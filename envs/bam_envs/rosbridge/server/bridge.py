@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, ProtocolError
 from bam_envs.core.wording import brief
-from bam_envs.ros.interfaces import complete, request_type, response_type
+from bam_envs.ros.interfaces import complete, normal_name, request_type, response_type
 from bam_envs.rosbridge.bus import Caller, Handler, Listener, Message, refusal_of
 from bam_envs.rosbridge.encoding import decode_frame
 from bam_envs.rosbridge.fragments import Id, read_id
@@ -34,7 +34,7 @@ from bam_envs.rosbridge.server.client_session import (
     read_wire,
 )
 from bam_envs.rosbridge.server.outgoing import Packet, Publication, pack
-from bam_envs.rosbridge.server.services import Request, Services, checked, new_service, packed_response
+from bam_envs.rosbridge.server.services import Request, Service, Services, checked, packed_response
 from bam_envs.rosbridge.server.topics import Stream, Topic, Topics, Wish
 
 T = TypeVar("T")
@@ -104,7 +104,7 @@ class Bridge:
             "send_action_goal": self._send_action_goal,
         }
         for name, (kind, handler) in self._rosapi(clock).items():
-            self.services.offer(new_service(name, kind, name, handler=handler, inline=True))
+            self.services.offer(Service(name, kind, name, handler=handler, inline=True))
 
     # ---- clients
 
@@ -124,18 +124,6 @@ class Bridge:
         self.topics.leave(session)
         for callback in self._leave:
             _tell(callback, session.caller)
-
-    def receive(self, session: Session, frame: str | bytes, now: float) -> None:
-        """Do what a frame of a client says. Never raises about what the frame holds.
-
-        Args:
-            session: The client.
-            frame: Of text, or binary.
-            now: Any steady clock [s]; the same one everywhere.
-        """
-        text = self.take(session, self.read(frame), now)
-        if text is not None:
-            self.take(session, self.read(text, joined=True), now)
 
     def read(self, frame: str | bytes, *, joined: bool = False) -> Incoming:
         """What a frame says, for `take`. It may be long work, and may be done in any thread.
@@ -181,7 +169,16 @@ class Bridge:
         return None
 
     def take(self, session: Session, incoming: Incoming, now: float) -> str | None:
-        """Do what a frame of a client says; the text of a message whose last fragment it was, to be read in turn."""
+        """Do what a frame of a client says. Never raises about what the frame holds.
+
+        Args:
+            session: The client.
+            incoming: What `read` made of the frame.
+            now: Any steady clock [s]; the same one everywhere.
+
+        Returns:
+            The text of a message whose last fragment it was, to be read in turn.
+        """
         message = incoming.message
         try:
             if incoming.error is not None:
@@ -208,7 +205,7 @@ class Bridge:
 
     @property
     def next_deadline(self) -> float | None:
-        """When `tick` is needed next [s], clock of `receive`; None if nothing waits."""
+        """When `tick` is needed next [s], clock of `take`; None if nothing waits."""
         times = [self.services.deadline, self.topics.deadline]
         times += [session.fragments.deadline for session in self._fragmented]
         return min((one for one in times if one is not None), default=None)
@@ -266,7 +263,7 @@ class Bridge:
 
     def serve(self, service: str, kind: str, handler: Handler) -> None:
         """Answer `service` with `handler`; the events `Invoke` say when."""
-        _own(lambda: self.services.offer(new_service(canonical(service), kind, service, handler=handler)))
+        _own(lambda: self.services.offer(Service(canonical(service), normal_name(kind), service, handler=handler)))
 
     def on_leave(self, callback: Callable[[Caller], None]) -> None:
         """Call `callback` when a client's connection ends."""
@@ -355,7 +352,7 @@ class Bridge:
         message = incoming.message
         name, kind = read_name(message, "service"), read_text(message, "type")
         _require_room(len(session.services), session.options.services, "services")
-        before = self.services.offer(new_service(name, kind, read_text(message, "service"), provider=session))
+        before = self.services.offer(Service(name, normal_name(kind), read_text(message, "service"), provider=session))
         if before is not None and before.provider is not None:
             self._status(before.provider, f"Service {name} is offered by another client now.")
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from bam_envs.core.errors import BamEnvsError, ProtocolError
 from bam_envs.core.wording import brief
-from bam_envs.ros.interfaces import complete, complete_known, normal_name, request_type, response_type, variants
+from bam_envs.ros.interfaces import complete, complete_known, request_type, response_type, variants
 from bam_envs.rosbridge.bus import Handler
 from bam_envs.rosbridge.fragments import Id
 from bam_envs.rosbridge.server.client_session import Event, Invoke, Send, Session
@@ -284,8 +284,3 @@ def checked(kind: str, part: Callable[[str], str], values: Any) -> dict[str, Any
             raise ProtocolError(f"args: expected an object, found {brief(values)}.")
         values = {one.name: value for one, value in zip(fields[0], values, strict=False)}
     return (complete_known if kind in _LENIENT else complete)(name, {} if values is None else values)
-
-
-def new_service(name: str, kind: str, spelling: str, **offered: Any) -> Service:
-    """A service of type `kind`, with or without ``/srv/``."""
-    return Service(name, normal_name(kind), spelling, **offered)

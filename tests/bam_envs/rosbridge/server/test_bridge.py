@@ -22,6 +22,13 @@ JOINTS, FLOATS, TEXT, TRIGGER, SET_BOOL = (
 )
 
 
+def receive(bridge, session, frame, now):
+    """Do what a frame of a client says, as a server does."""
+    text = bridge.take(session, bridge.read(frame), now)
+    if text is not None:
+        bridge.take(session, bridge.read(text, joined=True), now)
+
+
 class Peers:
     """A bridge, clients that keep what they get, and a clock that is set by hand."""
 
@@ -39,7 +46,7 @@ class Peers:
     def say(self, session, *messages, **message):
         """Send messages; returns what this client got since, as objects."""
         for one in [*messages, *([message] if message else [])]:
-            self.bridge.receive(session, one if isinstance(one, (str, bytes)) else json.dumps(one), self.now)
+            receive(self.bridge, session, one if isinstance(one, (str, bytes)) else json.dumps(one), self.now)
         return self.take(session)
 
     def take(self, session):
