@@ -54,6 +54,7 @@ from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.sessions import is_over
 from bam_envs.rosbridge.string_rpc import StringRpc
 from bam_envs.safety.gate import ClearedCommand
+from bam_envs.safety.guard import measured_places
 
 Array = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
@@ -474,18 +475,10 @@ class RosbridgeRobot:
 
 
 def _rest_command(spec: RobotSpec, sinks: tuple[Sink, ...], signals: Mapping[str, Array]) -> Array:
-    """The command of a robot at rest: speeds 0, the rest as measured, NaN where it is not. Shape: (m,).
-
-    A number of the command is measured by the number of a signal with the same label and unit.
-    """
-    measured = {
-        (label, unit): signals[signal.name][0, column]
-        for signal in reversed(spec.signals)
-        if signal.name in signals
-        for column, (label, unit) in enumerate(zip(signal.labels, signal.units, strict=True))
-    }
-    pairs = zip(spec.command.labels, spec.command.units, strict=True)
-    rest = np.array([measured.get(pair, np.nan) for pair in pairs])
+    """The command of a robot at rest: speeds 0, the rest as measured, NaN where it is not. Shape: (m,)."""
+    rest = np.full(len(spec.command.labels), np.nan)
+    for place, name, column in measured_places(spec, spec.command.units) if signals else ():
+        rest[place] = signals[name][0, column]
     for sink in sinks:
         if sink.hold == "zero":
             rest[_places(spec, sink)] = 0.0

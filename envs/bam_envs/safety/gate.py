@@ -31,6 +31,7 @@ from bam_envs.safety.guard import (
     columns_in,
     is_base,
     joint_columns,
+    measured_places,
     position_range,
     require_bounded,
 )
@@ -190,8 +191,8 @@ class SafeRobot(metaclass=Sealed):
         self._guards = tuple(default_guards(robot.spec, self._limits, tool_position=tool_position))
         self._robot: Any = robot
         self._clock = clock
-        self._is_base, self._places = is_base(robot.spec), _measured_places(robot.spec)
-        self._speeds = _places_of(robot.spec, [f"{unit}/s" for unit in robot.spec.command.units])
+        self._is_base, self._places = is_base(robot.spec), _required_places(robot.spec)
+        self._speeds = measured_places(robot.spec, [f"{unit}/s" for unit in robot.spec.command.units])
         every = (*self._further, *self._guards)
         self._counts = {guard.name: {"altered": 0, "held": 0, "stopped": 0} for guard in every}
         self._stopped: tuple[str, str] | None = None
@@ -632,24 +633,13 @@ def _copy(tick: Tick) -> Tick:
     return replace(tick, **{name: value.copy() for name, value in vars(tick).items() if isinstance(value, np.ndarray)})
 
 
-def _places_of(spec: RobotSpec, units: Sequence[str]) -> list[tuple[int, str, int]]:
-    """Place in the command, signal and column of the numbers that have its labels and are in `units`."""
-    measured = {
-        pair: (signal.name, column)
-        for signal in reversed(spec.signals)
-        for column, pair in enumerate(zip(signal.labels, signal.units, strict=True))
-    }
-    numbers = enumerate(zip(spec.command.labels, units, strict=True))
-    return [(place, *measured[pair]) for place, pair in numbers if pair in measured]
-
-
-def _measured_places(spec: RobotSpec) -> list[tuple[int, str, int]]:
+def _required_places(spec: RobotSpec) -> list[tuple[int, str, int]]:
     """Place in the command, signal and column of what is measured of a command.
 
     Raises:
         InvalidValue: A joint is not measured: the guards could not know where the arm is.
     """
-    places = _places_of(spec, spec.command.units)
+    places = measured_places(spec, spec.command.units)
     known = {place for place, _, _ in places}
     numbers = enumerate(zip(spec.command.labels, spec.command.units, strict=True))
     missing = [label for place, (label, unit) in numbers if unit == "rad" and place not in known]

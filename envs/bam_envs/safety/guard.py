@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from types import MappingProxyType
 from typing import Any
@@ -263,3 +263,17 @@ def position_range(spec: RobotSpec, limits: Limits) -> tuple[Array, Array]:
         label = spec.command.labels[int(np.flatnonzero(low > high)[0])]
         raise InvalidValue(f"The limit position_margin of {limits.position_margin:g} rad leaves {label} no room.")
     return low, high
+
+
+def measured_places(spec: RobotSpec, units: Sequence[str]) -> list[tuple[int, str, int]]:
+    """Where the numbers of a command are measured, in `units`: index in the command, signal, column of the signal.
+
+    A number is measured by the first signal that has one with the same label and that unit.
+    """
+    measured = {
+        pair: (signal.name, column)
+        for signal in reversed(spec.signals)
+        for column, pair in enumerate(zip(signal.labels, signal.units, strict=True))
+    }
+    numbers = enumerate(zip(spec.command.labels, units, strict=True))
+    return [(place, *measured[pair]) for place, pair in numbers if pair in measured]
