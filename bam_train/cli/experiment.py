@@ -92,7 +92,7 @@ def require_cpus(number: int) -> None:
         SettingsError: With the most that there can be; the one that learns counts as none.
     """
     from bam_train.errors import SettingsError
-    from bam_train.trainers.rllib.cluster.resources import cores
+    from bam_train.trainers.rllib.ray_resources import cores
 
     if number - 1 > cores():
         raise SettingsError(

@@ -139,8 +139,8 @@ def training_settings(
     Raises:
         SettingsError: There is no such run here; says why.
     """
-    from bam_train.trainers.rllib import hyperparameters
-    from bam_train.trainers.rllib.config import is_plain
+    from bam_train.trainers.rllib.algorithm_config import is_plain
+    from bam_train.trainers.rllib.rllib_hyperparameters import complete
 
     algorithm = RLLIB_ALGORITHMS.get(parts.algorithm)
     own_module = type(restored.module).__module__.startswith("ray.rllib.algorithms.")
@@ -151,7 +151,7 @@ def training_settings(
         raise SettingsError("its connectors are others than those of a run here")
     config, model = restored.config, restored.module.model_config
     model = model if isinstance(model, Mapping) else vars(model)
-    names = hyperparameters.complete(algorithm, {})
+    names = complete(algorithm, {})
     own = {name: getattr(config, name) for name in names if _is_json(getattr(config, name, object()))}
     own["train_batch_size_per_learner"] = config.train_batch_size_per_learner
     own["model_config"] = {name: model[name] for name in names["model_config"] if name in model}
@@ -169,7 +169,7 @@ def training_settings(
             "num_learners": config.num_learners,
             "normalize": given is not None
             and {"clip_by_value": given.limit, "de_mean_to_zero": given.center, "de_std_to_one": given.scale},
-            "hyperparameters": hyperparameters.complete(algorithm, json.loads(json.dumps(own))),
+            "hyperparameters": complete(algorithm, json.loads(json.dumps(own))),
         }
     )
 
@@ -188,7 +188,7 @@ def states(directory: Directory) -> dict[str, bytes]:
     Raises:
         CheckpointError: One cannot be read.
     """
-    from bam_train.trainers.rllib.state import FOLDER, NOTES, STATES
+    from bam_train.trainers.rllib.rllib_state import FOLDER, NOTES, STATES
 
     root = directory.root or directory.policy
     files = sorted(path for path in root.rglob("*.pkl") if path.name in STATES)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from bam_train.trainers.base import Trainer
 
 TRAINERS: dict[str, str] = {
-    "rllib": "bam_train.trainers.rllib.trainer:RLlibTrainer",
+    "rllib": "bam_train.trainers.rllib.rllib_trainer:RLlibTrainer",
     "sb3": "bam_train.trainers.sb3.sb3_trainer:SB3Trainer",
 }
 """Name of a trainer to its ``"module:Class"``."""

@@ -7,8 +7,8 @@ Importing this registers every environment of ours with RLlib, so that a script 
 
     PPOConfig().environment("bam/pick", env_config={"randomize": True})
 
-RLlib's own runner makes one Python environment for every row. `RobotEnvRunner`, which ``bam-train`` uses, steps all
-rows of a runner in one batched simulation: ``.env_runners(env_runner_cls=RobotEnvRunner)``.
+RLlib's own runner makes n separate environments. `RobotEnvRunner`, which ``bam-train`` uses, steps all environments of
+a runner in one batched simulation: ``.env_runners(env_runner_cls=RobotEnvRunner)``.
 
 Ray is not started.
 """
@@ -17,12 +17,12 @@ import importlib.util
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from bam_train.trainers.rllib.sampling.env_runner import RobotEnvRunner
+    from bam_train.trainers.rllib.robot_env_runner import RobotEnvRunner
 
 __all__ = ["RobotEnvRunner"]
 
-if importlib.util.find_spec("ray") is not None:  # `foreign` and `pickles` read RLlib's files without it
-    from bam_train.trainers.rllib.registration import register
+if importlib.util.find_spec("ray") is not None:  # the old layout of RLlib's files is read without it
+    from bam_train.trainers.rllib.rllib_registration import register
 
     register()
 
@@ -30,7 +30,7 @@ if importlib.util.find_spec("ray") is not None:  # `foreign` and `pickles` read 
 def __getattr__(name: str) -> Any:
     """`RobotEnvRunner`, imported on use: it imports all of RLlib."""
     if name == "RobotEnvRunner":
-        from bam_train.trainers.rllib.sampling.env_runner import RobotEnvRunner
+        from bam_train.trainers.rllib.robot_env_runner import RobotEnvRunner
 
         return RobotEnvRunner
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,7 +1,8 @@
-"""What a run does when a process of RLlib's dies: it goes on with the others while a new one takes its place.
+"""What a run does when an env runner dies: it goes on with the others while a new one takes its place.
 
 Lost is what the dead runner had sampled since its last delivery, no more: an update takes the samples that were
-delivered, and only those are counted.
+delivered, and only those are counted. RLlib ends a runner whose environment fails, and keeps the cause in a log file on
+that computer; so a runner writes the cause into the cluster's key-value store before it ends.
 """
 
 from __future__ import annotations
@@ -11,10 +12,16 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+import gymnasium as gym
+import ray
 from ray.exceptions import RayError
+from ray.experimental import internal_kv
+from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 
 from bam_train.errors import ProcessesLost, SettingsError, TrainingFailed
-from bam_train.trainers.rllib.cluster import faults
+
+LONGEST_CAUSE = 500
+"""Characters of a cause that are kept."""
 
 SAMPLE_TIMEOUT = 60.0
 """How long an update waits for the samples of its slowest runner [s]."""
@@ -39,6 +46,74 @@ LONGEST_ALONE = 180.0
 """How long a run waits while all of its runners are gone [s]; a busy computer takes half a minute to start one."""
 
 
+class FaultReporting:
+    """Beside a runner class, before it: what goes wrong in `sample` is reported, and raised as it was.
+
+    So is what goes wrong while it is made, such as its environment on a computer that lacks something.
+    """
+
+    def __init__(self, **named: Any) -> None:
+        try:
+            super().__init__(**named)
+        except Exception as error:
+            if index := int(named.get("worker_index") or 0):
+                report(index, _own_cause(error))
+            raise
+
+    def sample(self, *arguments: Any, **named: Any) -> Any:
+        """Collect samples as the runner does."""
+        try:
+            return super().sample(*arguments, **named)  # type: ignore[misc]
+        except Exception as error:
+            cause = _own_cause(error)
+            index = int(getattr(self, "worker_index", 0) or 0)
+            if index:
+                report(index, cause)
+                raise
+            raise cause from None if cause is not error else cause.__cause__
+
+
+class ReportingEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc]
+    """RLlib's own runner of single agents, which says why it dies."""
+
+    def make_env(self) -> None:
+        """As RLlib's, which registers the same name every time, and Gymnasium warns of it from the second time on."""
+        gym.registry.pop("rllib-single-agent-env-v0", None)
+        super().make_env()
+
+
+def report(index: int, error: BaseException) -> None:
+    """Keep why the runner with this index dies."""
+    text = f"{type(error).__name__}: {' '.join(str(error).split())}"[:LONGEST_CAUSE].rstrip(": ")
+    internal_kv._internal_kv_put(_key(index), text.encode())
+
+
+def cause_of_death(index: int) -> str | None:
+    """Why the runner with this index died last, as far as it could say; the next call does not say it again."""
+    text: bytes | None = internal_kv._internal_kv_get(_key(index))
+    if text is not None:
+        internal_kv._internal_kv_del(_key(index))
+    return None if text is None else text.decode(errors="replace")
+
+
+def first_cause_of_death(number: int) -> str | None:
+    """Why the first that died of runners 1 to `number` did, as far as one could say."""
+    if not internal_kv._internal_kv_initialized():
+        return None
+    said = ((index, cause_of_death(index)) for index in range(1, number + 1))
+    return next((f"env runner {index} died ({why})" for index, why in said if why), None)
+
+
+def _key(index: int) -> bytes:
+    return f"bam-train/{ray.get_runtime_context().get_job_id()}/runner-{index}".encode()
+
+
+def _own_cause(error: Exception) -> Exception:
+    """RLlib raises a bare RuntimeError from what an environment raised."""
+    cause = error.__cause__
+    return cause if type(error) is RuntimeError and not error.args and isinstance(cause, Exception) else error
+
+
 def fault_tolerance(config: Any) -> Any:
     """Make an `AlgorithmConfig` go on when a runner or a computer dies in mid-training.
 
@@ -51,7 +126,7 @@ def fault_tolerance(config: Any) -> Any:
         The same config.
     """
     if config.env_runner_cls is None:
-        config.env_runners(env_runner_cls=faults.ReportingEnvRunner)
+        config.env_runners(env_runner_cls=ReportingEnvRunner)
     config.env_runners(sample_timeout_s=SAMPLE_TIMEOUT)
     return config.fault_tolerance(
         restart_failed_env_runners=True,
@@ -122,7 +197,7 @@ class RunnerWatch:
             return
         self._gone |= died
         for index in sorted(died):
-            why = faults.take(index)
+            why = cause_of_death(index)
             self._cause = f" ({why})" if why else ""
             self._lines.append(f"env runner {index} died{self._cause}: what it had not delivered yet is lost")
             self._deaths[index].append(self._update)

@@ -8,7 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -17,13 +16,12 @@ pytest.importorskip("ray.rllib")
 
 import psutil
 import ray
-from ray._private import utils
 
 from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.settings import TrainSettings
-from bam_train.trainers.rllib.cluster import cluster as module
-from bam_train.trainers.rllib.cluster.cluster import cluster
-from bam_train.trainers.rllib.cluster.descendants import Descendants
+from bam_train.signals import Terminated
+from bam_train.trainers.rllib.ray_cluster import cluster, own_folder
+from bam_train.trainers.rllib.ray_resources import cores
 
 pytestmark = pytest.mark.slow
 
@@ -69,48 +67,41 @@ def folders(processes):
     return {found for process in processes for found in re.findall(r"/\S*bam-ray-\w+", " ".join(process.cmdline()))}
 
 
+STUBBORN = "import signal, time; signal.signal(15, signal.SIG_IGN); print(flush=True); time.sleep(60)"
+
+
 def test_one_of_its_own_is_here_alone_and_gone_afterwards(home, capfd):
-    environment, handler = dict(os.environ), signal.getsignal(signal.SIGTERM)
-    handlers = logging.getLogger("ray").handlers[:]
-    with cluster(settings()):
-        processes = started()
-        assert len(processes) >= 5
-        assert os.getpgrp() not in {os.getpgid(process.pid) for process in processes}
-        assert listening([psutil.Process(), *processes]) == {"127.0.0.1"}
-        assert ray.cluster_resources()["CPU"] == module.cores()
-        assert signal.getsignal(signal.SIGTERM) is handler
-        (folder,) = folders(processes)
-        assert Path(folder).is_dir()
-    assert not any(process.is_running() for process in processes)
-    assert not Path(folder).exists()
-    assert not (home / ".ray").exists()
-    assert not ray.is_initialized()
-    assert logging.getLogger("ray").handlers == handlers
-    changed = {name for name in os.environ if environment.get(name) != os.environ[name]}
-    assert changed <= {"RAY_USAGE_STATS_ENABLED", "RAY_CLIENT_MODE", "PYTHONBREAKPOINT"}
-    assert capfd.readouterr() == ("", "")
-
-
-def test_it_is_gone_after_an_exception():
-    processes = []
-
-    def interrupted():
-        with cluster(settings()):
-            processes.extend(started())
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
-    assert processes
-    assert not any(process.is_running() for process in processes)
-
-
-def test_sigterm_is_heard_afterwards():
-    came = []
+    environment, handlers, came = dict(os.environ), logging.getLogger("ray").handlers[:], []
     before = signal.signal(signal.SIGTERM, lambda number, _: came.append(number))
+    handler = signal.getsignal(signal.SIGTERM)
     try:
         with cluster(settings()):
-            pass
+            processes = started()
+            assert len(processes) >= 5
+            assert os.getpgrp() not in {os.getpgid(process.pid) for process in processes}
+            assert listening([psutil.Process(), *processes]) == {"127.0.0.1"}
+            assert ray.cluster_resources()["CPU"] == cores()
+            assert signal.getsignal(signal.SIGTERM) is handler
+            (folder,) = folders(processes)
+            assert Path(folder).is_dir()
+            with cluster(settings()):  # one that runs in this process is used, and stays
+                assert len(started()) == len(processes)
+            assert ray.is_initialized()
+            with pytest.raises(SettingsError, match="in the cluster"), cluster(settings(num_env_runners=1000)):
+                pass
+            stubborn = subprocess.Popen([sys.executable, "-c", STUBBORN], stdout=subprocess.PIPE)
+            stubborn.stdout.readline()
+        assert not psutil.pid_exists(stubborn.pid)
+        stubborn.wait()  # whose status is known already
+        stubborn.stdout.close()
+        assert not any(process.is_running() for process in processes)
+        assert not Path(folder).exists()
+        assert not (home / ".ray").exists()
+        assert not ray.is_initialized()
+        assert logging.getLogger("ray").handlers == handlers
+        changed = {name for name in os.environ if environment.get(name) != os.environ[name]}
+        assert changed <= {"RAY_USAGE_STATS_ENABLED", "RAY_CLIENT_MODE", "PYTHONBREAKPOINT"}
+        assert capfd.readouterr() == ("", "")
         assert is_caught(signal.SIGTERM)
         signal.raise_signal(signal.SIGTERM)
         assert came == [signal.SIGTERM]
@@ -150,8 +141,8 @@ def test_another_ctrl_c_at_the_end_leaves_nothing_either(monkeypatch):
     assert not Path(found[0]).exists()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_while_it_starts_is_our_own(number, monkeypatch):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_a_signal_waits_while_it_starts(number, monkeypatch):
     class Came(BaseException):
         pass
 
@@ -159,7 +150,6 @@ def test_a_signal_while_it_starts_is_our_own(number, monkeypatch):
         raise Came
 
     def start(**_):
-        utils.set_sigterm_handler(lambda *_: pytest.fail("Ray's handler"))  # as `ray.init` does
         signal.raise_signal(number)
         ended.append(True)
 
@@ -174,14 +164,11 @@ def test_a_signal_while_it_starts_is_our_own(number, monkeypatch):
     assert ended == [True]
 
 
-def test_one_that_runs_in_this_process_is_used_and_stays():
-    with cluster(settings()):
-        processes = started()
-        with cluster(settings()):
-            assert len(started()) == len(processes)
-        assert ray.is_initialized()
-        with pytest.raises(SettingsError, match="in the cluster"), cluster(settings(num_env_runners=1000)):
-            pass
+def test_a_sigterm_that_ray_takes_while_it_starts(monkeypatch):
+    monkeypatch.setattr(ray, "init", lambda **_: sys.exit(signal.SIGTERM))  # as Ray's own handler does
+    with pytest.raises(Terminated) as caught, cluster(settings()):
+        pass
+    assert caught.value.signal == signal.SIGTERM
 
 
 def test_too_much_is_refused_before_anything_is_started(monkeypatch):
@@ -205,17 +192,30 @@ def test_a_ray_that_does_not_start(monkeypatch):
     )
 
 
-def test_a_process_that_does_not_go_is_killed(monkeypatch):
-    monkeypatch.setattr("bam_train.trainers.rllib.cluster.descendants.GRACE", 0.2)
-    descendants = Descendants()
-    code = "import signal, time; signal.signal(15, signal.SIG_IGN); print(flush=True); time.sleep(60)"
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as process:
-        process.stdout.readline()
-        descendants.watch()
-        before = time.monotonic()
-        descendants.end()
-        assert not psutil.pid_exists(process.pid)
-        assert time.monotonic() - before < 10.0
+def test_a_folder_goes_away_and_takes_those_that_were_left_with_it(tmp_path):
+    left, other = tmp_path / "bam-ray-left", tmp_path / "bam-ray-without-a-lock"
+    for folder in (left, other):
+        (folder / "session").mkdir(parents=True)
+    (left / "in-use").touch()
+    with own_folder(str(tmp_path)) as first:
+        assert sorted(tmp_path.iterdir()) == sorted([other, first])
+        with own_folder(str(tmp_path)) as second:
+            assert first.is_dir()
+            assert second.is_dir()
+        assert sorted(tmp_path.iterdir()) == sorted([other, first])
+    assert list(tmp_path.iterdir()) == [other]
+
+
+def test_the_lock_of_a_folder_ends_with_its_process(tmp_path):
+    code = (
+        "import os, sys; from bam_train.trainers.rllib.ray_cluster import own_folder\n"
+        "with own_folder(sys.argv[1]): os._exit(9)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], timeout=120, check=False)
+    assert done.returncode == 9
+    (left,) = tmp_path.iterdir()
+    with own_folder(str(tmp_path)):
+        assert not left.exists()
 
 
 CLUSTER = """
@@ -230,7 +230,7 @@ JOIN = """
 import sys, ray
 from bam_train.cli.program import guarded
 from bam_train.settings import TrainSettings
-from bam_train.trainers.rllib.cluster.cluster import cluster
+from bam_train.trainers.rllib.ray_cluster import cluster
 given = {"env": "bam/reach-v0", "algo": "ppo", "trainer": "rllib", "address": sys.argv[1]}
 def join():
     with cluster(TrainSettings.from_mapping(given | {"num_env_runners": int(sys.argv[2])})):
@@ -283,7 +283,5 @@ def test_a_cluster_is_joined_and_left_as_it_was(joinable):
         f"bam-train: {address}: the cluster does not accept the token, or none was given. Set RAY_AUTH_MODE=token, and "
         "RAY_AUTH_TOKEN to what ray get-auth-token says on its head\n",
     )
-    assert join(address) == refused
-    assert join(address, RAY_AUTH_MODE="token") == refused
     assert join(address, RAY_AUTH_MODE="token", RAY_AUTH_TOKEN="f" * 64) == refused
     assert all(process.is_running() for process in processes if "IDLE" not in process.name())

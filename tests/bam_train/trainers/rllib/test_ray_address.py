@@ -12,8 +12,8 @@ pytest.importorskip("ray.rllib")
 from ray._private import utils as ray_utils
 
 from bam_train.errors import SettingsError, TrainingFailed
-from bam_train.trainers.rllib.cluster import address
-from bam_train.trainers.rllib.cluster.address import find, reach
+from bam_train.trainers.rllib import ray_address as address
+from bam_train.trainers.rllib.ray_address import find, reach
 
 
 @pytest.fixture
@@ -126,4 +126,4 @@ def test_it_all_takes_less_than_twenty_seconds():
     ],
 )
 def test_reasons(came, said, start):
-    assert address._reason(came, said).startswith(start)
+    assert address.reason(came, said).startswith(start)

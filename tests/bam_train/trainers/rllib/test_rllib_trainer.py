@@ -21,10 +21,13 @@ from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
 from bam_train.trainers.resolve_settings import resolve, resolve_resumed
-from bam_train.trainers.rllib import hyperparameters, registration, state
-from bam_train.trainers.rllib.cluster.cluster import cluster
-from bam_train.trainers.rllib.config import envs_each
-from bam_train.trainers.rllib.trainer import RLlibTrainer
+from bam_train.trainers.rllib import rllib_hyperparameters as hyperparameters
+from bam_train.trainers.rllib import rllib_state as state
+from bam_train.trainers.rllib.algorithm_config import envs_each
+from bam_train.trainers.rllib.ray_cluster import cluster
+from bam_train.trainers.rllib.recorded_episodes import load
+from bam_train.trainers.rllib.rllib_registration import own_ids
+from bam_train.trainers.rllib.rllib_trainer import RLlibTrainer
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*:DeprecationWarning:ray")  # Ray's own, of its data library
 
@@ -46,13 +49,14 @@ def settled(algo="ppo", env="bam/reach", hyper=PPO, **given):
     )
 
 
-@pytest.fixture
-def trained(tmp_path):
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
     trainer = RLlibTrainer.create(settled(normalize=True, seed=3))
     seen = []
     trainer.train(256, lambda progress: seen.append((progress.steps, progress.total)) or True)
     assert seen == [(128, 256), (256, 256)]
-    yield trainer, trainer.save(tmp_path / "a.zip", {"success_rate": 0.5}, {"best": None})
+    path = tmp_path_factory.mktemp("trained") / "a.zip"
+    yield trainer, trainer.save(path, {"success_rate": 0.5}, {"best": None})
     trainer.close()
 
 
@@ -73,7 +77,7 @@ def test_the_frozen_policy_is_the_policy(trained):
     frozen = FrozenPolicy.load(checkpoint.path).act_batch(observations)
     assert np.abs(frozen - trainer.freeze().act_batch(observations)).max() <= 1e-6
     runner = trainer.algorithm.env_runner
-    runner._seen = runner._filter.rows(observations, update=False)
+    runner._seen = runner._filter.normalize(observations, update=False)
     _, actions = runner._act(0, explore=False)
     assert np.abs(frozen - actions).max() <= 1e-5
 
@@ -225,10 +229,14 @@ def sampled():
     gym.registry.pop("test/Sampled-v0", None)
 
 
-@pytest.mark.parametrize("normalize", [False, True])
 @pytest.mark.parametrize(
-    "space",
-    [Box(0, 9, (3,), np.int32), Box(-1, 1, (3, 2)), Box(-1, 1, (), np.float64), Discrete(3, start=5)],
+    ("space", "normalize"),
+    [
+        (Box(0, 9, (3,), np.int32), True),
+        (Box(-1, 1, (3, 2)), False),
+        (Box(-1, 1, (), np.float64), True),
+        (Discrete(3, start=5), False),
+    ],
     ids=["whole numbers", "two axes", "one number", "start"],
 )
 def test_observations_that_rllib_takes_as_a_vector_alone(space, normalize, sampled, tmp_path):
@@ -384,29 +392,26 @@ def test_the_preset_belongs_to_its_trainer():
 
 
 @pytest.mark.filterwarnings("ignore:.*Overriding environment rllib-single-agent-env-v0")  # by RLlib's own runner
-@pytest.mark.parametrize("runners", [0, 1])
-def test_a_script_needs_one_import(runners, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("runners", "name"), [(0, "bam/reach"), (1, "bam/reach-v0")])
+def test_a_script_needs_one_import(runners, name):
     from ray.rllib.algorithms.ppo import PPOConfig
-    from ray.tune.trainable import trainable
 
-    monkeypatch.setattr(trainable, "DEFAULT_STORAGE_PATH", str(tmp_path))  # else ~/ray_results
-
-    for name in ("bam/reach", "bam/reach-v0"):
-        config = (
-            PPOConfig()
-            .environment(name, env_config={"randomize": True})
-            .env_runners(num_env_runners=runners, num_envs_per_env_runner=2)
-            .training(train_batch_size_per_learner=64, minibatch_size=32, num_epochs=1)
-        )
-        algorithm = config.build_algo()
-        assert algorithm.train()["env_runners"]["num_env_steps_sampled_lifetime"] >= 64
-        algorithm.stop()
+    config = (
+        PPOConfig()
+        .environment(name, env_config={"randomize": True})
+        .env_runners(num_env_runners=runners, num_envs_per_env_runner=2)
+        .training(train_batch_size_per_learner=64, minibatch_size=32, num_epochs=1)
+    )
+    algorithm = config.build_algo()
+    assert algorithm.train()["env_runners"]["num_env_steps_sampled_lifetime"] >= 64
+    algorithm.stop()
+    Path(algorithm.logdir).rmdir()
 
 
 def test_every_environment_of_ours_is_registered():
     from ray.tune.registry import ENV_CREATOR, _global_registry
 
-    for env_id in registration.own_ids():
+    for env_id in own_ids():
         assert _global_registry.contains(ENV_CREATOR, env_id)
         assert _global_registry.contains(ENV_CREATOR, env_id.rpartition("-v")[0])
 
@@ -464,7 +469,6 @@ def recorded(folder, **columns):
     return str(folder)
 
 
-@pytest.mark.parametrize("learners", [0, 1])
 @pytest.mark.parametrize(
     ("columns", "text"),
     [
@@ -483,16 +487,17 @@ def recorded(folder, **columns):
     ],
     ids=["choice", "text", "null", "nan", "ragged", "empty"],
 )
-def test_recorded_rows_that_are_not_whole(columns, text, learners, sampled, tmp_path):
-    if learners and "7" not in text:
-        pytest.skip("as the first")
-    hyper = {"train_batch_size_per_learner": 8, "model_config": SMALL}
-    env = sampled(Box(-1, 1, (2,)))
-    trainer = RLlibTrainer.create(
-        settled("bc", env, hyper, data=recorded(tmp_path, **columns), steps=64, num_learners=learners)
-    )
+def test_recorded_rows_that_are_not_whole(columns, text, tmp_path):
     with pytest.raises(SettingsError) as caught:
-        trainer.train(64, lambda progress: True)
-    trainer.close()
+        load(recorded(tmp_path, **columns), Box(-1, 1, (2,)), Discrete(2, start=-1), 0.9)
     assert text in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_what_a_learner_elsewhere_says_of_recorded_rows(sampled, tmp_path):
+    hyper = {"train_batch_size_per_learner": 8, "model_config": SMALL}
+    data, env = recorded(tmp_path, actions=[-1, 0, 7, 0, 0, 0]), sampled(Box(-1, 1, (2,)))
+    trainer = RLlibTrainer.create(settled("bc", env, hyper, data=data, steps=64, num_learners=1))
+    with pytest.raises(SettingsError, match="actions: expected -1 to 0, found 7"):
+        trainer.train(64, lambda progress: True)
+    trainer.close()

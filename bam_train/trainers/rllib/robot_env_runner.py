@@ -1,10 +1,10 @@
-"""RLlib's runner over one batched simulation: arrays of all rows from step to step, episodes at the end.
+"""RLlib's runner over one batched simulation: arrays of all environments from step to step, episodes at the end.
 
 RLlib's own `SingleAgentEnvRunner` appends to n Python episodes at every step, and runs its connectors over each. Here a
-step of n rows is one pass of the module, one batched action and one `RobotVectorEnv.step`. What comes out is the same:
-a list of `SingleAgentEpisode`, the ones that ended with what they observed last, the running ones in pieces.
+step of n environments is one pass of the module, one batched action and one `RobotVectorEnv.step`. What comes out is
+the same: a list of `SingleAgentEpisode`, the ones that ended with what they observed last, the running ones in pieces.
 
-The file is long because it is one class, each of whose methods stands in for one of RLlib's.
+The file is long because each method of its one large class stands in for one of RLlib's.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-from collections.abc import Iterator
+import uuid
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -26,15 +28,15 @@ from ray.rllib.env.env_context import EnvContext
 from ray.rllib.env.env_runner import ENV_STEP_FAILURE
 from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
+from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 from ray.rllib.utils.metrics import RLMODULE_INFERENCE_TIMER, WEIGHTS_SEQ_NO
 from ray.rllib.utils.spaces.space_utils import clip_action, unsquash_action
 
 from bam_train.environments import is_batched, make_rows
 from bam_train.errors import SettingsError
 from bam_train.finite_envs import FiniteRows
-from bam_train.trainers.rllib.cluster.faults import FaultReporting
-from bam_train.trainers.rllib.sampling.filters import MeanStdFilter
-from bam_train.trainers.rllib.sampling.rows import End, Rollout, Running
+from bam_train.trainers.rllib.mean_std_filter import MeanStdFilter
+from bam_train.trainers.rllib.runner_deaths import FaultReporting
 
 Array = NDArray[Any]
 
@@ -43,7 +45,7 @@ ENDS = "ends"
 
 
 class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc]
-    """Collects episodes on ``num_envs_per_env_runner`` rows of one of our environments.
+    """Collects episodes on ``num_envs_per_env_runner`` batched copies of one of our environments.
 
     Its connectors are RLlib's defaults and, before them, `MeanStdFilter` or nothing; its module has no state.
     Callbacks on single steps and episodes are not called.
@@ -73,13 +75,13 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
         if strange or self.config._module_to_env_connector is not None:
             found = ", ".join(strange) or "a module-to-env connector"
             raise SettingsError(
-                "RobotEnvRunner: expected the MeanStdFilter of bam_train.trainers.rllib.sampling.filters or no "
+                "RobotEnvRunner: expected the MeanStdFilter of bam_train.trainers.rllib.mean_std_filter or no "
                 f"connector, found {found}; leave env_runner_cls out to use RLlib's own runner"
             )
         return own[0] if own else None
 
     def make_env(self) -> None:
-        """One vector environment of all rows, with automatic resets in the same step."""
+        """One vector environment, with automatic resets in the same step."""
         if self.env is not None:
             self.env.close()
         name = self.config.env
@@ -92,7 +94,7 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
         with _cores(self.config.num_cpus_per_env_runner if self.worker_index else None):
             self.env = FiniteRows(make_rows(env_id, kwargs, self.config.num_envs_per_env_runner), env_id)
         if self.env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
-            raise SettingsError(f"{env_id}: expected rows that restart in the same step")
+            raise SettingsError(f"{env_id}: expected environments that restart in the same step")
         self.num_envs = self.env.num_envs
         self._needs_initial_reset = True
         context = EnvContext(kwargs, worker_index=self.worker_index or 0, num_workers=self.num_workers)
@@ -117,7 +119,7 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
         random_actions: bool = False,
         force_reset: bool = False,
     ) -> list[SingleAgentEpisode]:
-        """As many steps as asked for, up to the next multiple of the rows; or whole episodes."""
+        """As many steps as asked for, up to the next multiple of the number of environments; or whole episodes."""
         if force_reset or num_episodes is not None or self._needs_initial_reset:
             self._begin()
         self._needs_initial_reset = num_episodes is not None
@@ -135,13 +137,13 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
         return episodes
 
     def _begin(self) -> None:
-        """Begin an episode on every row; row i of the k-th runner is seeded by how many rows come before it."""
-        seed = self._row_seed() if self._needs_initial_reset else None
+        """Begin an episode everywhere; environment i of the k-th runner is seeded by how many come before it."""
+        seed = self._first_seed() if self._needs_initial_reset else None
         observations, _ = self._try_env_reset(seed=seed, options=None)
         self._seen = self._as_seen(observations)
         self._running = Running(self.num_envs)
 
-    def _row_seed(self) -> int | None:
+    def _first_seed(self) -> int | None:
         if self._seed is None:
             return None
         index = self.worker_index or 0
@@ -149,10 +151,10 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
 
     def _as_seen(self, observations: Array) -> Array:
         """Observations as the module sees them: a copy, for the environment may write into its own."""
-        return np.array(observations) if self._filter is None else self._filter.rows(observations)
+        return np.array(observations) if self._filter is None else self._filter.normalize(observations)
 
     def _collect(self, steps: int, explore: bool, random_actions: bool) -> list[SingleAgentEpisode] | None:
-        """Step every row `steps` times; None if the environment failed."""
+        """Step every environment `steps` times; None if the environment failed."""
         rollout = Rollout(self.num_envs, steps, self._seen)
         for _ in range(steps):
             if not self._step(rollout, explore, random_actions):
@@ -160,7 +162,7 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
         return self._cut(rollout)
 
     def _collect_episodes(self, count: int, explore: bool, random_actions: bool) -> list[SingleAgentEpisode] | None:
-        """Step every row until `count` episodes have ended, and return these."""
+        """Step every environment until `count` episodes have ended, and return these."""
         done: list[SingleAgentEpisode] = []
         pieces: dict[str, list[SingleAgentEpisode]] = {}
         while len(done) < count:
@@ -174,7 +176,7 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
         return done[:count]
 
     def _step(self, rollout: Rollout, explore: bool, random_actions: bool) -> bool:
-        """One step of every row; False if the environment failed and was made anew."""
+        """One step of every environment; False if the environment failed and was made anew."""
         columns, actions = self._random() if random_actions else self._act(rollout.steps, explore)
         results = self._try_env_step(actions)
         if results == ENV_STEP_FAILURE:
@@ -218,7 +220,7 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
         return {**said, Columns.ACTIONS: actions, Columns.ACTION_LOGP: distribution.logp(actions)}
 
     def _for_env(self, actions: Array) -> Array:
-        """RLlib's `NormalizeAndClipActions`, for all rows at once."""
+        """RLlib's `NormalizeAndClipActions`, for the whole batch."""
         space = self.env.single_action_space
         if self.config.normalize_actions:
             actions = unsquash_action(actions, space)
@@ -289,3 +291,164 @@ def _joined(pieces: list[SingleAgentEpisode]) -> SingleAgentEpisode:
     for piece in others:
         whole.concat_episode(piece)
     return whole
+
+
+@dataclass(frozen=True)
+class End:
+    """How an episode went that ended."""
+
+    length: int
+    """Its steps."""
+    total: float
+    """Undiscounted sum of its rewards."""
+    success: bool | None
+    """None if the environment does not say."""
+
+
+class Running:
+    """The running episode of every environment: its name, how far it is, and what it has earned.
+
+    Attributes:
+        ids: Names, n.
+        lengths: Steps so far. Shape: (n,).
+        returns: Undiscounted sums of rewards. Shape: (n,).
+    """
+
+    def __init__(self, num_envs: int) -> None:
+        self.ids = [uuid.uuid4().hex for _ in range(num_envs)]
+        self.lengths = np.zeros(num_envs, np.int64)
+        self.returns = np.zeros(num_envs)
+
+    def restart(self, env_id: int) -> None:
+        """The environment's next episode begins."""
+        self.ids[env_id] = uuid.uuid4().hex
+        self.lengths[env_id], self.returns[env_id] = 0, 0.0
+
+
+class Rollout:
+    """T steps of n environments.
+
+    Args:
+        num_envs: n.
+        steps: T at most.
+        first: What the environments observe at its start, as the module sees it. Shape: (n, ...).
+    """
+
+    def __init__(self, num_envs: int, steps: int, first: Array) -> None:
+        self.steps = 0
+        self.observations = np.empty((num_envs, steps + 1, *first.shape[1:]), first.dtype)
+        self.observations[:, 0] = first
+        self.rewards = np.empty((num_envs, steps), np.float32)
+        self.terminated = np.zeros((num_envs, steps), bool)
+        self.truncated = np.zeros((num_envs, steps), bool)
+        self._finals: dict[tuple[int, int], tuple[Array, bool | None]] = {}
+        self._capacity = steps
+        self._columns: dict[str, Array] = {}
+
+    def add(
+        self,
+        columns: Mapping[str, Array],
+        rewards: Array,
+        terminated: Array,
+        truncated: Array,
+        following: Array,
+    ) -> None:
+        """One step of every environment.
+
+        Args:
+            columns: Actions and whatever else the module said, each (n, ...).
+            rewards: (n,).
+            terminated: (n,) bool.
+            truncated: (n,) bool.
+            following: What the environments observe now, as the module sees it, (n, ...).
+        """
+        t = self.steps
+        for name, values in columns.items():
+            if name not in self._columns:
+                self._columns[name] = np.empty((len(values), self._capacity, *values.shape[1:]), values.dtype)
+            self._columns[name][:, t] = values
+        self.rewards[:, t], self.terminated[:, t], self.truncated[:, t] = rewards, terminated, truncated
+        self.observations[:, t + 1] = following
+        self.steps = t + 1
+
+    def end(self, env_ids: Array, observations: Array, success: Array | None) -> None:
+        """The step that is added next ends the episodes of some environments.
+
+        Args:
+            env_ids: Which, (k,).
+            observations: What they observe last, as the module sees it, (k, ...); `add` is given what follows.
+            success: Of all environments, (n,) bool; None if the environment does not say.
+        """
+        for env_id, last in zip(env_ids.tolist(), observations, strict=True):
+            self._finals[env_id, self.steps] = last, None if success is None else bool(success[env_id])
+
+    def episodes(
+        self,
+        running: Running,
+        observation_space: gym.Space[Any],
+        action_space: gym.Space[Any],
+        extra: Mapping[str, Any],
+    ) -> tuple[list[SingleAgentEpisode], list[End]]:
+        """The steps as episodes and pieces of episodes, those that ended first; and how these went.
+
+        Args:
+            running: The episodes as they were when the rollout began; afterwards as they are at its end.
+            observation_space: As the module sees it.
+            action_space: The environment's.
+            extra: Values that every step has, whoever took it.
+        """
+        ended, open_, ends = [], [], []
+        for env_id in range(len(self.rewards)):
+            start = 0
+            done = self.terminated[env_id, : self.steps] | self.truncated[env_id, : self.steps]
+            for stop in (np.flatnonzero(done) + 1).tolist():
+                ended.append(self._piece(env_id, start, stop, running, observation_space, action_space, extra))
+                self._go_on(running, env_id, start, stop)
+                success = self._finals[env_id, stop - 1][1]
+                ends.append(End(int(running.lengths[env_id]), float(running.returns[env_id]), success))
+                running.restart(env_id)
+                start = stop
+            if start < self.steps:
+                open_.append(self._piece(env_id, start, self.steps, running, observation_space, action_space, extra))
+                self._go_on(running, env_id, start, self.steps)
+        return ended + open_, ends
+
+    def _go_on(self, running: Running, env_id: int, start: int, stop: int) -> None:
+        running.lengths[env_id] += stop - start
+        running.returns[env_id] += self.rewards[env_id, start:stop].sum(dtype=np.float64)
+
+    def _piece(
+        self,
+        env_id: int,
+        start: int,
+        stop: int,
+        running: Running,
+        observation_space: gym.Space[Any],
+        action_space: gym.Space[Any],
+        extra: Mapping[str, Any],
+    ) -> SingleAgentEpisode:
+        observations = self.observations[env_id, start : stop + 1].copy()
+        terminated, truncated = bool(self.terminated[env_id, stop - 1]), bool(self.truncated[env_id, stop - 1])
+        if terminated or truncated:
+            observations[-1] = self._finals[env_id, stop - 1][0]
+        columns = {name: _buffer(values[env_id, start:stop].copy()) for name, values in self._columns.items()}
+        fixed = {name: _buffer(np.full(stop - start, value)) for name, value in extra.items()}
+        before = int(running.lengths[env_id])
+        return SingleAgentEpisode(
+            id_=running.ids[env_id],
+            observations=_buffer(observations, observation_space),
+            observation_space=observation_space,
+            actions=_buffer(columns.pop("actions").data, action_space),
+            action_space=action_space,
+            rewards=_buffer(self.rewards[env_id, start:stop].copy()),
+            infos=[{}] * (stop - start + 1),
+            terminated=terminated,
+            truncated=truncated and not terminated,
+            extra_model_outputs={**columns, **fixed},
+            t_started=before,
+            len_lookback_buffer=0,
+        )
+
+
+def _buffer(values: Array, space: gym.Space[Any] | None = None) -> InfiniteLookbackBuffer:
+    return InfiniteLookbackBuffer(values, 0, space)

@@ -86,7 +86,7 @@ def reach(place: str) -> None:
     came, said = _probe(place)
     if came == "joined":
         return
-    raise TrainingFailed(f"{place}: {_reason(came, said)}")
+    raise TrainingFailed(f"{place}: {reason(came, said)}")
 
 
 def _connect(place: str) -> None:
@@ -117,7 +117,7 @@ def _probe(place: str) -> tuple[str, str]:
     return next((stage for stage in reversed(_STAGES) if stage in lines), ""), said
 
 
-def _reason(came: str, said: str) -> str:
+def reason(came: str, said: str) -> str:
     """Why the way into a cluster ended, and what to do."""
     if re.search("InvalidAuthToken|AuthenticationError|authentication token", said):
         return (

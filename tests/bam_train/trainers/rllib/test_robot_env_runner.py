@@ -18,10 +18,9 @@ from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 from ray.rllib.utils.filter import RunningStat
 
 from bam_train.environments import make_rows
-from bam_train.trainers.rllib.registration import register
-from bam_train.trainers.rllib.sampling.env_runner import RobotEnvRunner
-from bam_train.trainers.rllib.sampling.filters import MeanStdFilter, forget_deltas, push
-from bam_train.trainers.rllib.sampling.rows import Rollout, Running
+from bam_train.trainers.rllib.mean_std_filter import MeanStdFilter, forget_deltas, push
+from bam_train.trainers.rllib.rllib_registration import register
+from bam_train.trainers.rllib.robot_env_runner import RobotEnvRunner, Rollout, Running
 
 NETWORK = {"fcnet_hiddens": [16]}
 BOX = gym.spaces.Box(-10, 10, (2,), np.float32)
@@ -82,7 +81,7 @@ def test_merging_two_runners_is_counting_all():
         one.input_observation_space = BOX
     for part in (slice(0, 10), slice(10, 30)):
         for runner, rows in zip(runners, observations, strict=True):
-            runner.rows(rows[part])
+            runner.normalize(rows[part])
         state = merged.merge_states([runner.get_state() for runner in runners])
         merged.set_state(state)
         for runner in runners:
@@ -114,12 +113,12 @@ def test_what_was_handed_in_is_not_handed_in_again():
     for one in (merged, first, second):
         one.input_observation_space = BOX
     alone = np.random.default_rng(0).normal(3, 2, (40, 2)).astype(np.float32)
-    merged.rows(alone)  # a process that collected by itself, and then goes on with two runners
+    merged.normalize(alone)  # a process that collected by itself, and then goes on with two runners
     state = merged.get_state()
     merged.set_state(state)
     for runner in (first, second):
         runner.set_state(state)
-        runner.rows(alone[:5])
+        runner.normalize(alone[:5])
     merged.set_state(merged.merge_states([first.get_state(), second.get_state()]))
     stat = merged._filters[None].running_stats
     assert stat.num_pushes == 50

@@ -2,12 +2,14 @@
 
 ``bam/resume/rllib/…`` is what ``Algorithm.save_to_path`` writes, so that ``Algorithm.from_checkpoint`` of the unpacked
 folder works for those who trust it. Ours builds the algorithm from its settings and sets the states in those files,
-which are read as arrays and plain values (`pickles.read_state`); how objects are made (``class_and_ctor_args.pkl``) is
-never read. ``bam/resume/learner.json`` is what the tree leaves out (`learner_extras`).
+which are read as arrays and plain values (`state_pickles.read_state`); ``class_and_ctor_args.pkl``, which says how
+objects are made, is never read. ``bam/resume/learner.json`` is what the tree leaves out: numbers of the learners that
+adapt themselves.
 """
 
 from __future__ import annotations
 
+import functools
 import json
 import random
 import tempfile
@@ -18,10 +20,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from ray.rllib.utils.schedules.scheduler import Scheduler
 
 from bam_train.checkpoint import Checkpoint
 from bam_train.errors import AlteredCheckpoint, CheckpointMismatch, FormatError
-from bam_train.trainers.rllib.learner_extras import extras_of, set_extras
 from bam_train.trainers.rllib.state_pickles import read_state
 
 FOLDER, NOTES, EXTRAS = "bam/resume/rllib/", "bam/resume/notes.json", "bam/resume/learner.json"
@@ -188,3 +190,65 @@ def undisturbed() -> Iterator[None]:
         random.setstate(before[0])
         np.random.set_state(before[1])
         torch.set_rng_state(before[2])
+
+
+# What RLlib's learners keep beside their state
+
+Extras = dict[str, dict[str, float]]
+"""Attribute of the learner to module to number."""
+
+_NAMES = (
+    "curr_kl_coeffs_per_module",
+    "curr_log_alpha",
+    "moving_avg_sqd_adv_norms_per_module",
+    "last_update_ts_by_mid",
+    "_last_update_ts_by_mid",
+    "entropy_coeff_schedulers_per_module",
+)
+"""PPO's and APPO's KL coefficient, SAC's, TQC's and CQL's temperature, MARWIL's running mean of squared advantages,
+when the target networks of DQN, its relatives and APPO were updated last, and where a schedule of the entropy's weight
+is.
+``Learner.get_state`` of Ray 2.60 has none of them, so that a resumed run would begin them anew."""
+
+
+def extras_of(algorithm: Any) -> Extras:
+    """Attribute of the learner to module to number; {} if it has none. All learners have the same."""
+    results = list(algorithm.learner_group.foreach_learner(_take))
+    return dict(results[0].get()) if results else {}
+
+
+def set_extras(algorithm: Any, extras: Mapping[str, Mapping[str, float]]) -> None:
+    """Give them to every learner."""
+    for result in algorithm.learner_group.foreach_learner(functools.partial(_give, extras=extras)):
+        result.get()  # raises what went wrong there
+
+
+def _take(learner: Any) -> Extras:
+    tables = {name: getattr(learner, name) for name in _NAMES if hasattr(learner, name)}
+    return {name: {key: _number(table[key]) for key in learner.module.keys()} for name, table in tables.items()}  # noqa: SIM118 - no mapping
+
+
+def _number(value: Any) -> float:
+    """A tensor of one number, or a number, or what a schedule is at, as a number that JSON keeps exactly."""
+    if isinstance(value, Scheduler):
+        value = value.get_current_value()
+    number: float = value.item() if isinstance(value, torch.Tensor) else value
+    return number
+
+
+def _give(learner: Any, extras: Mapping[str, Mapping[str, float]]) -> None:
+    for name, numbers in extras.items():
+        table = getattr(learner, name)
+        for key, number in numbers.items():
+            if isinstance(table[key], Scheduler):
+                _set_schedule(table[key], number)
+            elif isinstance(table[key], torch.Tensor):
+                table[key].data.fill_(number)  # in place: an optimiser may hold it
+            else:
+                table[key] = number
+
+
+def _set_schedule(schedule: Scheduler, number: float) -> None:
+    """Where it is until the first update's end says so; a fixed number stays."""
+    if schedule.use_schedule:
+        schedule.get_current_value().data.fill_(number)

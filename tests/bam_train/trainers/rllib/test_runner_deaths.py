@@ -12,8 +12,8 @@ from ray.exceptions import RayError
 from ray.rllib.algorithms.ppo import PPOConfig
 
 from bam_train.errors import ProcessesLost, TrainingFailed
-from bam_train.trainers.rllib.cluster import faults
-from bam_train.trainers.rllib.cluster.fault_tolerance import RunnerWatch, fault_tolerance
+from bam_train.trainers.rllib import runner_deaths
+from bam_train.trainers.rllib.runner_deaths import RunnerWatch, fault_tolerance
 
 
 class Algorithm:
@@ -46,7 +46,7 @@ QUIET = [((), [])]
 def causes(monkeypatch):
     """What runners said before they died."""
     said = {}
-    monkeypatch.setattr(faults, "take", lambda index: said.pop(index, None))
+    monkeypatch.setattr(runner_deaths, "cause_of_death", lambda index: said.pop(index, None))
     return said
 
 
@@ -164,11 +164,11 @@ def test_a_config():
     config = fault_tolerance(PPOConfig())
     assert config.restart_failed_env_runners is True
     assert (config.env_runner_health_probe_timeout_s, config.delay_between_env_runner_restarts_s) == (0.25, 1.0)
-    assert config.env_runner_cls is faults.ReportingEnvRunner
+    assert config.env_runner_cls is runner_deaths.ReportingEnvRunner
 
 
 def test_a_runner_class_that_was_chosen_stays():
-    class Own(faults.ReportingEnvRunner):
+    class Own(runner_deaths.ReportingEnvRunner):
         pass
 
     assert fault_tolerance(PPOConfig().env_runners(env_runner_cls=Own)).env_runner_cls is Own

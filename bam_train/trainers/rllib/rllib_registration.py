@@ -65,9 +65,9 @@ def create(env_id: str, context: Mapping[str, Any]) -> gym.Env[Any, Any]:
     kwargs = dict(context)
     if "num_envs" in kwargs:
         raise InvalidValue(
-            f"{env_id}: RLlib's own runner expects rows that restart in the step after their end, and ours restart in "
-            "the same. Use .env_runners(env_runner_cls=bam_train.trainers.rllib.RobotEnvRunner), which steps all rows "
-            "at once, and leave gym_env_vectorize_mode out."
+            f"{env_id}: RLlib's own runner expects environments that restart in the step after their end, and ours "
+            "restart in the same. Use .env_runners(env_runner_cls=bam_train.trainers.rllib.RobotEnvRunner), which "
+            "steps all of them at once, and leave gym_env_vectorize_mode out."
         )
     return FiniteEnv(gym.make(env_id, disable_env_checker=True, **kwargs), env_id)
 

@@ -1,7 +1,7 @@
-"""`RLlibTrainer`: a run of an algorithm of RLlib that can be stopped, saved and gone on with between two iterations.
+"""`RLlibTrainer`: a run of an algorithm of RLlib that can be stopped, saved and resumed between two iterations.
 
 The file is long because a trainer has many small methods: those of the protocol `Trainer`, and what each of them asks
-of RLlib. What is more than that (configuration, states, freezing, the cluster) is in modules of its own.
+of RLlib. Configuration, states, freezing and the cluster have modules of their own.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import copy
 import dataclasses
 import logging
 import math
-import tempfile
 import warnings
 from collections import deque
 from collections.abc import Iterator, Mapping
@@ -23,7 +22,6 @@ import torch
 from gymnasium import Space, spaces
 from gymnasium.vector import VectorEnv
 from ray.rllib.core import DEFAULT_MODULE_ID
-from ray.tune.trainable import trainable
 
 from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint, write_checkpoint
@@ -35,13 +33,13 @@ from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
 from bam_train.trainers.base import OnProgress, Progress, Statistics
 from bam_train.trainers.manifest_fields import manifest
 from bam_train.trainers.resolve_settings import own_settings
-from bam_train.trainers.rllib import hyperparameters, state
-from bam_train.trainers.rllib.cluster.cluster import cluster
-from bam_train.trainers.rllib.cluster.fault_tolerance import RunnerWatch
-from bam_train.trainers.rllib.config import envs_each, make_config, refusals
+from bam_train.trainers.rllib import rllib_state
+from bam_train.trainers.rllib.algorithm_config import envs_each, make_config, refusals
+from bam_train.trainers.rllib.ray_cluster import cluster
 from bam_train.trainers.rllib.rllib_freezing import PolicyParts, RLlibPolicy, freeze, golden, parts_of
-from bam_train.trainers.rllib.sampling.env_runner import ENDS
-from bam_train.trainers.rllib.tensorboard import TensorBoard
+from bam_train.trainers.rllib.rllib_hyperparameters import complete, complete_normalize
+from bam_train.trainers.rllib.robot_env_runner import ENDS
+from bam_train.trainers.rllib.runner_deaths import RunnerWatch
 
 _FINITE = "expected finite numbers: try a smaller lr"
 _EPISODES = 100
@@ -81,10 +79,11 @@ class RLlibTrainer:
         torch.set_num_threads(settings.threads)
         with contextlib.ExitStack() as stack:
             stack.enter_context(cluster(settings))
-            with refusals(settings), _no_folder_at_home():
+            with refusals(settings):
                 self._config = make_config(settings, seen.observation_space, seen.action_space, seed)
                 self.algorithm = self._config.build_algo()
             stack.callback(self.algorithm.stop)
+            _remove_empty_folder(Path(self.algorithm.logdir))
             self._watch = RunnerWatch(self.algorithm)
             self._open = stack.pop_all()
 
@@ -96,12 +95,12 @@ class RLlibTrainer:
         seen = Seen.of(settings)
         algorithm.require_actions(settings.env, type(seen.action_space).__name__)
         _require_no_bytes(settings.env, seen.observation_space)
-        values = hyperparameters.complete(algorithm, settings.hyperparameters)
+        values = complete(algorithm, settings.hyperparameters)
         _require_two_critics(values, seen.action_space)
         return dataclasses.replace(
             settings,
             hyperparameters=values,
-            normalize=hyperparameters.complete_normalize(settings.normalize),
+            normalize=complete_normalize(settings.normalize),
             eval_every=settings.eval_every or max(1000, settings.steps // 20),
         )
 
@@ -111,8 +110,8 @@ class RLlibTrainer:
         trainer = cls(settings, Seen.of(settings), settings.seed)
         values = settings.hyperparameters
         with trainer._or_close():
-            state.start_actions(trainer.algorithm, values["log_std_init"], values["action_init_scale"])
-            state.hand_out(trainer.algorithm)
+            rllib_state.start_actions(trainer.algorithm, values["log_std_init"], values["action_init_scale"])
+            rllib_state.hand_out(trainer.algorithm)
             trainer.freeze()  # what cannot be frozen is refused before it is trained
         return trainer
 
@@ -125,7 +124,7 @@ class RLlibTrainer:
         steps = checkpoint.manifest.steps
         trainer = cls(settings, Seen.of(settings), settings.seed + steps)  # other episodes than the first ones again
         with trainer._or_close():
-            state.load(checkpoint, trainer.algorithm)
+            rllib_state.load(checkpoint, trainer.algorithm)
         trainer._steps = steps
         trainer.notices += _not_saved(settings)
         return trainer
@@ -240,13 +239,13 @@ class RLlibTrainer:
 
     def save(self, path: Path, scores: Mapping[str, Any], notes: Mapping[str, Any]) -> Checkpoint:
         """Write a checkpoint that can be resumed and deployed."""
-        with state.undisturbed():
+        with rllib_state.undisturbed():
             module = copy.deepcopy(self._module())  # of appo and impala, a thread goes on learning
             parts = self._parts(module)
             members = {
                 "bam/policy.onnx": freeze(parts),
                 "bam/golden.safetensors": golden(parts, self._run_by_rllib(module)),
-                **state.members(self.algorithm, notes),
+                **rllib_state.members(self.algorithm, notes),
             }
         return write_checkpoint(path, self._manifest(scores), members)
 
@@ -262,20 +261,20 @@ class RLlibTrainer:
 
     def freeze(self) -> FrozenPolicy:
         """The policy as it is now."""
-        with state.undisturbed():
+        with rllib_state.undisturbed():
             graph = freeze(self._parts(self._module()))
         spaces = space_to_json(self._seen.observation_space), space_to_json(self._seen.action_space)
         return FrozenPolicy.from_graph(graph, *spaces)
 
     def exploring(self) -> RLlibPolicy:
         """The policy as it is now, drawing its actions as in training."""
-        with state.undisturbed():
+        with rllib_state.undisturbed():
             return self._run_by_rllib(self._module(), explore=True)
 
     @contextlib.contextmanager
     def undisturbed(self) -> Iterator[None]:
         """Do something between two iterations that leaves training's random numbers as they were."""
-        with state.undisturbed():
+        with rllib_state.undisturbed():
             yield
 
     @contextlib.contextmanager
@@ -363,16 +362,11 @@ def _not_saved(settings: TrainSettings) -> list[str]:
     return [f"RLlib saves no {lost}: new ones begin, so the rest differs from an unbroken run"]
 
 
-@contextlib.contextmanager
-def _no_folder_at_home() -> Iterator[None]:
-    """RLlib makes a folder below ~/ray_results for files that it then does not write; within, one that goes away."""
-    before = trainable.DEFAULT_STORAGE_PATH
-    with tempfile.TemporaryDirectory(prefix="bam-rllib-") as folder:
-        trainable.DEFAULT_STORAGE_PATH = folder
-        try:
-            yield
-        finally:
-            trainable.DEFAULT_STORAGE_PATH = before
+def _remove_empty_folder(folder: Path) -> None:
+    """RLlib makes a folder of its own below ~/ray_results, and then writes nothing there."""
+    with contextlib.suppress(OSError):
+        folder.rmdir()
+        folder.parent.rmdir()
 
 
 @contextlib.contextmanager
@@ -387,3 +381,33 @@ def _number(value: Any) -> float | None:
     """A number of RLlib's results; None if it is something else."""
     array = np.asarray(value)
     return float(array) if array.ndim == 0 and array.dtype.kind in "fiu" else None
+
+
+class TensorBoard:
+    """Writes event files into a folder until it cannot.
+
+    Args:
+        folder: Where they go.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._writer: Any = SummaryWriter(str(folder))
+
+    def write(self, numbers: Mapping[str, float], step: int) -> None:
+        """Write numbers at a step."""
+        if self._writer is None:
+            return
+        try:
+            for name, value in numbers.items():
+                self._writer.add_scalar(name, value, step)
+        except OSError:
+            self.close()
+
+    def close(self) -> None:
+        """Let go of the files."""
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            with contextlib.suppress(OSError):
+                writer.close()

@@ -21,12 +21,12 @@ from ray.rllib.connectors.env_to_module.mean_std_filter import MeanStdFilter
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.utils.replay_buffers import EpisodeReplayBuffer, PrioritizedEpisodeReplayBuffer
 
+from bam_envs.core.validation import Finite, Fraction, NonNegative, Positive, PositiveInt, check
 from bam_envs.core.wording import brief, did_you_mean
 from bam_train.errors import SettingsError
 from bam_train.settings import NAMES
 from bam_train.trainers.algorithms import Algorithm
-from bam_train.trainers.library_arguments import fit, fits
-from bam_train.trainers.rllib.ranges import check_ranges
+from bam_train.trainers.library_arguments import fit, fits, ranges
 
 ELSEWHERE = {
     "train_batch_size": "train_batch_size_per_learner",
@@ -122,7 +122,7 @@ def complete(algorithm: Algorithm, given: Mapping[str, Any]) -> dict[str, Any]:
     values["model_config"] = _complete_model(config, given.get("model_config", {}))
     if values["log_std_init"] is not None and not values["model_config"]["free_log_std"]:
         raise SettingsError("log_std_init: only a free standard deviation has one; add model_config.free_log_std=true")
-    check_ranges(values)
+    _require_ranges(values)
     return values
 
 
@@ -258,3 +258,80 @@ def _require_known(name: str, known: Iterable[str], what: str, others: Iterable[
     if name in _OF_THE_OLD_STACK:
         raise SettingsError(f"{name} cannot be set: it belongs to RLlib's old API stack, or bam-train takes care of it")
     raise SettingsError(f"Unknown {what} {name!r}. {did_you_mean(name, [*known, *others])}")
+
+
+# Numbers, schedules and layers that no algorithm can learn with; some of them RLlib takes, and then hangs
+
+_RANGES = ranges(
+    {
+        Fraction: ("gamma", "lambda_", "tau", "expectile", "epsilon"),
+        Positive: (
+            *("lr", "actor_lr", "critic_lr", "alpha_lr", "value_lr", "adam_epsilon"),
+            *("grad_clip", "clip_param", "vf_clip_param", "kl_target", "initial_alpha", "temperature"),
+        ),
+        PositiveInt: (
+            *("train_batch_size_per_learner", "minibatch_size", "num_epochs", "rollout_fragment_length", "n_step"),
+            *("num_atoms", "n_quantiles", "n_critics", "num_actions", "broadcast_interval", "simple_queue_size"),
+            *("circular_buffer_num_batches", "circular_buffer_iterations_per_batch"),
+        ),
+        NonNegative: (
+            *("action_init_scale", "entropy_coeff", "vf_loss_coeff", "vf_coeff", "kl_coeff", "beta", "sigma0"),
+            *(
+                "num_steps_sampled_before_learning_starts",
+                "target_network_update_freq",
+                "top_quantiles_to_drop_per_net",
+            ),
+        ),
+    }
+)
+_LAST = {name: NonNegative if kind is Positive else kind for name, kind in _RANGES.items() if kind is not PositiveInt}
+"""What a schedule may come to: a rate of 0 ends learning, and does no harm at its end."""
+
+
+def _require_ranges(values: Mapping[str, Any]) -> None:
+    """Refuse what no algorithm can learn with among complete hyperparameters.
+
+    Raises:
+        SettingsError: Names it, what was expected and what was found.
+    """
+    for name, value in values.items():
+        if isinstance(value, bool):
+            continue
+        if isinstance(value, (int, float)):
+            check(value, _RANGES.get(name, Finite), name, SettingsError)
+        elif name == "rollout_fragment_length" and value != "auto":
+            raise SettingsError(f"{name}: expected a whole number or 'auto', found {value!r}")
+        elif name == "target_entropy" and value not in (None, "auto"):
+            raise SettingsError(f"{name}: expected a number or 'auto', found {value!r}")
+        elif name == "n_step" and value is not None:
+            _require_span(name, value)
+        elif isinstance(value, list):
+            _require_schedule(name, value)
+    _require_layers(values["model_config"])
+
+
+def _require_span(name: str, value: list[int]) -> None:
+    """Least and most of a number that is drawn."""
+    if not 1 <= value[0] <= value[1]:
+        raise SettingsError(f"{name}: expected [least, most] of at least 1, found {value!r}")
+
+
+def _require_schedule(name: str, value: list[list[float]]) -> None:
+    """Steps that rise from 0, with a value at each."""
+    steps = [pair[0] for pair in value if len(pair) == 2]
+    if len(steps) < max(2, len(value)) or steps[0] != 0 or sorted(set(steps)) != steps:
+        text = "expected a number or a schedule [[0, value], [step, value], ...] with rising steps"
+        raise SettingsError(f"{name}: {text}, found {value!r}")
+    check(value[0][1], _RANGES.get(name, Finite), name, SettingsError)
+    for _, number in value[1:]:
+        check(number, _LAST.get(name, Finite), name, SettingsError)
+
+
+def _require_layers(model_config: Mapping[str, Any]) -> None:
+    """Every layer has a neuron, and there is one layer at least before the heads."""
+    for name, sizes in model_config.items():
+        if not name.endswith("_hiddens") or sizes is None:
+            continue
+        if any(size < 1 for size in sizes) or (name == "fcnet_hiddens" and not sizes):
+            wanted = "one size of a layer or more, each" if name == "fcnet_hiddens" else "sizes of layers of"
+            raise SettingsError(f"model_config.{name}: expected {wanted} at least 1, found {sizes!r}")

@@ -1,4 +1,4 @@
-"""RLlib's `MeanStdFilter`, for many rows at once, and right where several runners are merged.
+"""RLlib's `MeanStdFilter`, for a batch at once, and right where several runners are merged.
 
 A runner sends what it saw since the last merge as "deltas" that `RunningStat.update` takes for the count, mean and sum
 of squares of those observations alone. RLlib's own `RunningStat.push` keeps something else in them (how far the overall
@@ -23,9 +23,9 @@ Array = NDArray[Any]
 
 
 class MeanStdFilter(_MeanStdFilter):  # type: ignore[misc]
-    """RLlib's filter, which `rows` runs over n observations of one array at once. Same name, state and files."""
+    """RLlib's filter, which `normalize` runs over n observations of one array at once. Same name, state and files."""
 
-    def rows(self, observations: Array, update: bool = True) -> NDArray[np.float32]:
+    def normalize(self, observations: Array, update: bool = True) -> NDArray[np.float32]:
         """Normalise observations, and count them in first.
 
         Args:
@@ -44,7 +44,7 @@ class MeanStdFilter(_MeanStdFilter):  # type: ignore[misc]
         return np.asarray(np.clip(value, -own.clip, own.clip) if own.clip else value, np.float32)
 
     def __call__(self, *, episodes: list[Any], **kwargs: Any) -> Any:
-        """As RLlib's, one row after the other; the deltas are mended afterwards."""
+        """As RLlib's, one observation after the other; the deltas are mended afterwards."""
         if self._filters is None:
             self._init_new_filters()
         plain = isinstance(self._filters[None].running_stats, RunningStat) if None in self._filters else False
@@ -53,7 +53,7 @@ class MeanStdFilter(_MeanStdFilter):  # type: ignore[misc]
         space = self.observation_space
         for episode in self.single_agent_episode_iterator(episodes):
             seen = np.asarray(episode.get_observations(indices=-1))
-            filtered = self.rows(seen[None])[0].astype(seen.dtype)
+            filtered = self.normalize(seen[None])[0].astype(seen.dtype)
             episode.set_observations(at_indices=-1, new_data=filtered)
             episode.observation_space = space
         return kwargs["batch"]

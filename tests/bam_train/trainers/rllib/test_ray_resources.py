@@ -10,8 +10,8 @@ import ray
 
 from bam_train.errors import SettingsError
 from bam_train.settings import TrainSettings
-from bam_train.trainers.rllib.cluster import resources
-from bam_train.trainers.rllib.cluster.resources import asked, gpus, learners, require_resources
+from bam_train.trainers.rllib import ray_resources as resources
+from bam_train.trainers.rllib.ray_resources import asked, gpus, learners, require_resources
 
 
 @pytest.fixture(autouse=True)

@@ -17,13 +17,12 @@ from bam_train.environments import is_batched
 from bam_train.errors import BamTrainError, SettingsError
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
-from bam_train.trainers.rllib import hyperparameters
-from bam_train.trainers.rllib.cluster import faults
-from bam_train.trainers.rllib.cluster.cluster import fault_tolerance, learners
-from bam_train.trainers.rllib.registration import register_foreign
-from bam_train.trainers.rllib.sampling.env_runner import RobotEnvRunner, log_end
-from bam_train.trainers.rllib.sampling.filters import MeanStdFilter
-from bam_train.trainers.rllib.sampling.rows import End
+from bam_train.trainers.rllib.mean_std_filter import MeanStdFilter
+from bam_train.trainers.rllib.ray_resources import learners
+from bam_train.trainers.rllib.rllib_hyperparameters import training_arguments
+from bam_train.trainers.rllib.rllib_registration import register_foreign
+from bam_train.trainers.rllib.robot_env_runner import End, RobotEnvRunner, log_end
+from bam_train.trainers.rllib.runner_deaths import fault_tolerance, first_cause_of_death
 
 STEPS_AT_LEAST = 200
 """Steps of an iteration of an algorithm that updates after every few: its overhead is then small."""
@@ -42,7 +41,7 @@ def make_config(settings: TrainSettings, observation_space: Space[Any], action_s
     number, gpus_each = learners(settings)
     config = algorithm.load()()
     config.framework("torch").rl_module(model_config=dict(values["model_config"]))
-    config.training(**hyperparameters.training_arguments(values))
+    config.training(**training_arguments(values))
     config.learners(num_learners=number, num_gpus_per_learner=gpus_each)
     config.debugging(seed=seed, log_level="ERROR")
     config.reporting(min_time_s_per_iteration=0, min_sample_timesteps_per_iteration=_least_steps(settings))
@@ -99,13 +98,13 @@ def _least_steps(settings: TrainSettings) -> int:
 
 
 def _offline(config: Any, settings: TrainSettings, observation_space: Space[Any], action_space: Space[Any]) -> Any:
-    from bam_train.trainers.rllib.offline import add_data
+    from bam_train.trainers.rllib.recorded_episodes import add_data
 
     return add_data(config, settings, observation_space, action_space)
 
 
 _REFUSALS = (
-    *(AssertionError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError),
+    *(AssertionError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError, OSError),
     UnsupportedSpaceException,
 )
 
@@ -119,7 +118,7 @@ def refusals(settings: TrainSettings) -> Iterator[None]:
         raise
     except _REFUSALS as error:
         said = " ".join(str(error).partition("To suppress all validation errors")[0].split()) or type(error).__name__
-        text = faults.take_first(settings.num_env_runners) or said  # RLlib's is about runners that are not there
+        text = first_cause_of_death(settings.num_env_runners) or said  # RLlib's is about runners that are not there
         raise SettingsError(f"{settings.algo} on {settings.env} cannot be set up: {text:.400}") from error
 
 

@@ -29,7 +29,7 @@ from ray.rllib.utils.spaces.space_utils import normalize_action
 
 from bam_train.errors import SettingsError
 from bam_train.settings import TrainSettings
-from bam_train.trainers.rllib.registration import register_foreign
+from bam_train.trainers.rllib.rllib_registration import register_foreign
 
 Array = NDArray[Any]
 

@@ -17,8 +17,8 @@ from ray.cluster_utils import Cluster
 from bam_train.checkpoint import Checkpoint
 from bam_train.errors import ProcessesLost, SettingsError
 from bam_train.trainers.resolve_settings import resolve
-from bam_train.trainers.rllib.cluster.cluster import loopback_only
-from bam_train.trainers.rllib.trainer import RLlibTrainer
+from bam_train.trainers.rllib.ray_cluster import loopback_only
+from bam_train.trainers.rllib.rllib_trainer import RLlibTrainer
 
 pytestmark = pytest.mark.slow
 
@@ -108,9 +108,9 @@ def test_a_runner_and_a_node_die_in_mid_training(nodes, tmp_path):
             cluster.remove_node(second, allow_graceful=False)
             return True
 
-        def ten_more_updates():
+        def three_more_updates():
             plan.later = getattr(plan, "later", 0) + 1
-            return plan.later == 10
+            return plan.later == 3
 
         killed, second_index = None, None
         plan = Plan(trainer, [kill_a_runner])
@@ -120,7 +120,7 @@ def test_a_runner_and_a_node_die_in_mid_training(nodes, tmp_path):
             after(f"env runner {killed} is back"),
             kill_a_node,
             after(f"env runner {second_index} died: what it had not delivered yet is lost"),
-            ten_more_updates,
+            three_more_updates,
         ]
         trainer.train(10**9, plan)
 
@@ -166,7 +166,7 @@ def test_a_runner_that_dies_again_and_again(tmp_path, monkeypatch):
     (tmp_path / "broken.py").write_text(BROKEN)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
-    monkeypatch.setattr("bam_train.trainers.rllib.cluster.fault_tolerance.MOST_DEATHS", 1)
+    monkeypatch.setattr("bam_train.trainers.rllib.runner_deaths.MOST_DEATHS", 1)
     settings = train_settings(None, env="broken:test/Broken-v0", num_envs=1, num_env_runners=1)
     with contextlib.closing(RLlibTrainer.create(settings)) as trainer:
         with pytest.raises(ProcessesLost) as caught:

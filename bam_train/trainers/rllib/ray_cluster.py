@@ -1,0 +1,325 @@
+"""Ray for one training run: a quiet one of its own on this computer, or a cluster that is there already.
+
+The own one listens on the loopback device only, asks for a token that nobody else has, keeps its files in a folder of
+its own, and is gone when the run ends, however it ends. A cluster is joined and left as it was.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib
+import logging
+import os
+import secrets
+import shutil
+import signal
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import ray
+import ray.rllib  # sets up its loggers
+
+from bam_train.errors import TrainingFailed
+from bam_train.settings import TrainSettings
+from bam_train.signals import interrupt, waiting
+from bam_train.trainers.quit_callbacks import at_quit
+from bam_train.trainers.rllib.ray_address import find, reach
+from bam_train.trainers.rllib.ray_resources import cores, gpus, require_resources
+
+try:
+    import fcntl
+except ImportError:  # Windows: folders that were left stay
+    fcntl = None  # type: ignore[assignment]
+
+psutil: Any = importlib.import_module("psutil")  # Ray has it in a folder of its own
+
+OBJECT_STORE = 200 * 2**20
+"""Memory that the own Ray shares samples and weights through [bytes]; they are a few megabytes."""
+
+GRACE = 3.0
+"""How long a process of Ray's may take to end by itself once Ray has shut down [s]."""
+
+_TOKEN = secrets.token_hex(32)
+_LOGGERS = ("ray", "ray.rllib", "ray.tune", "ray.train", "ray.data")
+_MODE, _TOKENS = "RAY_AUTH_MODE", ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
+_PREFIX, _LOCK, _NEW = "bam-ray-", "in-use", "new"
+
+
+@contextlib.contextmanager
+def cluster(settings: TrainSettings) -> Iterator[None]:
+    """Ray for a run, within this; one that runs in this process already is used, and left running.
+
+    Args:
+        settings: `address` is None for a Ray of the run's own, else ``auto`` or ``host:port`` of the cluster to join;
+            runners, learners and GPUs say how much of it is asked for.
+
+    Raises:
+        SettingsError: More is asked for than there is, or the address cannot be one.
+        TrainingFailed: Ray does not start, or the cluster does not answer or let us in; within 20 s.
+    """
+    with _quiet():
+        if ray.is_initialized():
+            require_resources(settings)
+            yield
+        elif settings.address is None:
+            require_resources(settings)
+            with _own(settings):
+                yield
+        else:
+            with _joined(settings.address):
+                require_resources(settings)
+                yield
+
+
+@contextlib.contextmanager
+def _own(settings: TrainSettings) -> Iterator[None]:
+    """A Ray of the run's own, on this computer alone."""
+    before = set(psutil.Process().children())
+    with own_folder() as folder, at_quit(lambda: _abandon(before, folder)), _private_token():
+        try:
+            try:
+                with _starting(), loopback_only(), _out_of_the_group():
+                    ray.init(
+                        address="local",
+                        num_cpus=cores(),
+                        num_gpus=gpus(settings),
+                        object_store_memory=OBJECT_STORE,
+                        include_dashboard=False,
+                        log_to_driver=False,
+                        configure_logging=False,
+                        _temp_dir=str(folder),
+                    )
+            except Exception as error:  # Ray has no one error for what may go wrong with its processes
+                why = str(error).strip().partition("\n")[0].rstrip(".")
+                text = f"Ray does not start on this computer: {why}. Is there enough memory and disk?"
+                raise TrainingFailed(text) from error
+            yield
+        finally:
+            # Another Ctrl-C waits until Ray is gone: half of it would be left. A handler that quits at once may do so.
+            quits = signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+            with contextlib.nullcontext() if quits else waiting():
+                started = _started_since(before)  # with their children: once a parent is gone, they cannot be found
+                with contextlib.suppress(Exception):  # whatever it says about its end, nothing of it must be left
+                    _shut_down(wait_for_processes=True)
+                _end(started)
+
+
+def _started_since(before: set[Any]) -> list[Any]:
+    """The processes below this one whose ancestor here is not among those of `before`."""
+    found: set[Any] = set()
+    for child in set(psutil.Process().children()) - before:
+        found.add(child)
+        with contextlib.suppress(psutil.Error):
+            found.update(child.children(recursive=True))
+    return list(found)
+
+
+def _end(processes: list[Any]) -> None:
+    """Wait until all of them are gone; those that stay are killed."""
+    _, alive = psutil.wait_procs(processes, timeout=GRACE)
+    _kill(alive)
+    psutil.wait_procs(alive, timeout=GRACE)
+
+
+def _kill(processes: list[Any]) -> None:
+    for process in processes:
+        with contextlib.suppress(psutil.Error):
+            process.kill()
+
+
+def _abandon(before: set[Any], folder: Path) -> None:
+    """What `_own` does at its end, without waiting for anything; two of Ray's processes would go on for a minute."""
+    _kill(_started_since(before))
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def own_folder(root: str | None = None) -> Iterator[Path]:
+    """A new folder, within this; those of runs that were killed are removed first.
+
+    A process that is killed removes nothing. A file in the folder is locked for as long as its process lives, so the
+    next run knows which folders are nobody's, whichever number their process had.
+
+    Args:
+        root: Folder to make it in, with a short name, as Ray's sockets in it need; None for the usual one.
+    """
+    root = root or ("/tmp" if os.path.isdir("/tmp") else tempfile.gettempdir())
+    _remove_abandoned(Path(root))
+    folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=root))
+    lock = os.open(folder / _NEW, os.O_CREAT | os.O_RDWR, 0o600)
+    try:
+        if _locked(lock):
+            os.rename(folder / _NEW, folder / _LOCK)  # under this name others try it, and it is locked by now
+        yield folder
+    finally:
+        os.close(lock)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _remove_abandoned(root: Path) -> None:
+    for path in root.glob(f"{_PREFIX}*/{_LOCK}"):
+        with contextlib.suppress(OSError):  # somebody else's
+            lock = os.open(path, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
+            try:
+                if _locked(lock):
+                    shutil.rmtree(path.parent, ignore_errors=True)
+            finally:
+                os.close(lock)
+
+
+def _locked(lock: int) -> bool:
+    """Whether the file could be locked: nobody has it."""
+    if fcntl is None:
+        return False
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def _private_token() -> Iterator[None]:
+    """A token of this process alone for the own Ray, instead of the one that Ray would write into the home folder."""
+    if any(name in os.environ for name in (_MODE, *_TOKENS)):
+        yield  # whoever set them knows
+        return
+    try:
+        with _environment(**{_MODE: "token", _TOKENS[0]: _TOKEN}):
+            _read_token_again()
+            yield
+    finally:
+        _read_token_again()
+
+
+def _read_token_again() -> None:
+    """Ray reads mode and token once, when it is imported."""
+    raylet: Any = importlib.import_module("ray._raylet")
+    raylet.Config.initialize("")
+    raylet.AuthenticationTokenLoader.instance().reset_cache()
+
+
+@contextlib.contextmanager
+def _environment(**variables: str) -> Iterator[None]:
+    """Within this, these environment variables are set so, for what is started too."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@contextlib.contextmanager
+def loopback_only() -> Iterator[None]:
+    """Ray started within this takes 127.0.0.1 for its computer's address, and its servers bind to nothing else.
+
+    `ray.init(_node_ip_address="127.0.0.1")` would not do: Ray puts an address that others can reach in its place,
+    except where clusters are not enabled. It reads that from the environment when it is imported, so its constant is
+    set here: there is no public way to it, and other computers must not reach this Ray.
+    """
+    from ray._private import ray_constants
+
+    before = ray_constants.ENABLE_RAY_CLUSTER
+    ray_constants.ENABLE_RAY_CLUSTER = False
+    try:
+        with _environment(**{ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR: "0"}):
+            yield
+    finally:
+        ray_constants.ENABLE_RAY_CLUSTER = before
+
+
+@contextlib.contextmanager
+def _out_of_the_group() -> Iterator[None]:
+    """Ray started within this has sessions of its own: what a whole process group is sent does not reach it.
+
+    ``timeout``, batch systems and terminals send their signal to the group; Ray's processes would be gone before the
+    update is finished and saved, and Ray has no public way to start them elsewhere. They end with this process as
+    before, as Linux kills them then. On other systems Ray itself kills the group for that, so they stay in it.
+    """
+    from ray._private import services, utils
+
+    if not (sys.platform == "linux" and utils.detect_fate_sharing_support()):
+        yield
+        return
+    before = services.ConsolePopen
+    services.ConsolePopen = functools.partial(before, start_new_session=True)
+    try:
+        yield
+    finally:
+        services.ConsolePopen = before
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Within this, Ray's and RLlib's loggers say nothing: `RunnerWatch` and errors say what the user needs to know."""
+    loggers = [logging.getLogger(name) for name in _LOGGERS]
+    before = [(logger, logger.handlers[:], logger.propagate) for logger in loggers]
+    _hush()
+    try:
+        yield
+    finally:
+        for logger, handlers, propagate in before:
+            logger.handlers[:], logger.propagate = handlers, propagate
+
+
+@contextlib.contextmanager
+def _starting() -> Iterator[None]:
+    """Around `ray.init`: its C++ part learns to be quiet, and says so on standard error; signals wait.
+
+    An exception that a signal raises would make the C++ part abort. `ray.init` handles SIGTERM itself, by SystemExit.
+    """
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        with waiting(), _environment(RAY_BACKEND_LOG_LEVEL="fatal"):
+            os.dup2(nowhere, 2)
+            try:
+                yield
+            finally:
+                os.dup2(kept, 2)
+    except SystemExit as end:
+        interrupt(int(end.code or signal.SIGTERM))
+    finally:
+        os.close(kept)
+        os.close(nowhere)
+        _hush()
+
+
+def _hush() -> None:
+    """Take their handlers from the loggers of Ray; `ray.init` does that too, and leaves none."""
+    for name in _LOGGERS:
+        logger = logging.getLogger(name)
+        logger.handlers[:], logger.propagate = [logging.NullHandler()], False
+
+
+@contextlib.contextmanager
+def _joined(address: str) -> Iterator[None]:
+    """A cluster that is there already."""
+    place = find(address)
+    reach(place)
+    try:
+        with _starting():
+            ray.init(address=place, log_to_driver=False, configure_logging=False)
+        yield
+    finally:
+        _shut_down()
+
+
+def _shut_down(**given: bool) -> None:
+    """Shut Ray down; its C++ part leaves SIGTERM to kill the process, so the handler is installed once more."""
+    try:
+        ray.shutdown(**given)
+    finally:
+        handler = signal.getsignal(signal.SIGTERM)
+        if handler is not None and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, handler)

@@ -1,1 +1,0 @@
-"""Collecting samples: one batched simulation in each runner."""
