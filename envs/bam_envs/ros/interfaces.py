@@ -1,7 +1,7 @@
 """Messages are checked against their types before anything else sees them: fields, types, ranges, finite numbers.
 
 A message of a known type (`definitions`) comes out complete: what it leaves out gets the type's default. Of an unknown
-type only plain values are taken. Nothing that is not finite, and no null, gets through either way.
+type only plain values are taken. Values that are not finite and nulls are refused in both cases.
 """
 
 from __future__ import annotations

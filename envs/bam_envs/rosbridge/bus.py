@@ -89,7 +89,7 @@ class Bus(Protocol):
         """Call `callback` when a caller's connection ends, where the bus knows; elsewhere never."""
 
     def close(self) -> None:
-        """Stop serving and let go of everything. As often as one likes."""
+        """Stop serving and release everything. Idempotent."""
 
 
 def namespaces_with(link: Any, kind: Literal["topics", "services"], name: str) -> str:

@@ -101,7 +101,7 @@ class RosbridgeLink:
         """Connect, and see that the server answers. Afterwards the link comes back by itself whenever it drops.
 
         Raises:
-            NoServer: There is none, or not one that can be used; the text says which of many reasons.
+            NoServer: There is no server that can be used; the text says why.
             InvalidValue: The CA file cannot be read.
             LinkLost: The link was closed, or dropped and is not back yet.
         """
@@ -261,9 +261,9 @@ class RosbridgeLink:
                 the server itself allows. In the first case nothing was sent; in the others what was asked may have been
                 done.
             RemoteError: The service, or the server, refused or failed.
-            ProtocolError: The response is none.
-            InvalidValue: A number in `args` is not finite or not plain; `timeout` is none; or called on the network
-                thread.
+            ProtocolError: The response has no fields.
+            InvalidValue: A number in `args` is not finite or not plain, `timeout` is not a time, or the caller is the
+                network thread.
         """
         self._require_waiting_allowed("call")
         if not isinstance(timeout, int | float) or not 0.0 < timeout < float("inf"):
@@ -491,7 +491,7 @@ class RosbridgeLink:
             connection.pass_over(f"a message with op {operation!r:.40}")
 
     def _answer(self, connection: Connection, request: dict[str, Any]) -> None:
-        """Have a request answered off the network thread, which waits for nobody."""
+        """Answer a request of the server in a worker thread; the network thread waits for no handler."""
         service = request.get("service")
         response = {"op": "service_response", "service": service, "id": request.get("id")}
         handler = self._declarations.handler(str(service))

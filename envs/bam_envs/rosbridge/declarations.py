@@ -112,7 +112,7 @@ class Declarations:
             return [*self._topics.values(), *services, *(entry.request for entry in self._subscriptions.values())]
 
     def farewell(self) -> list[dict[str, Any]]:
-        """What to take back before leaving: some servers keep a service that nobody answers any more."""
+        """What to take back before leaving: some servers keep a service whose client has left."""
         with self._lock:
             return [
                 *({"op": "unadvertise_service", "service": service} for service in self._services),

@@ -1,7 +1,7 @@
 """The embedded rosbridge server: the protocol of `bridge` on WebSockets, in a thread of its own.
 
-The thread of the network runs the protocol and the listeners; handlers of services run in a pool of threads, and what
-is long is read in a thread of its own, so that nobody's halt waits for it. A client that sends nonsense, does not read,
+The network thread runs the protocol and the listeners; handlers of services run in a pool of threads, and long messages
+are read in a thread of their own, so that no halt waits for them. A client that sends nonsense, does not read,
 or opens sockets and says nothing costs a bounded amount of memory and time.
 """
 

@@ -18,7 +18,7 @@ from bam_envs.rosbridge.tokens import Role
 TRY_AGAIN_LATER = 1013
 """Close code of a client that does not read what it must get."""
 _STRANGERS, _STRANGERS_OF_ONE = 128, 32
-"""Sockets that nobody has been let in through yet: of all, and of one address. The oldest is closed for a new one."""
+"""Most sockets without an admitted client, in all and of one address. The oldest is closed for a new one."""
 _OF_A_STRANGER = 65536
 """What a stranger may say [bytes]."""
 _FRAME = 200
@@ -110,7 +110,7 @@ class BridgeConnection(ServerConnection):
         return self._waiting + len(self.protocol.reader.buffer)
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """asyncio: a socket opened. Sockets that say nothing keep nobody out: the oldest is closed for a new one."""
+        """asyncio: a socket opened. Of those that say nothing the oldest is closed, so that they keep no client out."""
         super().connection_made(transport)
         self.host = str((self.remote_address or [""])[0])
         self._sockets.add(self)

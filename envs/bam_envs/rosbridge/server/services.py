@@ -1,6 +1,6 @@
 """The services of a rosbridge server: who offers them, which calls are unanswered. Every call is answered.
 
-Each of the ways in which a call can end is in this file: that none is missing is to be seen here.
+Every end that a call can have is in this file, which shows that none is missing.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from bam_envs.rosbridge.server.client_session import Event, Invoke, Send, Sessio
 from bam_envs.rosbridge.server.outgoing import Packet, Wire, pack
 
 _LENIENT = ("bam_msgs/GymAPI",)
-"""Types that are still growing: fields of a newer version are ignored, as on every other way to an environment."""
+"""Types that are still growing: fields of a newer version are ignored, as every transport does."""
 _LONGEST_NUMBER = 20
 """Digits of the number of a call."""
 _logger = logging.getLogger(__name__)
@@ -186,7 +186,7 @@ class Services:
             )
         except BamEnvsError as error:
             return _packed(call, str(error), False)
-        # A caller is always answered, whatever the handler of somebody else does.
+        # A caller is always answered, whatever the handler, which is foreign code, does.
         except Exception as error:
             _logger.exception("The handler of %s failed.", call.service.name)
             line = " ".join(f"{type(error).__name__}: {error}".split())

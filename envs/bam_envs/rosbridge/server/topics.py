@@ -114,11 +114,11 @@ class Topic:
 
     @property
     def is_ours(self) -> bool:
-        """Whether this process publishes it: what it says, such as where its robot is, nobody says in its place."""
+        """Whether this process publishes it: then no client may, or it could say where the robot is."""
         return None in self.publishers
 
     def packed(self, publication: Publication) -> Publication:
-        """`publication`, packed for those who get it at once, so that nobody else waits for that. From any thread."""
+        """`publication`, packed for the subscribers that get it at once. In any thread: the network thread need not."""
         for stream in list(self.streams.values()):
             if stream.is_prompt:
                 publication.packet(stream.name, stream.wish.wire)
