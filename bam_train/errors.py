@@ -29,7 +29,6 @@ Third-party errors are mapped to these at the border, with the cause kept by ``f
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -103,10 +102,12 @@ class UnknownVariable(LoopError, LookupError):  # noqa: N818 - reads as what hap
     """
 
     def __init__(self, name: str, known: Iterable[str], role: str = "") -> None:
+        from bam_envs.core.wording import closest  # not above: a policy alone needs no environments
+
         self.name = name
         names = sorted(known)
-        close = difflib.get_close_matches(str(name), names, n=1)
-        question = f", did you mean {close[0]!r}?" if close else "."
+        close = closest(name, names, cutoff=0.6)
+        question = "." if close is None else f", did you mean {close!r}?"
         has = f" It has {', '.join(map(repr, names))}." if names else " It is empty."
         super().__init__(f"{role} {name!r} is not in the workspace{question}{has}".lstrip())
 

@@ -134,12 +134,11 @@ def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSe
         del asked["normalize"]
     settings = TrainSettings.from_mapping(merge(own, asked), str(checkpoint.path))
     require_algorithm(settings.trainer, settings.algo)
-    for name, wanted, found in differences(asked, own):
-        if name not in CHANGEABLE and found is not None:
-            raise _mismatch(checkpoint, name, wanted, found)
+    fixed = [row for row in differences(asked, own) if row[0] not in CHANGEABLE]
+    _require_same([row for row in fixed if row[2] is not None], checkpoint)
     _require_of_trainer(settings)
-    completed = load_trainer(settings.trainer).complete(settings)
-    _require_same(asked, own, checkpoint)
+    completed = load_trainer(settings.trainer).complete(settings)  # refuses names that the algorithm does not have
+    _require_same(fixed, checkpoint)
     _require_steps_left(checkpoint, completed)
     return completed
 
@@ -175,16 +174,11 @@ def _tuned_as(env: str) -> str:
     return env if entry is None else entry.id
 
 
-def _require_same(asked: Mapping[str, Any], own: Mapping[str, Any], checkpoint: Checkpoint) -> None:
-    """Refuse what the checkpoint has no value for at all."""
-    for name, wanted, found in differences(asked, own):
-        if name not in CHANGEABLE:
-            raise _mismatch(checkpoint, name, wanted, found)
-
-
-def _mismatch(checkpoint: Checkpoint, name: str, wanted: Any, found: Any) -> CheckpointMismatch:
-    message = f"was trained with {name} {found!r}, not {wanted!r}. Leave {name} out to go on with it, or train anew"
-    return CheckpointMismatch(checkpoint.path, message)
+def _require_same(differing: list[tuple[str, Any, Any]], checkpoint: Checkpoint) -> None:
+    """Refuse the first setting that is asked for otherwise than the checkpoint has it."""
+    for name, wanted, found in differing[:1]:
+        text = f"was trained with {name} {found!r}, not {wanted!r}. Leave {name} out to go on with it, or train anew"
+        raise CheckpointMismatch(checkpoint.path, text)
 
 
 def _require_steps_left(checkpoint: Checkpoint, settings: TrainSettings) -> None:
