@@ -111,7 +111,7 @@ _NO_SETTINGS = frozenset({"env_id", "render_mode", "task_options", "timeout"}) |
 
 
 def is_batched(env_id: str) -> bool:
-    """Whether `env_id` is one of ours, whose rows share one batched simulation."""
+    """Whether `env_id` is one of ours, of which any number share one batched simulation."""
     return entry_of(env_id) is not None
 
 
@@ -184,7 +184,7 @@ def require_one(transports: tuple[str, ...]) -> str:
     return transports[0]
 
 
-def make_rows(
+def make_vector_env(
     env_id: str, env_kwargs: Mapping[str, Any] | None, num_envs: int, place: Place = HERE
 ) -> VectorEnv[Any, Any, Any]:
     """`num_envs` environments stepped together, with automatic resets in the same step.

@@ -18,9 +18,9 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from bam_envs.core.validation import NonNegativeInt, PositiveInt, check
-from bam_train.environments import is_batched, make_rows
+from bam_train.environments import is_batched, make_vector_env
 from bam_train.errors import SettingsError
-from bam_train.finite_envs import FiniteRows
+from bam_train.finite_envs import FiniteVectorEnv
 from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, VecGymAgent, Workspace
 from bam_train.loop.gym.gym_observations import names
 from bam_train.loop.video_agent import VideoAgent
@@ -145,7 +145,7 @@ def evaluate(
         episodes: How many episodes count; at least 1.
         seed: Seed of the first episode; episode k gets ``seed + k``.
         num_envs: Environments stepped side by side; by default as many as is quick and not more than `episodes`.
-        env: A vector environment made by `make_rows` to use instead of making one; it is left open.
+        env: A vector environment made by `make_vector_env` to use instead of making one; it is left open.
         on_progress: Called after every wave of environments.
 
     Raises:
@@ -246,9 +246,9 @@ def _batch(
     if env is not None:
         if env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
             raise SettingsError(f"env: expected autoreset mode SAME_STEP, found {env.metadata.get('autoreset_mode')}")
-        yield FiniteRows(env, env_id)
+        yield FiniteVectorEnv(env, env_id)
         return
-    own = FiniteRows(make_rows(env_id, env_kwargs, num_envs or default_num_envs(env_id, episodes)), env_id)
+    own = FiniteVectorEnv(make_vector_env(env_id, env_kwargs, num_envs or default_num_envs(env_id, episodes)), env_id)
     try:
         yield own
     finally:

@@ -49,7 +49,7 @@ class FiniteEnv(gym.Wrapper[Any, Any, Any, Any]):
             raise _failed(self, self._name, *found, self._steps, self._index)
 
 
-class FiniteRows(VectorWrapper):
+class FiniteVectorEnv(VectorWrapper):
     """A vector environment whose observations and rewards are finite; its environments restart in the same step.
 
     Args:

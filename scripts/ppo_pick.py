@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 from bam_envs.core.errors import BamEnvsError
-from bam_train.environments import make_rows
+from bam_train.environments import make_vector_env
 from bam_train.errors import BamTrainError
 from bam_train.evaluation import FIRST_SEED, evaluate
 from bam_train.loop import Agent, Agents, TemporalAgent, VecGymAgent, Workspace, gae
@@ -106,7 +106,7 @@ def train(seed: int, steps: int, until: float, num_envs: int, episodes: int) -> 
     start, workspace, taken, rollouts, rate = time.monotonic(), Workspace(), 0, 0, 0.0
     torch.set_num_threads(1)
     torch.manual_seed(seed)
-    envs = VecGymAgent(lambda: make_rows(ENV, None, num_envs), seed=seed)
+    envs = VecGymAgent(lambda: make_vector_env(ENV, None, num_envs), seed=seed)
     actor, critic = Actor(*envs.get_obs_and_actions_sizes()), Critic(envs.get_obs_and_actions_sizes()[0])
     optimiser = torch.optim.Adam([*actor.parameters(), *critic.parameters()], lr=RATE, eps=1e-5, fused=True)
     collect = TemporalAgent(Agents(envs, actor, Clip()))

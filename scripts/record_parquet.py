@@ -20,7 +20,7 @@ import numpy as np
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.experiment import ScriptParser, whole
 from bam_train.cli.program import guarded
-from bam_train.environments import environment_of, make_rows
+from bam_train.environments import environment_of, make_vector_env
 from bam_train.errors import OutputError
 from bam_train.policy import FrozenPolicy
 
@@ -36,7 +36,7 @@ def main() -> None:
     checkpoint = Checkpoint.open(options.checkpoint.expanduser())
     policy = FrozenPolicy.from_checkpoint(checkpoint)
     folder = make_folder(options.out.expanduser())
-    rows = make_rows(*environment_of(checkpoint, options.env), min(options.num_envs, options.episodes))
+    rows = make_vector_env(*environment_of(checkpoint, options.env), min(options.num_envs, options.episodes))
     episodes = record(rows, policy, options.episodes, options.seed, options.noise)
     rows.close()
     files = write(episodes, folder)

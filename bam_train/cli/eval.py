@@ -34,7 +34,7 @@ class Subject:
 
 def evaluate_checkpoint(config: EvalConfig) -> int:
     """The program, with its arguments read."""
-    from bam_train.environments import make_rows, require_fit
+    from bam_train.environments import make_vector_env, require_fit
     from bam_train.evaluation import default_num_envs, evaluate
     from bam_train.trainers.sb3.plain_sb3_zip import is_plain_sb3
     from bam_train.video import require_video_path
@@ -44,7 +44,9 @@ def evaluate_checkpoint(config: EvalConfig) -> int:
     subject = _foreign(config, path) if is_plain_sb3(path) else _own(config, path)
     if video is not None:
         _require_picture(subject)
-    rows = make_rows(subject.env, subject.env_kwargs, config.num_envs or default_num_envs(subject.env, config.episodes))
+    rows = make_vector_env(
+        subject.env, subject.env_kwargs, config.num_envs or default_num_envs(subject.env, config.episodes)
+    )
     try:
         if subject.checkpoint is not None:
             require_fit(subject.checkpoint, rows)

@@ -82,11 +82,11 @@ def make_env(config: ServeConfig) -> Env:
         UnknownName: Nothing of that name is registered.
     """
     from bam_envs.core.registry import resolve_id
-    from bam_train.environments import make_env, make_rows
+    from bam_train.environments import make_env, make_vector_env
 
     env_id, kwargs = resolve_id(config.env), env_kwargs(config.set)
     _require_known(env_id, kwargs)
-    return make_env(env_id, kwargs) if config.num_envs == 1 else make_rows(env_id, kwargs, config.num_envs)
+    return make_env(env_id, kwargs) if config.num_envs == 1 else make_vector_env(env_id, kwargs, config.num_envs)
 
 
 def _require_known(env_id: str, kwargs: dict[str, Any]) -> None:

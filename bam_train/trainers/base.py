@@ -105,7 +105,7 @@ class Trainer(Protocol):
     def undisturbed(self) -> AbstractContextManager[None]:
         """Do something between two updates, an evaluation say, that leaves training's random numbers as they were."""
 
-    def evaluation_rows(self) -> AbstractContextManager[VectorEnv[Any, Any, Any] | None]:
+    def evaluation_envs(self) -> AbstractContextManager[VectorEnv[Any, Any, Any] | None]:
         """What to evaluate on between two updates, where no other environments can be made; None: make some."""
 
     def log(self, metrics: Mapping[str, float]) -> None:

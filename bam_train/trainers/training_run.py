@@ -242,7 +242,7 @@ class TrainingRun:
     def _evaluate(self) -> None:
         """Evaluate the frozen policy; the best is kept."""
         steps = self._evaluated_at = self.trainer.steps
-        with self.trainer.undisturbed(), self.trainer.evaluation_rows() as envs:
+        with self.trainer.undisturbed(), self.trainer.evaluation_envs() as envs:
             last = steps >= self.settings.steps
             report, self._reached = judge(self.trainer.freeze(), self.settings, last=last, envs=envs)
         if report.success_rate is None and self.settings.until_success is not None and self._report is None:

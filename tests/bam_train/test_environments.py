@@ -18,7 +18,7 @@ from bam_train.environments import (
     first_difference,
     is_batched,
     make_env,
-    make_rows,
+    make_vector_env,
     require_fit,
 )
 from bam_train.errors import CheckpointMismatch, SettingsError
@@ -26,7 +26,7 @@ from bam_train.errors import CheckpointMismatch, SettingsError
 
 def test_rows_reset_in_the_same_step(corridor):
     for env_id in (corridor, "CartPole-v1", *ENVIRONMENTS):
-        rows = make_rows(env_id, None, 2)
+        rows = make_vector_env(env_id, None, 2)
         assert rows.num_envs == 2
         assert rows.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
         rows.close()
@@ -34,7 +34,7 @@ def test_rows_reset_in_the_same_step(corridor):
 
 def test_arguments_reach_the_environment(corridor):
     assert make_env(corridor, {"slow": True}).unwrapped.slow
-    rows = make_rows(corridor, {"slow": True}, 2)
+    rows = make_vector_env(corridor, {"slow": True}, 2)
     assert rows.get_attr("slow") == (True, True)
     rows.close()
 
@@ -57,7 +57,7 @@ def test_only_ours_are_batched(corridor):
     ],
 )
 def test_what_cannot_be_made(corridor, env_id, kwargs, message):
-    for make in (make_env, lambda *arguments: make_rows(*arguments, 2)):
+    for make in (make_env, lambda *arguments: make_vector_env(*arguments, 2)):
         with pytest.raises(SettingsError) as caught:
             make(env_id, kwargs)
         assert str(caught.value).startswith(message)
@@ -134,7 +134,7 @@ def test_signals_and_period_must_fit(corridor, corridor_checkpoint, fields, mess
 
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_every_environment_of_ours_fits_what_it_says_of_itself(corridor_checkpoint, env_id):
-    env, rows = make_env(env_id), make_rows(env_id, None, 2)
+    env, rows = make_env(env_id), make_vector_env(env_id, None, 2)
     said = {
         "observation_space": space_to_json(env.observation_space),
         "action_space": space_to_json(env.action_space),
@@ -230,7 +230,7 @@ def test_an_environment_that_only_the_manifest_knows(corridor_checkpoint):
 
 
 def test_rows_fit_as_one_environment_does(corridor, corridor_checkpoint):
-    rows = make_rows(corridor, None, 3)
+    rows = make_vector_env(corridor, None, 3)
     require_fit(Checkpoint.open(corridor_checkpoint()), rows)
     rows.close()
 

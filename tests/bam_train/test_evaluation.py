@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from bam_envs.core.registry import ENVIRONMENTS
-from bam_train.environments import make_rows
+from bam_train.environments import make_vector_env
 from bam_train.errors import PolicyError, SettingsError
 from bam_train.evaluation import (
     Episode,
@@ -87,7 +87,7 @@ def test_json_is_plain(corridor):
 
 def test_recurrent_state_is_forgotten_at_the_start_of_every_wave(corridor, starting_cell):
     policy = Always(1)
-    rows = make_rows(corridor, None, 2)
+    rows = make_vector_env(corridor, None, 2)
     seed = next(seed for seed in range(100) if starting_cell(seed) == 3 and starting_cell(seed + 1) == 2)
     waves = [play_wave(rows, policy, seed, 2) for _ in range(2)]
     rows.close()
@@ -97,7 +97,7 @@ def test_recurrent_state_is_forgotten_at_the_start_of_every_wave(corridor, start
 
 
 def test_given_rows_are_used_again_and_left_open(corridor):
-    rows = make_rows(corridor, None, 4)
+    rows = make_vector_env(corridor, None, 4)
     policy = Always(1)
     first = evaluate(policy, corridor, episodes=6, seed=1, env=rows)
     again = evaluate(policy, corridor, episodes=6, seed=1, env=rows)
@@ -186,7 +186,7 @@ class Steady:
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_an_episode_depends_on_its_seed_and_on_no_other_episode(env_id):
     options = {"max_episode_steps": 40}
-    rows = make_rows(env_id, options, 4)
+    rows = make_vector_env(env_id, options, 4)
     policy = Steady(rows.single_action_space.shape[0])
     together = evaluate(policy, env_id, episodes=4, seed=3, env=rows)
     rows.close()
@@ -200,7 +200,7 @@ def test_given_rows_are_left_open_after_an_exception():
         def act_batch(self, observations):
             return np.full((len(observations), 1), np.nan, np.float32)
 
-    rows = make_rows("Pendulum-v1", None, 2)
+    rows = make_vector_env("Pendulum-v1", None, 2)
     with pytest.raises(PolicyError):
         evaluate(Broken(), "Pendulum-v1", episodes=2, env=rows)
     assert not rows.closed

@@ -9,10 +9,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from bam_train.environments import make_rows
+from bam_train.environments import make_vector_env
 from bam_train.errors import EnvironmentFailed
 from bam_train.evaluation import evaluate
-from bam_train.finite_envs import FiniteEnv, FiniteRows
+from bam_train.finite_envs import FiniteEnv, FiniteVectorEnv
 from bam_train.trainers.sb3.sb3_vec_env import make_training_env
 
 CASES = [
@@ -48,7 +48,7 @@ def test_one_environment(spoilt, kwargs, text):
 @pytest.mark.parametrize(("kwargs", "text"), CASES)
 def test_rows(spoilt, kwargs, text):
     """Also in what is observed last, which the first observation of the next episode stands in for."""
-    rows = FiniteRows(make_rows(spoilt, kwargs, 3), spoilt)
+    rows = FiniteVectorEnv(make_vector_env(spoilt, kwargs, 3), spoilt)
 
     def play():
         rows.reset(seed=1)
@@ -93,7 +93,7 @@ def test_evaluation(spoilt):
 
 
 def test_rows_are_otherwise_the_environments_own():
-    rows = FiniteRows(make_rows("bam/reach-v0", {}, 2), "bam/reach-v0")
+    rows = FiniteVectorEnv(make_vector_env("bam/reach-v0", {}, 2), "bam/reach-v0")
     assert rows.period == rows.unwrapped.period
     rows.reset(seed=3)
     other = copy.deepcopy(rows)

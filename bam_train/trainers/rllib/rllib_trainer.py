@@ -278,7 +278,7 @@ class RLlibTrainer:
             yield
 
     @contextlib.contextmanager
-    def evaluation_rows(self) -> Iterator[VectorEnv[Any, Any, Any] | None]:
+    def evaluation_envs(self) -> Iterator[VectorEnv[Any, Any, Any] | None]:
         """None: evaluation makes its own."""
         yield None
 

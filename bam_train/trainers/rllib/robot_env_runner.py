@@ -32,9 +32,9 @@ from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 from ray.rllib.utils.metrics import RLMODULE_INFERENCE_TIMER, WEIGHTS_SEQ_NO
 from ray.rllib.utils.spaces.space_utils import clip_action, unsquash_action
 
-from bam_train.environments import is_batched, make_rows
+from bam_train.environments import is_batched, make_vector_env
 from bam_train.errors import SettingsError
-from bam_train.finite_envs import FiniteRows
+from bam_train.finite_envs import FiniteVectorEnv
 from bam_train.trainers.rllib.mean_std_filter import MeanStdFilter
 from bam_train.trainers.rllib.runner_deaths import FaultReporting
 
@@ -92,7 +92,7 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
             )
         kwargs = dict(self.config.env_config)
         with _cores(self.config.num_cpus_per_env_runner if self.worker_index else None):
-            self.env = FiniteRows(make_rows(env_id, kwargs, self.config.num_envs_per_env_runner), env_id)
+            self.env = FiniteVectorEnv(make_vector_env(env_id, kwargs, self.config.num_envs_per_env_runner), env_id)
         if self.env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
             raise SettingsError(f"{env_id}: expected environments that restart in the same step")
         self.num_envs = self.env.num_envs

@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint, write_checkpoint
-from bam_train.environments import make_env, make_rows, require_fit
+from bam_train.environments import make_env, make_vector_env, require_fit
 from bam_train.errors import TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
@@ -45,8 +45,8 @@ _FINITE = "expected finite numbers: try a smaller learning_rate"
 def _look(settings: TrainSettings) -> tuple[int, Space[Any], Space[Any]]:
     """How many environments there are, as many as the servers have where they run elsewhere; what they see and do."""
     if settings.transport:
-        with contextlib.closing(make_rows(settings.env, {}, 1, settings.place)) as rows:
-            return rows.num_envs, rows.single_observation_space, rows.single_action_space
+        with contextlib.closing(make_vector_env(settings.env, {}, 1, settings.place)) as envs:
+            return envs.num_envs, envs.single_observation_space, envs.single_action_space
     with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
         return settings.num_envs, env.observation_space, env.action_space
 
@@ -234,7 +234,7 @@ class SB3Trainer:
             yield
 
     @contextlib.contextmanager
-    def evaluation_rows(self) -> Iterator[VectorEnv[Any, Any, Any] | None]:
+    def evaluation_envs(self) -> Iterator[VectorEnv[Any, Any, Any] | None]:
         """The environments that training uses, where there can be no others; its running episodes end there."""
         if not self.settings.transport:
             yield None

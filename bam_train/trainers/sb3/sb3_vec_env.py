@@ -15,9 +15,9 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from bam_train.env_location import HERE, Place
-from bam_train.environments import is_batched, make_env, make_rows
+from bam_train.environments import is_batched, make_env, make_vector_env
 from bam_train.errors import SettingsError
-from bam_train.finite_envs import FiniteEnv, FiniteRows
+from bam_train.finite_envs import FiniteEnv, FiniteVectorEnv
 from bam_train.trainers.zero_based_spaces import from_zero
 
 Observations = Any
@@ -31,7 +31,7 @@ def make_training_env(env_id: str, env_kwargs: Mapping[str, Any], num_envs: int,
         SettingsError: The environment cannot be made.
     """
     if is_batched(env_id) or place.transport:
-        return BatchVecEnv(make_rows(env_id, env_kwargs, num_envs, place), env_id)
+        return BatchVecEnv(make_vector_env(env_id, env_kwargs, num_envs, place), env_id)
 
     def make_one(index: int) -> Monitor:
         return Monitor(from_zero(FiniteEnv(make_env(env_id, env_kwargs), env_id, index)))
@@ -58,7 +58,7 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         start = getattr(batch.single_action_space, "start", 0)
         if np.any(start):
             raise SettingsError(f"{batch}: expected actions that count from 0, found {batch.single_action_space}")
-        self.batch = FiniteRows(batch, env_id)
+        self.batch = FiniteVectorEnv(batch, env_id)
         super().__init__(batch.num_envs, batch.single_observation_space, batch.single_action_space)
         self._dict = isinstance(batch.single_observation_space, spaces.Dict)
         self._returns = np.zeros(self.num_envs)

@@ -77,7 +77,7 @@ class Counter:
     def undisturbed(self):
         return nullcontext()
 
-    def evaluation_rows(self):
+    def evaluation_envs(self):
         return nullcontext(self.rows)
 
     def log(self, metrics):

@@ -17,7 +17,7 @@ from ray.rllib.connectors.env_to_module.mean_std_filter import MeanStdFilter as 
 from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 from ray.rllib.utils.filter import RunningStat
 
-from bam_train.environments import make_rows
+from bam_train.environments import make_vector_env
 from bam_train.trainers.rllib.mean_std_filter import MeanStdFilter, forget_deltas, push
 from bam_train.trainers.rllib.rllib_registration import register
 from bam_train.trainers.rllib.robot_env_runner import RobotEnvRunner, Rollout, Running
@@ -165,6 +165,6 @@ def _collected(kind, rows):
 
 
 def test_rows_of_ours_restart_in_the_same_step():
-    rows = make_rows("bam/reach-v0", {}, 2)
+    rows = make_vector_env("bam/reach-v0", {}, 2)
     assert rows.metadata["autoreset_mode"].value == "SameStep"
     rows.close()

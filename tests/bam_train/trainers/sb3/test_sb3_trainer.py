@@ -65,7 +65,7 @@ def test_it_trains_on_as_many_rows_as_the_servers_have(walk, rows, counts, tmp_p
         assert settings.num_envs == sum(count or 1 for count in counts)
         trainer = SB3Trainer.create(settings)
         trainer.train(96, lambda progress: True)
-        with trainer.evaluation_rows() as lent:
+        with trainer.evaluation_envs() as lent:
             assert lent.num_envs == settings.num_envs
             lent.reset(seed=1)
         trainer.train(trainer.steps + 32 * settings.num_envs, lambda progress: True)
