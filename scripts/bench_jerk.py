@@ -110,7 +110,7 @@ class DrivenArm(SimulatedArm):
             self.positions.append(self.physics.qpos[0, :6].copy())
             self.targets.append(wanted + (goal - wanted) * k / PHYSICS_STEPS)
         self._wanted = goal
-        yield self._measure(self._all_rows)
+        yield self._measure(self._all)
 
     def _take(self, goal: Array) -> None:
         """A new command replaces the one that runs."""

@@ -14,10 +14,10 @@ from bam_envs.core.task import Array, Flags, Floats, Label, Score
 from bam_envs.robots.ur import JOINTS, START
 from bam_envs.tasks.isaac_reach import TOOL1, IsaacReachTask
 from bam_envs.tasks.ur_arm import UrTask, in_frame, joint_labels, normalised, spherical
-from bam_envs.tasks.ur_avoidance import SPREAD, UrAvoidanceTask, UrObstacleTask, obstacle_labels
+from bam_envs.tasks.ur_avoidance import COLLISION, SPREAD, UrAvoidanceTask, UrObstacleTask, obstacle_labels
 from bam_envs.tasks.ur_empty import UrEmptyTask
 from bam_envs.tasks.ur_reach import UrReachTask
-from bam_envs.tasks.ur_track import COLLISION, FIXED_PATHS, UrTrackTask
+from bam_envs.tasks.ur_track import FIXED_PATHS, UrTrackTask
 
 _INF = np.inf
 _UNSCALED = ("1", "1", "1")

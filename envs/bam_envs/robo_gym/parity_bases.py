@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -119,7 +120,8 @@ class Mir100AvoidanceParity(DriveParity, Mir100AvoidanceTask):
         near: Flags = np.fmin(np.fmin.reduce(front, axis=1), np.fmin.reduce(back, axis=1)) < NEAREST
         near &= ~np.isnan(front[:, 0])  # Python's min() never leaves a first number that is none
         near |= self._corner_near_box(state.signals["base_pose"])
-        failed: Flags = near | state.truth.get("collision", np.False_)
+        touching: Any = state.truth.get("collision", False)
+        failed: Flags = near | touching
         return failed
 
     def _corner_near_box(self, pose: Array) -> Flags:

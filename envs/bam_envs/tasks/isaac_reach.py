@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from bam_envs.core.errors import InvalidValue
-from bam_envs.core.kinematics import quaternions
+from bam_envs.core.kinematics import angle_between, from_angles, quaternions
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.rotations import angle_between, from_angles
 from bam_envs.core.task import Array, Flags, Floats, Label, Score
 from bam_envs.tasks.ur_arm import UrTask, collisions, frame_keys, joint_labels, joint_option, number_option, wire_states
 

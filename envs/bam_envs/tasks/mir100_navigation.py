@@ -274,7 +274,7 @@ class Mir100NavigationTask(DriveTask):
 
     def failed(self, state: RobotState) -> Flags:
         """Whether the base left the floor. Shape: (n,)."""
-        outside: Flags = (np.abs(state.signals["base_pose"][:, :2]) > BOUNDARY).any(axis=1)
+        outside: Flags = np.any(np.abs(state.signals["base_pose"][:, :2]) > BOUNDARY, axis=1)
         return outside
 
 

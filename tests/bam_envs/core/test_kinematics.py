@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bam_envs.core.kinematics import LINKS, UR5E, cube_yaw_phase, quaternions
+from bam_envs.core.kinematics import LINKS, UR5E, angle_between, cube_yaw_phase, from_angles, quaternions
 from bam_envs.robots.physics.mujoco_batch import MODELS
 from bam_envs.robots.ur import UR_MODELS
 from bam_envs.robots.ur5e import GEOMETRY
@@ -186,3 +186,33 @@ def test_quaternions_of_rotations():
     found = quaternions(rotation)
     np.testing.assert_allclose(np.abs(np.einsum("ij,ij->i", found, expected)), 1.0, atol=1e-12)
     assert (found[:, 3] >= 0).all()
+
+
+H = np.sqrt(0.5)
+
+
+@pytest.mark.parametrize(
+    ("angles", "quaternion"),
+    [
+        ((0, 0, 0), (0, 0, 0, 1)),
+        ((np.pi / 2, 0, 0), (H, 0, 0, H)),
+        ((0, np.pi / 2, 0), (0, H, 0, H)),
+        ((0, 0, np.pi / 2), (0, 0, H, H)),
+        ((0, np.pi / 2, np.pi / 2), (-0.5, 0.5, 0.5, 0.5)),  # x points down, then all turned to the left
+        ((np.pi / 2, np.pi / 2, 0), (0.5, 0.5, -0.5, 0.5)),
+    ],
+)
+def test_angles_about_fixed_axes(angles, quaternion):
+    np.testing.assert_allclose(from_angles(np.array([angles], float)), [quaternion], atol=1e-15)
+
+
+def test_the_angle_between_two():
+    one = from_angles(np.array([[0.0, 0.0, 0.3], [0.0, 1.2, 0.0], [0.1, 0.2, 0.3], [0.0, 0.0, 0.0]]))
+    other = from_angles(np.array([[0.0, 0.0, -0.1], [0.0, 1.2, 0.0], [0.1, 0.2, 0.3], [np.pi, 0.0, 0.0]]))
+    np.testing.assert_allclose(angle_between(one, other), [0.4, 0.0, 0.0, np.pi], atol=1e-15)
+    np.testing.assert_allclose(angle_between(one, -other), [0.4, 0.0, 0.0, np.pi], atol=1e-15)
+
+
+def test_small_angles_are_exact():
+    turned = from_angles(np.array([[0.0, 0.0, 1e-9]]))
+    np.testing.assert_allclose(angle_between(turned, np.array([[0.0, 0.0, 0.0, 1.0]])), [1e-9], rtol=1e-9)

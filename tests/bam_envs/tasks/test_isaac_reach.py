@@ -3,10 +3,8 @@
 import math
 import pickle
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.kinematics import UR10, quaternions
@@ -293,17 +291,6 @@ def test_wire_states():
     assert [wire[f"object_0_to_ref_translation_{axis}"] for axis in "xyz"] == task.target[0].tolist()
     turned = np.array([wire[f"ee_to_ref_rotation_{axis}"] for axis in "xyzw"])
     assert abs(turned @ task.quaternion[0]) == pytest.approx(1.0, abs=1e-12)  # tool1 is at the target
-
-
-def test_gymnasiums_checker():
-    check_env(gym.make("bam/isaac-reach-v0", disable_env_checker=True).unwrapped, skip_render_check=True)
-
-
-@pytest.mark.filterwarnings("ignore:.*Box (observation|action) space:UserWarning")  # Isaac's are in radians
-@pytest.mark.filterwarnings("ignore:.*action spaces? .* symmetric:UserWarning")
-def test_gymnasiums_checker_of_parity():
-    env = gym.make("bam/isaac-reach-v0", parity=True, disable_env_checker=True)
-    check_env(env.unwrapped, skip_render_check=True)
 
 
 def test_the_arm_gets_there(make):

@@ -4,10 +4,8 @@ import copy
 import math
 import pickle
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 import bam_envs  # noqa: F401 - registers the environments
 from bam_envs.core.errors import InvalidValue, ProtocolError
@@ -238,27 +236,3 @@ def test_the_state_of_robo_gyms_server(make, parity):
     assert sent[1020] == 0.0
     assert sent[1021:] == ([0.0] * 9 if parity else env.unwrapped.task.obstacles.ravel().tolist())
     assert pickle.loads(pickle.dumps(sent)) == copy.deepcopy(sent) == sent
-
-
-@pytest.mark.parametrize("parity", [False, True])
-@pytest.mark.filterwarnings("ignore:.*A Box observation space .* value is .*infinity.*")
-def test_gymnasiums_checker(parity):
-    check_env(gym.make(ENV, parity=parity, disable_env_checker=True).unwrapped, skip_render_check=True)
-
-
-@pytest.mark.parametrize("parity", [False, True])
-@pytest.mark.parametrize("randomize", [False, True])
-def test_rows_are_single_environments(make, make_rows, actions_of, parity, randomize):
-    envs, alone = make_rows(ENV, 3, parity=parity, randomize=randomize), make(ENV, parity=parity, randomize=randomize)
-    together, rewards = [envs.reset(seed=7)[0][2]], []
-    actions = [actions_of(row, 150, 2) for row in range(3)]
-    for step in range(150):
-        observation, reward, *_ = envs.step(np.stack([row[step] for row in actions]))
-        together.append(observation[2])
-        rewards.append(reward[2])
-    single = [alone.reset(seed=9)[0]]
-    for action, reward in zip(actions[2], rewards, strict=True):
-        observation, same, terminated, truncated, _ = alone.step(action)
-        assert same == reward
-        single.append(alone.reset()[0] if terminated or truncated else observation)
-    np.testing.assert_array_equal(together, single)

@@ -4,10 +4,8 @@ import copy
 import math
 import pickle
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 import bam_envs  # noqa: F401 - registers the environments
 from bam_envs.core.errors import InvalidValue, UnknownName
@@ -234,19 +232,3 @@ def test_the_state_of_robo_gyms_server(make):
     assert sent[8:1020] == [29.0] * 1012
     assert sent[1020:] == [0.0] * 10
     assert pickle.loads(pickle.dumps(sent)) == copy.deepcopy(sent) == sent
-
-
-@pytest.mark.parametrize("parity", [False, True])
-@pytest.mark.filterwarnings("ignore:.*A Box observation space .* value is .*infinity.*")
-def test_gymnasiums_checker(parity):
-    check_env(gym.make(ENV, parity=parity, disable_env_checker=True).unwrapped, skip_render_check=True)
-
-
-@pytest.mark.parametrize("parity", [False, True])
-def test_rows_are_single_environments(make, make_rows, actions_of, parity):
-    envs, alone = make_rows(ENV, 3, parity=parity), make(ENV, parity=parity)
-    first = envs.reset(seed=7)[0][2]
-    actions = [actions_of(row, 120, 2) for row in range(3)]
-    together = [first, *(envs.step(np.stack(rows))[0][2] for rows in zip(*actions, strict=True))]
-    single = [alone.reset(seed=9)[0], *(alone.step(action)[0] for action in actions[2])]
-    np.testing.assert_array_equal(together, single)

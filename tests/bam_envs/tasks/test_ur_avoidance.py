@@ -3,10 +3,8 @@
 import math
 import pickle
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot import RobotState
@@ -257,16 +255,6 @@ def test_wire_states():
         assert [wire[f"{frame}_to_ref_translation_{axis}"] for axis in "xyz"] == place.tolist()
 
 
-def test_gymnasiums_checker():
-    check_env(gym.make("bam/ur-avoidance-v0", disable_env_checker=True).unwrapped, skip_render_check=True)
-
-
-@pytest.mark.filterwarnings("ignore:.*Box observation space:UserWarning")  # robo-gym's are without limits, or [0, 0]
-def test_gymnasiums_checker_of_parity():
-    env = gym.make("bam/ur-avoidance-v0", parity=True, disable_env_checker=True)
-    check_env(env.unwrapped, skip_render_check=True)
-
-
 def test_an_episode_in_the_environment(make):
     env = make("bam/ur-avoidance-v0", parity=True)
     env.reset(seed=0, options={"fixed_object_position": [1.0, 1.0, 1.0]})
@@ -281,12 +269,3 @@ def test_an_episode_in_the_environment(make):
     np.testing.assert_array_equal(info["target_coord"], [1.0, 1.0, 1.0])
     with pytest.raises(UnknownName, match="Did you mean 'joint_positions'"):
         env.reset(options={"joint_position": [0.0] * 6})
-
-
-def test_the_default_is_truncated(make):
-    env = make("bam/ur-avoidance-v0", fixed_object_position=(1.0, 1.0, 1.0))
-    env.reset(seed=0)
-    for step in range(1000):
-        *_, terminated, truncated, info = env.step(np.zeros(5, np.float32))
-        assert (terminated, truncated) == (False, step == 999)
-    assert (info["final_status"], info["is_success"]) == ("success", True)

@@ -276,26 +276,6 @@ def test_robo_gyms_state_in_the_info(make):
     assert env.unwrapped.task.marks()[0][0].tolist() == far_pose()[:3]
 
 
-def test_rows_are_single_environments(make, make_rows, actions_of):
-    envs = make_rows("bam/ur-reach-v0", 3, parity=True, ur_model="ur10e")
-    observations, _ = envs.reset(seed=5)
-    actions = np.stack([actions_of(row, 60, 5) for row in range(3)], axis=1)
-    for row in range(3):
-        env = make("bam/ur-reach-v0", parity=True, ur_model="ur10e")
-        np.testing.assert_array_equal(env.reset(seed=5 + row)[0], observations[row])
-    singles = [make("bam/ur-reach-v0", parity=True, ur_model="ur10e") for _ in range(3)]
-    for row, env in enumerate(singles):
-        env.reset(seed=5 + row)
-    for action in actions:
-        observations, rewards, terminated, *_ = envs.step(action)
-        for row, env in enumerate(singles):
-            observation, reward, ended, *_ = env.step(action[row])
-            assert (reward, ended) == (rewards[row], terminated[row])
-            if ended:
-                return
-            np.testing.assert_array_equal(observation, observations[row])
-
-
 @pytest.mark.parametrize("name", UR_MODELS)
 def test_the_joints_of_a_place_bring_the_flange_there(make_rows, name):
     """Twenty places: an action that never changes is a success, with every model."""

@@ -3,10 +3,8 @@
 import json
 import math
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import RobotState
@@ -257,34 +255,6 @@ def test_the_arm_can_follow_it(make):
         assert not terminated
     assert truncated
     assert (info["targets_reached"], info["final_status"], info["is_success"]) == (5, "success", True)
-
-
-def test_gymnasiums_checker():
-    check_env(gym.make("bam/ur-track-v0", disable_env_checker=True).unwrapped, skip_render_check=True)
-
-
-@pytest.mark.filterwarnings("ignore:.*Box observation space:UserWarning")  # robo-gym's are without limits
-def test_gymnasiums_checker_of_parity():
-    env = gym.make("bam/ur-track-v0", parity=True, disable_env_checker=True)
-    check_env(env.unwrapped, skip_render_check=True)
-
-
-@pytest.mark.parametrize("options", [{}, {"parity": True, "fixed_paths": True}])
-def test_rows_are_what_each_is_alone(make, make_rows, actions_of, options):
-    """Collisions and what follows them too."""
-    envs = make_rows("bam/ur-track-v0", 3, **options)
-    actions = np.stack([actions_of(row, 120, 5) for row in range(3)], axis=1)
-    together = [envs.reset(seed=5)[0], *(envs.step(action)[0] for action in actions)]
-    ended = 0
-    for row in range(3):
-        env = make("bam/ur-track-v0", **options)
-        alone = [env.reset(seed=5 + row)[0]]
-        for action in actions:
-            observation, _, terminated, *_ = env.step(action[row])
-            ended += terminated
-            alone.append(env.reset()[0] if terminated else observation)
-        np.testing.assert_array_equal([one[row] for one in together], alone)
-    assert ended > 0
 
 
 def test_everything_is_saved_and_restored(make_rows):

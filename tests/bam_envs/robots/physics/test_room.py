@@ -1,11 +1,12 @@
-"""Contacts of the base's footprint with walls and boxes, by hand."""
+"""What a base touches in a room, and what its lasers see."""
 
 import math
 
 import numpy as np
 import pytest
 
-from bam_envs.robots.physics.room import LAB, NOWHERE, touches
+from bam_envs.robots.mir100 import BACK_MASKED, BACK_MOUNT, BACK_RAYS, FRONT_MASKED, FRONT_MOUNT, FRONT_RAYS
+from bam_envs.robots.physics.room import LAB, NOISE, NOWHERE, LaserScanner, Room, measured, mixed, noise, touches
 
 NO_BOXES = np.zeros((1, 0, 3))
 
@@ -66,3 +67,119 @@ def test_nothing_there():
     assert not touching((0, 0, 0), LAB)
     np.testing.assert_array_equal(touches(np.zeros((1, 3)), None, NO_BOXES), [False])
     assert not touching((500, 500, 0), None, [NOWHERE])
+
+
+FRONT, BACK = LaserScanner(FRONT_MOUNT, FRONT_MASKED), LaserScanner(BACK_MOUNT, BACK_MASKED)
+FORWARDS = 150  # -135 + (30 + 150) / 2 = -45 degrees in a scanner that looks to +45
+LEFTWARDS = 330  # +45 degrees there
+BACKWARDS = 170  # -135 + (10 + 170) / 2 = -45 degrees in a scanner that looks to -135
+RIGHTWARDS = 350  # +45 degrees there
+
+
+def cast(scanner, pose, room=LAB, boxes=()):
+    boxes = np.array([boxes], dtype=float).reshape(1, -1, 3)
+    return scanner.cast(np.array([pose], dtype=float), room, boxes)[0]
+
+
+def test_rays():
+    assert (FRONT.rays, BACK.rays) == (FRONT_RAYS, BACK_RAYS) == (501, 511)
+
+
+def test_walls_from_both_corners():
+    front, back = cast(FRONT, (0.5, 1.0, 0.0)), cast(BACK, (0.5, 1.0, 0.0))
+    assert front[FORWARDS] == pytest.approx(2.823 - 0.5 - 0.4288, abs=1e-6)
+    assert front[LEFTWARDS] == pytest.approx(3.864 - 1.0 - 0.2358, abs=1e-6)
+    assert back[BACKWARDS] == pytest.approx(2.877 + 0.5 - 0.3548, abs=1e-6)
+    assert back[RIGHTWARDS] == pytest.approx(3.836 + 1.0 - 0.2352, abs=1e-6)
+    diagonal = 240  # along the scanner's own +45 degrees
+    assert front[diagonal] == pytest.approx((2.823 - 0.5 - 0.4288) * math.sqrt(2), abs=1e-5)
+
+
+def test_walls_of_a_turned_base():
+    front, back = cast(FRONT, (0.5, 1.0, math.pi / 2)), cast(BACK, (0.5, 1.0, math.pi / 2))
+    assert front[FORWARDS] == pytest.approx(3.864 - 1.0 - 0.4288, abs=1e-6)
+    assert front[LEFTWARDS] == pytest.approx(2.877 + 0.5 - 0.2358, abs=1e-6)
+    assert back[BACKWARDS] == pytest.approx(3.836 + 1.0 - 0.3548, abs=1e-6)
+
+
+def test_a_box_ahead_of_the_front_scanner():
+    front = cast(FRONT, (0, 0, 0), None, [(2.0, 0.2358, 0.0)])
+    assert front[FORWARDS] == pytest.approx(2.0 - 0.25 - 0.4288, abs=1e-6)
+    half = math.degrees(math.atan(0.25 / (1.75 - 0.4288)))
+    hit = np.flatnonzero(np.isfinite(front))
+    np.testing.assert_array_equal(hit, np.arange(FORWARDS - int(half * 2), FORWARDS + int(half * 2) + 1))
+    turned = cast(FRONT, (0, 0, 0), None, [(2.0, 0.2358, math.pi / 4)])
+    assert turned[FORWARDS] == pytest.approx(2.0 - 0.25 * math.sqrt(2) - 0.4288, abs=1e-6)
+
+
+def test_a_box_behind_is_seen_by_the_back_scanner_alone():
+    box = [(-2.0, -0.2352, 0.0)]
+    back = cast(BACK, (0, 0, 0), None, box)
+    assert back[BACKWARDS] == pytest.approx(2.0 - 0.25 - 0.3548, abs=1e-6)
+    assert np.isinf(cast(FRONT, (0, 0, 0), None, box)[FORWARDS])
+
+
+def test_the_nearer_of_two_boxes_hides_the_other():
+    boxes = [(2.0, 0.2358, 0.0), (1.2, 0.2358, 0.0)]
+    assert cast(FRONT, (0, 0, 0), LAB, boxes)[FORWARDS] == pytest.approx(1.2 - 0.25 - 0.4288, abs=1e-6)
+
+
+def test_from_inside_a_box_everything_is_near():
+    assert (cast(FRONT, (0, 0, 0), LAB, [(0.4288, 0.2358, 0.3)]) == 0).all()
+
+
+def test_without_walls_nothing_is_in_sight():
+    assert np.isinf(cast(FRONT, (1.0, 2.0, 0.3), None)).all()
+
+
+def test_as_a_plain_search_finds_it():
+    """Points along each ray, a millimetre apart, until one is outside the room or inside a box."""
+    room, boxes = Room((-1.5, -1.2), (1.4, 1.6)), [(0.9, 1.0, 0.4), (-1.0, 0.4, 1.1), (0.3, -0.9, -0.2)]
+    pose = (0.05, 0.1, 0.37)
+    for scanner, mount, masked in ((FRONT, FRONT_MOUNT, FRONT_MASKED), (BACK, BACK_MOUNT, BACK_MASKED)):
+        ranges = cast(scanner, pose, room, boxes)
+        x = pose[0] + mount[0] * math.cos(pose[2]) - mount[1] * math.sin(pose[2])
+        y = pose[1] + mount[0] * math.sin(pose[2]) + mount[1] * math.cos(pose[2])
+        bearing = pose[2] + mount[2] + np.radians(np.linspace(-135, 135, 541)[masked[0] : 541 - masked[1]])
+        far = np.arange(0.0, 4.0, 0.001)
+        px, py = x + far * np.cos(bearing)[:, None], y + far * np.sin(bearing)[:, None]
+        solid = (px < room.low[0]) | (px > room.high[0]) | (py < room.low[1]) | (py > room.high[1])
+        for bx, by, yaw in boxes:
+            u = (px - bx) * math.cos(yaw) + (py - by) * math.sin(yaw)
+            v = (py - by) * math.cos(yaw) - (px - bx) * math.sin(yaw)
+            solid |= (np.abs(u) < 0.25) & (np.abs(v) < 0.25)
+        found = far[solid.argmax(axis=1)]
+        grazing = np.abs(ranges - found) > 0.003  # a millimetre of a corner may be missed
+        assert grazing.sum() <= 2
+
+
+def test_a_row_of_many_is_the_row_alone():
+    rng = np.random.default_rng(0)
+    poses = np.stack([rng.uniform(-2, 2, 150), rng.uniform(-3, 3, 150), rng.uniform(-4, 4, 150)], axis=1)
+    boxes = rng.uniform(-2, 2, (150, 3, 3))
+    many = FRONT.cast(poses, LAB, boxes)
+    for row in (0, 1, 63, 64, 149):
+        np.testing.assert_array_equal(FRONT.cast(poses[[row]], LAB, boxes[[row]])[0], many[row])
+
+
+def test_measured_ranges_are_inside_what_a_scanner_says():
+    true = np.array([[0.01, 1.0, 28.995, np.inf, np.nan]], np.float32)
+    said = measured(true, np.full((1, 5), 0.01, np.float32))
+    assert said.dtype == np.float64
+    np.testing.assert_allclose(said, [[0.05, 1.01, 29.0, 29.0, 0.05]], atol=1e-6)
+
+
+def test_noise_is_normal_and_follows_seed_and_count():
+    seeds, counts = np.arange(400, dtype=np.uint64), np.zeros(400, np.uint64)
+    deviates = noise(seeds, counts, 1012)
+    assert deviates.shape == (400, 1012)
+    assert deviates.mean() == pytest.approx(0.0, abs=2e-4)
+    assert deviates.std() == pytest.approx(NOISE, rel=0.01)
+    np.testing.assert_array_equal(noise(seeds, counts, 1012), deviates)
+    for other in (noise(seeds + np.uint64(1000), counts, 1012), noise(seeds, counts + np.uint64(1), 1012)):
+        assert abs(np.corrcoef(deviates.ravel(), other.ravel())[0, 1]) < 0.01
+
+
+def test_mixed_numbers():
+    """The first of splitmix64 seeded with 0, as published."""
+    assert int(mixed(np.zeros(1, np.uint64))[0]) == 0xE220A8397B1DCDAF
