@@ -40,6 +40,8 @@ class Variable:
     """The class of its values."""
     KIND = "a numpy.ndarray"
     """The same, for error messages."""
+    COPIES = True
+    """Whether values are copied in; else the objects themselves are kept."""
     library: Any = np
 
     def __init__(
@@ -94,7 +96,14 @@ class Variable:
         """
         if not self._fits(value):
             self._check(value, f"t={t}")
-        self._store(t, self._own(value))
+        if self.COPIES:
+            value = np.array(value)
+        values = self._values
+        if values is not None and t - self.first == len(values) < self._limit:  # the usual case, without a call
+            self._joined = None
+            values.append(value)
+        else:
+            self._store(t, value)
 
     def get(self, t: int) -> Any:
         """The value at time t, B x ...; -1 is the last.
@@ -117,7 +126,7 @@ class Variable:
             for k in range(len(value)):
                 self.set(self.first + k, value[k, ...])
             return
-        self._values, self._whole, self._joined = None, self._own(value), None
+        self._values, self._whole, self._joined = None, np.array(value) if self.COPIES else value, None
         self._be_like(value.shape[1:], value)
 
     def full(self) -> Any:
@@ -163,10 +172,6 @@ class Variable:
     def _fits(self, value: Any) -> bool:
         """Whether the value is like those before; quick."""
         return type(value) is np.ndarray and value.shape == self.shape and value.dtype == self.dtype
-
-    def _own(self, value: Any) -> Any:
-        """The value as it is kept."""
-        return np.array(value)
 
     def _join(self, values: Sequence[Any]) -> Any:
         """T values B x ..., at least one, as one new array T x B x ...."""

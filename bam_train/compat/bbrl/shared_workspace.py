@@ -30,6 +30,8 @@ class _SharedVariable(Variable):
         memory: The shared tensor.
     """
 
+    COPIES = False  # `_store` and `set_full` do
+
     def __init__(self, name: str, memory: torch.Tensor) -> None:
         super().__init__(name)
         self.memory = memory
@@ -37,9 +39,6 @@ class _SharedVariable(Variable):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.name, self.memory)
-
-    def _own(self, value: Any) -> Any:
-        return value  # `_store` and `set_full` copy it
 
     def _store(self, t: int, value: Any) -> None:
         if t < -len(self.memory):

@@ -16,6 +16,7 @@ class TensorVariable(Variable):
 
     ARRAY = torch.Tensor
     KIND = "a torch.Tensor"
+    COPIES = False
     library = torch
 
     _device: torch.device | None = None
@@ -46,13 +47,16 @@ class TensorVariable(Variable):
         Raises:
             TimeNotWritten: Nobody wrote it.
         """
-        value = super().get(t)
+        values: Any = self._whole if self._values is None else self._values
+        index = t - self.first if t >= 0 else len(values) + t
+        if not 0 <= index < len(values):
+            raise self._not_written(t)
+        value: torch.Tensor = values[index]
         if type(value) is np.ndarray:
             value = torch.from_numpy(value)
             if not torch.is_inference_mode_enabled():  # others could not use it outside
-                self._listed()[t - self.first if t >= 0 else t] = value
-        tensor: torch.Tensor = value
-        return tensor
+                values[index] = value
+        return value
 
     def full(self) -> torch.Tensor:
         """All times kept, T x B x ...: one tensor itself, of a list a copy."""
@@ -81,9 +85,6 @@ class TensorVariable(Variable):
             self._whole = self._whole.detach()
         else:
             self._values = [value if type(value) is np.ndarray else value.detach() for value in self._values]
-
-    def _own(self, value: Any) -> Any:
-        return value
 
     def _fits(self, value: Any) -> bool:
         try:
