@@ -42,7 +42,7 @@ def environment_of(
     """The environment that a checkpoint belongs to, and its arguments; a file alone makes nothing be imported.
 
     Args:
-        checkpoint: May come from a stranger.
+        checkpoint: May be untrusted.
         named: What a person says that it was trained on; its module is imported.
         elsewhere: It runs on another computer, and nothing is imported here.
 

@@ -1,6 +1,6 @@
 """`bam/manifest.json`: what a checkpoint is, and the sha256 of every other member.
 
-It is read against one schema before anything is done with it: a checkpoint may come from a stranger.
+It is read against one schema before anything is done with it: a checkpoint may be untrusted.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Run a policy's ONNX graph with onnxruntime, on one thread.
 
-A graph may come from a stranger, and onnxruntime cannot be interrupted by Ctrl-C. So its memory is bounded, and it is
+A graph may be untrusted, and onnxruntime cannot be interrupted by Ctrl-C. So its memory is bounded, and it is
 loaded and run for the first time in a thread that is waited for only so long. A later run takes as long as the first:
 no operation of a policy takes longer for other numbers.
 """

@@ -108,7 +108,7 @@ def _notes(resumed: Checkpoint) -> _Notes:
 
 
 def _is_in_own_folder(resumed: Checkpoint) -> bool:
-    """Whether the file lies where a run here made it: a file from a stranger may note any path as its best."""
+    """Whether the file lies where a run here made it: an untrusted file may note any path as its best."""
     try:
         settings = read_config(resumed.path.parent / "config.json")
     except SettingsError:

@@ -79,7 +79,7 @@ def own_settings(checkpoint: Checkpoint, env: str | None = None, *, elsewhere: b
     """Settings that a checkpoint's run had, but for where it computed, which no file says.
 
     Args:
-        checkpoint: May come from a stranger.
+        checkpoint: May be untrusted.
         env: The environment, if somebody named it.
         elsewhere: It runs on another computer.
 

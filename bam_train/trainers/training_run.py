@@ -39,7 +39,7 @@ RECORD_EVERY = 0.1
 
 
 class Watcher(Protocol):
-    """Whoever shows how a run goes."""
+    """What is told how a run goes, such as a display."""
 
     def training(
         self, progress: Progress, statistics: Statistics, steps_per_second: float, seconds_left: float | None
@@ -244,7 +244,7 @@ class TrainingRun:
         steps = self._evaluated_at = self.trainer.steps
         with self.trainer.undisturbed(), self.trainer.evaluation_envs() as envs:
             last = steps >= self.settings.steps
-            report, self._reached = judge(self.trainer.freeze(), self.settings, last=last, envs=envs)
+            report, self._reached = evaluate_for_success(self.trainer.freeze(), self.settings, last=last, envs=envs)
         if report.success_rate is None and self.settings.until_success is not None and self._report is None:
             self.watcher.note(f"{self.settings.env} reports no is_success, so --until-success has no effect")
         self._report = report
@@ -351,11 +351,11 @@ def _training_record(steps: int, seconds: float, rate: float, statistics: Statis
     }
 
 
-JUDGE_SEED = 2_000_000
+EVALUATION_SEED = 2_000_000
 """Where these seeds start: apart from training's small ones and from bam-eval's, whose episodes must be fresh."""
 
 
-def judge(
+def evaluate_for_success(
     policy: BatchPolicy,
     settings: TrainSettings,
     last: bool = False,
@@ -368,7 +368,7 @@ def judge(
 
     Args:
         policy: What acts.
-        settings: Of the run; episode k is seeded JUDGE_SEED + seed + k.
+        settings: Of the run; episode k is seeded EVALUATION_SEED + seed + k.
         last: Whether this is the run's last evaluation, which is never cut short.
         envs: Environments to evaluate on, left open; by default some are made.
 
@@ -393,7 +393,7 @@ def judge(
 def _episodes(
     policy: BatchPolicy, settings: TrainSettings, skip: int, count: int, envs: VectorEnv[Any, Any, Any] | None
 ) -> EvaluationReport:
-    seed = JUDGE_SEED + settings.seed + skip
+    seed = EVALUATION_SEED + settings.seed + skip
     return evaluate(policy, settings.env, settings.env_kwargs, episodes=count, seed=seed, env=envs)
 
 
