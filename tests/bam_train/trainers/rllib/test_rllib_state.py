@@ -17,10 +17,8 @@ pytest.importorskip("ray")
 
 from bam_train.checkpoint import Checkpoint, write_checkpoint
 from bam_train.errors import AlteredCheckpoint
-from bam_train.settings import TrainSettings
 from bam_train.trainers.resolve_settings import resolve, resolve_resumed
 from bam_train.trainers.rllib import rllib_state as state
-from bam_train.trainers.rllib.ray_cluster import cluster
 from bam_train.trainers.rllib.rllib_state import extras_of
 from bam_train.trainers.rllib.rllib_trainer import RLlibTrainer
 from bam_train.trainers.rllib.state_pickles import read_state
@@ -35,14 +33,10 @@ OFF_POLICY = {
 }
 MODULE = "default_policy"
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*:DeprecationWarning:ray")  # Ray's own, of its own data library
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_ray():
-    """One Ray for all runs of this module."""
-    with cluster(TrainSettings(env="bam/reach-v0", algo="ppo", trainer="rllib")):
-        yield
+pytestmark = [
+    pytest.mark.usefixtures("one_ray"),
+    pytest.mark.filterwarnings("ignore:.*:DeprecationWarning:ray"),  # Ray's own, of its data library
+]
 
 
 def made(algo="ppo", hyper=ON_POLICY, **given):

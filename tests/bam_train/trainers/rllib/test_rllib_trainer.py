@@ -24,23 +24,17 @@ from bam_train.trainers.resolve_settings import resolve, resolve_resumed
 from bam_train.trainers.rllib import rllib_hyperparameters as hyperparameters
 from bam_train.trainers.rllib import rllib_state as state
 from bam_train.trainers.rllib.algorithm_config import envs_each
-from bam_train.trainers.rllib.ray_cluster import cluster
 from bam_train.trainers.rllib.recorded_episodes import load
 from bam_train.trainers.rllib.rllib_registration import own_ids
 from bam_train.trainers.rllib.rllib_trainer import RLlibTrainer
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*:DeprecationWarning:ray")  # Ray's own, of its data library
+pytestmark = [
+    pytest.mark.usefixtures("one_ray"),
+    pytest.mark.filterwarnings("ignore:.*:DeprecationWarning:ray"),  # Ray's own, of its data library
+]
 
 SMALL = {"fcnet_hiddens": [16, 16]}
 PPO = {"train_batch_size_per_learner": 128, "minibatch_size": 64, "num_epochs": 2, "model_config": SMALL}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_ray():
-    """One Ray for all runs of this module."""
-    with cluster(TrainSettings(env="bam/reach-v0", algo="ppo", trainer="rllib")):
-        yield
-    assert not ray.is_initialized()
 
 
 def settled(algo="ppo", env="bam/reach", hyper=PPO, **given):
