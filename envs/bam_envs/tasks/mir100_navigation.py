@@ -139,22 +139,17 @@ class DriveTask(TaskMemory):
         distance: Array = np.sqrt(dx * dx + dy * dy)
         return distance
 
-    def bearing(self, state: RobotState) -> Array:
-        """Where the target is, seen from the base, from -pi to pi [rad]. Shape: (n,)."""
+    def way(self, state: RobotState) -> tuple[Array, Array]:
+        """Distance [m] and bearing from -pi to pi [rad] of the target, seen from the base. Shape: (n,) each."""
         pose = state.signals["base_pose"]
         dx, dy = self.target[:, 0] - pose[:, 0], self.target[:, 1] - pose[:, 1]
-        bearing: Array = np.mod(np.arctan2(dy, dx) - pose[:, 2] + math.pi, 2 * math.pi) - math.pi
-        return bearing
+        bearing = np.mod(np.arctan2(dy, dx) - pose[:, 2] + math.pi, 2 * math.pi) - math.pi
+        return np.sqrt(dx * dx + dy * dy), bearing
 
     def _columns(self, state: RobotState) -> list[Array]:
         """The first four numbers of an observation. Shape: (n,) each."""
-        v, w = state.signals["base_velocity"].T
-        return [
-            self.distance(state) / DISTANCE_SCALE,
-            self.bearing(state) / math.pi,
-            v / FASTEST[0],
-            w / FASTEST[1],
-        ]
+        (distance, bearing), (v, w) = self.way(state), state.signals["base_velocity"].T
+        return [distance / DISTANCE_SCALE, bearing / math.pi, v / FASTEST[0], w / FASTEST[1]]
 
     def observe(self, state: RobotState) -> Floats:
         """See `observation_labels`. Shape: (n, k) float32."""
