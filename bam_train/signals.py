@@ -145,3 +145,29 @@ def drop_handlers() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, signal.valid_signals())
+
+
+# A program that quits at once runs no `finally`, but only what is registered here.
+
+_CALLS: list[Callable[[], None]] = []
+
+
+@contextlib.contextmanager
+def at_quit(call: Callable[[], None]) -> Iterator[None]:
+    """Within, `call` is to be called before the process quits at once.
+
+    Args:
+        call: Short, and fit for a signal handler, as it may come in the middle of anything.
+    """
+    _CALLS.append(call)
+    try:
+        yield
+    finally:
+        _CALLS.remove(call)
+
+
+def before_quitting() -> None:
+    """Call what is registered, the latest first, whatever becomes of it."""
+    for call in reversed(_CALLS):
+        with contextlib.suppress(Exception):  # nobody is left to be told, and quitting must not fail
+            call()

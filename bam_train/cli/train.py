@@ -145,7 +145,7 @@ def stopped_by_signals(run: TrainingRun) -> Iterator[list[int]]:
 
 def _quit(run: TrainingRun, number: int) -> None:
     """End the process here, wherever it is: an exception might be caught, or wait for threads."""
-    from bam_train.trainers.quit_callbacks import before_quitting
+    from bam_train.signals import before_quitting
 
     kept = f"the last checkpoint on the disk is {run.last}" if run.last else "no checkpoint had been saved yet"
     _write(f"bam-train: quit at once; {kept}\n")

@@ -26,8 +26,7 @@ import ray.rllib  # sets up its loggers
 
 from bam_train.errors import TrainingFailed
 from bam_train.settings import TrainSettings
-from bam_train.signals import interrupt, waiting
-from bam_train.trainers.quit_callbacks import at_quit
+from bam_train.signals import at_quit, interrupt, waiting
 from bam_train.trainers.rllib.ray_address import find, reach
 from bam_train.trainers.rllib.ray_resources import cores, gpus, require_resources
 

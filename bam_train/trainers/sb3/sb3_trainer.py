@@ -35,7 +35,7 @@ from bam_train.trainers.sb3 import sb3_resume as resume
 from bam_train.trainers.sb3.sb3_freezing import freeze
 from bam_train.trainers.sb3.sb3_golden import golden
 from bam_train.trainers.sb3.sb3_model import library_notices, make_model, meaning, one_env, refusals, sb3_members
-from bam_train.trainers.sb3.sb3_state import all_finite, refused_distribution, undisturbed
+from bam_train.trainers.sb3.sb3_resume import all_finite, refused_distribution, undisturbed
 from bam_train.trainers.sb3.sb3_tensorboard import ForgivingTensorBoard
 from bam_train.trainers.sb3.sb3_vec_env import BatchVecEnv, make_training_env
 

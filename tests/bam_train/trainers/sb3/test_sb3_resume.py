@@ -18,7 +18,7 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.nested_state import pack
 from bam_train.errors import AlteredCheckpoint
 from bam_train.settings import TrainSettings
-from bam_train.trainers.sb3 import sb3_state as state
+from bam_train.trainers.sb3 import sb3_resume as state
 from bam_train.trainers.sb3.sb3_trainer import SB3Trainer
 
 SMALL = {"net_arch": [16, 16]}
@@ -65,9 +65,9 @@ def everything(trainer: SB3Trainer) -> bytes:
         "weights": state.weights(trainer.model),
         "counters": counters,
         "random": state.random_states(trainer.model),
-        "normaliser": state.normaliser(trainer._normaliser),
-        "replay": state.replay(trainer.model),
-        "noise": state.noise(trainer.model),
+        "normaliser": state.normaliser_state(trainer._normaliser),
+        "replay": state.replay_state(trainer.model),
+        "noise": state.noise_state(trainer.model),
         "env": trainer.venv.state_dict(),
     }
     return b"".join(pack(tree))
@@ -148,7 +148,7 @@ import hashlib, sys
 from pathlib import Path
 from bam_train.checkpoint import Checkpoint
 from bam_train.settings import TrainSettings
-from bam_train.trainers.sb3 import sb3_state as state
+from bam_train.trainers.sb3 import sb3_resume as state
 from bam_train.trainers.sb3.sb3_trainer import SB3Trainer
 from bam_train.checkpoint.nested_state import pack
 import json

@@ -2,7 +2,7 @@
 
 import pytest
 
-from bam_train.trainers.quit_callbacks import at_quit, before_quitting
+from bam_train.signals import at_quit, before_quitting
 
 
 def test_the_latest_comes_first_and_only_within():
