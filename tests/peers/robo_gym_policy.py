@@ -18,7 +18,7 @@ from bam_envs.robots.physics.kinematic_arm import reach_arm
 from bam_envs.robots.physics.kinematic_base import open_floor
 from bam_envs.robots.ur import ur_model
 from bam_envs.tasks.ur_arm import POSITIONS, UrControl, wire_states
-from bam_envs.tasks.ur_reach import RATE, VELOCITY_SCALE
+from bam_envs.tasks.ur_reach import UrReachTask
 from bam_train.policy import FrozenPolicy
 from tests.bam_envs.making import make_task
 from tests.bam_envs.robo_gym.theirs import make_theirs
@@ -58,7 +58,7 @@ class ArmServer(services.RobotServerServicer):
 
     def __init__(self):
         self.robot, self.model = reach_arm(1), ur_model("ur5")
-        self.control = UrControl(self.model, 1, RATE, VELOCITY_SCALE)
+        self.control = UrControl(self.model, 1, UrReachTask.rate, UrReachTask.velocity_scale)
         self.robot.connect()
 
     def SetState(self, request, context):  # noqa: N802
