@@ -10,6 +10,8 @@ import pytest
 from tests.peers.conftest import PEERS
 
 PYTHON = str(PEERS / "robo_gym" / "bin" / "python")
+OPTIONS = ("-p", "no:cacheprovider", "--noconftest", "-rs")
+"""There is no hypothesis, which our conftest.py needs, beside robo-gym."""
 ENV = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST", "PYTHON"))}
 
 
@@ -33,7 +35,7 @@ def run(*command, root, limit=900.0):
 def test_parity(request):
     """Observation, reward and end of ours with parity=True are those of robo-gym's classes."""
     tests = ["tests/bam_envs/robo_gym/test_parity.py", "tests/bam_envs/robo_gym/test_rs_state.py"]
-    output = run(PYTHON, "-m", "pytest", "-p", "no:cacheprovider", "-rs", *tests, root=request.config.rootpath)
+    output = run(PYTHON, "-m", "pytest", *OPTIONS, *tests, root=request.config.rootpath)
     assert "skipped" not in output, output
 
 
