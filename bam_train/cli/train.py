@@ -57,7 +57,7 @@ def _settings(config: TrainConfig, checkpoint: Checkpoint | None) -> TrainSettin
 
 def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint | None) -> int:
     """Train with complete settings; returns the exit status."""
-    from bam_train.cli.train_display import nobody_need_read
+    from bam_train.cli.train_display import stderr_may_close
     from bam_train.trainers import load_trainer
     from bam_train.trainers.best_checkpoint import choose_output
     from bam_train.trainers.checkpoint_copies import Copies
@@ -73,7 +73,7 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
     except BaseException:
         made.close()
         raise
-    with nobody_need_read():
+    with stderr_may_close():
         return _run(made, folder, output, copies, _title(settings, checkpoint))
 
 

@@ -16,8 +16,6 @@ from bam_train.errors import OutputError
 from bam_train.terminal_text import rich_text
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from bam_train.evaluation import EvaluationReport
     from bam_train.settings import TrainSettings
     from bam_train.trainers.base import Progress, Statistics
@@ -28,12 +26,8 @@ LINE_EVERY = 1.0
 """Seconds between two plain lines about training at least."""
 
 
-class Forgiving:
-    """A text stream that may go away, as a closed pipe or terminal does: from then on, what is written is dropped.
-
-    Args:
-        stream: Where text goes as long as it can.
-    """
+class _Droppable:
+    """A text stream that may go away, as a closed pipe or terminal does: from then on, what is written is dropped."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -43,31 +37,31 @@ class Forgiving:
 
     def write(self, text: str) -> int:
         """Write `text` if somebody reads."""
-        try:
-            return self._stream.write(text)
-        except OSError:
-            self._give_up()
-            return len(text)
+        with self._dropping():
+            self._stream.write(text)
+        return len(text)
 
     def flush(self) -> None:
         """Pass on what was written if somebody reads."""
-        try:
+        with self._dropping():
             self._stream.flush()
-        except OSError:
-            self._give_up()
 
-    def _give_up(self) -> None:
-        """Put the null device in its place, so that what is still buffered goes there too."""
-        with contextlib.suppress(OSError):  # a stream that is no file
-            null = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(null, self._stream.fileno())
-            os.close(null)
+    @contextlib.contextmanager
+    def _dropping(self) -> Iterator[None]:
+        """After an error, put the null device in the stream's place, so that what is still buffered goes there too."""
+        try:
+            yield
+        except OSError:
+            with contextlib.suppress(OSError):  # a stream that is no file
+                null = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(null, self._stream.fileno())
+                os.close(null)
 
 
 @contextlib.contextmanager
-def nobody_need_read() -> Iterator[None]:
+def stderr_may_close() -> Iterator[None]:
     """Within, the run goes on whether or not somebody still reads standard error."""
-    with contextlib.redirect_stderr(Forgiving(sys.stderr)):
+    with contextlib.redirect_stderr(_Droppable(sys.stderr)):
         yield
 
 
@@ -93,9 +87,7 @@ class PlainDisplay:
         self.note(self.title)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         return
 
     def training(
@@ -130,9 +122,7 @@ class LiveDisplay(PlainDisplay):
         self._live.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._live.stop()
 
     def training(
