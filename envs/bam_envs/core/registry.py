@@ -1,6 +1,6 @@
-"""The one table of environments: it registers them with Gymnasium, and other learners read the same rows.
+"""The one table of environments: it registers them with Gymnasium, and other learners read the same entries.
 
-Importing this imports neither a simulator nor a task; a row's task and robot are strings, resolved when the
+Importing this imports neither a simulator nor a task; an entry's task and robot are strings, resolved when the
 environment is made. The file is long for its table.
 """
 
@@ -287,9 +287,11 @@ def make_env(
     Raises:
         InvalidValue: Arguments that exclude each other.
     """
-    _require_one_place(robot, transport, profile, task_options)
-    _require_simulation(robot or transport, render_mode, randomize)
-    _require_answers(transport, timeout)
+    if robot is not None and transport is not None:
+        raise InvalidValue("robot= and transport= exclude each other: the task runs here, or with the robot elsewhere.")
+    if robot is None and profile is not None:
+        raise InvalidValue(f"profile={profile!r} describes a live robot; give its address with robot= too.")
+    _check_place(robot, transport, timeout, render_mode, randomize, task_options)
     if transport is not None:
         from bam_envs.remote.remote_env import make_remote_env
 
@@ -332,29 +334,24 @@ def _gymnasium_limits() -> bool:
     return told is not None or getattr(registered, "max_episode_steps", None) is not None
 
 
-def _require_simulation(elsewhere: object, render_mode: str | None, randomize: bool) -> None:
-    """What only a simulation has is not asked of anything else."""
-    asked = [name for name, given in (("render_mode", render_mode is not None), ("randomize", randomize)) if given]
-    if elsewhere is not None and asked:
-        raise InvalidValue(f"{', '.join(asked)}: only the simulation here has that, and not {elsewhere}; leave it out.")
-
-
-def _require_answers(transport: object, timeout: float | None) -> None:
+def _check_place(
+    robot: str | None,
+    transport: object,
+    timeout: float | None,
+    render_mode: str | None,
+    randomize: bool,
+    task_options: Mapping[str, Any],
+) -> None:
+    """Refuse options of another place than the one where the environment runs."""
     if transport is None and timeout is not None:
         raise InvalidValue(f"timeout={timeout!r} is how long an answer of transport= is waited for; leave it out.")
-
-
-def _require_one_place(
-    robot: str | None, transport: str | None, profile: str | None, task_options: Mapping[str, Any]
-) -> None:
-    """The environment runs in one place, and each option belongs to one."""
-    if robot is not None and transport is not None:
-        raise InvalidValue("robot= and transport= exclude each other: the task runs here, or with the robot elsewhere.")
     if transport is not None and task_options:
         names = ", ".join(task_options)
         raise InvalidValue(f"{names}: the task runs at {transport}; give its options to bam-serve there.")
-    if robot is None and profile is not None:
-        raise InvalidValue(f"profile={profile!r} describes a live robot; give its address with robot= too.")
+    elsewhere = robot if transport is None else transport
+    asked = [name for name, given in (("render_mode", render_mode is not None), ("randomize", randomize)) if given]
+    if elsewhere is not None and asked:
+        raise InvalidValue(f"{', '.join(asked)}: only the simulation here has that, and not {elsewhere}; leave it out.")
 
 
 def make_vector_env(
@@ -373,21 +370,20 @@ def make_vector_env(
 ) -> RobotVectorEnv | RemoteVectorEnv:
     """Simulated robots and their task, stepped together; what `gymnasium.make_vec` calls.
 
-    With `transport`, one address or several, they run elsewhere: the rows of one server are one request.
+    With `transport`, one address or several, they run elsewhere: the environments of one server are one request.
 
     Raises:
-        InvalidValue: Arguments that exclude each other, or rows that are not there.
+        InvalidValue: Arguments that exclude each other, or environments that are not there.
     """
-    if num_envs < 1:
-        raise InvalidValue(f"num_envs must be at least 1, not {num_envs}.")
+    from bam_envs.core.validation import PositiveInt, check
+
+    check(num_envs, PositiveInt, "num_envs")
     if robot is not None:
         raise InvalidValue("A live robot is one environment, which nothing may reset unasked; use gymnasium.make.")
-    _require_answers(transport, timeout)
+    _check_place(None, transport, timeout, render_mode, randomize, task_options)
     if transport is not None:
         from bam_envs.remote.remote_env import make_remote_vector_env
 
-        _require_one_place(None, str(transport), None, task_options)
-        _require_simulation(transport, render_mode, randomize)
         return make_remote_vector_env(
             env_id, transport, num_envs, ca_file=ca_file, token_file=token_file, timeout=timeout
         )

@@ -201,24 +201,6 @@ def _plain(value: Any) -> Any:
     return float(value) if isinstance(value, np.generic) else value
 
 
-class OneEnd(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
-    """Outside a time limit: an episode whose task ends in its last step is terminated, and not truncated too.
-
-    A task that counts its own steps (`ends_by_itself`) ends in the step in which Gymnasium's limit comes.
-    """
-
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        gym.utils.RecordConstructorArgs.__init__(self)
-        super().__init__(env)
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step the environment."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        task = getattr(self.unwrapped, "task", None)
-        one_end = task is None or getattr(task, "ends_by_itself", False)
-        return observation, reward, terminated, truncated and not (terminated and one_end), info
-
-
 class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
     """n simulated robots stepped together; environment i equals a `RobotEnv` with the same seed, bit for bit.
 
@@ -290,7 +272,7 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[NDArray[np.float32], ND
         score = self.task.score(self.state, actions)
         observation = self.task.observe(self.state)
         self.elapsed += 1
-        truncated = self._truncated(score)
+        truncated = self._truncated()
         infos = {"is_success": score.success, "_is_success": self._all.copy()}
         for key, value in score.info.items():
             infos[key], infos["_" + key] = value, _says(value)
@@ -299,11 +281,11 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[NDArray[np.float32], ND
             observation = self._next_episodes(ended, observation, infos)
         return observation, score.reward, score.terminated, truncated, infos
 
-    def _truncated(self, score: Score) -> NDArray[np.bool_]:
+    def _truncated(self) -> NDArray[np.bool_]:
         if self.max_episode_steps is None:
             return np.zeros(self.num_envs, dtype=bool)
         truncated: NDArray[np.bool_] = self.elapsed >= self.max_episode_steps
-        return truncated & ~score.terminated if getattr(self.task, "ends_by_itself", False) else truncated
+        return truncated
 
     def _next_episodes(
         self, ended: NDArray[np.bool_], observation: NDArray[np.float32], infos: dict[str, Any]

@@ -127,8 +127,8 @@ def expected(kind: Any) -> str:
     if origin in (Union, types.UnionType):
         return " or ".join(expected(one) for one in arguments if one is not type(None))
     if origin is Literal:
-        *rest, last = [repr(one) for one in arguments]
-        return f"{', '.join(rest)} or {last}" if rest else last
+        choices = [repr(one) for one in arguments]
+        return " or ".join([", ".join(choices[:-1]), choices[-1]] if choices[1:] else choices)
     base = origin or kind
     if base in (list, tuple, Sequence) and arguments:
         if base is not tuple or arguments[-1] is ...:

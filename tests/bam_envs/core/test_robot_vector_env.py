@@ -312,4 +312,4 @@ def test_a_pickled_environment_goes_on_as_the_first(make_rows, actions_of, env_i
 def test_at_least_one_row():
     with pytest.raises(InvalidValue) as caught:
         gym.make_vec("bam/pick-v0", num_envs=0)
-    assert str(caught.value) == "num_envs must be at least 1, not 0."
+    assert str(caught.value) == "num_envs: expected a whole number of at least 1, found 0"
