@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import inspect
 import json
 import math
 from collections.abc import Callable, Mapping
@@ -93,7 +92,7 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
         return
     options, theirs = entry.options(), ROBO_GYM.get(env.rpartition(":")[2])
     taken, refused = constructor_options(theirs) if theirs else (frozenset(), frozenset())
-    own = set(inspect.signature(registry.make_env).parameters) - _NO_SETTINGS
+    own = set(registry.MAKE_OPTIONS) - _NO_SETTINGS
     known = own | taken | options.keys() | {"max_episode_steps"}
     for name in given:
         if name not in known | refused:  # making it says why it is refused
@@ -106,8 +105,8 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
         raise SettingsError(f"env_kwargs: {error}") from error
 
 
-_NO_SETTINGS = frozenset({"env_id", "render_mode", "task_options", "timeout"}) | WHERE
-"""Arguments of `make_env` that are no settings, or say where the environment runs, which has settings of its own."""
+_NO_SETTINGS = frozenset({"render_mode", "timeout"}) | WHERE
+"""Options of every environment that are no settings, or that say where it runs, which has settings of its own."""
 
 
 def is_batched(env_id: str) -> bool:

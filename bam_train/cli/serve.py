@@ -91,13 +91,10 @@ def make_env(config: ServeConfig) -> Env:
 
 def _require_known(env_id: str, kwargs: dict[str, Any]) -> None:
     """Refuse a slip of the pen with the closest match; what says where it runs may be given here."""
-    from inspect import signature
-
-    from bam_envs.core.registry import make_env
+    from bam_envs.core.registry import MAKE_OPTIONS
     from bam_train.environments import require_env_kwargs
 
-    anywhere = signature(make_env).parameters
-    require_env_kwargs(env_id, {name: value for name, value in kwargs.items() if name not in anywhere})
+    require_env_kwargs(env_id, {name: value for name, value in kwargs.items() if name not in MAKE_OPTIONS})
 
 
 def env_kwargs(assignments: Sequence[str]) -> dict[str, Any]:

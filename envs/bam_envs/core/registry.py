@@ -7,9 +7,7 @@ environment is made. The file is long for its table.
 from __future__ import annotations
 
 import importlib
-import inspect
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -20,12 +18,10 @@ from bam_envs.core.errors import InvalidValue, UnknownName
 
 if TYPE_CHECKING:
     from bam_envs.core.robot import Robot
-    from bam_envs.core.robot_env import RobotEnv, RobotVectorEnv
     from bam_envs.core.task import Task
-    from bam_envs.remote.remote_env import RemoteVectorEnv
 
-_NO_OPTIONS = {"env_id", "task_options"}
-"""Arguments of `make_env` that nobody gives to `gymnasium.make`."""
+MAKE_OPTIONS = ("render_mode", "randomize", "robot", "transport", "profile", "ca_file", "token_file", "timeout")
+"""What `gymnasium.make` takes for every environment of ours, beside the options of its task."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +60,7 @@ class EnvEntry:
             InvalidValue: An option cannot be what it is.
         """
         options = self.options()
-        require_known(self.id, options, given, set(inspect.signature(make_env).parameters) - _NO_OPTIONS)
+        require_known(self.id, options, given, MAKE_OPTIONS)
         require_kinds(self.id, options, given)
         flags = [flag for flag in self.variants if given.get(flag)]
         kind = resolve(self.variants[flags[0]] if flags else self.task)
@@ -182,7 +178,7 @@ ALIASES: dict[str, Alias] = {}
 def register() -> None:
     """Register every environment with Gymnasium; idempotent. Plug-ins add their variants before."""
     for entry in ENVIRONMENTS.values():
-        register_id(entry.id, "bam_envs.core.registry", None if entry.variants else entry.max_episode_steps)
+        register_id(entry.id, "bam_envs.make_env", None if entry.variants else entry.max_episode_steps)
 
 
 def register_alias(env_id: str, alias: Alias, module: str) -> None:
@@ -253,149 +249,3 @@ def resolve(reference: str) -> Any:
     """The object that ``"module:name"`` names."""
     module, _, name = reference.partition(":")
     return getattr(importlib.import_module(module), name)
-
-
-def make_env(
-    env_id: str,
-    *,
-    render_mode: str | None = None,
-    randomize: bool = False,
-    robot: str | None = None,
-    transport: str | None = None,
-    profile: str | None = None,
-    ca_file: str | None = None,
-    token_file: str | None = None,
-    timeout: float | None = None,
-    **task_options: Any,
-) -> gym.Env[Any, Any]:
-    """One robot and its task; what `gymnasium.make` calls.
-
-    Args:
-        env_id: Key of `ENVIRONMENTS`.
-        render_mode: Of the simulated robot.
-        randomize: Of the simulated robot.
-        robot: Address of a live robot behind rosbridge, such as ``"ws://10.0.0.5:9090"``, instead of the simulated one.
-            The task runs here. A path puts a namespace before the robot's topics.
-        transport: Address of a whole environment that runs elsewhere, such as ``"ws://10.0.0.5:9090/bam_001"`` or
-            ``"tcp://10.0.0.5:9091"``; there is no robot and no task here.
-        profile: What the live robot's topics are: a shipped name or a file; by default that of the simulated robot.
-        ca_file: Certificates that ``wss://`` trusts instead of the system's.
-        token_file: File with the token that the server asks for.
-        timeout: Longest that an answer of `transport` is waited for [s]; 30 by default.
-        task_options: Arguments of the task.
-
-    Raises:
-        InvalidValue: Arguments that exclude each other.
-    """
-    if robot is not None and transport is not None:
-        raise InvalidValue("robot= and transport= exclude each other: the task runs here, or with the robot elsewhere.")
-    if robot is None and profile is not None:
-        raise InvalidValue(f"profile={profile!r} describes a live robot; give its address with robot= too.")
-    _check_place(robot, transport, timeout, render_mode, randomize, task_options)
-    if transport is not None:
-        from bam_envs.remote.remote_env import make_remote_env
-
-        return make_remote_env(env_id, transport, ca_file=ca_file, token_file=token_file, timeout=timeout)
-    from bam_envs.core.robot_env import RobotEnv
-
-    entry = ENVIRONMENTS[env_id]
-    task = entry.make_task(1, task_options)
-    simulated = entry.make_robot(1, randomize, task_options)
-    if robot is None:
-        return limited(RobotEnv(simulated, task, render_mode=render_mode), entry)
-    from bam_envs.live.building import live_robot
-
-    tool = getattr(simulated, "tool_position", None)  # forward kinematics of an arm that is no UR5e
-    live = live_robot(
-        robot, simulated.spec, profile=profile, tool_position=tool, ca_file=ca_file, token_file=token_file
-    )
-    return limited(RobotEnv(live, task, render_mode=render_mode), entry)
-
-
-def limited(env: RobotEnv, entry: EnvEntry) -> gym.Env[Any, Any]:
-    """`env` with the time limit that Gymnasium does not put around it."""
-    if not entry.variants or getattr(env.task, "ends_by_itself", False) or _gymnasium_limits():
-        return env
-    return gym.wrappers.TimeLimit(env, entry.max_episode_steps)
-
-
-def _gymnasium_limits() -> bool:
-    """Whether `gymnasium.make`, which calls this, was told of a limit, or of -1 for none.
-
-    It keeps its ``max_episode_steps`` to itself, and a limit within would cut what is to be longer. So its frame is
-    asked; where there is none, nobody was told of a limit.
-    """
-    frame: Any = sys._getframe()
-    while frame is not None and frame.f_code is not gym.make.__code__:
-        frame = frame.f_back
-    if frame is None:
-        return False
-    told, registered = frame.f_locals.get("max_episode_steps"), frame.f_locals.get("env_spec")
-    return told is not None or getattr(registered, "max_episode_steps", None) is not None
-
-
-def _check_place(
-    robot: str | None,
-    transport: object,
-    timeout: float | None,
-    render_mode: str | None,
-    randomize: bool,
-    task_options: Mapping[str, Any],
-) -> None:
-    """Refuse options of another place than the one where the environment runs."""
-    if transport is None and timeout is not None:
-        raise InvalidValue(f"timeout={timeout!r} is how long an answer of transport= is waited for; leave it out.")
-    if transport is not None and task_options:
-        names = ", ".join(task_options)
-        raise InvalidValue(f"{names}: the task runs at {transport}; give its options to bam-serve there.")
-    elsewhere = robot if transport is None else transport
-    asked = [name for name, given in (("render_mode", render_mode is not None), ("randomize", randomize)) if given]
-    if elsewhere is not None and asked:
-        raise InvalidValue(f"{', '.join(asked)}: only the simulation here has that, and not {elsewhere}; leave it out.")
-
-
-def make_vector_env(
-    env_id: str,
-    num_envs: int = 1,
-    *,
-    max_episode_steps: int | None = None,
-    render_mode: str | None = None,
-    randomize: bool = False,
-    robot: str | None = None,
-    transport: str | Sequence[str] | None = None,
-    ca_file: str | None = None,
-    token_file: str | None = None,
-    timeout: float | None = None,
-    **task_options: Any,
-) -> RobotVectorEnv | RemoteVectorEnv:
-    """Simulated robots and their task, stepped together; what `gymnasium.make_vec` calls.
-
-    With `transport`, one address or several, they run elsewhere: the environments of one server are one request.
-
-    Raises:
-        InvalidValue: Arguments that exclude each other, or environments that are not there.
-    """
-    from bam_envs.core.validation import PositiveInt, check
-
-    check(num_envs, PositiveInt, "num_envs")
-    if robot is not None:
-        raise InvalidValue("A live robot is one environment, which nothing may reset unasked; use gymnasium.make.")
-    _check_place(None, transport, timeout, render_mode, randomize, task_options)
-    if transport is not None:
-        from bam_envs.remote.remote_env import make_remote_vector_env
-
-        return make_remote_vector_env(
-            env_id, transport, num_envs, ca_file=ca_file, token_file=token_file, timeout=timeout
-        )
-    from bam_envs.core.robot_env import RobotVectorEnv
-
-    entry = ENVIRONMENTS[env_id]
-    task = entry.make_task(num_envs, task_options)
-    if max_episode_steps is None and not getattr(task, "ends_by_itself", False):
-        max_episode_steps = entry.max_episode_steps if entry.variants else None  # Gymnasium gives that of the others
-    return RobotVectorEnv(
-        entry.make_robot(num_envs, randomize, task_options),
-        task,
-        max_episode_steps=max_episode_steps,
-        render_mode=render_mode,
-    )

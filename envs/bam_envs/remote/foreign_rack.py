@@ -10,7 +10,7 @@ from gymnasium import Space
 
 from bam_envs.core.registry import resolve_id
 from bam_envs.core.validation import PositiveInt, check
-from bam_envs.remote.gymapi.codec import DEFAULT, EnvCodec
+from bam_envs.remote.gymapi.gymapi_codec import DEFAULT, EnvCodec
 from bam_envs.remote.gymapi.versions import Version, version_named
 from bam_envs.remote.transport import EnvSpecMessage, Info
 

@@ -14,8 +14,8 @@ from gymnasium import Space
 from bam_envs.core.errors import LinkLost, NoServer, ProtocolError, RemoteError, UnknownName
 from bam_envs.core.validation import check
 from bam_envs.remote.foreign_rack import ForeignRack, LastKnown
-from bam_envs.remote.gymapi.codec import DEFAULT, EnvCodec
-from bam_envs.remote.gymapi.messages import (
+from bam_envs.remote.gymapi.gymapi_codec import DEFAULT, EnvCodec
+from bam_envs.remote.gymapi.gymapi_messages import (
     KIND,
     GymRequest,
     GymResponse,

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
-from bam_envs.core import registry
+from bam_envs import make_env as ours
 from bam_envs.core.errors import InvalidValue
+from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.core.robot import Robot
 from bam_envs.core.robot_env import RobotEnv, RobotVectorEnv
 from bam_envs.core.task import Task
@@ -23,7 +24,7 @@ def make_env(env_id: str, **options: Any) -> gym.Env[Any, Any]:
 
     Args:
         env_id: Key of `ROBO_GYM`.
-        options: Those of robo-gym's class of that id, and those of `bam_envs.core.registry.make_env`.
+        options: Those of robo-gym's class of that id, and those of `bam_envs.make_env.make_env`.
 
     Raises:
         UnknownName: An option that neither has.
@@ -32,12 +33,12 @@ def make_env(env_id: str, **options: Any) -> gym.Env[Any, Any]:
     entry = ROBO_GYM[env_id]
     arguments = translate(entry, options)
     if arguments.get("transport") is not None:
-        return registry.make_env(env_id, **arguments)
-    made = registry.make_env(entry.env_id, **arguments).unwrapped
+        return ours.make_env(env_id, **arguments)
+    made = ours.make_env(entry.env_id, **arguments).unwrapped
     if not isinstance(made, RobotEnv):
         raise TypeError(f"{entry.env_id} is a {type(made).__name__}, and a RobotEnv was expected.")
     env = RoboGymEnv(made.robot, made.task, made.render_mode, is_live=arguments.get("robot") is not None)
-    return registry.limited(env, registry.ENVIRONMENTS[entry.env_id])
+    return ours.limited(env, ENVIRONMENTS[entry.env_id])
 
 
 def make_vector_env(env_id: str, num_envs: int = 1, **options: Any) -> RobotVectorEnv | RemoteVectorEnv:
@@ -52,10 +53,10 @@ def make_vector_env(env_id: str, num_envs: int = 1, **options: Any) -> RobotVect
         )
     arguments = translate(entry, options)
     if arguments.get("transport") is not None:
-        return registry.make_vector_env(env_id, num_envs, **arguments)
+        return ours.make_vector_env(env_id, num_envs, **arguments)
     if "rs_state_to_info" not in options:
         arguments.pop("rs_state_to_info", None)
-    return registry.make_vector_env(entry.env_id, num_envs, **arguments)
+    return ours.make_vector_env(entry.env_id, num_envs, **arguments)
 
 
 class RoboGymEnv(RobotEnv):

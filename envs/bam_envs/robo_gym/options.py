@@ -1,11 +1,10 @@
-"""What robo-gym's constructor options mean here: from its arguments to those of `bam_envs.core.registry.make_env`.
+"""What robo-gym's constructor options mean here: from its arguments to those of `bam_envs.make_env.make_env`.
 
 Where an option means something else here, that is logged, once in a process.
 """
 
 from __future__ import annotations
 
-import inspect
 import logging
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -25,7 +24,7 @@ _SIMULATED = (*_MANAGER, *_WINDOWS)
 PLACES = frozenset({*_SIMULATED, "rs_address"})
 """Options that say where an environment of robo-gym's ran, and nothing of what it is."""
 _OTHER_TARGETS = "give the target itself: ee_target_pose=[x, y, z, roll, pitch, yaw], here or to each reset"
-_OF_ENVIRONMENT = frozenset(inspect.signature(registry.make_env).parameters) | {"max_episode_steps"}
+_OF_ENVIRONMENT = frozenset(registry.MAKE_OPTIONS) | {"max_episode_steps"}
 _NOT_HERE = {
     "max_velocity_scale_factor": "the arm's speed belongs to the environment, which would be another one",
     "action_rate": "the rate belongs to the environment, which would be another one",
@@ -49,7 +48,7 @@ _NOT_HERE = {
 
 
 def translate(entry: RoboGymId, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Arguments of `bam_envs.core.registry.make_env` for `entry`; says once in a process what an option means here.
+    """Arguments of `bam_envs.make_env.make_env` for `entry`; says once in a process what an option means here.
 
     Raises:
         UnknownName: Neither robo-gym nor we have such an option; it carries the closest match.

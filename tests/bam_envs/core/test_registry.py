@@ -1,12 +1,15 @@
 """The one table of environments."""
 
+import inspect
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue, UnknownName
-from bam_envs.core.registry import ENVIRONMENTS, make_vector_env, register, resolve, resolve_id
+from bam_envs.core.registry import ENVIRONMENTS, MAKE_OPTIONS, register, resolve, resolve_id
 from bam_envs.core.robot_env import RobotEnv, RobotVectorEnv
+from bam_envs.make_env import make_env, make_vector_env
 
 
 def test_the_table():
@@ -127,6 +130,11 @@ def test_the_time_limit_of_rows_can_be_changed():
     envs = gym.make_vec("bam/reach-v0", num_envs=2, max_episode_steps=7)
     assert envs.unwrapped.max_episode_steps == 7
     envs.close()
+
+
+def test_the_options_of_every_environment_are_those_that_make_them():
+    parameters = inspect.signature(make_env).parameters
+    assert tuple(name for name in parameters if name not in ("env_id", "task_options")) == MAKE_OPTIONS
 
 
 def test_an_option_that_does_not_exist_is_an_error(make):

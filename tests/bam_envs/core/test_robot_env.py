@@ -10,8 +10,9 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import FlattenObservation, NormalizeObservation, RecordEpisodeStatistics, RescaleAction
 
 from bam_envs.core.errors import InvalidValue, ResetNeeded
-from bam_envs.core.registry import ENVIRONMENTS, make_env
+from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.core.robot_env import RobotEnv
+from bam_envs.make_env import make_env
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.scripted import SCRIPTED, scripted_policy

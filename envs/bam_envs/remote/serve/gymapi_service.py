@@ -14,8 +14,8 @@ from functools import partial
 from typing import Any
 
 from bam_envs.core.errors import BamEnvsError, RemoteError
-from bam_envs.remote.gymapi.codec import EnvCodec
-from bam_envs.remote.gymapi.messages import (
+from bam_envs.remote.gymapi.gymapi_codec import EnvCodec
+from bam_envs.remote.gymapi.gymapi_messages import (
     KIND,
     GymRequest,
     RequestType,

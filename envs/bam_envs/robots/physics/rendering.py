@@ -17,22 +17,22 @@ import warnings
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import BamEnvsError
 from bam_envs.robots.physics.engine import load_mujoco
-from bam_envs.robots.physics.shapes import Colour, Shape, View
 
 if TYPE_CHECKING:
     from bam_envs.robots.physics.mujoco_batch import Physics
+    from bam_envs.robots.physics.shapes import Colour, Shape, View
 
 mujoco = load_mujoco("A picture of a robot")
 
 Array = NDArray[np.float64]
-Mark = tuple[Array, Colour]
+Mark: TypeAlias = "tuple[Array, Colour]"
 Draw = Callable[[Any], None]
 """Appends bodies that are in no model to an ``MjvScene``."""
 WIDTH, HEIGHT = 640, 480

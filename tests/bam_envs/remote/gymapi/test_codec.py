@@ -11,8 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
-from bam_envs.remote.gymapi.codec import EnvCodec
-from bam_envs.remote.gymapi.messages import (
+from bam_envs.remote.gymapi.gymapi_codec import EnvCodec
+from bam_envs.remote.gymapi.gymapi_messages import (
     GymRequest,
     RequestType,
     read_request,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue, NotInCommand, ProtocolError, RemoteError
-from bam_envs.remote.gymapi.messages import (
+from bam_envs.remote.gymapi.gymapi_messages import (
     GymRequest,
     RequestType,
     base_name,

@@ -125,7 +125,7 @@ def test_rows_are_drawn_after_close_and_reset(make_rows):
 
 
 def test_an_unknown_mode_is_refused(make):
-    from bam_envs.core.registry import make_env
+    from bam_envs.make_env import make_env
 
     with pytest.raises(InvalidValue) as caught:
         make_env("bam/pick-v0", render_mode="ansi")

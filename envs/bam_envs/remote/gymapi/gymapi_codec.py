@@ -16,6 +16,7 @@ from gymnasium import Space, spaces
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.core.wording import brief
+from bam_envs.remote.gymapi.gymapi_messages import PREFIX, GymResponse, write_feedback
 from bam_envs.remote.gymapi.leaves import (
     EXACT,
     GRIPPER_WIDTH,
@@ -31,7 +32,6 @@ from bam_envs.remote.gymapi.leaves import (
     read_numbers,
     read_pose,
 )
-from bam_envs.remote.gymapi.messages import PREFIX, GymResponse, write_feedback
 from bam_envs.remote.gymapi.versions import JUNE_22, Version
 from bam_envs.remote.transport import EnvSpecMessage, Info
 from bam_envs.remote.values import exact, pack, tree_from_json, tree_to_json

@@ -1,0 +1,99 @@
+"""The folders show the architecture: packages in one order, no circles, files that are easy to find."""
+
+import ast
+from collections import Counter
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+ORDER = {
+    "bam_envs": [
+        "core",
+        "ros",
+        "rosbridge",
+        "safety",
+        "robots",
+        "tasks",
+        "live",
+        "remote",
+        "make_env",
+        "robo_gym",
+        "testing",
+    ],
+    "bam_train": [
+        *("errors", "signals", "terminal_text", "atomic_file", "env_location", "settings", "finite_envs"),
+        *("checkpoint", "policy", "environments", "video", "loop", "evaluation", "deploy", "trainers", "compat", "cli"),
+    ],
+}
+"""Each package or module imports what stands before it, and nothing behind it."""
+SOURCES = {
+    ".".join(path.relative_to(folder).with_suffix("").parts).removesuffix(".__init__"): path
+    for folder, package in ((ROOT / "envs", "bam_envs"), (ROOT, "bam_train"))
+    for path in sorted((folder / package).rglob("*.py"))
+}
+
+
+def imports(module):
+    """The modules of ours that a module imports, at its top or in a function, other than for types only."""
+    path = SOURCES[module]
+    package = module.split(".") if path.name == "__init__.py" else module.split(".")[:-1]
+    found = set()
+    for node in without_type_checking(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            origin = ".".join([*base, *([node.module] if node.module else [])])
+            names = [f"{origin}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        for name in names:
+            while name and name not in SOURCES:
+                name = name.rpartition(".")[0]
+            found |= {name} - {"", module}
+    return found
+
+
+def without_type_checking(tree):
+    for node in ast.iter_child_nodes(tree):
+        if not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)):
+            yield node
+            yield from without_type_checking(node)
+
+
+def place(module):
+    """Where a module stands: its distribution's place, then its package's; the root of a package comes last."""
+    top, *rest = module.split(".")
+    return list(ORDER).index(top), ORDER[top].index(rest[0]) if rest else len(ORDER[top])
+
+
+def test_every_package_has_its_place():
+    for top, packages in ORDER.items():
+        assert {module.split(".")[1] for module in SOURCES if module.startswith(f"{top}.")} == set(packages)
+
+
+def test_imports_point_up_the_order():
+    wrong = [f"{a} imports {b}" for a in SOURCES for b in imports(a) if place(b) > place(a)]
+    assert wrong == []
+
+
+def test_no_file_imports_itself_round_a_circle():
+    TopologicalSorter({module: imports(module) for module in SOURCES}).prepare()
+
+
+def test_folders_are_small():
+    sizes = Counter(path.parent for path in SOURCES.values())
+    assert [str(folder) for folder, number in sizes.items() if number > 15] == []
+
+
+def test_names_of_files_are_unique():
+    """Other than the tree of exceptions, which each package has."""
+    names = Counter(path.name for path in SOURCES.values() if path.name not in ("__init__.py", "errors.py"))
+    assert [name for name, number in names.items() if number > 1] == []
+
+
+@pytest.mark.parametrize("name", ["utils", "common", "helpers", "misc"])
+def test_no_file_of_leftovers(name):
+    assert [module for module in SOURCES if module.rpartition(".")[2] == name] == []
