@@ -167,7 +167,10 @@ def _model_class() -> Any:
                 field.type = field.Type.Value(f"TYPE_{kind.upper()}")
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName("bam_onnx.Model"))
+    model = pool.FindMessageTypeByName("bam_onnx.Model")
+    if not hasattr(message_factory, "GetMessageClass"):  # protobuf 3.20, which robo-gym needs
+        return message_factory.MessageFactory(pool).GetPrototype(model)
+    return message_factory.GetMessageClass(model)
 
 
 _MODEL = _model_class()
