@@ -132,6 +132,7 @@ def _within(seconds: float, call: Callable[[], T], stop: Callable[[], None] = la
     finally:
         if thread.is_alive():
             stop()
+            thread.join(1.0)  # a thread that is inside onnxruntime while Python ends would abort the process
     if errors:
         raise errors[0]
     if not results:
