@@ -129,14 +129,14 @@ def _within(seconds: float, call: Callable[[], T], stop: Callable[[], None] = la
     thread.start()
     try:
         thread.join(seconds)
+        if thread.is_alive():
+            raise PolicyError(f"the policy takes more than {seconds:g} s for one action")
     finally:
         if thread.is_alive():
             stop()
             thread.join(1.0)  # a thread that is inside onnxruntime while Python ends would abort the process
     if errors:
         raise errors[0]
-    if not results:
-        raise PolicyError(f"the policy takes more than {seconds:g} s for one action")
     return results[0]
 
 
