@@ -118,23 +118,23 @@ def _within(seconds: float, call: Callable[[], T], stop: Callable[[], None] = la
     """
     results: list[T] = []
     errors: list[BaseException] = []
+    done = threading.Event()  # Ctrl-C in Thread.join makes the thread look ended in Python 3.11
 
     def work() -> None:
         try:
             results.append(call())
         except BaseException as error:
             errors.append(error)
+        done.set()
 
-    thread = threading.Thread(target=work, name="first run of a policy", daemon=True)
-    thread.start()
+    threading.Thread(target=work, name="first run of a policy", daemon=True).start()
     try:
-        thread.join(seconds)
-        if thread.is_alive():
+        if not done.wait(seconds):
             raise PolicyError(f"the policy takes more than {seconds:g} s for one action")
     finally:
-        if thread.is_alive():
+        if not done.is_set():
             stop()
-            thread.join(1.0)  # a thread that is inside onnxruntime while Python ends would abort the process
+            done.wait(1.0)  # a thread that is inside onnxruntime while Python ends would abort the process
     if errors:
         raise errors[0]
     return results[0]
