@@ -72,7 +72,7 @@ class PickTask(TaskMemory):
         leaves the table.
 
     Success:
-        The cube is at least 10 cm above where it lay for 5 steps on end (0.25 s).
+        The cube is at least 10 cm above where it lay for 5 steps in a row (0.25 s).
 
     End:
         Terminated at success, and when the cube is lower than 3 cm below the table top: it has left the table.

@@ -51,7 +51,7 @@ class PickPlaceTask(PickTask):
 
     Success:
         The cube has been lifted 3 cm in this episode, is within 2 cm of where it would lie at the goal, and the
-        gripper has been told to open and is open by more than 60 % of its width, for 5 steps on end (0.25 s).
+        gripper has been told to open and is open by more than 60 % of its width, for 5 steps in a row (0.25 s).
 
     End:
         Terminated at success, and when the cube is lower than 3 cm below the table top: it has left the table.
