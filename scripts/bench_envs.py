@@ -54,7 +54,7 @@ class Tape:
 
     def replayer(self) -> Callable[[], None]:
         """`mujoco.rollout` over the tape: the same model, states, controls, substeps and threads."""
-        model, rows = self.physics.model, self.physics.rows
+        model, rows = self.physics.model, self.physics.num_envs
         substeps = self.controls[0].shape[1]
         threads = min(len(os.sched_getaffinity(0)), rows) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         data = [mujoco.MjData(model) for _ in range(threads)]

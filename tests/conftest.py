@@ -38,8 +38,8 @@ KINDS = {
 
 
 def kind_of(file: str) -> str | None:
-    """The marker of a test file, whose path begins with ``tests/``."""
-    name = file.partition("tests/")[2]
+    """The marker of a test or its file, whose path begins with ``tests/``."""
+    name = file.partition("::")[0].partition("tests/")[2]
     return next((kind for kind, places in KINDS.items() if any(f"{name}/".startswith(f"{p}/") for p in places)), None)
 
 
