@@ -22,7 +22,7 @@ from bam_train.environments import is_batched, make_vector_env
 from bam_train.errors import SettingsError
 from bam_train.finite_envs import FiniteVectorEnv
 from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, VecGymAgent, Workspace
-from bam_train.loop.gym.gym_observations import names
+from bam_train.loop.gym.gym_spaces import names
 from bam_train.loop.video_agent import VideoAgent
 from bam_train.video import Frame
 

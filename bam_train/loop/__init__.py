@@ -19,6 +19,7 @@ from bam_train.loop.agents import CopyTAgent as CopyTAgent
 from bam_train.loop.agents import EpisodesDone as EpisodesDone
 from bam_train.loop.agents import KWAgentWrapper as KWAgentWrapper
 from bam_train.loop.agents import PrintAgent as PrintAgent
+from bam_train.loop.agents import SeedableAgent as SeedableAgent
 from bam_train.loop.temporal_agent import TemporalAgent as TemporalAgent
 from bam_train.loop.workspace import Workspace as Workspace
 
@@ -40,22 +41,11 @@ _ON_USE = {
     "loop.policy_agent": ("PolicyAgent",),
     "loop.robot_agent": ("RobotAgent",),
     "loop.tensors.replay_buffer": ("ReplayBuffer",),
-    "loop.tensors.returns": (
-        "cumulated_reward",
-        "doubleqlearning_temporal_difference",
-        "gae",
-        "temporal_difference",
-    ),
+    "loop.tensors.returns": ("cumulated_reward", "doubleqlearning_temporal_difference", "gae", "temporal_difference"),
     "loop.video_agent": ("record_video",),
-    "compat.bbrl.classname": ("get_arguments", "get_class", "instantiate_class"),
     "compat.bbrl.conventions": (
-        "SeedableAgent",
-        "SeedableAgentLast",
-        "SeedableAgentMean",
-        "SeedableAgentSum",
-        "SerializableAgent",
-        "TimeAgent",
-        "load",
+        *("SeedableAgentLast", "SeedableAgentMean", "SeedableAgentSum", "SerializableAgent", "TimeAgent", "load"),
+        *("get_arguments", "get_class", "instantiate_class"),
     ),
     "compat.bbrl.dataset_agents": ("DataLoaderAgent", "ShuffledDatasetAgent"),
     "compat.bbrl.old_gym_agents": ("AutoResetGymAgent", "NoAutoResetGymAgent"),
@@ -71,6 +61,7 @@ __all__ = [
     "EpisodesDone",
     "KWAgentWrapper",
     "PrintAgent",
+    "SeedableAgent",
     "TemporalAgent",
     "Workspace",
     *_MODULES,

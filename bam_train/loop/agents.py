@@ -163,6 +163,35 @@ class EpisodesDone(Agent):
         self.set((self.out_var, t), self.state)
 
 
+class SeedableAgent(Agent):
+    """An agent that is seeded once.
+
+    Args:
+        seed: The seed, if it is known already.
+        kwargs: ``name``, ``verbose``.
+    """
+
+    _SEED_AGAIN = "SeedableAgentLast, SeedableAgentSum and SeedableAgentMean take several seeds."
+
+    def __init__(self, seed: int | None = None, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self._seed = seed
+
+    def seed(self, seed: int) -> Any:
+        """Take the seed; the agent itself is returned.
+
+        Raises:
+            LoopError: It has one already.
+        """
+        if self._seed is not None:
+            raise LoopError(
+                f"{type(self).__name__} is seeded with {self._seed} already and cannot be seeded with {seed}; "
+                f"{self._SEED_AGAIN.format(seed=seed)}"
+            )
+        self._seed = seed
+        return self
+
+
 def _only_runs_members(agent: Agent) -> bool:
     kind: Any = type(agent)
     return kind.forward is Agents.forward and kind.__call__ is Agent.__call__

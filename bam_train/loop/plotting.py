@@ -11,6 +11,7 @@ import numpy as np
 
 from bam_envs.core.errors import MissingExtra
 from bam_train.errors import WorkspaceError
+from bam_train.loop.variables import to_array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,17 +29,13 @@ MAX_VALUE_AXES = 2
 def plot(workspace: Workspace, *names: str, batch: int | Sequence[int] | None = None) -> Figure:
     """Draws variables over time: one picture below the other, one line for each batch column and component.
 
-    Numbers with a fraction are drawn as lines, bool and integers as steps. At most 10 lines are drawn in a picture,
-    whose title then says of how many. The figure does not belong to pyplot; a notebook shows it where it is the last
-    value of a cell, and ``figure.savefig("run.png")`` writes it.
+    Numbers with a fraction are drawn as lines, bool and integers as steps; at most 10 lines in a picture, whose title
+    then says of how many. A notebook shows the figure, which does not belong to pyplot, as the last value of a cell.
 
     Args:
         workspace: With at least one variable.
         *names: The variables, in this order; without names all, but for images.
         batch: The batch column or columns to draw; None draws all.
-
-    Returns:
-        A :class:`matplotlib.figure.Figure`.
 
     Raises:
         UnknownVariable: A name is not in the workspace.
@@ -104,7 +101,8 @@ def _column(values: np.ndarray, own: Any, rows: Any) -> Series:
 
 def _arrays(workspace: Workspace, names: tuple[str, ...], purpose: str) -> dict[str, np.ndarray]:
     """The named variables, (T, B, ...) each, without images; all where no name is given."""
-    arrays = {name: _to_numpy(workspace.get_full(name)) for name in names or workspace.keys()}
+    arrays = {name: to_array(workspace.get_full(name)) for name in names or workspace.keys()}
+    arrays = {name: array if array.ndim > 1 else array[:, None] for name, array in arrays.items()}  # without a batch
     images = [name for name, array in arrays.items() if array.ndim > 2 + MAX_VALUE_AXES]
     if names and images:
         shape = arrays[images[0]].shape[2:]
@@ -117,14 +115,6 @@ def _arrays(workspace: Workspace, names: tuple[str, ...], purpose: str) -> dict[
             f"{purpose} has nothing to show: the workspace {'has only images' if images else 'is empty'}."
         )
     return {name: array for name, array in arrays.items() if name not in images}
-
-
-def _to_numpy(value: Any) -> np.ndarray:
-    """T x B x ...; what has no batch gets one column."""
-    if not isinstance(value, np.ndarray):
-        value = value.detach().cpu()
-        value = (value.float() if str(value.dtype) == "torch.bfloat16" else value).numpy()
-    return np.asarray(value if value.ndim > 1 else value[:, None])
 
 
 def _columns(name: str, width: int, batch: int | Sequence[int] | None) -> list[int]:

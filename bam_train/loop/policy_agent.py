@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bam_train.errors import PolicyError
 from bam_train.loop.agent import Agent
@@ -46,42 +45,28 @@ class PolicyAgent(Agent):
         self._declare(PolicyAgent, reads=(*self.names, self._timestep, self._done), writes=(output_string,))
 
     def forward(self, t: int, seed: int | Sequence[int] | None = None, **kwargs: Any) -> None:
-        """Act on the observation at t.
-
-        Args:
-            t: The time.
-            seed: Of the episode, or of each environment's, for an error message.
-            kwargs: Not used.
+        """Act on the observation at t; `seed`, of the episode or of each environment's, is for an error message.
 
         Raises:
             PolicyError: An action that is not finite.
         """
-        self._forget(t)
+        steps = self.get((self._timestep, t))
+        if not steps.all():
+            begun = np.flatnonzero(steps == 0)
+            self.policy.reset(*(() if len(begun) == len(steps) else (begun,)))
         values = [self.get((name, t)) for name in self.names]
         if self.single:
             values = [value[0].copy() for value in values]  # the policy may keep it
         observation = values[0] if self._keys is None else dict(zip(self._keys, values, strict=True))
         action = np.asarray(self.policy.act(observation) if self.single else self.policy.act_batch(observation))
-        if not self.get((self._done, t)).all():  # once all have ended, the action is not used
-            _require_finite(action, seed, t)
+        # Once all have ended, the action is not used.
+        if action.dtype.kind == "f" and not (np.isfinite(action).all() or self.get((self._done, t)).all()):
+            index = tuple(int(i) for i in np.argwhere(~np.isfinite(action))[0])
+            which = "the episode" if seed is None else f"the episode with seed {seed}"
+            if isinstance(seed, Sequence):
+                which = f"the episodes from seed {seed[0]} on"
+            raise PolicyError(
+                f"action{list(index)} is {action[index]} at step {t} of {which}; "
+                f"expected finite numbers: the policy is broken"
+            )
         self.set((self.output, t), action[None] if self.single else action)
-
-    def _forget(self, t: int) -> None:
-        """Forget the state of the environments whose episode begins at t."""
-        steps = self.get((self._timestep, t))
-        if not steps.all():
-            env_ids = np.flatnonzero(steps == 0)
-            self.policy.reset(*(() if len(env_ids) == len(steps) else (env_ids,)))
-
-
-def _require_finite(action: NDArray[Any], seed: int | Sequence[int] | None, t: int) -> None:
-    """Refuse an action that is not finite, naming the first such number."""
-    if action.dtype.kind == "f" and not np.isfinite(action).all():
-        index = tuple(int(i) for i in np.argwhere(~np.isfinite(action))[0])
-        which = "the episode" if seed is None else f"the episode with seed {seed}"
-        if isinstance(seed, Sequence):
-            which = f"the episodes from seed {seed[0]} on"
-        raise PolicyError(
-            f"action{list(index)} is {action[index]} at step {t} of {which}; "
-            f"expected finite numbers: the policy is broken"
-        )

@@ -10,7 +10,7 @@ import numpy as np
 
 from bam_train.errors import LoopError
 from bam_train.loop.agent import Agent
-from bam_train.loop.gym.gym_observations import Entry, entries, names, pack
+from bam_train.loop.gym.gym_spaces import Entry, entries, names, pack
 
 FLAGS = ("terminated", "truncated", "done")
 SUCCESS = "info/is_success"
@@ -55,7 +55,7 @@ class RobotAgent(Agent):
         self._running = self._closed = False
 
     def connect(self) -> None:
-        """Open the link to the robot, if there is one, without moving it: what is missing shows before the loop."""
+        """Open the link to the robot, if there is one, without moving it."""
         self._closed = False
         robot = robot_of(self.env)
         if robot is not None:
@@ -81,11 +81,7 @@ class RobotAgent(Agent):
         self._closed = True
 
     def forward(self, t: int, seed: int | None = None, **kwargs: Any) -> None:
-        """Reset with `seed` at t = 0, else step.
-
-        Raises:
-            LoopError: t > 0 and no episode is running.
-        """
+        """Reset with `seed` at t = 0, else step; refused when no episode is running."""
         if t == 0:
             self._closed = False
             observation, info = self.env.reset(seed=seed)

@@ -37,7 +37,7 @@ class TemporalAgent(Agent):
         if not isinstance(agent, Agent):
             raise LoopError(f"TemporalAgent: expected an agent, found {type(agent).__name__}.")
         if is_live(agent):  # before the robot is connected
-            _check_chain(_declared(agent), frozenset(), None)
+            _check(agent, (), None)
         self.agent = agent
         self.progress = progress
 
@@ -76,24 +76,25 @@ class TemporalAgent(Agent):
         """Check the agents and run them; close them when an exception comes."""
         workspace = self.workspace
         try:
-            _check_called(self.agent, workspace, stop_variable)
+            _check(self.agent, workspace, stop_variable)
         except WiringError:
             if is_live(self.agent):  # a robot that waits for the next call
                 self.agent.close()
             raise
         try:
-            with self._advance(n_steps, t) as advance:
-                self._run(workspace, t, n_steps, stop_variable, advance, kwargs)
-        except BaseException as error:
-            self._close_after(error)
-            raise
+            display: Any = nullcontext(None)
+            if self.progress is not False:
+                from bam_train.loop.progress import progress_display
 
-    def _close_after(self, error: BaseException) -> None:
-        """Close all agents; the first error is the one to be seen."""
-        try:
-            self.agent.close()
-        except Exception as failure:
-            _note(error, f"Closing failed too: {type(failure).__name__}: {failure}")
+                display = progress_display(self.progress, n_steps, t, self.name or "steps")
+            with display as advance:
+                self._run(workspace, t, n_steps, stop_variable, advance, kwargs)
+        except BaseException as error:  # the one to be seen, also if closing fails
+            try:
+                self.agent.close()
+            except Exception as failure:
+                _note(error, f"Closing failed too: {type(failure).__name__}: {failure}")
+            raise
 
     def _run(
         self,
@@ -115,18 +116,14 @@ class TemporalAgent(Agent):
                     raise
             if advance is not None:
                 advance(1)
-            if stop_variable is not None and _is_reached(workspace, stop_variable, t):
-                return
+            if stop_variable is not None:
+                if stop_variable not in workspace:
+                    raise UnknownVariable(stop_variable, workspace.keys(), "stop_variable")
+                if workspace.get(stop_variable, t).all():
+                    return
             t += 1
             if end is not None and t >= end:
                 return
-
-    def _advance(self, n_steps: int | None, t: int) -> Any:
-        if self.progress is False:
-            return nullcontext(None)
-        from bam_train.loop.progress import progress_display
-
-        return progress_display(self.progress, n_steps, t, self.name or "steps")
 
     def _inner(self) -> tuple[Agent, ...]:
         return (self.agent,)
@@ -137,14 +134,6 @@ class TemporalAgent(Agent):
     def __getstate__(self) -> dict[str, Any]:
         """A display of the caller's stays with the original."""
         return {**super().__getstate__(), "progress": self.progress is True}
-
-
-def _is_reached(workspace: Workspace, stop_variable: str, t: int) -> bool:
-    """Whether the stop variable is true for the whole batch."""
-    try:
-        return bool(workspace.get(stop_variable, t).all())
-    except UnknownVariable:
-        raise UnknownVariable(stop_variable, workspace.keys(), "stop_variable") from None
 
 
 def _note(error: BaseException, text: str) -> None:
@@ -160,32 +149,24 @@ def _note(error: BaseException, text: str) -> None:
 # one agent does not say what it writes, anything may be.
 
 
-def _check_called(agent: Agent, held: Iterable[str], stop_variable: str | None) -> None:
-    """Check a chain that is about to run on a workspace that holds the variables `held`.
+def _check(agent: Agent, held: Iterable[str], stop_variable: str | None) -> None:
+    """Check a chain that runs on a workspace which holds the variables `held`.
 
     Raises:
-        WiringError: An agent reads what nobody writes, or nobody writes the stop variable.
+        WiringError: An agent reads what nobody writes, nobody writes the stop variable, or an agent in a chain with a
+            robot does not say what it reads and writes.
     """
-    chain = _declared(agent) if is_live(agent) else leaves(agent)
-    if not any(one.writes is None for one in chain):
-        _check_chain(chain, frozenset(held), stop_variable)
-
-
-def _declared(agent: Agent) -> list[Agent]:
-    """The agents of a chain, all of which say what they read and write."""
-    chain = leaves(agent)
-    for one in chain:
-        if one.reads is None or one.writes is None:
-            raise WiringError(
-                f"{agent_name(one)} is in a chain with a robot and does not say what it reads and writes; "
-                f'give its class reads = ("name", ...) and writes = ("name", ...).'
-            )
-    return chain
-
-
-def _check_chain(chain: list[Agent], held: frozenset[str], stop_variable: str | None) -> None:
-    everything = held.union(*(one.writes or () for one in chain))
-    before = set(held)
+    chain, before = leaves(agent), set(held)
+    if is_live(agent):
+        for one in chain:
+            if one.reads is None or one.writes is None:
+                raise WiringError(
+                    f"{agent_name(one)} is in a chain with a robot and does not say what it reads and writes; "
+                    f'give its class reads = ("name", ...) and writes = ("name", ...).'
+                )
+    if any(one.writes is None for one in chain):
+        return
+    everything = before.union(*(one.writes or () for one in chain))
     for one in chain:
         for name in one.reads_previous:
             if name not in everything:

@@ -66,21 +66,12 @@ class Variable:
         """Where the values are."""
         return "cpu"
 
-    @property
-    def stop(self) -> int:
+    def time_size(self) -> int:
         """One after the last time written."""
         return self.first + len(self._whole if self._values is None else self._values)
 
-    def time_size(self) -> int:
-        """One after the last time written."""
-        return self.stop
-
     def batch_size(self) -> int:
-        """B.
-
-        Raises:
-            WorkspaceError: There is no batch axis: `set_full` takes shape (T,) too.
-        """
+        """B; refused without a batch axis, as `set_full` takes shape (T,) too."""
         if not self.shape:
             raise WorkspaceError(f"{self.name!r} has no batch axis; write it as T x B x ....")
         return int(self.shape[0])
@@ -88,12 +79,7 @@ class Variable:
     # -- one time --------------------------------------------------------------------------------------------------
 
     def set(self, t: int, value: Any) -> None:
-        """Write `value` (B x ...) at time t; missing earlier times become zeros.
-
-        Raises:
-            ValueMismatch: Another shape, dtype, device or kind than before.
-            TimeNotWritten: A negative time before the first, or one that has left the window.
-        """
+        """Write `value` (B x ...) at time t; missing earlier times become zeros."""
         if not self._fits(value):
             self._check(value, f"t={t}")
         if self.COPIES:
@@ -106,11 +92,7 @@ class Variable:
             self._store(t, value)
 
     def get(self, t: int) -> Any:
-        """The value at time t, B x ...; -1 is the last.
-
-        Raises:
-            TimeNotWritten: Nobody wrote it.
-        """
+        """The value at time t, B x ...; -1 is the last."""
         values = self._whole if self._values is None else self._values  # both take an index
         index = t - self.first if t >= 0 else len(values) + t
         if 0 <= index < len(values):
@@ -230,6 +212,7 @@ class Variable:
         return self._values
 
     def _be_like(self, shape: Any, value: Any) -> None:
+        """Take the shape, dtype and device of the first value."""
         self.shape, self.dtype = shape, value.dtype
 
     def _check(self, value: Any, where: str) -> None:
@@ -259,10 +242,10 @@ class Variable:
 
     def kept_times(self) -> str:
         """Which times there are, for an error message."""
-        if self.stop <= self.first:
+        if self.time_size() <= self.first:
             return "it has none"
-        several = self.stop - self.first > 1
-        text = f"it has times {self.first} to {self.stop - 1}" if several else f"it has time {self.first} only"
+        several = self.time_size() - self.first > 1
+        text = f"it has times {self.first} to {self.time_size() - 1}" if several else f"it has time {self.first} only"
         return f"{text}; earlier ones have left the window" if self.first else text
 
 
@@ -291,3 +274,15 @@ def kind_mismatch(name: str, where: str, expected: str, found: Any) -> ValueMism
     return ValueMismatch(
         f"{name!r} at {where}: expected {expected}, found {'an' if kind[0] in 'aeiou' else 'a'} {kind}."
     )
+
+
+def to_array(value: Any) -> np.ndarray:
+    """A tensor or array as an array; shares its memory where it can."""
+    if isinstance(value, np.ndarray):
+        return value
+    try:
+        array: np.ndarray = value.numpy()
+    except (RuntimeError, TypeError):  # with a gradient, on another device, or of a dtype that NumPy lacks
+        value = value.detach().cpu()
+        array = (value.float() if value.is_floating_point() and value.itemsize < 4 else value).numpy()
+    return array

@@ -9,7 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from bam_train.loop.agent import Agent
+from bam_train.loop.agent import Agent, import_torch
 from bam_train.loop.agents import Agents, KWAgentWrapper
 from bam_train.loop.temporal_agent import TemporalAgent
 from bam_train.loop.workspace import Workspace
@@ -35,11 +35,7 @@ class VideoAgent(Agent):
         self.env, self.add, self.count = env, add, 0
 
     def forward(self, t: int, **kwargs: Any) -> None:
-        """Take the picture at time t.
-
-        Raises:
-            SettingsError: The environment gives none.
-        """
+        """Take the picture at time t; refused where the environment gives none."""
         self.add(picture(self.env))
         self.count += 1
 
@@ -72,7 +68,8 @@ def record_video(env: gym.Env[Any, Any], policy: Agent, path: str | Path, *, arr
     path = require_video_path(path)
     agent = policy.agent if isinstance(policy, TemporalAgent) else policy
     try:
-        with _no_grad(arrays), open_video(path, env.metadata.get("render_fps", 30)) as add:
+        gradients = nullcontext() if arrays == "numpy" else import_torch("record_video()").no_grad()
+        with gradients, open_video(path, env.metadata.get("render_fps", 30)) as add:
             # Not seeded: as the environment is. The policy gets no keyword but t.
             stepper = KWAgentWrapper(ParallelGymAgent(lambda: env, 1, arrays=arrays), seed=[None])
             loop = TemporalAgent(Agents(stepper, VideoAgent(env, add), agent))
@@ -80,11 +77,3 @@ def record_video(env: gym.Env[Any, Any], policy: Agent, path: str | Path, *, arr
     finally:
         env.close()  # type: ignore[no-untyped-call]
     return path
-
-
-def _no_grad(arrays: str) -> Any:
-    if arrays == "numpy":
-        return nullcontext()
-    import torch
-
-    return torch.no_grad()

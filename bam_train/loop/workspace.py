@@ -5,13 +5,11 @@ as they are, with their graph, or NumPy arrays, which are copied in and need no 
 
 It is BBRL's `Workspace`, with these differences:
 
-- What BBRL asserts is an exception here that names the variable, what was expected and what was found.
-- A first write that fails leaves nothing behind.
+- What BBRL asserts is an exception here that names the variable, what was expected and what was found; a first write
+  that fails leaves nothing behind.
 - A full read is kept until the next write, see `bam_train.loop.variables`.
-- `to`, `cat_batch` and `sample_subworkspace` with more than one window work.
-- `copy_n_last_steps` copies only the variables that it was given, and once, also where the copied times overlap (BBRL
-  copies once for each variable).
-- `select_batch` gives variables of one tensor each, which are quicker to read.
+- `to`, `cat_batch` and `sample_subworkspace` with more than one window work; `copy_n_last_steps` copies the variables
+  that it was given only, and once.
 - A workspace with a window gives old times to a sink and forgets them: memory stays flat however long the loop runs.
   What is made of it (`contiguous`, `select_batch`, `to`, a copy) holds the times kept, and begins at time 0 again.
 
@@ -21,7 +19,6 @@ Longer than most files here: BBRL's users find every member in one class.
 from __future__ import annotations
 
 import sys
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, KeysView, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -42,7 +39,7 @@ _LEAST_PIECE = 64
 
 
 class Workspace:
-    """Named variables over time.
+    """Named variables over time. Whatever is given the name of a variable that nobody wrote raises `UnknownVariable`.
 
     Args:
         workspace: Begin as a copy of this one, sharing no memory.
@@ -69,7 +66,6 @@ class Workspace:
         self.variables: dict[str, Variable] = {}
         self.first_time = 0
         self.window, self._sink = window, sink
-        self._outbox: deque[tuple[int, dict[str, Any]]] = deque()  # what the sink has still to get
         if workspace is not None:
             for name, variable in workspace.variables.items():
                 self.set_full(name, variable.copied(variable.full()))
@@ -110,7 +106,6 @@ class Workspace:
         """The value at time t, B x ...; -1 is the last.
 
         Raises:
-            UnknownVariable: Nobody wrote it.
             TimeNotWritten: Nobody wrote it at t, or t has left the window.
         """
         try:
@@ -140,11 +135,7 @@ class Workspace:
         self.variables[name] = variable
 
     def get_full(self, name: str) -> Any:
-        """All times kept, T x B x ....
-
-        Raises:
-            UnknownVariable: Nobody wrote it.
-        """
+        """All times kept, T x B x ...."""
         return self._variable(name).full()
 
     def get_time_truncated(self, name: str, from_time: int, to_time: int) -> Any:
@@ -159,11 +150,7 @@ class Workspace:
         return variable.truncated(from_time, to_time)
 
     def remove_variable(self, name: str) -> None:
-        """Forget one variable; it may come back with another shape.
-
-        Raises:
-            UnknownVariable: Nobody wrote it.
-        """
+        """Forget one variable; it may come back with another shape."""
         self._variable(name)
         del self.variables[name]
 
@@ -273,11 +260,8 @@ class Workspace:
         size = self.batch_size()
         if not size:
             raise WorkspaceError(f"select_batch_n: {n} columns are wanted, and there are none.")
-        if self._has_tensors():
-            import torch
-
-            return self.select_batch(torch.randint(low=0, high=size, size=(n,)))
-        return self.select_batch(np.random.randint(size, size=n))
+        torch = self._torch()
+        return self.select_batch(torch.randint(size, (n,)) if torch else np.random.randint(size, size=n))
 
     def select_subtime(self, t: Any, window_size: int) -> Workspace:
         """A new workspace where column b has times t[b] to t[b] + window_size - 1.
@@ -319,22 +303,17 @@ class Workspace:
                 f"sample_subworkspace: expected one or more windows of at most {times} times, "
                 f"found {n_times} of {n_timesteps}."
             )
-        pieces = [self._random_window(n_batch_elements, n_timesteps) for _ in range(n_times)]
+        columns, torch, pieces = self.batch_size() or 0, self._torch(), []
+        for _ in range(n_times):
+            window = self
+            if n_timesteps < times:
+                start = int(np.random.randint(times - n_timesteps))  # BBRL's draw: the last window never comes
+                window = self.subtime(start, start + n_timesteps)
+            if n_batch_elements < columns:
+                drawn = torch.randperm(columns) if torch else np.random.permutation(columns)
+                window = window.select_batch(drawn[:n_batch_elements])
+            pieces.append(window)
         return pieces[0] if n_times == 1 else Workspace.cat_batch(pieces)
-
-    def _random_window(self, n_columns: int, n_times: int) -> Workspace:
-        """One random window, drawn with the same random numbers as BBRL's."""
-        times, columns, window = self.time_size() or 0, self.batch_size() or 0, self
-        if n_times < times:
-            start = int(np.random.randint(times - n_times))
-            window = self.subtime(start, start + n_times)
-        if n_columns >= columns:
-            return window
-        if self._has_tensors():
-            import torch
-
-            return window.select_batch(torch.randperm(columns)[:n_columns])
-        return window.select_batch(np.random.permutation(columns)[:n_columns])
 
     @staticmethod
     def cat_batch(workspaces: Sequence[Workspace]) -> Workspace:
@@ -342,7 +321,6 @@ class Workspace:
 
         Raises:
             WorkspaceError: There are none, or they have different lengths.
-            UnknownVariable: One lacks a variable that the first has.
         """
         if not workspaces:
             raise WorkspaceError("cat_batch: expected one workspace or more, found none.")
@@ -371,21 +349,20 @@ class Workspace:
             filter_key: The variable that says where episodes end.
 
         Raises:
-            UnknownVariable: There is no `filter_key`.
             WorkspaceError: A variable is not as long as `filter_key`.
         """
-        if no_final_state:
-            return _of({name: _pairs(one, None) for name, one in self.variables.items()})
-        if filter_key not in self.variables:
-            raise UnknownVariable(filter_key, self.variables, "filter_key")
-        done = self.variables[filter_key]
-        for name, one in self.variables.items():
-            if one.time_size() != done.time_size():
-                raise WorkspaceError(
-                    f"{name!r} has {one.time_size()} times and {filter_key!r} has {done.time_size()}; "
-                    f"get_transitions needs all to be alike."
-                )
-        inside = done.view()[:-1] == 0
+        inside = None
+        if not no_final_state:
+            if filter_key not in self.variables:
+                raise UnknownVariable(filter_key, self.variables, "filter_key")
+            done = self.variables[filter_key]
+            for name, one in self.variables.items():
+                if one.time_size() != done.time_size():
+                    raise WorkspaceError(
+                        f"{name!r} has {one.time_size()} times and {filter_key!r} has {done.time_size()}; "
+                        f"get_transitions needs all to be alike."
+                    )
+            inside = done.view()[:-1] == 0
         return _of({name: _pairs(one, inside) for name, one in self.variables.items()})
 
     # -- the whole -------------------------------------------------------------------------------------------------
@@ -405,32 +382,22 @@ class Workspace:
 
     def flush(self) -> None:
         """Give all that is left to the sink, forget it, and begin again at time 0."""
-        stop = max((one.stop for one in self.variables.values()), default=0)
-        if stop > self.first_time:
-            self._take_out(stop)
+        stop = max((one.time_size() for one in self.variables.values()), default=0)
+        first, piece = self._take_out(stop) if stop > self.first_time else (0, {})
         self.clear()
-        self._deliver()
+        if self._sink is not None and piece:
+            self._sink(first, piece)
 
     # -- pictures --------------------------------------------------------------------------------------------------
 
     def plot(self, *names: str, batch: int | Sequence[int] | None = None) -> Figure:
-        """A matplotlib figure of these variables over time (all without a name), see `bam_train.loop.plotting.plot`.
-
-        Raises:
-            MissingExtra: matplotlib is not installed.
-            UnknownVariable: Nobody wrote it.
-        """
+        """A matplotlib figure of these variables over time (all without a name), see `bam_train.loop.plotting.plot`."""
         from bam_train.loop.plotting import plot
 
         return plot(self, *names, batch=batch)
 
     def to_dataframe(self, *names: str) -> pd.DataFrame:
-        """A pandas table of these variables (all without a name): one line for each time and batch column.
-
-        Raises:
-            MissingExtra: pandas is not installed.
-            UnknownVariable: Nobody wrote it.
-        """
+        """A pandas table of these variables, see `bam_train.loop.plotting.to_dataframe`."""
         from bam_train.loop.plotting import to_dataframe
 
         return to_dataframe(self, *names)
@@ -463,8 +430,9 @@ class Workspace:
     def _chosen(self, names: Sequence[str] | None) -> dict[str, Variable]:
         return {name: self._variable(name) for name in (self.variables if names is None else names)}
 
-    def _has_tensors(self) -> bool:
-        return not all(one.ARRAY is np.ndarray for one in self.variables.values())
+    def _torch(self) -> Any:
+        """The module torch where there are tensors, which are drawn from with its random numbers; else None."""
+        return None if all(one.ARRAY is np.ndarray for one in self.variables.values()) else sys.modules["torch"]
 
     def _require_times(self, name: str, begin: int, end: int) -> None:
         """Refuse a range of times that is empty, negative, or has left the window."""
@@ -475,28 +443,21 @@ class Workspace:
 
     def _make_room(self, t: int) -> None:
         """Forget so much that time t fits; what is forgotten goes to the sink."""
-        first = t - (self.window or 0) + 1
-        self._take_out(first)
+        stop = t - (self.window or 0) + 1
+        first, piece = self._take_out(stop)
         for one in self.variables.values():
-            one.drop(first)
-        self._deliver()
+            one.drop(stop)
+        if self._sink is not None:
+            self._sink(first, piece)  # last: each piece goes there once, also if it fails
 
-    def _take_out(self, stop: int) -> None:
-        """Keep the times before `stop` for the sink, and count them as forgotten."""
+    def _take_out(self, stop: int) -> tuple[int, dict[str, Any]]:
+        """The first time kept and what the sink gets of the times before `stop`, which count as forgotten now."""
         first, self.first_time = self.first_time, stop
-        if self._sink is None:
-            return
-        piece = {
-            name: one.copied(one.truncated(first, min(stop, one.stop)))  # of one array it would be a view
+        return first, {
+            name: one.copied(one.truncated(first, min(stop, one.time_size())))  # of one array it would be a view
             for name, one in self.variables.items()
-            if one.stop > first
+            if one.time_size() > first and self._sink is not None
         }
-        self._outbox.append((first, piece))
-
-    def _deliver(self) -> None:
-        """Give the sink what is waiting for it; each piece once, also if the sink fails."""
-        while self._outbox and self._sink is not None:
-            self._sink(*self._outbox.popleft())
 
 
 def _of(arrays: Mapping[str, Any]) -> Workspace:
@@ -518,20 +479,14 @@ def _pairs(one: Variable, inside: Any) -> Any:
 
 
 def _common(what: str, sizes: Mapping[str, int]) -> int | None:
-    """The one size that all variables have; None when there are none.
-
-    Raises:
-        WorkspaceError: Two differ; names them.
-    """
-    first = next(iter(sizes), None)
-    if first is None:
-        return None
-    for name, size in sizes.items():
-        if size != sizes[first]:
+    """The one size that all variables have; None when there are none."""
+    (first, common), *others = sizes.items() or [("", None)]
+    for name, size in others:
+        if size != common:
             raise WorkspaceError(
-                f"The variables have different {what} sizes: {first!r} has {sizes[first]}, {name!r} has {size}."
+                f"The variables have different {what} sizes: {first!r} has {common}, {name!r} has {size}."
             )
-    return sizes[first]
+    return common
 
 
 def _no_time(name: str, t: Any) -> WorkspaceError:

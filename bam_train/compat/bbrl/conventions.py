@@ -1,17 +1,23 @@
-"""Conventions of BBRL's agents: those that take a time, a seed, or can be saved. They are inherited together."""
+"""Conventions of BBRL: agents that take a time, a seed, or can be saved, and objects from configurations.
+
+A configuration names a class, ``{"classname": "package.module.Class", "size": 3}``. It is a mapping, or an object with
+attributes such as OmegaConf's, and is never changed.
+"""
 
 from __future__ import annotations
 
+import importlib
 import pickle
-from abc import ABC
 from pathlib import Path
 from typing import Any
 
-from bam_train.errors import LoopError, OutputError
+from bam_envs.core.wording import brief, did_you_mean
+from bam_train.errors import LoopError, OutputError, SettingsError
 from bam_train.loop.agent import Agent
+from bam_train.loop.agents import SeedableAgent
 
 
-class TimeAgent(Agent, ABC):
+class TimeAgent(Agent):
     """An agent whose ``forward`` takes the time t."""
 
     def forward(self, t: int, *args: Any, **kwargs: Any) -> Any:
@@ -19,61 +25,31 @@ class TimeAgent(Agent, ABC):
         raise NotImplementedError(f"{type(self).__name__} must override forward(self, t, **kwargs).")
 
 
-class SeedableAgent(Agent, ABC):
-    """An agent that is seeded once.
-
-    Args:
-        seed: The seed, if it is known already.
-    """
-
-    def __init__(self, seed: int | None = None, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self._seed = seed
-        self._seeds: list[int] = []
-
-    def seed(self, seed: int) -> Any:
-        """Take the seed; the agent itself is returned.
-
-        Raises:
-            LoopError: It has one already.
-        """
-        if self._seed is not None:
-            raise LoopError(
-                f"{type(self).__name__} is seeded with {self._seed} already and cannot be seeded with {seed}; "
-                f"SeedableAgentLast, SeedableAgentSum and SeedableAgentMean take several seeds."
-            )
-        self._seed = seed
-        return self
-
-
-class SeedableAgentLast(SeedableAgent, ABC):
+class SeedableAgentLast(SeedableAgent):
     """An agent that has the last seed it was given."""
+
+    _combined: Any = staticmethod(lambda seeds: seeds[-1])
 
     def seed(self, seed: int) -> Any:
         """Take the seed; the agent itself is returned."""
-        self._seeds.append(seed)
+        self._seeds = [*getattr(self, "_seeds", ()), seed]
         self._seed = self._combined(self._seeds)
         return self
 
-    def _combined(self, seeds: list[int]) -> int:
-        return seeds[-1]
 
-
-class SeedableAgentSum(SeedableAgentLast, ABC):
+class SeedableAgentSum(SeedableAgentLast):
     """An agent that has the sum of the seeds it was given."""
 
-    def _combined(self, seeds: list[int]) -> int:
-        return sum(seeds)
+    _combined = staticmethod(sum)
 
 
-class SeedableAgentMean(SeedableAgentLast, ABC):
+class SeedableAgentMean(SeedableAgentLast):
     """An agent that has the mean of the seeds it was given, rounded down to a whole number."""
 
-    def _combined(self, seeds: list[int]) -> int:
-        return int(sum(seeds) / len(seeds))
+    _combined = staticmethod(lambda seeds: sum(seeds) // len(seeds))
 
 
-class SerializableAgent(Agent, ABC):
+class SerializableAgent(Agent):
     """An agent that can be saved; override `serialize` to leave out what cannot."""
 
     def serialize(self) -> Any:
@@ -107,3 +83,48 @@ def load(filename: str | Path) -> Any:
         return pickle.loads(Path(filename).expanduser().read_bytes())
     except (OSError, pickle.UnpicklingError, EOFError) as error:
         raise LoopError(f"{filename}: no agent can be loaded: {error}") from error
+
+
+def get_class(arguments: Any) -> Any:
+    """The class (or function) that a configuration's `classname` names.
+
+    Raises:
+        SettingsError: There is no `classname`, or it cannot be imported.
+    """
+    path = _entries(arguments).get("classname")
+    parts = path.split(".") if isinstance(path, str) else []
+    if len(parts) < 2 or not all(part.isidentifier() for part in parts):
+        found = "none" if path is None else brief(path)
+        raise SettingsError(f'classname: expected a path such as "package.module.Class", found {found}.')
+    *folders, name = parts
+    try:
+        module = importlib.import_module(".".join(folders))
+    except ModuleNotFoundError as error:
+        raise SettingsError(f"classname {path!r}: {error}; install it or correct the name.") from error
+    if not hasattr(module, name):
+        names = [one for one in dir(module) if not one.startswith("_")]
+        raise SettingsError(
+            f"classname {path!r}: module {module.__name__!r} has no {name!r}. {did_you_mean(name, names)}"
+        )
+    return getattr(module, name)
+
+
+def get_arguments(arguments: Any) -> dict[str, Any]:
+    """Every entry of a configuration but its `classname`, in a new dict."""
+    return {name: value for name, value in _entries(arguments).items() if name != "classname"}
+
+
+def instantiate_class(arguments: Any) -> Any:
+    """Call the class that a configuration names, with its other entries as keyword arguments.
+
+    Raises:
+        SettingsError: There is no `classname`, or it cannot be imported.
+    """
+    return get_class(arguments)(**get_arguments(arguments))
+
+
+def _entries(arguments: Any) -> dict[str, Any]:
+    try:
+        return dict(vars(arguments) if hasattr(arguments, "__dict__") and not hasattr(arguments, "keys") else arguments)
+    except TypeError:
+        raise SettingsError(f"configuration: expected a mapping with a classname, found {brief(arguments)}.") from None

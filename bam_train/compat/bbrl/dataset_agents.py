@@ -1,8 +1,7 @@
 """Agents that write batches of a dataset at time 0.
 
-Differences from BBRL's agents of the same names: `ShuffledDatasetAgent` works, seeded and unseeded; a batch with fewer
-values than there are names is an error; a batch may be a mapping or one tensor; a finished `DataLoaderAgent` stays
-finished however often it is called; neither draws from torch's random numbers when it is made.
+Differences from BBRL's agents of the same names: `ShuffledDatasetAgent` works; a batch with fewer values than there are
+names is an error; a batch may be a mapping or one tensor; neither draws from torch's random numbers when it is made.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from bam_envs.core.validation import NonNegativeInt, check
 from bam_train.errors import WorkspaceError
 from bam_train.loop.agent import Agent
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class _DatasetAgent(Agent):
-    """Writes batches, on the device where the agent is (`to`)."""
+    """Writes batches, on the device where the agent is (`to`); refuses those with fewer values than it has names."""
 
     reads = ()
 
@@ -82,11 +82,7 @@ class DataLoaderAgent(_DatasetAgent):
         return self._finished
 
     def forward(self, **kwargs: Any) -> None:
-        """Write the next batch at time 0.
-
-        Raises:
-            WorkspaceError: The batch has fewer values than there are names.
-        """
+        """Write the next batch at time 0."""
         if self._finished:
             return
         for batch in self.iter:
@@ -111,27 +107,12 @@ class ShuffledDatasetAgent(_DatasetAgent):
         self._rng: np.random.Generator | None = None
 
     def seed(self, seed: int | None = None) -> Self:
-        """Draw from a generator of its own from now on; the agent itself is returned.
-
-        An agent that is never seeded draws from torch's global generator.
-
-        Args:
-            seed: The same one gives the same batches; None gives others every time.
-
-        Raises:
-            WorkspaceError: A negative seed, or no int.
-        """
-        if seed is not None and (not isinstance(seed, int) or seed < 0):
-            raise WorkspaceError(f"seed: expected an int of at least 0, or None, found {seed!r}.")
-        self._rng = np.random.default_rng(seed)
+        """Draw from a generator of its own from now on, not from torch's; None gives other batches every time."""
+        self._rng = np.random.default_rng(check(seed, NonNegativeInt | None, "seed", WorkspaceError))
         return self
 
     def forward(self, **kwargs: Any) -> None:
-        """Write a batch at time 0.
-
-        Raises:
-            WorkspaceError: The dataset is empty, or its items have fewer values than there are names.
-        """
+        """Write a batch at time 0."""
         size, count = len(self.dataset), self.batch_size
         if not size:
             raise WorkspaceError("The dataset is empty: there is nothing to draw from.")

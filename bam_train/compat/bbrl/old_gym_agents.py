@@ -19,9 +19,9 @@ from bam_train.loop.gym.parallel_gym_agent import Env, ParallelGymAgent, has_aut
 
 
 class _OldGymAgent(ParallelGymAgent):
-    """What both have in common; `_autoreset` is all that differs.
+    """Writes what `ParallelGymAgent` does, with a seed for each environment.
 
-    It writes what `ParallelGymAgent` does, in the variables env_obs, done, truncated, reward, timestep and
+    That is in the variables env_obs, done, truncated, reward, timestep and
     cumulated_reward. Environment k is seeded with ``seed + k`` when it is made; no reset seeds it again.
 
     Args:
@@ -117,7 +117,7 @@ class _OldGymAgent(ParallelGymAgent):
 
 
 class AutoResetGymAgent(_OldGymAgent):
-    """Environments that begin the next episode after one has ended, at the time after its last."""
+    """Environments that begin the next episode at the time after the last of one."""
 
     _autoreset = True
 

@@ -6,13 +6,11 @@ failure in an `AsynchronousAgent` seems to run for ever:
 - They work, with every start method. "spawn" is the default, because torch's threads and CUDA do not survive a fork; in
   a notebook, or with agents that cannot be pickled, give ``start_method="fork"``.
 - A failure there is a `RemoteAgentError` here. The processes are closed then; the next call starts new ones.
-- Weights are in shared memory: ``load_state_dict`` on what `get_by_name` finds is seen in the process at once. For a
-  run on weights that stay as they are, give the agent a clone.
-- `seed` seeds the process's global generators as well, so that the noise of two processes differs; it works after the
-  start, too. Nobody needs to seed: process k has seed k, or, of a lone agent, its generators one from torch's.
-- `NRemoteAgent.create` leaves the agent it is given as it was. With no processes, what it returns is not seeded.
+- Weights are in shared memory: ``load_state_dict`` on what `get_by_name` finds is seen in the process at once.
+- `seed` seeds the process's global generators as well, before and after the start. Unseeded, process k has seed k; the
+  generators of a lone agent have one from torch's.
 - `close` can be called at any time; processes also end with the agent's last reference and with the parent.
-- A process is a daemon: the agent in it cannot start processes of its own. It has one torch thread.
+- A process is a daemon, which cannot start processes of its own, with one torch thread.
 """
 
 from __future__ import annotations
@@ -57,9 +55,7 @@ class _ProcessAgent(Agent):
         return super().get_by_name(n) + self.agent.get_by_name(n)
 
     def seed(self, seed: int) -> Self:
-        """Seed the agent, and the process's global generators (torch, NumPy, random); itself is returned.
-
-        Before the start it is kept for the start.
+        """Seed the agent, and the process's global generators (torch, NumPy, random), now or when it starts.
 
         Raises:
             RemoteAgentError: The agent refuses, for instance because it is seeded already.
@@ -75,11 +71,7 @@ class _ProcessAgent(Agent):
         return self
 
     def is_running(self) -> bool:
-        """Whether a call is still under way.
-
-        Raises:
-            RemoteAgentError: It failed; the process is closed.
-        """
+        """Whether a call is still under way; a failure is raised here, and the process is closed."""
         try:
             return self._worker is not None and self._worker.poll()
         except RemoteAgentError:
@@ -93,11 +85,7 @@ class _ProcessAgent(Agent):
             self._worker = None
 
     def _running_worker(self) -> Worker:
-        """The process, started if there is none.
-
-        Raises:
-            LoopError: It is busy.
-        """
+        """The process, started if there is none."""
         if self._worker is not None and self._worker.closed:
             self._worker = None
         if self._worker is None:
@@ -245,11 +233,7 @@ class NRemoteAgent(Agent):
             raise
 
     def is_running(self) -> bool:
-        """Whether a call that did not wait is still under way in a process.
-
-        Raises:
-            RemoteAgentError: A copy failed. All are closed then.
-        """
+        """Whether a call that did not wait is still under way in a process; if a copy failed, all are closed."""
         try:
             return bool([agent for agent in self.agents if agent.is_running()])  # looks at all: one may have failed
         except RemoteAgentError:
@@ -275,9 +259,6 @@ class NRemoteAgent(Agent):
 
     def close(self) -> None:
         """End all processes; at any time, and idempotent. The next call starts new ones."""
-        for agent in self.agents:
-            if agent._worker is not None:
-                agent._worker.ask_to_end()  # so that they end at the same time
         for agent in self.agents:
             agent.close()
 
@@ -325,11 +306,7 @@ class AsynchronousAgent(_ProcessAgent):
         self._last, self._expected = None, True
 
     def is_running(self) -> bool:
-        """Whether the last call is still under way.
-
-        Raises:
-            RemoteAgentError: It failed.
-        """
+        """Whether the last call is still under way; a failure is raised here."""
         if super().is_running():
             return True
         if self._expected and self._worker is not None:
@@ -339,11 +316,7 @@ class AsynchronousAgent(_ProcessAgent):
         return False
 
     def get_workspace(self) -> Workspace | None:
-        """The workspace of the last call; None while it is under way, and before the first.
-
-        Raises:
-            RemoteAgentError: The call failed.
-        """
+        """The workspace of the last call; None while it is under way, and before the first."""
         return None if self.is_running() else self._last
 
     def close(self) -> None:

@@ -1,11 +1,8 @@
 """A workspace whose memory several processes see.
 
 Its variables and its length are fixed. Values are copied in, without their graph; what is read is a view of the memory,
-which changes when another process writes.
-
-Differences from BBRL: a split workspace has all members of a workspace; `set_full` writes into the shared memory, where
-BBRL's puts a private tensor in its place; times that overlap can be copied; writing beyond the end, another shape or
-another dtype is an error that names the variable; NumPy variables can be shared, too.
+which changes when another process writes. Unlike BBRL's, `set_full` writes into the shared memory, a split workspace
+has all members of a workspace, and NumPy variables can be shared, too.
 """
 
 from __future__ import annotations

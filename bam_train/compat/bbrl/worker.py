@@ -1,10 +1,8 @@
 """A process that runs one agent for another process, and never outlives it.
 
-The two ends talk through one pipe: a command there, an answer back. Whoever waits looks at whether the process is still
-alive, so that the wait ends when the process does. What goes wrong there is raised here, with the traceback.
-
-Weights (parameters and buffers) are in shared memory: what `load_state_dict` or an optimiser writes into them here is
-seen there. Everything else of an agent is a copy.
+The two ends talk through one pipe: a command there, an answer back. A wait for the answer ends when the process does.
+What goes wrong there is raised here, with the traceback. Weights (parameters and buffers) are in shared memory;
+everything else of an agent is a copy.
 """
 
 from __future__ import annotations
@@ -45,7 +43,7 @@ class _ChildTraceback(Exception):  # noqa: N818 - the cause of a RemoteAgentErro
 
 
 class Worker:
-    """The parent's end: starts the process.
+    """The parent's end: starts the process. Its methods raise `RemoteAgentError`.
 
     Args:
         agent: What it runs.
@@ -55,9 +53,6 @@ class Worker:
     Attributes:
         closed: Whether the process has been ended.
         result: What the last command that had a result gave.
-
-    Raises:
-        RemoteAgentError: The agent cannot be sent to the process.
     """
 
     def __init__(self, agent: Agent, start_method: str, seed: int | None) -> None:
@@ -65,7 +60,7 @@ class Worker:
         self.closed = False
         self.result: Any = None
         self._owner = os.getpid()
-        self._started = self._asked = False
+        self._started = False
         if isinstance(agent, torch.nn.Module):
             agent.share_memory()
         # A forked process has the agent already, and need not be able to pickle it.
@@ -80,48 +75,30 @@ class Worker:
         self._pending = 1  # it says when it is ready
 
     def send(self, command: str, *arguments: Any) -> None:
-        """Begin a command; `wait` or `poll` for its end.
-
-        Raises:
-            RemoteAgentError: The arguments cannot be sent.
-        """
+        """Begin a command; `wait` or `poll` for its end."""
         data = self._pickled((command, *arguments))
         with suppress(OSError):  # it has ended: the answer says so
             self._connection.send_bytes(data)
         self._pending += 1
 
     def wait(self) -> None:
-        """Wait for the end of all commands.
-
-        Raises:
-            RemoteAgentError: One failed, or the process ended; it is closed then.
-        """
+        """Wait for the end of all commands; when one fails, or the process ends, it is closed."""
         while self._pending:
             self._take_if_ready(_LOOK_AGAIN)
 
     def poll(self) -> bool:
-        """Whether a command other than the start is still under way; does not wait.
-
-        Raises:
-            RemoteAgentError: One failed, or the process ended; it is closed then.
-        """
+        """Whether a command other than the start is still under way; does not wait."""
         while self._pending and self._take_if_ready(0):
             pass
         return self._pending > (0 if self._started else 1)
 
-    def ask_to_end(self) -> None:
-        """Ask an idle process to close its agent and end, without waiting; only `close` may follow."""
-        if not (self._pending or self._asked or self.closed) and self._is_mine():
-            self._asked = True
-            with suppress(OSError):
-                self._connection.send_bytes(self._pickled(("exit",)))
-
     def close(self) -> None:
         """End the process, at once if it is busy; in any state, and idempotent."""
-        if self.closed or not self._is_mine():
+        if self.closed or self._owner != os.getpid():  # a forked process has copies of its siblings' ends
             return
-        self.ask_to_end()
         if not self._pending:
+            with suppress(OSError):
+                self._connection.send_bytes(self._pickled(("exit",)))
             self._process.join(PATIENCE)
         for end in (self._process.terminate, self._process.kill):
             if self._process.is_alive():
@@ -129,10 +106,6 @@ class Worker:
                 self._process.join(PATIENCE)
         self.closed, self._pending = True, 0
         self._connection.close()
-
-    def _is_mine(self) -> bool:
-        """Whether this process started it: a forked one has copies of its siblings' ends."""
-        return self._owner == os.getpid()
 
     def _take_if_ready(self, seconds: float) -> bool:
         """Take one answer if it comes in time; closes the process on whatever goes wrong, Ctrl-C too."""
@@ -190,9 +163,8 @@ def wait_for_any(workers: Sequence[Worker]) -> None:
 def _signals_blocked(blocked: bool) -> Iterator[None]:
     """Keep signals from a forked process until it has handlers of its own.
 
-    It begins inside ``os.fork()`` with this process's handlers. One that raises, such as Ray's for SIGTERM or the one
-    for Ctrl-C, would leave ``os.fork()`` there and go on with this process's own code a second time. The forked process
-    inherits the mask; `drop_handlers` takes the handlers away and then unblocks.
+    A handler of this process that raises, such as Ray's for SIGTERM, would leave ``os.fork()`` there and go on with
+    this process's own code a second time. The forked process inherits the mask until `drop_handlers` unblocks.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals() if blocked else ())
     try:
@@ -238,41 +210,41 @@ class _Server:
         self.finished = False
 
     def start(self, payload: Any, seed: int | None, noise: int) -> None:
-        """Take the agent, and seed it."""
-        self.agent = _unpickled(payload) if isinstance(payload, bytes) else payload
+        try:
+            self.agent = pickle.loads(payload) if isinstance(payload, bytes) else payload
+        except (AttributeError, ImportError) as error:  # its class is not where this process can import it
+            raise LoopError(
+                f"{error}; define what the agent is made of in a module that can be imported, or give "
+                'start_method="fork"'
+            ) from error
         _seed_generators(noise)
         if seed is not None:
             self.agent.seed(seed)
 
     def obey(self, command: str, *arguments: Any) -> Any:
-        """Do one of the commands below."""
         return getattr(self, command)(*arguments)
 
     def run(self, workspace: Any, kwargs: dict[str, Any]) -> None:
-        """Run the agent on a shared workspace; None is the one of the last time."""
+        # No workspace: that of the last time.
         self.workspace = self.workspace if workspace is None else workspace
         with torch.no_grad():
             self.agent(self.workspace, **kwargs)
 
     def run_alone(self, kwargs: dict[str, Any]) -> bytes:
-        """Run the agent on a new workspace; its variables, in memory that is not shared."""
         workspace = Workspace()
         with torch.no_grad():
             self.agent(workspace, **kwargs)
         return pickle.dumps({name: one.full() for name, one in workspace.to("cpu").variables.items()})
 
     def seed(self, seed: int) -> None:
-        """Seed the agent and the global generators."""
         _seed_generators(seed)
         self.agent.seed(seed)
 
     def train(self, mode: bool) -> None:
-        """Set the mode."""
         if isinstance(self.agent, torch.nn.Module):
             self.agent.train(mode)
 
     def exit(self) -> None:
-        """Close the agent, and end."""
         self.finished = True
         if self.agent is not None:
             self.agent.close()
@@ -282,15 +254,6 @@ def _seed_generators(seed: int) -> None:
     torch.manual_seed(seed)
     np.random.seed(seed % 2**32)
     random.seed(seed)
-
-
-def _unpickled(payload: bytes) -> Any:
-    try:
-        return pickle.loads(payload)
-    except (AttributeError, ImportError) as error:  # its class is not where this process can import it
-        raise LoopError(
-            f'{error}; define what the agent is made of in a module that can be imported, or give start_method="fork"'
-        ) from error
 
 
 def _end_with_parent(parent: int) -> None:

@@ -1,4 +1,4 @@
-"""What the agents of Gymnasium environments have in common: names of variables, spaces, seeds, stepping, writing."""
+"""What the agents of Gymnasium environments have in common: variables, spaces, seeds, stepping."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ import sys
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from gymnasium import Space, spaces
 
 from bam_train.errors import LoopError, SettingsError
-from bam_train.loop.agent import Agent, agent_name, import_torch
-from bam_train.loop.gym.gym_actions import ActionReader
-from bam_train.loop.gym.gym_observations import Array, InfoRecorder, names
+from bam_train.loop.agent import agent_name, import_torch
+from bam_train.loop.agents import SeedableAgent
+from bam_train.loop.gym.gym_spaces import ActionReader, Array, Entry, InfoRecorder, names
+from bam_train.loop.workspace import Workspace
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -32,21 +33,45 @@ class Frame(NamedTuple):
     infos: dict[str, Array]
 
 
-class Stepper(Protocol):
-    """The environments of one run, with the sums and counts of their episodes."""
+class Stepper(ABC):
+    """The environments of one run of an agent, with the sums and counts of their episodes."""
 
+    def __init__(self, agent: Any) -> None:
+        self._envs, self._include_last = agent.envs, agent.include_last_state
+        self._for_torch = agent.arrays == "torch"
+        self._floats = np.dtype(np.float32 if self._for_torch else np.float64)
+        self._actions = ActionReader(agent.input, agent.action_space, agent.num_envs)
+        self._infos = InfoRecorder(agent.info_keys, agent.num_envs, self._floats)
+        self._entries: list[Entry] = []
+        self._cumulated: Any = np.zeros(agent.num_envs)
+        self._timestep = np.zeros(agent.num_envs, dtype=np.int64)
+
+    @abstractmethod
     def reset(self, seeds: Any) -> Frame:
-        """Begin an episode in every environment."""
+        """Begin an episode in every environment; `seeds` is a number to count from, or one for each environment."""
 
-    def step(self, actions: Any) -> Frame:
-        """Step every environment."""
+    @abstractmethod
+    def step(self, workspace: Workspace, t: int) -> Frame:
+        """Step every environment with its action of time t."""
+
+    def _frame(
+        self, observations: dict[str, Array], rewards: Any, terminated: Array, truncated: Array, infos: dict[str, Array]
+    ) -> Frame:
+        numbers = {
+            "terminated": terminated,
+            "truncated": truncated,
+            "done": terminated | truncated,
+            "reward": np.array(rewards, dtype=self._floats),
+            "cumulated_reward": np.array(self._cumulated, dtype=self._floats),
+            "timestep": self._timestep.copy(),
+        }
+        return Frame(observations, numbers, infos)
 
 
-class GymAgent(Agent, ABC):
+class GymAgent(SeedableAgent):
     """Base of `ParallelGymAgent` and `VecGymAgent`.
 
     Args:
-        args: For classes that are inherited beside this one.
         input_string: The variable with the action; or, where actions are dicts, the first part of their names.
         output_string: Put before the names of all variables that it writes.
         reward_at_t: Write the reward and the cumulated reward of action[t] at t, not at t + 1. The reward at the
@@ -56,8 +81,7 @@ class GymAgent(Agent, ABC):
         arrays: ``"torch"``: tensors, float32 and int64. ``"numpy"``: arrays, observations of the space's dtype,
             rewards float64; torch is not needed.
         info_keys: Entries k of the environments' infos to write too: ``info/k`` beside the mask ``info/_k``.
-        seed: The seed, if it is known already.
-        kwargs: ``name``, ``verbose``.
+        kwargs: ``seed``, ``name``, ``verbose``.
 
     Attributes:
         ghost_params: An empty parameter; its device is where observations are put. None with NumPy.
@@ -72,6 +96,8 @@ class GymAgent(Agent, ABC):
     num_envs: int
     observation_space: Space[Any]
     action_space: Space[Any]
+    _STEPPER: type[Stepper]
+    _SEED_AGAIN = "give a run another seed with agent(workspace, t=0, seed={seed})."
 
     def __new__(cls, *args: Any, arrays: str = "torch", **kwargs: Any) -> Self:
         """See `Agent`; with tensors it is an `nn.Module` also where nobody has imported torch yet."""
@@ -81,27 +107,25 @@ class GymAgent(Agent, ABC):
 
     def __init__(
         self,
-        *args: Any,
+        *,
         input_string: str = "action",
         output_string: str = "env/",
         reward_at_t: bool = False,
         include_last_state: bool = True,
         arrays: str = "torch",
         info_keys: Sequence[str] = (),
-        seed: int | None = None,
         **kwargs: Any,
     ) -> None:
         if arrays not in ("torch", "numpy"):
             raise SettingsError(f'arrays: expected "torch" or "numpy", found {arrays!r}.')
         if isinstance(info_keys, str):
             raise SettingsError(f"info_keys: expected several names, found {info_keys!r}; write ({info_keys!r},).")
-        super().__init__(*args, **kwargs)
+        super().__init__(**kwargs)
         self.input, self.output = input_string, output_string
         self.reward_at_t, self.include_last_state = reward_at_t, include_last_state
         self.arrays, self.info_keys = arrays, tuple(info_keys)
-        self._seed, self._nb_reset = seed, 1
+        self._nb_reset = 1
         self._stepper: Stepper | None = None
-        self._floats = np.dtype(np.float32 if arrays == "torch" else np.float64)
         self.ghost_params: Any = None
         if arrays == "torch":
             torch = sys.modules["torch"]
@@ -109,22 +133,13 @@ class GymAgent(Agent, ABC):
 
     # -- running ---------------------------------------------------------------------------------------------------
 
-    @abstractmethod
     def _open(self) -> None:
         """Make the environments `envs`, and call `_opened`."""
-
-    @abstractmethod
-    def _make_stepper(self, infos: InfoRecorder) -> Stepper:
-        """A stepper for a new run of the environments."""
-
-    @abstractmethod
-    def _read_actions(self, actions: ActionReader, t: int) -> Any:
-        """The actions of time t as the stepper wants them."""
+        raise NotImplementedError
 
     def _opened(self, observation_space: Space[Any], action_space: Space[Any]) -> None:
         """Take the spaces of one environment, and declare what is written."""
         self.observation_space, self.action_space = observation_space, action_space
-        self._actions = ActionReader(self.input, action_space, self.num_envs)
         self._declare(GymAgent, reads=None, writes=self._written())
 
     def forward(self, t: int = 0, **kwargs: Any) -> None:
@@ -148,15 +163,12 @@ class GymAgent(Agent, ABC):
             self._nb_reset += 1
             if self.envs is None:
                 self._open()
-            self._stepper = self._make_stepper(InfoRecorder(self.info_keys, self.num_envs, self.arrays == "torch"))
+            self._stepper = self._STEPPER(self)
             frame = self._stepper.reset(self._reset_seeds(seed))
         elif self._stepper is None:
             raise LoopError(f"{agent_name(self)} has no episode running; its environments are (re)started at t=0.")
         else:
-            frame = self._stepper.step(self._read_actions(self._actions, t - 1))
-        self._write(frame, t)
-
-    def _write(self, frame: Frame, t: int) -> None:
+            frame = self._stepper.step(self.workspace, t - 1)
         numbers = self._numbers(frame)
         self._put(frame.observations, t)
         if self.reward_at_t:
@@ -193,22 +205,6 @@ class GymAgent(Agent, ABC):
         """The names of all variables that it writes."""
         infos = [name for key in self.info_keys for name in (f"info/{key}", f"info/_{key}")]
         return tuple(self.output + name for name in (*names(self.observation_space), *NUMBERS, *infos))
-
-    # -- seeds -----------------------------------------------------------------------------------------------------
-
-    def seed(self, seed: int) -> Any:
-        """Take the seed; the agent itself is returned.
-
-        Raises:
-            LoopError: It has one already.
-        """
-        if self._seed is not None:
-            raise LoopError(
-                f"{type(self).__name__} is seeded with {self._seed} already and cannot be seeded with {seed}; "
-                f"give a run another seed with agent(workspace, t=0, seed={seed})."
-            )
-        self._seed = seed
-        return self
 
     def _reset_seeds(self, seed: Any) -> int | list[int | None]:
         """What the environments are reset with at t = 0: one seed to count from, or one for each.

@@ -27,9 +27,9 @@ from gymnasium.wrappers import Autoreset
 
 from bam_envs.safety.gate import SafeRobot
 from bam_train.errors import SettingsError, ValueMismatch
-from bam_train.loop.gym.gym_actions import ActionReader
-from bam_train.loop.gym.gym_agent import Frame, GymAgent
-from bam_train.loop.gym.gym_observations import Entry, InfoRecorder, entries, pack
+from bam_train.loop.gym.gym_agent import Frame, GymAgent, Stepper
+from bam_train.loop.gym.gym_spaces import Array, entries, pack
+from bam_train.loop.workspace import Workspace
 
 Env = gym.Env[Any, Any]
 
@@ -62,6 +62,61 @@ def has_autoreset(env: Env) -> bool:
     return False
 
 
+class _SingleEnvs(Stepper):
+    """n environments, stepped one after the other."""
+
+    def __init__(self, agent: ParallelGymAgent) -> None:
+        super().__init__(agent)
+        self._autoreset = agent._is_autoreset
+        self._steps: list[Callable[[Any], Any]] = [env.step for env in self._envs]
+        self._cumulated = [0.0] * len(self._envs)  # Python's sums, as BBRL's
+        self._advance = np.ones(len(self._envs), dtype=np.int64)
+
+    def reset(self, seeds: int | Sequence[int | None]) -> Frame:
+        """Begin an episode in every environment."""
+        n = len(self._envs)
+        each = range(seeds, seeds + n) if isinstance(seeds, int) else seeds
+        pairs = [env.reset(seed=seed) for env, seed in zip(self._envs, each, strict=True)]
+        observations, infos = zip(*pairs, strict=True)
+        self._entries = entries(observations[0], self._envs[0].observation_space, self._for_torch)
+        return self._joined(observations, [0.0] * n, np.zeros(n, dtype=bool), np.zeros(n, dtype=bool), infos)
+
+    def step(self, workspace: Workspace, t: int) -> Frame:
+        """Step every environment that has not ended for good."""
+        actions = self._actions.each(workspace, t)
+        results = [step(action) for step, action in zip(self._steps, actions, strict=True)]
+        observations, rewards, terminated, truncated, infos = zip(*results, strict=True)
+        self._cumulated = list(map(add, self._cumulated, rewards))
+        self._timestep = self._timestep + self._advance
+        terminations, truncations = np.array(terminated, dtype=bool), np.array(truncated, dtype=bool)
+        ended = np.flatnonzero(terminations | truncations).tolist() if any(terminated) or any(truncated) else ()
+        if ended and self._autoreset and not self._include_last:
+            firsts = {k: self._steps[k](None)[0] for k in ended}
+            observations = tuple(firsts.get(k, one) for k, one in enumerate(observations))
+        frame = self._joined(observations, rewards, terminations, truncations, infos)
+        for k in ended:
+            if self._autoreset:
+                self._cumulated[k] = 0.0
+                self._timestep[k] = -1  # so that the reset is step 0
+            else:
+                observation, _, *rest = results[k]
+                self._steps[k], self._advance[k] = partial(_repeat, (observation, 0.0, *rest)), 0
+        return frame
+
+    def _joined(self, observations: Any, rewards: Any, terminated: Array, truncated: Array, infos: Any) -> Frame:
+        """The frame of what the environments gave, one by one."""
+        packed = {entry.name: pack(entry, observations) for entry in self._entries}
+        frame = self._frame(packed, rewards, terminated, truncated, self._infos.of_each(infos))
+        if frame.numbers["reward"].ndim != 1:
+            raise ValueMismatch(f"'reward': expected one number from each environment, found {rewards[0]!r}.")
+        return frame
+
+
+def _repeat(result: tuple[Any, ...], action: Any) -> tuple[Any, ...]:
+    """The step of an environment that has ended for good."""
+    return result
+
+
 class ParallelGymAgent(GymAgent):
     """Resets n environments at t = 0, and at t > 0 steps each with its action of t - 1.
 
@@ -86,19 +141,19 @@ class ParallelGymAgent(GymAgent):
         make_env_fn: Called `num_envs` times with `make_env_args`.
         num_envs: The number of environments.
         make_env_args: Keywords of `make_env_fn`.
-        args: For classes that are inherited beside this one.
         kwargs: See `GymAgent`.
 
     Raises:
         SettingsError: `num_envs` is not at least 1, or `make_env_fn` does not make new single environments.
     """
 
+    _STEPPER = _SingleEnvs
+
     def __init__(
         self,
         make_env_fn: Callable[..., Env],
         num_envs: int,
         make_env_args: Mapping[str, Any] | None = None,
-        *args: Any,
         **kwargs: Any,
     ) -> None:
         if "autoreset" in kwargs or "auto_reset" in kwargs:
@@ -106,7 +161,7 @@ class ParallelGymAgent(GymAgent):
                 "ParallelGymAgent begins new episodes where the environment has Gymnasium's Autoreset wrapper: "
                 "give autoreset=True to make_env, not to it."
             )
-        super().__init__(*args, **kwargs)
+        super().__init__(**kwargs)
         if isinstance(num_envs, bool) or not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
             raise SettingsError(f"num_envs: expected a whole number of at least 1, found {num_envs!r}.")
         self.num_envs = int(num_envs)
@@ -128,12 +183,6 @@ class ParallelGymAgent(GymAgent):
             )
         return self.make_env_fn(**self._make_env_args)
 
-    def _make_stepper(self, infos: InfoRecorder) -> _SingleEnvs:
-        return _SingleEnvs(self.envs, self._is_autoreset, self.include_last_state, infos, self._floats)
-
-    def _read_actions(self, actions: ActionReader, t: int) -> Sequence[Any]:
-        return actions.each(self.workspace, t)
-
     def close(self) -> None:
         """Close the environments; they are made anew at the next t = 0."""
         envs, self.envs, self._stepper = self.envs or (), None, None
@@ -148,80 +197,6 @@ class ParallelGymAgent(GymAgent):
 
         found = entries(frame, None, for_torch=True)
         return {entry.name: torch.from_numpy(pack(entry, [frame])) for entry in found}
-
-
-class _SingleEnvs:
-    """n environments, stepped one after the other.
-
-    Args:
-        envs: With an `Autoreset` in the chain of each where `autoreset` is True.
-        autoreset: Whether an ended episode is followed by a new one; else its last frame is repeated with reward 0.
-        include_last_state: Whether the time at which an episode ends has its last observation. If not it has the
-            first of the next episode, and no time is spent on the reset.
-        infos: Takes entries of the infos.
-        floats: The dtype of rewards. With float32 observations have the dtypes that torch learns on.
-    """
-
-    def __init__(
-        self, envs: Sequence[Env], autoreset: bool, include_last_state: bool, infos: InfoRecorder, floats: np.dtype[Any]
-    ) -> None:
-        self._envs, self._autoreset, self._include_last = envs, autoreset, include_last_state
-        self._infos, self._floats = infos, floats
-        self._entries: list[Entry] = []
-        self._steps: list[Callable[[Any], Any]] = [env.step for env in envs]
-        self._cumulated: list[float] = [0.0] * len(envs)  # Python's sums, as BBRL's
-        self._timestep = np.zeros(len(envs), dtype=np.int64)
-        self._advance = np.ones(len(envs), dtype=np.int64)
-
-    def reset(self, seeds: int | Sequence[int | None]) -> Frame:
-        """Begin an episode in every environment."""
-        each = [seeds + k for k in range(len(self._envs))] if isinstance(seeds, int) else seeds
-        pairs = [env.reset(seed=seed) for env, seed in zip(self._envs, each, strict=True)]
-        observations, infos = zip(*pairs, strict=True)
-        self._entries = entries(observations[0], self._envs[0].observation_space, self._floats == np.float32)
-        zeros, no = [0.0] * len(pairs), [False] * len(pairs)
-        return self._frame(observations, zeros, np.array(no), np.array(no), infos)
-
-    def step(self, actions: Sequence[Any]) -> Frame:
-        """Step every environment that has not ended for good."""
-        results = [step(action) for step, action in zip(self._steps, actions, strict=True)]
-        observations, rewards, terminated, truncated, infos = zip(*results, strict=True)
-        self._cumulated = list(map(add, self._cumulated, rewards))
-        self._timestep = self._timestep + self._advance
-        terminations, truncations = np.array(terminated, dtype=bool), np.array(truncated, dtype=bool)
-        ended = np.flatnonzero(terminations | truncations).tolist() if any(terminated) or any(truncated) else ()
-        if ended and self._autoreset and not self._include_last:
-            firsts = {k: self._steps[k](None)[0] for k in ended}
-            observations = tuple(firsts.get(k, one) for k, one in enumerate(observations))
-        frame = self._frame(observations, rewards, terminations, truncations, infos)
-        for k in ended:
-            if self._autoreset:
-                self._cumulated[k] = 0.0
-                self._timestep[k] = -1  # so that the reset is step 0
-            else:
-                observation, _, *rest = results[k]
-                self._steps[k], self._advance[k] = partial(_repeat, (observation, 0.0, *rest)), 0
-        return frame
-
-    def _frame(self, observations: Any, rewards: Any, terminated: Any, truncated: Any, infos: Any) -> Frame:
-        reward = np.array(rewards, dtype=self._floats)
-        if reward.ndim != 1:
-            raise ValueMismatch(f"'reward': expected one number from each environment, found {rewards[0]!r}.")
-        numbers = {
-            "terminated": terminated,
-            "truncated": truncated,
-            "done": terminated | truncated,
-            "reward": reward,
-            "cumulated_reward": np.array(self._cumulated, dtype=self._floats),
-            "timestep": self._timestep.copy(),
-        }
-        packed = {entry.name: pack(entry, observations) for entry in self._entries}
-        return Frame(packed, numbers, self._infos.of_each(infos))
-
-
-def _repeat(result: tuple[Any, ...], action: Any) -> tuple[Any, ...]:
-    """The step of an environment that has ended for good."""
-    return result
 
 
 def _require_envs(envs: Sequence[Any]) -> None:

@@ -3,15 +3,11 @@
 Differences from BBRL's `ReplayBuffer`:
 
 - One `put` of more than `max_size` items keeps the newest `max_size`; BBRL's raises or writes onto itself.
-- A `put` that does not fit (another T, shape or dtype, a new or a missing variable) is refused before anything
-  changes, with the variable's name; BBRL's stores a part of it, or items that do not belong together.
-- `to` moves what is put and drawn later, too, and returns the buffer. `variables` is empty, not None, before the first
-  `put`. NumPy workspaces are taken as well. There is no `print_obs`.
+- A `put` that does not fit is refused before anything changes; BBRL's stores a part of it.
+- `to` moves what is put and drawn later, too, and returns the buffer. NumPy workspaces are taken as well.
 """
 
 from __future__ import annotations
-
-from typing import Any
 
 import torch
 
@@ -50,7 +46,7 @@ class ReplayBuffer:
         """Add the N columns of a workspace (T x N x ...) as N items; the oldest items make room.
 
         Values are copied, detached, to the buffer's device. Transitions (`get_transitions`) have T = 2; whole rollouts
-        of one length T can be put as well. Of more than `max_size` items the last ones stay.
+        of one length T can be put as well.
 
         Raises:
             UnknownVariable: A variable that the buffer has is missing.
@@ -59,7 +55,14 @@ class ReplayBuffer:
         """
         if not workspace.variables:
             raise WorkspaceError("The workspace is empty: there is nothing to put into the replay buffer.")
-        items = {name: self._items(name, workspace.get_full(name)) for name in workspace}
+        items: dict[str, torch.Tensor] = {}
+        for name in workspace:  # N x T x ...
+            value = torch.as_tensor(workspace.get_full(name)).detach().to(self.device)
+            if value.ndim < 2:
+                raise ValueMismatch(
+                    f"{name!r} in the replay buffer: expected T x N x ..., found shape {tuple(value.shape)}."
+                )
+            items[name] = value.transpose(0, 1)
         count = workspace.batch_size() or 0
         if self.variables:
             self._require_alike(items)
@@ -102,17 +105,7 @@ class ReplayBuffer:
         self.variables = {name: value.to(self.device) for name, value in self.variables.items()}
         return self
 
-    def _items(self, name: str, value: Any) -> torch.Tensor:
-        """T x N x ... as N x T x ..., without graph, on the buffer's device."""
-        value = torch.as_tensor(value)
-        if value.ndim < 2:
-            raise ValueMismatch(
-                f"{name!r} in the replay buffer: expected T x N x ..., found shape {tuple(value.shape)}."
-            )
-        return value.detach().to(self.device).transpose(0, 1)
-
     def _require_alike(self, items: dict[str, torch.Tensor]) -> None:
-        """Refuse items that do not fit those in the buffer."""
         for name in self.variables:
             if name not in items:
                 raise UnknownVariable(name, items)

@@ -3,9 +3,8 @@
 T is time, B the batch. ``reward[t + 1]`` and ``critic[t + 1]`` follow from ``action[t]``: a workspace holds at t the
 reward of the action before it.
 
-Differences from BBRL's `bbrl.utils.functional`: shapes that differ are refused, where BBRL's broadcasts (N and N x 1
-give N x N without a word); `gae` takes log2(T) operations on whole tensors instead of T on single
-times, gives nothing from nothing, and keeps float64.
+Differences from BBRL's `bbrl.utils.functional`: shapes that differ raise `ValueMismatch`, where BBRL's broadcasts (N
+and N x 1 give N x N); `gae` takes log2(T) operations on whole tensors instead of T on single times, and keeps float64.
 """
 
 from __future__ import annotations
@@ -44,9 +43,6 @@ def gae(
 
     Returns:
         The advantages, the shape of `reward`.
-
-    Raises:
-        ValueMismatch: The four shapes differ.
     """
     shape = reward.shape
     _require_shapes("gae", shape, next_critic=next_critic, must_bootstrap=must_bootstrap, critic=critic)
@@ -82,16 +78,10 @@ def temporal_difference(
         td[t] = reward[t + 1] + discount_factor * must_bootstrap[t] * critic[t + 1] - critic[t],  td[T - 1] = 0
 
     Args:
-        critic: Values, T x B; the gradient goes through ``critic[t]`` only.
+        critic: Values, T x B as the result; the gradient goes through ``critic[t]`` only.
         reward: T x B.
         must_bootstrap: (T - 1) x B, True where the state at t + 1 is not terminal.
         discount_factor: Gamma.
-
-    Returns:
-        T x B; the last time is 0.
-
-    Raises:
-        ValueMismatch: The shapes do not fit.
     """
     _require_shapes("temporal_difference", critic.shape, reward=reward)
     must_bootstrap = _flags("temporal_difference", critic, must_bootstrap)
@@ -124,9 +114,6 @@ def doubleqlearning_temporal_difference(
 
     Returns:
         T x B; the last time is 0.
-
-    Raises:
-        ValueMismatch: The shapes do not fit.
     """
     name = "doubleqlearning_temporal_difference"
     _require_shapes(name, q.shape, q_target=q_target)
@@ -145,7 +132,6 @@ def cumulated_reward(reward: torch.Tensor, done: torch.Tensor) -> float:
         done: T x B, True (or 1) at the last step of an episode.
 
     Raises:
-        ValueMismatch: The shapes differ.
         WorkspaceError: An episode does not end.
     """
     _require_shapes("cumulated_reward", reward.shape, done=done)
@@ -161,20 +147,18 @@ def cumulated_reward(reward: torch.Tensor, done: torch.Tensor) -> float:
 
 
 def _of_action(q: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-    """``q[..., action]``, without the last axis."""
     return q.gather(-1, action.long().unsqueeze(-1)).squeeze(-1)
 
 
 def _with_last_zero(differences: torch.Tensor) -> torch.Tensor:
-    """With zeros at the last time, which has no next one."""
     return torch.cat([differences, differences.new_zeros((1, *differences.shape[1:]))])
 
 
-def _flags(function: str, rows: torch.Tensor, must_bootstrap: torch.Tensor) -> torch.Tensor:
+def _flags(function: str, times: torch.Tensor, must_bootstrap: torch.Tensor) -> torch.Tensor:
     """One flag for each transition, (T - 1) x B; of `get_transitions`, where T is 2, (B,) will do."""
-    if len(rows) == 2 and must_bootstrap.shape == rows.shape[1:]:
+    if len(times) == 2 and must_bootstrap.shape == times.shape[1:]:
         return must_bootstrap.unsqueeze(0)
-    _require_shapes(function, rows[1:].shape, must_bootstrap=must_bootstrap)
+    _require_shapes(function, times[1:].shape, must_bootstrap=must_bootstrap)
     return must_bootstrap
 
 

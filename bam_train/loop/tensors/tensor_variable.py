@@ -42,11 +42,7 @@ class TensorVariable(Variable):
         self._store(t, array)
 
     def get(self, t: int) -> torch.Tensor:
-        """The value at time t, B x ...; -1 is the last.
-
-        Raises:
-            TimeNotWritten: Nobody wrote it.
-        """
+        """The value at time t, B x ...; -1 is the last."""
         values: Any = self._whole if self._values is None else self._values
         index = t - self.first if t >= 0 else len(values) + t
         if not 0 <= index < len(values):

@@ -3,7 +3,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from bam_train.compat.bbrl.classname import get_arguments, get_class, instantiate_class
+from bam_train.loop import get_arguments, get_class, instantiate_class
 from bam_train.errors import SettingsError
 
 CONFIG = {"classname": "fractions.Fraction", "numerator": 3, "denominator": 4}

@@ -110,7 +110,7 @@ def test_an_empty_dataset():
 
 @pytest.mark.parametrize("seed", [-1, "a", 1.5])
 def test_seeds_are_natural_numbers(seed):
-    with pytest.raises(WorkspaceError, match=r"^seed: expected an int of at least 0, or None, found"):
+    with pytest.raises(WorkspaceError, match=r"^seed: expected a whole number of at least 0.*, found"):
         ShuffledDatasetAgent(DATA, 2).seed(seed)
 
 
