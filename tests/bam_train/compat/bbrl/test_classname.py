@@ -3,8 +3,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from bam_train.loop import get_arguments, get_class, instantiate_class
 from bam_train.errors import SettingsError
+from bam_train.loop import get_arguments, get_class, instantiate_class
 
 CONFIG = {"classname": "fractions.Fraction", "numerator": 3, "denominator": 4}
 
