@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 from bam_envs.core.errors import InvalidValue, LinkLost, ProtocolError, RemoteError, StaleState
 from bam_envs.core.timing import Deadline
 from bam_envs.live.state import LiveState, Mailbox
-from bam_envs.ros.codec import INFO_SERVICE, RobotInfo, read_info
-from bam_envs.ros.command_messages import has_room
+from bam_envs.ros.codec import INFO_SERVICE, RobotInfo, has_room, read_info
 from bam_envs.ros.messages import bare_type, same_type
 from bam_envs.ros.profile_tables import Readiness, RobotProfile, Sink
 from bam_envs.rosbridge.bus import Listener, namespaces_with

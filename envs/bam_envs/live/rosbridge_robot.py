@@ -44,8 +44,7 @@ from bam_envs.live.bringup import (
 )
 from bam_envs.live.session import DrivingSession
 from bam_envs.live.state import Letter, LiveState
-from bam_envs.ros.codec import HALT_TOPIC, SCENE_TOPIC, RobotInfo, encode_sink
-from bam_envs.ros.command_messages import has_room
+from bam_envs.ros.codec import HALT_TOPIC, SCENE_TOPIC, RobotInfo, encode_sink, has_room
 from bam_envs.ros.freshness import Tag
 from bam_envs.ros.profile_tables import RobotProfile, Sink
 from bam_envs.rosbridge.client import RosbridgeLink

@@ -1,6 +1,7 @@
 """States and commands as ROS messages and back, as a profile says: pure functions on dicts and arrays.
 
-A live robot reads states and writes commands; a served one writes states and reads commands.
+A live robot reads states and writes commands; a served one writes states and reads commands. A command type that holds
+a list of numbers is written and read by its own lines here; all others field by field (``fields`` of the sink).
 """
 
 from __future__ import annotations
@@ -18,7 +19,6 @@ from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.core.robot import RobotSpec, RobotState
 from bam_envs.core.validation import Positive, read_table
 from bam_envs.core.wording import brief
-from bam_envs.ros.command_messages import read_command, write_command
 from bam_envs.ros.freshness import Tag, read_tag
 from bam_envs.ros.messages import (
     has_header,
@@ -33,6 +33,7 @@ from bam_envs.ros.messages import (
     tag_text,
     usual_numbers,
     value_at,
+    write_stamp,
 )
 from bam_envs.ros.profile_tables import RobotProfile, Sink, Source
 
@@ -48,6 +49,15 @@ HALT_TOPIC = "/bam/halt"
 """Where a served robot hears that it must stop (std_msgs/Empty)."""
 SCENE_TOPIC = "/bam/scene"
 """Where a simulated robot is told how an episode begins, by requests on ``request`` and replies on ``reply`` below."""
+_ARRAYS = ("std_msgs/Float64MultiArray", "std_msgs/Float32MultiArray")
+_JOINTS = "sensor_msgs/JointState"
+LISTED_TYPES = frozenset({*_ARRAYS, _JOINTS, "trajectory_msgs/JointTrajectory"})
+"""Types of commands that are lists of numbers; those of all other types need `fields`."""
+
+
+def has_room(kind: str) -> bool:
+    """Whether a message of type `kind` has a field for a tag."""
+    return kind in _ARRAYS or has_header(kind)
 
 
 @dataclass(frozen=True)
@@ -86,27 +96,12 @@ def read_info(text: object, where: str) -> RobotInfo:
     return read_table(RobotInfo, known, where, ProtocolError)
 
 
-def decode_state(profile: RobotProfile, messages: Mapping[str, object]) -> dict[str, Array]:
-    """Each signal's numbers [SI] from the message that holds it.
-
-    Args:
-        profile: The robot.
-        messages: Signal -> the newest message of its topic.
-
-    Returns:
-        Signal -> numbers. Shape: (k,).
+def decode_source(source: Source, message: object, size: int) -> Array:
+    """The `size` numbers [SI] of one signal. Shape: (size,).
 
     Raises:
-        ProtocolError: A message is not what the profile says; it names topic, field or joint, expected and found.
+        ProtocolError: The message is not what the profile says; it names topic, field or joint, expected and found.
     """
-    return {
-        signal: decode_source(profile.source(signal), message, len(profile.signal(signal).labels))
-        for signal, message in messages.items()
-    }
-
-
-def decode_source(source: Source, message: object, size: int) -> Array:
-    """The `size` numbers [SI] of one signal. Shape: (size,). Errors as in `decode_state`."""
     where = source.topic
     content = require_message(message, where)
     if source.fields:
@@ -114,18 +109,14 @@ def decode_source(source: Source, message: object, size: int) -> Array:
     elif source.names:
         raw = _by_name(source, content, where)
     else:
-        raw = _in_order(source, content, where, size)
+        raw = numbers(value_at(content, source.field, where), f"{where}: {source.field}", missing=source.missing)
+        first, last = source.skip
+        if len(raw) != size + first + last:
+            raise ProtocolError(f"{where}: {source.field} must have {size + first + last} numbers, not {len(raw)}.")
+        raw = raw[first : first + size]
     if source.frame:
         require_frame(source.frame, content, where)
     return _to_si(source, raw if source.within is None else np.clip(raw, *source.within))
-
-
-def _in_order(source: Source, message: Message, where: str, size: int) -> Array:
-    values = numbers(value_at(message, source.field, where), f"{where}: {source.field}", missing=source.missing)
-    first, last = source.skip
-    if len(values) != size + first + last:
-        raise ProtocolError(f"{where}: {source.field} must have {size + first + last} numbers, not {len(values)}.")
-    return values[first : first + size]
 
 
 def _by_name(source: Source, message: Message, where: str) -> Array:
@@ -142,26 +133,20 @@ def _by_name(source: Source, message: Message, where: str) -> Array:
         length = f"{len(values)} numbers" if isinstance(values, (list, tuple, np.ndarray)) else brief(values)
         raise ProtocolError(f"{where}: {source.field} must have {len(found)} numbers, one for each name, not {length}.")
     place = {name: values[index] for index, name in enumerate(found)}
+    # One by one, so that an error names the joint.
     return np.array(
-        [_joint(place[name], f"{where}: {source.field} of {name}", source.missing) for name in source.names]
+        [number(place[name], f"{where}: {source.field} of {name}", missing=source.missing) for name in source.names]
     )
 
 
-def _joint(value: object, where: str, missing: float | None) -> float:
-    return float(numbers([value], where, missing=missing)[0]) if missing is not None else number(value, where)
-
-
 def _to_si(entry: Source | Sink, raw: Array) -> Array:
-    if entry.is_si:
-        return raw
     values: Array = raw * np.array(entry.scale) + np.array(entry.offset)
     return values
 
 
 def _from_si(entry: Source | Sink, values: Array) -> list[float]:
-    raw = values if entry.is_si else (values - np.array(entry.offset)) / np.array(entry.scale)
-    numbers: list[float] = raw.tolist()
-    return numbers
+    raw: list[float] = ((values - np.array(entry.offset)) / np.array(entry.scale)).tolist()
+    return raw
 
 
 @cache
@@ -189,31 +174,22 @@ def encode_state(
             continue
         key = (source.topic, source.names)
         if key not in messages:
-            messages[key] = (source.topic, source.type, _new_state(source, stamp))
-        _write_source(messages[key][2], source, state.signals[source.signal][row])
+            header = {"header": {"stamp": dict(stamp), "frame_id": source.frame}} if has_header(source.type) else {}
+            messages[key] = (source.topic, source.type, {**header, **source.constants})
+        message, raw = messages[key][2], _from_si(source, state.signals[source.signal][row])
+        if source.fields:
+            for path, value in zip(source.fields, raw, strict=True):
+                put_at(message, path, value)
+        elif source.names:
+            message["name"], message[source.field] = list(source.names), raw
+        else:
+            first, last = source.skip
+            message[source.field] = [0.0] * first + raw + [0.0] * last
     stamped = [one for one in messages.values() if has_header(one[1]) and not one[2]["header"]["frame_id"]]
     if not stamped:
         return list(messages.values())
     stamped[0][2]["header"]["frame_id"] = tag
     return [envelope for envelope in messages.values() if envelope is not stamped[0]] + [stamped[0]]
-
-
-def _new_state(source: Source, stamp: Mapping[str, int]) -> dict[str, Any]:
-    header = {"header": {"stamp": dict(stamp), "frame_id": source.frame}} if has_header(source.type) else {}
-    return {**header, **source.constants}
-
-
-def _write_source(message: dict[str, Any], source: Source, values: Array) -> None:
-    """Write the numbers [SI] of one signal into `message`, which may hold those of others already."""
-    raw = _from_si(source, values)
-    if source.fields:
-        for path, value in zip(source.fields, raw, strict=True):
-            put_at(message, path, value)
-    elif source.names:
-        message["name"], message[source.field] = list(source.names), raw
-    else:
-        first, last = source.skip
-        message[source.field] = [0.0] * first + raw + [0.0] * last
 
 
 def encode_command(
@@ -226,14 +202,14 @@ def encode_command(
     sign: Sign | None = None,
     ros1: bool = False,
 ) -> list[Envelope]:
-    """The messages that send `command`, in the order in which they must be sent.
+    """The messages that send `command` in `mode` (None: the default), in the order in which they must be sent.
 
     Args:
         profile: The robot.
         spec: Labels of the command, and the period.
         command: Finite numbers [SI]. Shape: (m,).
         tag: Who sends it when, for how long it means anything.
-        mode: Way of sending it; None is the default.
+        mode: One of the profile's.
         sign: Makes the text of `tag`; None: without a signature.
         ros1: Whether stamps are spelled as in ROS 1.
 
@@ -249,27 +225,40 @@ def encode_sink(
     sink: Sink, spec: RobotSpec, command: Array, tag: Tag | None, *, sign: Sign | None = None, ros1: bool = False
 ) -> Envelope:
     """The message that sends the part of `command` (m,) that goes to `sink`. Arguments as of `encode_command`."""
-    raw = _from_si(sink, command[_places(sink.labels, spec.command.labels)])
-    text = _tag_text(sink, raw, tag, sign, spec.period)
-    return sink.topic, sink.type, write_command(sink, raw, text, spec.period, ros1=ros1)
+    raw, text = _from_si(sink, command[_places(sink.labels, spec.command.labels)]), ""
+    if tag is not None and sink.tag:
+        content: list[float] | Array = raw
+        if any("(" in path for path in sink.fields):  # an angle is written as a quaternion, and read with rounding
+            content = _read_command(sink, _write_command(sink, raw, "", spec.period))
+        text = tag.to_text() if sign is None else sign(tag, sink.topic, _signed(content))
+    return sink.topic, sink.type, _write_command(sink, raw, text, spec.period, ros1=ros1)
 
 
-def _tag_text(sink: Sink, raw: list[float], tag: Tag | None, sign: Sign | None, period: float) -> str:
-    if tag is None or not sink.tag:
-        return ""
-    if sign is None:
-        return tag.to_text()
-    if any("(" in path for path in sink.fields):  # an angle is written as a quaternion, and read with rounding
-        return sign(tag, sink.topic, _content(read_command(sink, write_command(sink, raw, "", period))))
-    return sign(tag, sink.topic, _content(raw))
+def _write_command(sink: Sink, values: list[float], text: str, period: float, *, ros1: bool = False) -> dict[str, Any]:
+    """The message that carries raw numbers, in the order of the sink's labels, and the `text` of a tag."""
+    header = {"stamp": write_stamp(0.0, ros1=ros1), "frame_id": text}  # the stamp 0 means at once
+    names = list(sink.names)
+    if sink.fields:
+        stamped = has_header(sink.type)
+        message: dict[str, Any] = {"header": header} if stamped else {}
+        if sink.type in ("geometry_msgs/Twist", "geometry_msgs/TwistStamped"):  # all six, whichever are commanded
+            twist = {part: dict.fromkeys("xyz", 0.0) for part in ("linear", "angular")}
+            message.update({"twist": twist} if stamped else twist)
+        for path, value in zip(sink.fields, values, strict=True):
+            put_at(message, path, value)
+        return message
+    if sink.type in _ARRAYS:
+        dimension = {"label": text, "size": len(values), "stride": len(values)}
+        return {"layout": {"dim": [dimension], "data_offset": 0}, "data": values}
+    if sink.type == _JOINTS:
+        return {"header": header, "name": names, "position": values, "velocity": [], "effort": []}
+    reached = write_stamp(sink.reach_at(period), ros1=ros1)
+    point = {"positions": values, "velocities": [], "accelerations": [], "effort": [], "time_from_start": reached}
+    return {"header": header, "joint_names": names, "points": [point]}
 
 
-def _content(raw: list[float] | Array) -> bytes:
-    """What is signed of a command: its numbers as they are in the message, in 32 bits, since some types have no more.
-
-    Args:
-        raw: In the order of the sink's labels.
-    """
+def _signed(raw: list[float] | Array) -> bytes:
+    """What is signed of a command: its raw numbers (k,) in 32 bits, since some types have no more."""
     with np.errstate(over="ignore"):
         return np.asarray(raw, dtype="<f4").tobytes()
 
@@ -297,6 +286,32 @@ def decode_command(profile: RobotProfile, spec: RobotSpec, topic: str, message: 
     if sink is None:
         raise ProtocolError(f"{topic}: no command of {profile.name} comes here.")
     content = require_message(message, topic)
-    raw, tag = read_command(sink, content), read_tag(tag_text(content))
-    signed = _content(raw) if tag is not None and tag.mac else b""
+    raw, tag = _read_command(sink, content), read_tag(tag_text(content))
+    signed = _signed(raw) if tag is not None and tag.mac else b""
     return Decoded(list(_places(sink.labels, spec.command.labels)), _to_si(sink, raw), tag, signed)
+
+
+def _read_command(sink: Sink, message: Message) -> Array:
+    """The raw numbers in `message`, in the order of the labels of `sink`. Shape: (k,)."""
+    where = sink.topic
+    if sink.fields:
+        return np.array([number_at(message, path, where) for path in sink.fields])
+    if sink.type in _ARRAYS:
+        values = numbers(value_at(message, "data", where), f"{where}: data")
+        if len(values) != len(sink.labels):
+            expected = f"{len(sink.labels)} ({', '.join(sink.labels)})"
+            raise ProtocolError(f"{where}: data must have {expected} numbers, not {len(values)}.")
+        return values
+    field = "position"
+    names = names_of(message, "name" if sink.type == _JOINTS else "joint_names", where)
+    if sink.type != _JOINTS:
+        field, points = "positions", value_at(message, "points", where)
+        if not isinstance(points, list) or len(points) != 1:
+            found = f"{len(points)}" if isinstance(points, list) else brief(points)
+            raise ProtocolError(f"{where}: points must be a list of 1 point, not {found}.")
+        message = require_message(points[0], f"{where}: points[0]")
+    require_names(sink.names, names, where)
+    values = numbers(value_at(message, field, where), f"{where}: {field}")
+    if len(values) != len(names):
+        raise ProtocolError(f"{where}: {field} must have {len(names)} numbers, not {len(values)}.")
+    return values[[names.index(name) for name in sink.names]]

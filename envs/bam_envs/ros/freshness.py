@@ -16,7 +16,6 @@ import uuid
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import lru_cache
 
 from bam_envs.core.errors import RemoteError
 
@@ -60,11 +59,6 @@ def read_tag(text: object) -> Tag | None:
     """The tag in `text`, or None for anything else: messages of other programs have none."""
     if not isinstance(text, str) or len(text) > _LONGEST or not text.startswith(_MARK + " "):
         return None
-    return _read_tag(text)
-
-
-@lru_cache(maxsize=64)  # all messages of a command carry the same tag
-def _read_tag(text: str) -> Tag | None:
     fields = dict(part.split("=", 1) for part in text.split()[1:] if "=" in part)
     mac = fields.get("m", "")
     try:
@@ -109,13 +103,8 @@ class Tagger:
         self, clock: Callable[[], float] = time.monotonic, *, session: str | None = None, key: bytes = b""
     ) -> None:
         self.session = new_session() if session is None else session
-        self._key = key
-        self._clock, self._sequence, self._lock = clock, 0, threading.Lock()
-
-    @property
-    def signs(self) -> bool:
-        """Whether it has a key."""
-        return bool(self._key)
+        self.signs = bool(key)
+        self._key, self._clock, self._sequence, self._lock = key, clock, 0, threading.Lock()
 
     def sign(self, tag: Tag, channel: str, content: bytes) -> str:
         """The text of `tag` as it travels with `content` on `channel`."""
@@ -133,21 +122,19 @@ class ClockOffset:
     """Estimates the offset to the clock of a sender from one-way messages: the quickest one took about no time.
 
     The offset is the smallest difference seen, so the age of a message is how much longer it took than the quickest.
-    The smallest difference grows by `drift`, which follows clocks that drift apart.
+    The smallest difference grows by `drift` [s/s], which follows clocks that drift apart.
     """
 
     def __init__(self, drift: float = 1e-4) -> None:
-        self.drift = drift
-        """Largest drift between two clocks [s/s]."""
         self.offset: float | None = None
         """Our clock minus theirs [s]; None before the first message."""
-        self._at = 0.0
+        self._drift, self._at = drift, 0.0
 
     def age(self, sent: float, arrived: float) -> float:
         """Age [s] of a message at its arrival; `sent` on their clock, `arrived` on ours."""
         difference = arrived - sent
         if self.offset is not None:
-            self.offset += self.drift * max(0.0, arrived - self._at)
+            self.offset += self._drift * max(0.0, arrived - self._at)
         if self.offset is None or difference < self.offset:
             self.offset = difference
         self._at = arrived
@@ -157,8 +144,7 @@ class ClockOffset:
 class Freshness:
     """Decides which messages of one session are fresh, whatever a bridge kept in its queues. Thread-safe.
 
-    Args:
-        clock: Steady clock [s]: a step of the wall clock must not make commands old.
+    Its clock is steady [s]: a step of the wall clock must not make commands old.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -185,11 +171,7 @@ class Freshness:
 
 
 class FreshnessCheck:
-    """`Freshness` of each of the sessions that were heard of last. Thread-safe.
-
-    Args:
-        clock: As of `Freshness`.
-    """
+    """`Freshness` of each of the sessions that were heard of last. Thread-safe."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._lock = clock, threading.Lock()

@@ -6,7 +6,6 @@ Arrays are RGB. Message data are `bytes`, or base64 text as a JSON bridge sends 
 from __future__ import annotations
 
 import base64
-import binascii
 import importlib
 import io
 from collections.abc import Mapping
@@ -18,9 +17,8 @@ from numpy.typing import NDArray
 from bam_envs.core.errors import InvalidValue, MissingExtra, ProtocolError
 
 FORMATS = ("png", "jpeg")
-JPEG_QUALITY = 90
-MAX_DEPTH = 65.535
-"""Farthest that a depth image can say [m]."""
+_JPEG_QUALITY = 90
+_MAX_DEPTH = 65.535  # farthest that a depth image can say [m]
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
 _DEPTH_ENCODING = "16UC1; png"
@@ -41,7 +39,14 @@ def encode_image(image: NDArray[np.uint8], kind: str = "png") -> bytes:
     """
     if kind not in FORMATS:
         raise InvalidValue(f"The image format must be png or jpeg, not {kind!r}.")
-    return _encode(_pixels(image, kind), kind)
+    array = np.asarray(image)
+    channels = array.shape[2] if array.ndim == 3 else 1
+    fits = array.dtype == np.uint8 and array.ndim in (2, 3) and channels in _CHANNELS and array.size
+    if not fits or (kind == "jpeg" and channels == 4):
+        raise InvalidValue(
+            f"A {kind} image must be uint8 of shape (height, width, 3), not {array.dtype} of {array.shape}."
+        )
+    return _encode(array, kind)
 
 
 def decode_image(data: bytes) -> NDArray[np.uint8]:
@@ -62,23 +67,10 @@ def encode_depth(depth: NDArray[np.floating[Any]]) -> bytes:
 
     Args:
         depth: Shape (height, width) or (height, width, 1) [m]. What is not finite or below 0 becomes 0, which means
-            that nothing was measured; what is farther than `MAX_DEPTH` becomes that.
+            that nothing was measured; what is farther than 65.535 m becomes that.
     """
     metres = np.nan_to_num(np.asarray(depth, np.float64), nan=0.0, posinf=0.0, neginf=0.0)
-    millimetres = np.rint(np.clip(metres, 0.0, MAX_DEPTH) * 1000.0).astype(np.uint16)
-    return _encode(_flat(millimetres), "png")
-
-
-def decode_depth(data: bytes) -> NDArray[np.float32]:
-    """Metres in a PNG of uint16 millimetres: float32, (height, width).
-
-    Raises:
-        ProtocolError: It is not a grey PNG of 16 bits.
-    """
-    image = _decode(data)
-    if image.dtype != np.uint16 or image.ndim != 2:
-        raise ProtocolError(f"A depth image must be grey with 16 bits, not {image.dtype} of shape {image.shape}.")
-    return _metres(image)
+    return _encode(np.rint(np.clip(metres, 0.0, _MAX_DEPTH) * 1000.0).astype(np.uint16), "png")
 
 
 def color_message(
@@ -104,7 +96,9 @@ def read_color_message(message: Mapping[str, Any]) -> NDArray[np.uint8] | None:
 
 
 def read_depth_message(message: Mapping[str, Any]) -> NDArray[np.float32] | None:
-    """Metres in an Image or CompressedImage, PNG or raw (16UC1 in mm, 32FC1 in m), or None if it is empty.
+    """Metres in an Image or CompressedImage, or None if it is empty: float32, (height, width).
+
+    Its data are a grey PNG of 16 bits in mm, or raw: 16UC1 in mm, 32FC1 in m. 0 is where nothing was measured.
 
     Raises:
         ProtocolError: Its data are neither.
@@ -112,7 +106,23 @@ def read_depth_message(message: Mapping[str, Any]) -> NDArray[np.float32] | None
     data = message_bytes(message)
     if not data:
         return None
-    return decode_depth(data) if data.startswith(_PNG) else _raw_depth(message, data)
+    if data.startswith(_PNG):
+        pixels = _decode(data)
+        if pixels.dtype != np.uint16 or pixels.ndim != 2:
+            raise ProtocolError(f"A depth image must be grey with 16 bits, not {pixels.dtype} of shape {pixels.shape}.")
+    else:
+        dtype = _PIXEL_DTYPES.get(str(message.get("encoding")))
+        if dtype is None:
+            known = ", ".join(_PIXEL_DTYPES)
+            raise ProtocolError(f"A depth image must be a PNG or one of {known}, not {message.get('encoding')!r}.")
+        order = ">" if message.get("is_bigendian") else "<"
+        try:
+            pixels = np.frombuffer(data, order + dtype).reshape(message["height"], -1)[:, : message["width"]]
+        except (KeyError, TypeError, ValueError) as error:
+            raise ProtocolError(f"A depth image must have height x width pixels: {error}.") from error
+    # Not in place: uint16 cannot hold metres.
+    metres: NDArray[np.float32] = pixels.astype(np.float32) / np.float32(1000.0 if pixels.dtype.kind == "u" else 1.0)
+    return np.nan_to_num(metres, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def message_bytes(message: Mapping[str, Any]) -> bytes:
@@ -126,7 +136,7 @@ def message_bytes(message: Mapping[str, Any]) -> bytes:
         return bytes(data)
     try:
         return base64.b64decode(data, validate=True)
-    except (TypeError, ValueError, binascii.Error) as error:
+    except (TypeError, ValueError) as error:  # binascii.Error is a ValueError
         raise ProtocolError(f"data of an image must be bytes or base64: {error}.") from error
 
 
@@ -134,45 +144,9 @@ def _header(frame_id: str, stamp: Mapping[str, int] | None) -> dict[str, Any]:
     return {"stamp": dict(stamp or {"sec": 0, "nanosec": 0}), "frame_id": frame_id}
 
 
-def _raw_depth(message: Mapping[str, Any], data: bytes) -> NDArray[np.float32]:
-    dtype = _PIXEL_DTYPES.get(str(message.get("encoding")))
-    if dtype is None:
-        known = ", ".join(_PIXEL_DTYPES)
-        raise ProtocolError(f"A depth image must be a PNG or one of {known}, not {message.get('encoding')!r}.")
-    order = ">" if message.get("is_bigendian") else "<"
-    try:
-        pixels = np.frombuffer(data, order + dtype).reshape(message["height"], -1)[:, : message["width"]]
-    except (KeyError, TypeError, ValueError) as error:
-        raise ProtocolError(f"A depth image must have height x width pixels: {error}.") from error
-    if dtype != "f4":
-        return _metres(pixels)
-    # As in a PNG, 0 is where nothing was measured.
-    return np.nan_to_num(pixels.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
-
-
-def _metres(millimetres: NDArray[Any]) -> NDArray[np.float32]:
-    # Not in place: uint16 cannot hold metres.
-    metres: NDArray[np.float32] = millimetres.astype(np.float32) / np.float32(1000.0)
-    return metres
-
-
-def _pixels(image: NDArray[np.uint8], kind: str) -> NDArray[np.uint8]:
-    array = np.asarray(image)
-    channels = array.shape[2] if array.ndim == 3 else 1
-    fits = array.dtype == np.uint8 and array.ndim in (2, 3) and channels in _CHANNELS and array.size
-    if not fits or (kind == "jpeg" and channels == 4):
-        raise InvalidValue(
-            f"A {kind} image must be uint8 of shape (height, width, 3), not {array.dtype} of {array.shape}."
-        )
-    return _flat(array)
-
-
-def _flat(image: NDArray[Any]) -> NDArray[Any]:
-    return image[:, :, 0] if image.ndim == 3 and image.shape[2] == 1 else image
-
-
 def _encode(image: NDArray[Any], kind: str) -> bytes:
-    file, options = io.BytesIO(), {"compress_level": 1} if kind == "png" else {"quality": JPEG_QUALITY}
+    file, options = io.BytesIO(), {"compress_level": 1} if kind == "png" else {"quality": _JPEG_QUALITY}
+    image = image[:, :, 0] if image.ndim == 3 and image.shape[2] == 1 else image
     _pillow().fromarray(np.ascontiguousarray(image)).save(file, kind, **options)
     return file.getvalue()
 

@@ -7,7 +7,6 @@ type only plain values are taken. Values that are not finite and nulls are refus
 from __future__ import annotations
 
 import base64
-import binascii
 import math
 import re
 import sys
@@ -48,12 +47,10 @@ class _Misfit(Exception):  # noqa: N818 - becomes an InvalidValue
         self.expected, self.found, self.path = expected, said or brief(found), ""
 
     def under(self, step: str) -> _Misfit:
-        """The same, seen from one level further out."""
         self.path = step + self.path
         return self
 
     def error(self, place: str) -> InvalidValue:
-        """What the user is told, of a value that is called `place`."""
         return InvalidValue(f"{place}{self.path}: expected {self.expected}, found {self.found}.")
 
 
@@ -100,9 +97,7 @@ def variants(kind: str) -> tuple[tuple[Field, ...], ...]:
 def complete(kind: str, message: object) -> dict[str, Any]:
     """A message of type `kind` with every field there: a new dict, byte arrays as `bytes`. Read it, do not change it.
 
-    Args:
-        kind: Name of the type, with or without ``/msg/``.
-        message: A dict in the JSON form of rosbridge: byte arrays as base64, or as `bytes`, or as a list of integers.
+    Byte arrays of `message` may be base64, as JSON has them, `bytes`, or lists of integers.
 
     Raises:
         InvalidValue: It does not fit: the text names type, field, expected and found.
@@ -118,11 +113,7 @@ def complete(kind: str, message: object) -> dict[str, Any]:
 
 
 def complete_known(kind: str, message: object) -> dict[str, Any]:
-    """The same, and fields that the type does not have are ignored: they may be of a newer version of it.
-
-    Raises:
-        InvalidValue: A field that the type has does not fit.
-    """
+    """The same, and fields that the type does not have are ignored: they may be of a newer version of it."""
     try:
         return complete(kind, message)
     except InvalidValue:  # perhaps only because of a field too many
@@ -141,12 +132,7 @@ def _known_fields(kind: str, value: Any) -> Any:
 
 
 def require_plain(value: object, place: str = "value") -> None:
-    """Refuse what JSON cannot carry unharmed.
-
-    Raises:
-        InvalidValue: There is a NaN, an infinity, a huge integer, a broken text, or too deep a nesting in it; null is
-            allowed here.
-    """
+    """Raise `InvalidValue` for NaN, infinity, a huge integer, a broken text, too deep a nesting; null is allowed."""
     try:
         _plain(value, 0, null=True)
     except _Misfit as misfit:
@@ -255,11 +241,6 @@ def _number(kind: str, first: float) -> Check:
 
 def _array(kind: str, one: Check, size: int | None) -> Check:
     """The check of a list; `one` checks an item, `size` is the length if it is fixed."""
-    usual: Callable[[str, Sequence[Any]], list[Any] | None] | None = {
-        **dict.fromkeys(INTEGERS, _all_integers),
-        **dict.fromkeys(FLOATS, _all_floats),
-        "string": _all_ascii,
-    }.get(kind)
 
     def check(value: Any, depth: int) -> list[Any]:
         values = [_MISSING] * (size or 0) if value is _MISSING else value
@@ -267,9 +248,9 @@ def _array(kind: str, one: Check, size: int | None) -> Check:
             raise _Misfit("a list", values)
         if size is not None and len(values) != size:
             raise _Misfit(f"a list of {size}", values, f"a list of {len(values)}")
-        # A few passes in C instead of one in Python, which would hold up everybody for the time of a large list.
-        if usual is not None and (found := usual(kind, values)):
-            return found
+        usual = _usual(kind, values)
+        if usual is not None:
+            return usual
         checked: list[Any] = []
         try:
             checked.extend(one(item, depth + 1) for item in values)
@@ -280,29 +261,25 @@ def _array(kind: str, one: Check, size: int | None) -> Check:
     return check
 
 
-def _all_integers(kind: str, values: Sequence[Any]) -> list[int] | None:
-    """A copy of `values` if all of them are integers of the type `kind`."""
-    low, high = INTEGERS[kind]
-    fits = set(map(type, values)) == {int} and low <= min(values) and max(values) <= high
-    return list(values) if fits else None
+def _usual(kind: str, values: Sequence[Any]) -> list[Any] | None:
+    """A checked copy of numbers or texts by a few passes in C; None where an item needs a look of its own.
 
-
-def _all_floats(kind: str, values: Sequence[Any]) -> list[float] | None:
-    """`values` as floats if all of them are finite numbers of the type `kind`."""
+    One pass in Python would hold up everybody for the time of a large list.
+    """
     kinds = set(map(type, values))
-    if not kinds or not kinds <= {float, int}:
-        return None
-    try:
-        floats = list(values) if int not in kinds else list(map(float, values))
-    except OverflowError:
-        return None
-    finite = math.isfinite(sum(floats))  # a finite sum has finite terms
-    return floats if finite and (kind == "float64" or max(map(abs, floats)) <= FLOATS[kind]) else None
-
-
-def _all_ascii(kind: str, values: Sequence[Any]) -> list[str] | None:
-    """A copy of `values` if all of them are texts in ASCII."""
-    return list(values) if set(map(type, values)) == {str} and "".join(values).isascii() else None
+    if kind in FLOATS and kinds and kinds <= {float, int}:
+        try:
+            floats = list(values) if int not in kinds else list(map(float, values))
+        except OverflowError:
+            return None
+        finite = math.isfinite(sum(floats))  # a finite sum has finite terms
+        return floats if finite and (kind == "float64" or max(map(abs, floats)) <= FLOATS[kind]) else None
+    if kind in INTEGERS and kinds == {int}:
+        low, high = INTEGERS[kind]
+        return list(values) if low <= min(values) and max(values) <= high else None
+    if kind == "string" and kinds == {str}:
+        return list(values) if "".join(values).isascii() else None
+    return None
 
 
 def _bool(value: Any, depth: int) -> bool:
@@ -330,23 +307,21 @@ def _byte_array(value: Any, size: int | None) -> bytes:
     """Bytes as they are, as base64, or as a list of integers; zeros where they are left out."""
     if value is _MISSING:
         return bytes(size or 0)
-    data = _bytes(value)
+    data: bytes | None = None
+    try:
+        if isinstance(value, (bytes, bytearray, memoryview)):
+            data = bytes(value)
+        elif isinstance(value, str):
+            data = base64.b64decode(value, validate=True)
+        elif isinstance(value, (list, tuple)) and set(map(type, value)) <= {int}:
+            data = bytes(value)
+    except ValueError:  # binascii.Error is one
+        pass
+    if data is None:
+        raise _Misfit("bytes as base64 or a list of integers in [0, 255]", value)
     if size is not None and len(data) != size:
         raise _Misfit(f"{size} bytes", data, f"{len(data)} bytes")
     return data
-
-
-def _bytes(value: Any) -> bytes:
-    if isinstance(value, (bytes, bytearray, memoryview)):
-        return bytes(value)
-    try:
-        if isinstance(value, str):
-            return base64.b64decode(value, validate=True)
-        if isinstance(value, (list, tuple)) and set(map(type, value)) <= {int}:
-            return bytes(value)
-    except (binascii.Error, ValueError):
-        pass
-    raise _Misfit("bytes as base64 or a list of integers in [0, 255]", value)
 
 
 # ---- plain values of any type

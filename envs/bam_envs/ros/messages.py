@@ -52,7 +52,10 @@ def require_message(message: object, where: str) -> Message:
 def value_at(message: Message, path: str, where: str) -> Any:
     """What is at `path`, e.g. ``pose.position.x``; inside of what is stamped where the message is."""
     steps = _steps(path)
-    value: Any = _body(message, steps[0])
+    value: Any = message
+    if steps[0] not in message and len(message) == 2 and "header" in message:  # a PoseStamped: a header and a Pose
+        body = next(part for name, part in message.items() if name != "header")
+        value = body if isinstance(body, _OBJECT) else message
     for name in steps:
         if not isinstance(value, _OBJECT) or name not in value:
             found = ", ".join(map(str, value)) if isinstance(value, _OBJECT) else brief(value)
@@ -73,14 +76,6 @@ def _quaternion(path: str) -> tuple[str, ...]:
     return () if angle is None else tuple(f"{angle.group(1)}.{axis}" for axis in "xyzw")
 
 
-def _body(message: Message, first: str) -> Message:
-    """`message`, or what it stamps (a PoseStamped is a header and a Pose) if `first` is not a field of its own."""
-    if first in message or len(message) != 2 or "header" not in message:
-        return message
-    body = next(value for name, value in message.items() if name != "header")
-    return body if isinstance(body, _OBJECT) else message
-
-
 def number_at(message: Message, path: str, where: str) -> float:
     """The finite number at `path`; for ``yaw(path)`` the angle about z [rad] of the quaternion there."""
     quaternion = _quaternion(path)
@@ -92,8 +87,10 @@ def number_at(message: Message, path: str, where: str) -> float:
     return math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
-def number(value: object, where: str) -> float:
-    """`value`, which must be a plain finite number."""
+def number(value: object, where: str, *, missing: float | None = None) -> float:
+    """`value`, which must be a plain finite number; null, NaN and infinities become `missing`, if it is given."""
+    if missing is not None and _is_missing(value):
+        return missing
     if isinstance(value, (float, int, np.integer, np.floating)) and not isinstance(value, bool):
         try:
             found = float(value)
@@ -125,16 +122,10 @@ def numbers(value: object, where: str, *, missing: float | None = None) -> Array
         raise ProtocolError(f"{where} must be a list of numbers, not {brief(value)}.")
     if missing is not None:
         value = [missing if _is_missing(one) else one for one in value]
-    if not set(map(type, value)) <= {int, float}:
-        value = [number(one, f"{where}[{place}]") for place, one in enumerate(value)]
-    try:
-        array = np.array(value, dtype=np.float64)
-    except OverflowError:
-        array = np.array([number(one, f"{where}[{place}]") for place, one in enumerate(value)])
-    if not np.isfinite(array).all():
-        place = int(np.flatnonzero(~np.isfinite(array))[0])
-        number(value[place], f"{where}[{place}]")
-    return array
+        usual = usual_numbers(value)
+        if usual is not None:
+            return usual
+    return np.array([number(one, f"{where}[{place}]") for place, one in enumerate(value)], dtype=np.float64)
 
 
 def _is_missing(value: object) -> bool:
@@ -166,11 +157,7 @@ def require_names(names: Sequence[str], found: list[str], where: str, ignore: Se
 
 
 def require_frame(frame: str, message: Message, where: str) -> None:
-    """The header of `message` names `frame`; ROS 1 may write a slash before it.
-
-    Raises:
-        ProtocolError: It names another frame, or none: where its numbers are is not known.
-    """
+    """Refuse a `message` whose header names another frame, or none; ROS 1 may write a slash before it."""
     header = message.get("header")
     found = header.get("frame_id") if isinstance(header, _OBJECT) else None
     if found == frame or (isinstance(found, str) and found.lstrip("/") == frame):
@@ -196,29 +183,26 @@ def put_at(message: dict[str, Any], path: str, value: float) -> None:
 
 
 def read_stamp(message: Message, where: str) -> float | None:
-    """When the message says it was measured [s]; None if it says nothing, or 0.
-
-    Both spellings are read: ``secs``, ``nsecs`` of ROS 1 and ``sec``, ``nanosec`` of ROS 2.
-    """
+    """When the message says it was measured [s], in the spelling of ROS 1 or ROS 2; None if it says nothing, or 0."""
     header = message.get("header")
     stamp = header.get("stamp") if isinstance(header, _OBJECT) else None
     if stamp is None:
         return None
     if not isinstance(stamp, _OBJECT):
         require_message(stamp, f"{where}: header.stamp")
-    seconds, nano = _either(stamp, "sec", "secs", where), _either(stamp, "nanosec", "nsecs", where)
+    parts = []
+    for ros2, ros1 in (("sec", "secs"), ("nanosec", "nsecs")):
+        name = ros2 if ros2 in stamp else ros1
+        if name not in stamp:
+            raise ProtocolError(f"{where}: header.stamp has no {ros2}; found: {', '.join(stamp)}.")
+        part = stamp[name]
+        # What comes a thousand times a second is not to make a text that nobody reads.
+        plain = type(part) is int and part < 2**63
+        parts.append(part if plain else number(part, f"{where}: header.stamp.{name}"))
+    seconds, nano = parts
     if seconds < 0 or not 0 <= nano < _NANO:
         raise ProtocolError(f"{where}: header.stamp must be seconds and nanoseconds, not {brief(stamp)}.")
     return seconds + nano / _NANO or None
-
-
-def _either(stamp: Message, ros2: str, ros1: str, where: str) -> float:
-    name = ros2 if ros2 in stamp else ros1
-    if name not in stamp:
-        raise ProtocolError(f"{where}: header.stamp has no {ros2}; found: {', '.join(stamp)}.")
-    value = stamp[name]
-    # What comes a thousand times a second is not to make a text that nobody reads.
-    return value if type(value) is int and value < 2**63 else number(value, f"{where}: header.stamp.{name}")
 
 
 def write_stamp(seconds: float, *, ros1: bool = False) -> dict[str, int]:

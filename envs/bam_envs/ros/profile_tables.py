@@ -68,11 +68,6 @@ class Source:
     constants: Mapping[str, Finite] = dataclasses.field(default_factory=dict)
     """Further fields of the message, as a simulated robot sends them."""
 
-    @cached_property
-    def is_si(self) -> bool:
-        """Whether its numbers travel in SI units, as they are."""
-        return set(self.scale) == {1.0} and set(self.offset) == {0.0}
-
 
 @dataclass(frozen=True)
 class Sink:
@@ -106,11 +101,6 @@ class Sink:
     def reach_at(self, period: float) -> float:
         """When a trajectory's point is to be reached [s], where a command is sent every `period` [s]."""
         return period * self.reach_periods if self.reach is None else self.reach
-
-    @cached_property
-    def is_si(self) -> bool:
-        """Whether its numbers travel in SI units, as they are."""
-        return set(self.scale) == {1.0} and set(self.offset) == {0.0}
 
 
 @dataclass(frozen=True)
@@ -259,22 +249,18 @@ class RobotProfile:
             raise InvalidValue(f"Commands are {expected}, and {self.name} takes {found}. Choose another profile.")
         wanted = self.sinks(mode)
         for sink in wanted:
-            self._require_whole(sink, labels)
+            if missing := _missing(sink, labels):
+                taken, absent, alone = (", ".join(one) for one in (sink.labels, missing, labels))
+                raise InvalidValue(
+                    f"{sink.topic} takes {taken} in one message, and {absent} is not commanded. "
+                    f"Give the profile of {self.name} a command mode with a topic for {alone} alone."
+                )
         commands = {
             name: tuple(sink for sink in sinks if set(sink.labels) <= set(labels))
             for name, sinks in self.commands.items()
             if sinks is wanted or not any(_missing(sink, labels) for sink in sinks)
         }
         return dataclasses.replace(self, command=self.command.part(labels), commands=commands)
-
-    def _require_whole(self, sink: Sink, labels: tuple[str, ...]) -> None:
-        missing = _missing(sink, labels)
-        if missing:
-            taken, absent, alone = (", ".join(one) for one in (sink.labels, missing, labels))
-            raise InvalidValue(
-                f"{sink.topic} takes {taken} in one message, and {absent} is not commanded. "
-                f"Give the profile of {self.name} a command mode with a topic for {alone} alone."
-            )
 
     def spec(self, wanted: RobotSpec | None = None, mode: str | None = None) -> RobotSpec:
         """What this robot measures and is sent; only the signals and commands of `wanted`, at its period, if given.
@@ -286,20 +272,13 @@ class RobotProfile:
         Raises:
             InvalidValue: It does not measure a signal of `wanted`, or does not take its commands.
         """
+        period = self.period if wanted is None else wanted.period
+        # A trajectory that takes longer than a period is behind its commands for longer.
+        reached = (sink.reach_at(period) for sink in self.sinks(mode) if sink.type == _TRAJECTORY)
+        lag = _LAGS[self.kind] + max(0.0, max(reached, default=0.0) - period)
         if wanted is None:
             signals = tuple(signal for signal in self.signals if not self.source(signal.name).optional)
-            return RobotSpec(self.name, signals, self.command, self.period, self._lag(self.period, mode))
-        self._require_measured(wanted)
-        signals = tuple(self.signal(signal.name) for signal in wanted.signals)
-        command = self.narrowed(wanted.command.labels, mode).command
-        return RobotSpec(self.name, signals, command, wanted.period, self._lag(wanted.period, mode))
-
-    def _lag(self, period: float, mode: str | None) -> float:
-        """How far it is behind commands that are sent every `period` [s]: more where a trajectory takes longer."""
-        longest = max((sink.reach_at(period) for sink in self.sinks(mode) if sink.type == _TRAJECTORY), default=0.0)
-        return _LAGS[self.kind] + max(0.0, longest - period)
-
-    def _require_measured(self, wanted: RobotSpec) -> None:
+            return RobotSpec(self.name, signals, self.command, period, lag)
         known = {signal.name: signal for signal in self.signals}
         for signal in wanted.signals:
             if signal.name not in known:
@@ -310,6 +289,9 @@ class RobotProfile:
             if signal.labels != known[signal.name].labels:
                 found = ", ".join(known[signal.name].labels)
                 raise InvalidValue(f"{signal.name} must be {', '.join(signal.labels)}; that of {self.name} is {found}.")
+        signals = tuple(known[signal.name] for signal in wanted.signals)
+        command = self.narrowed(wanted.command.labels, mode).command
+        return RobotSpec(self.name, signals, command, period, lag)
 
 
 def _missing(sink: Sink, labels: tuple[str, ...]) -> list[str]:

@@ -8,15 +8,18 @@ dicts in the JSON form of rosbridge; a byte array is `bytes`. Types are written 
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, TypeVar
 
 from bam_envs.core.errors import LinkLost, RemoteError
 from bam_envs.core.wording import listed
 
+T = TypeVar("T")
 Message = Mapping[str, Any]
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,14 @@ Listener = Callable[[Message, Caller], None]
 Handler = Callable[[Message, Caller], Message]
 """Answers a service request with its response; runs in a thread of its own. What it raises of our errors is the text of
 a failed response."""
+
+
+def tell(callback: Callable[[T], object], news: T) -> None:
+    """Call foreign code; an exception in it is logged, and others are told all the same."""
+    try:
+        callback(news)
+    except Exception:
+        _log.exception("a callback failed")
 
 
 def refusal_of(topic: str, reason: object) -> str:
@@ -93,13 +104,7 @@ class Bus(Protocol):
 
 
 def namespaces_with(link: Any, kind: Literal["topics", "services"], name: str) -> str:
-    """A sentence about the namespaces in which a server has the topic or service `name`; empty if rosapi knows none.
-
-    Args:
-        link: A client link that is up.
-        kind: What `name` is of.
-        name: Without namespace.
-    """
+    """A sentence about the namespaces in which the server of `link` has the topic or service `name`, if it has any."""
     try:
         names = link.call(f"/rosapi/{kind}", f"rosapi/{kind.capitalize()}", {}, 1.0).get(kind) or []
     except (RemoteError, LinkLost):

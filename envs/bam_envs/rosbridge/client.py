@@ -24,8 +24,9 @@ from typing import Any
 from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NoServer, ProtocolError, RemoteError
 from bam_envs.core.wording import brief
 from bam_envs.ros.interfaces import normal_name
-from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller, Handler, Listener, Message
-from bam_envs.rosbridge.client_connection import Connection, ServerClock, bare_reason, tell_all
+from bam_envs.ros.messages import write_stamp
+from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller, Handler, Listener, Message, tell
+from bam_envs.rosbridge.client_connection import Connection, ServerClock, bare_reason
 from bam_envs.rosbridge.declarations import Declarations
 from bam_envs.rosbridge.encoding import dump_json
 from bam_envs.rosbridge.endpoint import Endpoint
@@ -51,11 +52,9 @@ class RosbridgeLink:
     Args:
         endpoint: The server; the text of a URL stands for `Endpoint(url)`.
         name: What it is for; in the names of its threads.
-        lost_after: The link drops when the server gives no sign of life for so long [s]; infinite: only when the
-            network says so. The server is asked by a WebSocket ping, which a bridge answers also while it holds
-            everything else back for a call.
+        lost_after: The link drops when the server answers no WebSocket ping for so long [s]; a bridge does also while
+            it holds everything else back for a call. Infinite: only when the network says so.
         max_message: Largest message, in either direction [bytes].
-        clock: Our wall clock [s].
 
     Raises:
         InvalidValue: The address is not the one of a rosbridge server.
@@ -68,7 +67,6 @@ class RosbridgeLink:
         name: str = "control",
         lost_after: float = math.inf,
         max_message: int = 64 * 1024 * 1024,
-        clock: Callable[[], float] = time.time,
     ) -> None:
         self._endpoint = Endpoint(endpoint) if isinstance(endpoint, str) else endpoint
         self.url, self.namespace, self.name = self._endpoint.address.url, self._endpoint.address.namespace, name
@@ -78,7 +76,7 @@ class RosbridgeLink:
         """Counts the connections; 0 before the first."""
         if not lost_after > 0.0:
             raise InvalidValue(f"lost_after: expected a time above 0 s, found {lost_after!r}.")
-        self._lost_after, self._max_message, self._clock = lost_after, max_message, clock
+        self._lost_after, self._max_message = lost_after, max_message
         self._declarations = Declarations()
         # A declaration and its announcement must reach the network thread in the same order.
         self._declaring = threading.Lock()
@@ -89,7 +87,8 @@ class RosbridgeLink:
         self._down_callbacks: list[Callable[[LinkLost], None]] = []
         self._status_callbacks: list[Callable[[Mapping[str, Any]], None]] = []
         self._numbers = itertools.count(1)
-        self._workers, self._answering = Workers(_MOST_ANSWERING, f"bam-link-{name}-service"), 0
+        self._workers = Workers(_MOST_ANSWERING, f"bam-link-{name}-service")
+        self._may_answer = threading.Semaphore(_MOST_ANSWERING)
         self._thread = LoopThread(f"bam-link-{name}")
         self._main_task: asyncio.Task[None] | None = None
         self._connecting, self._changed = threading.Lock(), threading.Condition()
@@ -138,11 +137,7 @@ class RosbridgeLink:
         return connection is not None and connection.is_open
 
     def wait_up(self, timeout: float) -> None:
-        """Wait until the link is up.
-
-        Raises:
-            LinkLost: It is not, after `timeout` [s].
-        """
+        """Wait until the link is up; `LinkLost` if it is not after `timeout` [s]."""
         self._require_waiting_allowed("wait_up")
         with self._changed:
             self._changed.wait_for(lambda: self._up is not None or self._closed, timeout)
@@ -150,10 +145,7 @@ class RosbridgeLink:
             raise LinkLost(f"{self.url}: the link is down ({self._why}).")
 
     def on_down(self, callback: Callable[[LinkLost], None]) -> None:
-        """Call `callback` with the reason each time the link drops, but not when it is closed.
-
-        On the network thread: it must return at once.
-        """
+        """Call `callback` with the reason on the network thread each time the link drops, but not when it is closed."""
         self._down_callbacks.append(callback)
 
     # ---- the server's time
@@ -170,10 +162,7 @@ class RosbridgeLink:
 
     def stamp(self, t: float) -> dict[str, int]:
         """A time [s] as the server spells it; as ROS 2 does where that is not known."""
-        seconds, nanoseconds = divmod(round(t * 1e9), 1_000_000_000)
-        if self.ros == "ros1":
-            return {"secs": seconds, "nsecs": nanoseconds}
-        return {"sec": seconds, "nanosec": nanoseconds}
+        return write_stamp(t, ros1=self.ros == "ros1")
 
     # ---- topics
 
@@ -196,12 +185,7 @@ class RosbridgeLink:
         self.publish_all([(topic, message)])
 
     def publish_all(self, messages: Sequence[tuple[str, Message]]) -> None:
-        """Send several messages, each on its topic, in this order: all of them or none.
-
-        Raises:
-            LinkLost: As `publish`.
-            InvalidValue: As `publish`.
-        """
+        """Send several messages, each on its topic, in this order: all of them or none. Raises as `publish`."""
         connection = self._require_up()
         for topic, _ in messages:
             self._declarations.require_advertised(topic)
@@ -253,13 +237,12 @@ class RosbridgeLink:
     def call(self, service: str, kind: str, args: Message, timeout: float) -> dict[str, Any]:
         """Ask `service` of type `kind`, and wait for its response.
 
-        With an empty `kind` the server looks the type up. For a service that may not exist: a server that is told the
-        type waits for the service to appear, and one that is not says at once that there is none.
+        With an empty `kind` the server looks the type up, and says at once if there is no such service; a server that
+        is told the type waits for it to appear.
 
         Raises:
-            LinkLost: The link is down, drops while waiting, or no answer comes in `timeout` [s], or in the time that
-                the server itself allows. In the first case nothing was sent; in the others what was asked may have been
-                done.
+            LinkLost: The link is down, and nothing was sent. Or it drops while waiting, or no answer comes in `timeout`
+                [s] or in the time that the server itself allows: what was asked may have been done.
             RemoteError: The service, or the server, refused or failed.
             ProtocolError: The response has no fields.
             InvalidValue: A number in `args` is not finite or not plain, `timeout` is not a time, or the caller is the
@@ -282,18 +265,25 @@ class RosbridgeLink:
             raise LinkLost(f"{self.url}: {service} did not answer in {timeout:g} s; it may still be at it.") from error
         finally:
             answer.cancel()
-        if said.get("result") is False and _ENDED in str(said.get("values")):
-            raise self._given_up(service, time.monotonic() - begun, timeout)
-        return _response(service, said)
+        return self._response(service, said, time.monotonic() - begun, timeout)
 
-    def _given_up(self, service: str, waited: float, timeout: float) -> LinkLost:
-        if waited > _NEARLY * timeout:
-            return LinkLost(f"{self.url}: {service} did not answer in {timeout:g} s; it may still be at it.")
-        return LinkLost(
-            f"{self.url}: the server gave up {service} after {waited:.1f} s, and {timeout:g} s were asked for; it may "
-            f"still be at it. Start the bridge with default_call_service_timeout:={timeout:.1f}, or use a pair of "
-            'topics instead of the service (channel="topics").'
-        )
+    def _response(self, service: str, answer: Mapping[str, Any], waited: float, timeout: float) -> dict[str, Any]:
+        values = answer.get("values")
+        if answer.get("result") is False and _ENDED in str(values):
+            if waited > _NEARLY * timeout:
+                raise LinkLost(f"{self.url}: {service} did not answer in {timeout:g} s; it may still be at it.")
+            raise LinkLost(
+                f"{self.url}: the server gave up {service} after {waited:.1f} s, and {timeout:g} s were asked for; it "
+                f"may still be at it. Start the bridge with default_call_service_timeout:={timeout:.1f}, or use a pair "
+                'of topics instead of the service (channel="topics").'
+            )
+        if answer.get("result") is False:
+            raise RemoteError(values if isinstance(values, str) and values else f"{service} failed: {values!r}.")
+        if values is None:
+            return {}
+        if not isinstance(values, dict):
+            raise ProtocolError(f"{service}: expected a response with fields, found {values!r}.")
+        return values
 
     def serve(self, service: str, kind: str, handler: Handler) -> None:
         """Answer `service` of type `kind` through the server: always, also when the handler fails."""
@@ -431,7 +421,7 @@ class RosbridgeLink:
         connection = Connection(
             self._endpoint, self.epoch + 1, self._max_message, self._lost_after, self._take, self._note_end
         )
-        await connection.open(timeout, self._clock)
+        await connection.open(timeout)
         try:
             for request in self._declarations.greeting():
                 frame = connection.announced[request["id"]] = dump_json(request)
@@ -449,7 +439,8 @@ class RosbridgeLink:
     def _note_end(self, connection: Connection, error: BamEnvsError) -> None:
         if connection is self._up:
             self._up, self._why = None, bare_reason(self.url, error)
-            tell_all(self._down_callbacks, LinkLost(str(error)))
+            for callback in self._down_callbacks:
+                tell(callback, LinkLost(str(error)))
 
     async def _leave(self) -> None:
         self._why = "it was closed; make a new one"
@@ -479,14 +470,17 @@ class RosbridgeLink:
             topic, content = message.get("topic"), message.get("msg")
             if not isinstance(topic, str) or not isinstance(content, Mapping):
                 raise ProtocolError(f"a published message has topic {topic!r} and msg {brief(content)}")
-            if self.ros is None:
-                self._seen_ros = _ros_of(content)
+            header = content.get("header") if self.ros is None else None
+            stamp = header.get("stamp") if isinstance(header, Mapping) else None
+            if isinstance(stamp, Mapping):
+                self._seen_ros = "ros2" if "sec" in stamp else "ros1" if "secs" in stamp else None
             self._declarations.deliver(topic, content)
         elif operation == "call_service":
             self._answer(connection, message)
         elif operation == "status":
             self.statuses.append(message)
-            tell_all(self._status_callbacks, message)
+            for callback in self._status_callbacks:
+                tell(callback, message)
         else:
             connection.pass_over(f"a message with op {operation!r:.40}")
 
@@ -495,14 +489,14 @@ class RosbridgeLink:
         service = request.get("service")
         response = {"op": "service_response", "service": service, "id": request.get("id")}
         handler = self._declarations.handler(str(service))
-        refusal = f"Service {service} is not served here" if handler is None else ""
-        if self._answering >= _MOST_ANSWERING:
-            refusal = f"{_MOST_ANSWERING} requests are being answered already"
-        if handler is None or refusal:
-            connection.send(dump_json({**response, "values": refusal, "result": False}))
+        if handler is None:
+            refusal = f"Service {service} is not served here"
+        elif self._may_answer.acquire(blocking=False):
+            self._workers.submit(partial(self._run_handler, connection, handler, request, response))
             return
-        self._answering += 1
-        self._workers.submit(partial(self._run_handler, connection, handler, request, response))
+        else:
+            refusal = f"{_MOST_ANSWERING} requests are being answered already"
+        connection.send(dump_json({**response, "values": refusal, "result": False}))
 
     def _run_handler(
         self, connection: Connection, handler: Handler, request: dict[str, Any], response: dict[str, Any]
@@ -516,30 +510,8 @@ class RosbridgeLink:
         except Exception as error:  # handlers are foreign code, and the caller waits for an answer in every case
             _LOG.exception("%s: the handler failed", response["service"])
             frame = dump_json({**response, "values": f"{type(error).__name__}: {error}", "result": False})
-        self._thread.post(self._note_answered)
+        self._may_answer.release()
         try:
             self._send(connection, frame)
         except BamEnvsError as gone:
             _LOG.warning("%s: the response could not be sent: %s", response["service"], gone)
-
-    def _note_answered(self) -> None:
-        self._answering -= 1
-
-
-def _response(service: str, answer: Mapping[str, Any]) -> dict[str, Any]:
-    values = answer.get("values")
-    if answer.get("result") is False:
-        raise RemoteError(values if isinstance(values, str) and values else f"{service} failed: {values!r}.")
-    if values is None:
-        return {}
-    if not isinstance(values, dict):
-        raise ProtocolError(f"{service}: expected a response with fields, found {values!r}.")
-    return values
-
-
-def _ros_of(message: Mapping[str, Any]) -> str | None:
-    header = message.get("header")
-    stamp = header.get("stamp") if isinstance(header, Mapping) else None
-    if not isinstance(stamp, Mapping):
-        return None
-    return "ros2" if "sec" in stamp else "ros1" if "secs" in stamp else None

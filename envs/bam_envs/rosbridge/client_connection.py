@@ -1,7 +1,7 @@
 """One WebSocket connection of a client, from its handshake to its end. Everything here runs on the network thread.
 
 A connection never comes back: what was handed to it and not sent when it ended is refused, and cannot reach the server
-over the next one.
+over the next one. What could not be opened says why: each reason has its own remedy.
 """
 
 from __future__ import annotations
@@ -10,25 +10,28 @@ import asyncio
 import contextlib
 import logging
 import math
+import socket
+import ssl
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
-from websockets.asyncio.client import ClientConnection
+from websockets.asyncio.client import ClientConnection, connect
 from websockets.asyncio.server import broadcast
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 from websockets.protocol import State
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NoServer, ProtocolError, RemoteError
-from bam_envs.rosbridge.dialing import CLOSE_WITHIN, open_socket, silent_bridge
-from bam_envs.rosbridge.encoding import decode_server_frame, dump_json
-from bam_envs.rosbridge.endpoint import Endpoint
-from bam_envs.rosbridge.fragments import Fragments
+from bam_envs.rosbridge.encoding import Fragments, decode_server_frame, dump_json
+from bam_envs.rosbridge.endpoint import Address, Endpoint
 
-T = TypeVar("T")
 _LOG = logging.getLogger(__name__)
+_QUIET = logging.getLogger(f"{__name__}.websockets")
+_QUIET.setLevel(logging.CRITICAL)  # a link says itself, and in one line, why it ended or did not open
+_CLOSE_WITHIN = 1.0
+"""Longest time for a closing handshake [s]."""
 _CLOCK_PROBES = 3
 _LOOK = 0.5
 """Time between two looks at a connection whose silence is no loss [s]."""
@@ -43,24 +46,12 @@ _TOO_LARGE = 1009
 _NOT_KEPT = "Nothing was sent, and nothing is kept."
 _DEAD_NODE = "context is invalid"
 """What rosbridge_suite answers to everything after its node was told to end."""
+_HOST_MISMATCH = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
 
 
 def bare_reason(url: str, error: BamEnvsError) -> str:
     """What `error` says, without the address and the full stop: for a text that begins with the address."""
     return str(error).removeprefix(f"{url}: ").rstrip(".")
-
-
-def tell_all(callbacks: Iterable[Callable[[T], None]], news: T) -> None:
-    """Call each callback with `news`; an exception in one is logged, and the others are called all the same."""
-    for callback in callbacks:
-        _tell_one(callback, news)
-
-
-def _tell_one(callback: Callable[[T], None], news: T) -> None:
-    try:
-        callback(news)
-    except Exception:  # callbacks are foreign code
-        _LOG.exception("a callback of a link failed")
 
 
 @dataclass(frozen=True)
@@ -79,7 +70,7 @@ class Connection:
     Args:
         endpoint: The server.
         epoch: Its number among the connections of a link.
-        max_message: Largest message, in either direction [bytes].
+        max_message: As of `RosbridgeLink`, as is `lost_after`.
         lost_after: Silence of the server after which the connection is lost [s]; infinite: it never is.
         on_message: Takes each message that is not an answer: publish, call_service, status.
         on_end: Called once, when it has ended, before whoever waits for an answer is told.
@@ -98,15 +89,13 @@ class Connection:
         self.error: BamEnvsError | None = None
         """Why it ended; None before."""
         self.ended = asyncio.Event()
-        """Set when it has ended."""
-        self.heard_at = time.monotonic()
-        """When the server last gave a sign of life [s, monotonic]. Any thread may read it."""
         self.announced: dict[str, str] = {}
         """What has been declared on it: id of the declaration -> its frame."""
         self.clock = ServerClock()
-        """What the server says of its time; known once it is open."""
+        """Known once it is open."""
         self._endpoint, self._max_message, self._lost_after = endpoint, max_message, lost_after
         self._on_message, self._on_end = on_message, on_end
+        self._heard_at = time.monotonic()  # when the server last gave a sign of life [s]
         self._socket: ClientConnection | None = None
         self._tasks: list[asyncio.Task[None]] = []
         self._ready = False  # whether the server has answered a request
@@ -114,12 +103,10 @@ class Connection:
         self._fragments = Fragments(max_message)
         self._passed_over = 0
 
-    async def open(self, timeout: float, clock: Callable[[], float]) -> None:
-        """Connect, and see that a rosbridge server answers.
+    # ---- opening
 
-        Args:
-            timeout: For everything together [s].
-            clock: Our wall clock [s].
+    async def open(self, timeout: float) -> None:
+        """Connect, and see that a rosbridge server answers, all within `timeout` [s].
 
         Raises:
             NoServer: One of many reasons, each with its own text; a `ConnectionRefusedError` is its cause where the
@@ -127,25 +114,29 @@ class Connection:
             InvalidValue: The CA file cannot be read.
         """
         deadline = time.monotonic() + timeout
-        self._socket = await open_socket(self._endpoint, timeout, self._max_message)
-        self.heard_at = time.monotonic()
+        self._socket = await _open_socket(self._endpoint, timeout, self._max_message)
+        self._heard_at = time.monotonic()
         loop = asyncio.get_running_loop()
         self._tasks = [loop.create_task(work(self._socket)) for work in (self._read, self._watch)]
         try:
-            self.clock = await asyncio.wait_for(self._first_answer(clock), deadline - time.monotonic())
+            self.clock = await asyncio.wait_for(self._first_answer(), deadline - time.monotonic())
             self._ready = True
         except asyncio.TimeoutError as error:
-            raise silent_bridge(self.url, timeout) from error
+            raise NoServer(
+                self.url,
+                f"a WebSocket server that answers no rosbridge request within {timeout:.1f} s. "
+                "Is it a rosbridge server, and is its ROS node alive?",
+            ) from error
         finally:
             if not self._ready:
                 self.drop(LinkLost(f"{self.url}: no answer."))
 
-    async def _first_answer(self, clock: Callable[[], float]) -> ServerClock:
-        best, best_trip = ServerClock(), float("inf")
+    async def _first_answer(self) -> ServerClock:
+        best, best_trip = ServerClock(), math.inf
         for probe in range(_CLOCK_PROBES):
-            asked = clock()
+            asked = time.time()
             found = await self._ask_time(f"ready:{self.epoch}:{probe}")
-            answered = clock()
+            answered = time.time()
             if found is None:
                 break
             if answered - asked < best_trip:
@@ -205,12 +196,7 @@ class Connection:
             broadcast([socket], frame)
 
     def ask(self, identity: str, frame: str, answer: Future[dict[str, Any]]) -> None:
-        """Send a request; `answer` gets the whole response, or why there is none.
-
-        Raises:
-            LinkLost: See `send`.
-            InvalidValue: See `send`.
-        """
+        """Send a request; `answer` gets the whole response, or why there is none. Raises as `send`."""
         self.send(frame)
         self._pending[identity] = answer
 
@@ -231,7 +217,7 @@ class Connection:
         if self._socket is not None and self.error is None:
             self._end(LinkLost(f"{self.url}: the link was closed."))
             with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._socket.close(), CLOSE_WITHIN)
+                await asyncio.wait_for(self._socket.close(), _CLOSE_WITHIN)
         self.drop(LinkLost(f"{self.url}: the link was closed."))
 
     def _end(self, error: BamEnvsError) -> None:
@@ -252,25 +238,26 @@ class Connection:
         """End the connection when the server gives no sign of life, or does not finish closing."""
         lost_after, closing_since = self._lost_after, math.inf
         every = _LOOK if lost_after == math.inf else lost_after / _PINGS
+
+        def ponged(pong: asyncio.Future[float]) -> None:
+            if not pong.cancelled() and pong.exception() is None:
+                self._heard_at = time.monotonic()
+
         while self.error is None:
             # A server that does not read what waits for it answers no ping either.
             if lost_after < math.inf and self.is_open and not socket.transport.get_write_buffer_size():
                 with contextlib.suppress(ConnectionClosed):
-                    asyncio.ensure_future(await socket.ping()).add_done_callback(self._ponged)
-            woken = time.monotonic() + min(every, max(0.0, self.heard_at + lost_after - time.monotonic()))
+                    asyncio.ensure_future(await socket.ping()).add_done_callback(ponged)
+            woken = time.monotonic() + min(every, max(0.0, self._heard_at + lost_after - time.monotonic()))
             await asyncio.sleep(woken - time.monotonic())
             now = time.monotonic()
             if now - woken > every:
-                self.heard_at = now  # this process itself stood still, and what came meanwhile is still unread
+                self._heard_at = now  # this process itself stood still, and what came meanwhile is still unread
             closing_since = math.inf if self.is_open else min(closing_since, now)
-            if now - self.heard_at >= lost_after:
+            if now - self._heard_at >= lost_after:
                 self.drop(LinkLost(f"{self.url}: nothing from the server for {lost_after:g} s."))
-            elif now - closing_since > CLOSE_WITHIN:
+            elif now - closing_since > _CLOSE_WITHIN:
                 self.drop(LinkLost(f"{self.url}: the link dropped: the server did not finish closing it."))
-
-    def _ponged(self, pong: asyncio.Future[float]) -> None:
-        if not pong.cancelled() and pong.exception() is None:
-            self.heard_at = time.monotonic()
 
     # ---- receiving
 
@@ -278,25 +265,24 @@ class Connection:
         try:
             while True:
                 frame = await socket.recv(decode=False)
-                self.heard_at = time.monotonic()
+                self._heard_at = time.monotonic()
                 try:
                     self._dispatch(decode_server_frame(frame))
                 except BamEnvsError as error:  # a meaningless message, or an answer to it that cannot be sent
                     self.pass_over(str(error))
         except ConnectionClosed as end:
-            self._end(self._reason(end))
-
-    def _reason(self, end: ConnectionClosed) -> BamEnvsError:
-        if end.sent is not None and end.sent.code == _TOO_LARGE and not end.rcvd_then_sent:
-            return ProtocolError(
-                f"{self.url}: the server sent a message above the limit of {self._max_message} bytes. "
-                "Take compressed images, or raise max_message."
-            )
-        if end.rcvd is not None:
-            said = ", ".join(filter(None, (f"code {end.rcvd.code}", end.rcvd.reason)))
-            return LinkLost(f"{self.url}: the link dropped: the server closed it with {said}.")
-        why = f": {end.__cause__}" if end.__cause__ is not None and str(end.__cause__) else ""
-        return LinkLost(f"{self.url}: the link dropped: the connection was cut{why}.")
+            if end.sent is not None and end.sent.code == _TOO_LARGE and not end.rcvd_then_sent:
+                reason: BamEnvsError = ProtocolError(
+                    f"{self.url}: the server sent a message above the limit of {self._max_message} bytes. "
+                    "Take compressed images, or raise max_message."
+                )
+            elif end.rcvd is not None:
+                said = ", ".join(filter(None, (f"code {end.rcvd.code}", end.rcvd.reason)))
+                reason = LinkLost(f"{self.url}: the link dropped: the server closed it with {said}.")
+            else:
+                why = f": {end.__cause__}" if end.__cause__ is not None and str(end.__cause__) else ""
+                reason = LinkLost(f"{self.url}: the link dropped: the connection was cut{why}.")
+            self._end(reason)
 
     def pass_over(self, text: str) -> None:
         """Take note of a message that means nothing here; a server that sends many of them is left."""
@@ -315,8 +301,8 @@ class Connection:
         if operation == "service_response":
             self._resolve(identity, message)
         elif operation == "fragment":
-            self._fragments.expire(self.heard_at)
-            whole = self._fragments.add(message, self.heard_at)
+            self._fragments.expire(self._heard_at)
+            whole = self._fragments.add(message, self._heard_at)
             if whole is not None:
                 self._dispatch(decode_server_frame(whole.encode()))
         # Before the server is known to be one: later on, a request of its own may have an id like ours.
@@ -344,3 +330,91 @@ def _read_clock(found: Mapping[str, Any], now: float) -> ServerClock:
         if isinstance(found.get(seconds), int) and isinstance(found.get(nanoseconds), int):
             return ServerClock(ros, now - found[seconds] - found[nanoseconds] * 1e-9)
     return ServerClock()
+
+
+# ---- the socket, and in words why it could not be opened
+
+
+async def _open_socket(endpoint: Endpoint, timeout: float, max_message: int) -> ClientConnection:
+    """Connect and do the WebSocket handshake, in `timeout` [s]; messages of up to `max_message` bytes are received."""
+    address, context = endpoint.address, endpoint.tls_context()
+    deadline = time.monotonic() + timeout
+    try:
+        # TCP first, so that a port that is closed, one behind a firewall and one that is silent are told apart; and
+        # so that websockets goes through no proxy, behind which no robot is.
+        plain = await asyncio.wait_for(_open_tcp(address), timeout)
+    except (OSError, asyncio.TimeoutError) as error:
+        raise NoServer(address.url, _no_connection(address, error, timeout)) from error
+    try:
+        return await connect(
+            f"{address.url}/",
+            sock=plain,
+            ssl=context,
+            server_hostname=address.host if context is not None else None,
+            additional_headers=endpoint.headers,
+            compression=None,  # deflate costs more time than a fast network saves
+            open_timeout=deadline - time.monotonic(),
+            close_timeout=_CLOSE_WITHIN,
+            ping_interval=None,
+            max_size=max_message,
+            logger=_QUIET,
+        )
+    except InvalidStatus as error:
+        status = error.response.status_code
+        text = f"a web server answers there, with HTTP {status}: no WebSocket. Is it the right port?"
+        if status in (401, 403):
+            text = f"the token was refused (HTTP {status}). Give the server's token (--token-file)."
+        raise NoServer(address.url, text) from error
+    except TimeoutError as error:
+        hint = " Does it speak TLS? If not, use ws://." if address.secure else ""
+        text = f"the port is open, and what listens there says nothing within {timeout:.1f} s. "
+        raise NoServer(address.url, f"{text}Is it a rosbridge server?{hint}") from error
+    except OSError as error:
+        raise NoServer(address.url, _no_connection(address, error, timeout)) from error
+    except ValueError as error:  # a redirect, which leads to another server than the one that was meant
+        raise NoServer(address.url, f"a web server answers there: {error}. Is it the right port?") from error
+    except WebSocketException as error:
+        reason = error.__cause__ or error
+        text = f"something listens there that is no WebSocket server ({reason}). If it has TLS, use wss://."
+        raise NoServer(address.url, text) from error
+
+
+async def _open_tcp(address: Address) -> socket.socket:
+    loop = asyncio.get_running_loop()
+    infos = await loop.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)
+    for place, (family, kind, protocol, _, target) in enumerate(infos):
+        plain = socket.socket(family, kind, protocol)
+        plain.setblocking(False)
+        try:
+            await loop.sock_connect(plain, target)
+            return plain
+        except BaseException as error:
+            plain.close()
+            if not isinstance(error, OSError) or place == len(infos) - 1:
+                raise
+    raise OSError("the name has no address")
+
+
+def _no_connection(address: Address, error: OSError | asyncio.TimeoutError, timeout: float) -> str:
+    """Why TCP or TLS did not come about within `timeout` [s]."""
+    if isinstance(error, ssl.SSLCertVerificationError):
+        reason = error.verify_message.rstrip(".")
+        if error.verify_code in _HOST_MISMATCH:
+            return f"the certificate is not for {address.host!r}: {reason}. Use a name that is in it."
+        remedy = "Give the file of the authority that signed it as ca_file (--ca-file)."
+        return f"the certificate is not trusted: {reason}. {remedy}"
+    if isinstance(error, ssl.SSLError):
+        return f"TLS failed: {error.reason}. If the server has no TLS, use ws://."
+    if isinstance(error, TimeoutError | asyncio.TimeoutError):
+        return f"no connection within {timeout:.1f} s. Is the address right, is the machine on, is a firewall between?"
+    if isinstance(error, socket.gaierror):
+        return f"the name {address.host!r} is not known: {error.strerror}. Try the IP address."
+    if isinstance(error, ConnectionRefusedError):
+        return (
+            f"refused: nothing listens there. Is the port open? Start one with `bam-serve --env bam/pick --port "
+            f"{address.port}` or `ros2 launch rosbridge_server rosbridge_websocket_launch.xml`."
+        )
+    if isinstance(error, ConnectionError):
+        hint = "If the server has no TLS, use ws://." if address.secure else "Is it the right port?"
+        return f"the connection was cut while it was made. {hint}"
+    return f"cannot be reached: {error.strerror or error}."

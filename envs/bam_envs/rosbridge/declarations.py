@@ -26,15 +26,13 @@ class _Subscription:
 
 
 class Declarations:
-    """The tables of one client; any thread."""
+    """The tables of one client; any thread. What declares something returns what to tell the server."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._topics: dict[str, dict[str, Any]] = {}
         self._subscriptions: dict[str, _Subscription] = {}
         self._services: dict[str, tuple[dict[str, Any], Handler]] = {}
-
-    # ---- declaring: each returns what to tell the server
 
     def advertise(self, topic: str, kind: str, latch: bool) -> dict[str, Any]:
         """`topic` will be published."""
@@ -92,18 +90,20 @@ class Declarations:
             self._services[service] = (request, handler)
         return request
 
-    # ---- using
-
     def handler(self, service: str) -> Handler | None:
         """Who answers `service`."""
-        found = self._services.get(service)
-        return None if found is None else found[1]
+        return self._services.get(service, (None, None))[1]
 
     def deliver(self, topic: str, message: Mapping[str, Any]) -> None:
         """Give a message to each listener of `topic`. What one of them raises is logged, and the others still hear."""
         entry = self._subscriptions.get(topic)
         for listener in () if entry is None else entry.listeners.values():
-            _give(topic, message, listener)
+            try:
+                listener(message, UNKNOWN_CALLER)
+            except BamEnvsError as error:  # noqa: PERF203 - each listener has its own
+                _LOG.info("a message was refused: %s", refusal_of(topic, error))
+            except Exception:  # listeners are foreign code
+                _LOG.exception("%s: a listener failed", topic)
 
     def greeting(self) -> list[dict[str, Any]]:
         """Everything, for a server that knows nothing yet."""
@@ -118,15 +118,6 @@ class Declarations:
                 *({"op": "unadvertise_service", "service": service} for service in self._services),
                 *({"op": "unadvertise", "id": f"advertise:{topic}", "topic": topic} for topic in self._topics),
             ]
-
-
-def _give(topic: str, message: Mapping[str, Any], listener: Listener) -> None:
-    try:
-        listener(message, UNKNOWN_CALLER)
-    except BamEnvsError as error:
-        _LOG.info("a message was refused: %s", refusal_of(topic, error))
-    except Exception:  # listeners are foreign code
-        _LOG.exception("%s: a listener failed", topic)
 
 
 def _same_type(known: dict[str, Any], topic: str, kind: str) -> dict[str, Any]:

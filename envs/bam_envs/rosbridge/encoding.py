@@ -1,4 +1,4 @@
-"""What a WebSocket frame of rosbridge holds: JSON, CBOR with typed arrays (RFC 8746), JSON inside a PNG."""
+"""What WebSocket frames of rosbridge hold: JSON, CBOR with typed arrays (RFC 8746), JSON inside a PNG, fragments."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import sys
 import zlib
 from array import array
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import cbor2
@@ -28,6 +29,20 @@ MOST_ITEMS_OF_A_SERVER = 4_000_000
 """The same for messages of a server: an image may come as a list of numbers."""
 _NOT_BRACKETS = bytes(set(range(256)) - set(b'"[]{}'))
 _ONE_KIND = bytes.maketrans(b"{}", b"[]")
+
+_LONGEST_ID = 256
+"""Most characters of an id: it is kept, and repeated, for as long as what it names is unfinished."""
+_LARGEST_ID = 2**53
+"""Largest id that is a number: what every JSON reader holds exactly."""
+_MOST_FRAGMENTS = 10_000
+"""Of one outgoing message: a smaller fragment size would cost more than it carries."""
+_EMPTY = 100
+"""About what a fragment without any text costs [bytes]."""
+
+_MOST_UNFINISHED = 16
+"""Messages of one connection of which fragments may be missing at the same time."""
+Id = str | int | None
+"""What a client calls an interaction; None if it does not."""
 
 # Tags of typed arrays by type, little-endian, with the type code of `array`.
 _TYPED = {
@@ -91,35 +106,14 @@ def load_json(text: object, what: str, most_items: int = MOST_ITEMS_OF_A_SERVER)
         raise ProtocolError(f"{what} must be a JSON object: {reason}.") from error
 
 
-def require_bounded(data: bytes, most_items: int = MOST_ITEMS) -> None:
-    """Refuse JSON that is too much work, from a few passes over its bytes in C.
-
-    Args:
-        data: In UTF-8.
-        most_items: Largest number of values. Commas and brackets in texts count too.
-
-    Raises:
-        ProtocolError: There are more, or lists and objects are too deeply nested.
-    """
+def _object(data: str | bytes, most_items: int, decoder: json.JSONDecoder) -> dict[str, Any]:
+    data = data.encode(errors="surrogatepass") if isinstance(data, str) else data
+    # Before it is parsed, what is too much work is refused, from a few passes over its bytes in C.
     openings = data.count(b"[") + data.count(b"{")
-    if openings + data.count(b",") > most_items:
+    if openings + data.count(b",") > most_items:  # commas and brackets in texts count too
         raise ProtocolError(f"Message: expected at most {most_items} values, found more.")
     if openings > MAX_DEPTH and _is_deep(data):
         raise ProtocolError(f"Message: expected at most {MAX_DEPTH} lists and objects in one another, found more.")
-
-
-def _is_deep(data: bytes) -> bool:
-    if b"\\" in data:
-        data = data.replace(b"\\\\", b"").replace(b'\\"', b"")
-    outside = b"".join(data.translate(_ONE_KIND, _NOT_BRACKETS).split(b'"')[::2])  # every second part is in a text
-    for _ in range(MAX_DEPTH):  # each pass removes the innermost pairs
-        outside = outside.replace(b"[]", b"")
-    return b"[" in outside
-
-
-def _object(data: str | bytes, most_items: int, decoder: json.JSONDecoder) -> dict[str, Any]:
-    data = data.encode(errors="surrogatepass") if isinstance(data, str) else data
-    require_bounded(data, most_items)
     try:
         value = decoder.decode(data.decode())
     except UnicodeDecodeError as error:
@@ -133,6 +127,15 @@ def _object(data: str | bytes, most_items: int, decoder: json.JSONDecoder) -> di
     if not isinstance(value, dict):
         raise ProtocolError(f"Message: expected an object, found {brief(value)}.")
     return value
+
+
+def _is_deep(data: bytes) -> bool:
+    if b"\\" in data:
+        data = data.replace(b"\\\\", b"").replace(b'\\"', b"")
+    outside = b"".join(data.translate(_ONE_KIND, _NOT_BRACKETS).split(b'"')[::2])  # every second part is in a text
+    for _ in range(MAX_DEPTH):  # each pass removes the innermost pairs
+        outside = outside.replace(b"[]", b"")
+    return b"[" in outside
 
 
 def decode_cbor(frame: bytes) -> dict[str, Any]:
@@ -236,6 +239,117 @@ def _finite(text: str) -> float:
     if not math.isfinite(number):
         raise ValueError(f"{text} is not a finite number")
     return number
+
+
+# ---- messages in fragments
+
+
+def split(text: str, size: int, name: str) -> list[str]:
+    """`text` as messages ``fragment`` with `size` characters of it in each; `text` itself if it is short enough."""
+    if len(text) <= size:
+        return [text]
+    size = max(size, math.ceil(len(text) / _MOST_FRAGMENTS))
+    starts = range(0, len(text), size)
+    return [
+        dump_json({"op": "fragment", "id": name, "data": text[at : at + size], "num": num, "total": len(starts)})
+        for num, at in enumerate(starts)
+    ]
+
+
+def read_id(message: Mapping[str, Any], where: str = "id") -> Id:
+    """The id of a message: a text or an integer that is not too long to be kept, if there is one."""
+    value = message.get("id")
+    if isinstance(value, bool) or not (value is None or isinstance(value, (str, int))):
+        raise ProtocolError(f"{where}: expected a text or an integer, found {brief(value)}.")
+    if isinstance(value, str) and len(value) > _LONGEST_ID:
+        raise ProtocolError(f"{where}: expected at most {_LONGEST_ID} characters, found {len(value)}.")
+    if isinstance(value, int) and abs(value) > _LARGEST_ID:
+        raise ProtocolError(f"{where}: expected an integer of 53 bits, found {brief(value)}.")
+    return value
+
+
+@dataclass
+class _Parts:
+    total: int
+    deadline: float
+    texts: dict[int, str] = field(default_factory=dict)
+    size: int = 0
+    """Bytes: a text that is not ASCII takes up to four for a character."""
+
+
+class Fragments:
+    """Joins the fragments of one connection, in whatever order they come.
+
+    All unfinished messages may hold `max_size` bytes together, and each may stay unfinished for `lifetime` [s].
+    """
+
+    def __init__(self, max_size: int, lifetime: float = 10.0) -> None:
+        self.max_size, self.lifetime = max_size, lifetime
+        self._unfinished: dict[Id, _Parts] = {}
+
+    @property
+    def size(self) -> int:
+        """What the unfinished messages hold [bytes]."""
+        return sum(parts.size for parts in self._unfinished.values())
+
+    def clear(self) -> None:
+        """Give all unfinished messages up."""
+        self._unfinished.clear()
+
+    @property
+    def deadline(self) -> float | None:
+        """When the first unfinished message is given up [s], clock of the caller; None if there is none."""
+        return min((parts.deadline for parts in self._unfinished.values()), default=None)
+
+    def add(self, message: Mapping[str, Any], now: float) -> str | None:
+        """Take a message ``fragment``; returns the whole text when it was the last one missing.
+
+        One that does not fit is a `ProtocolError`, and what there was of its message is given up.
+        """
+        name = read_id(message, "fragment.id")
+        if name is None:
+            raise ProtocolError("fragment.id: expected a text or an integer, found None.")
+        try:
+            return self._add(name, message, now)
+        except ProtocolError:
+            self._unfinished.pop(name, None)
+            raise
+
+    def expire(self, now: float) -> list[Id]:
+        """Give up what is too old; returns the ids."""
+        late = [name for name, parts in self._unfinished.items() if parts.deadline <= now]
+        for name in late:
+            del self._unfinished[name]
+        return late
+
+    def _add(self, name: Id, message: Mapping[str, Any], now: float) -> str | None:
+        num, total = _count(message, "num"), _count(message, "total")
+        data = message.get("data")
+        if not isinstance(data, str):
+            raise ProtocolError(f"fragment.data: expected a text, found {brief(data)}.")
+        if name not in self._unfinished and len(self._unfinished) >= _MOST_UNFINISHED:
+            raise ProtocolError(f"Fragments of {_MOST_UNFINISHED} messages are unfinished; send one to its end first.")
+        parts = self._unfinished.setdefault(name, _Parts(total, now + self.lifetime))
+        if total != parts.total or not num < total or parts.texts.get(num, data) != data:
+            raise ProtocolError(f"Fragment {num} of {total} of {name!r} does not fit the ones before it.")
+        if num not in parts.texts:
+            parts.texts[num] = data
+            # An empty fragment costs memory too.
+            parts.size += len(data) * (1 if data.isascii() else 4) + _EMPTY
+            if self.size > self.max_size:
+                raise ProtocolError(f"Fragments: expected at most {self.max_size} bytes, found {self.size}.")
+        if len(parts.texts) < total:
+            return None
+        del self._unfinished[name]
+        return "".join(parts.texts[place] for place in range(total))
+
+
+def _count(message: Mapping[str, Any], name: str) -> int:
+    value = message.get(name)
+    # The Python servers send the total as a float with a fraction: 8.52 for 8 fragments.
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < 2**31:
+        raise ProtocolError(f"fragment.{name}: expected a number >= 0, found {brief(value)}.")
+    return int(value)
 
 
 _ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False, check_circular=False, default=_base64)

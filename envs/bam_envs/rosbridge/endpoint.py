@@ -7,13 +7,12 @@ import ssl
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from urllib.parse import SplitResult, urlsplit
+from urllib.parse import urlsplit
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.rosbridge.tokens import read_token
 
-DEFAULT_PORT = 9090
-"""The port of a rosbridge server whose address names none."""
+_DEFAULT_PORT = 9090
 _NAMESPACE = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)*")
 _EXAMPLE = "Expected ws://host:port or wss://host:port, with a namespace behind it if there is one."
 
@@ -98,12 +97,38 @@ class Endpoint:
 
     @cached_property
     def address(self) -> Address:
-        """The parts of `url`.
+        """The parts of `url`; the port is rosbridge's 9090 where it is left out.
 
         Raises:
             InvalidValue: It is not the address of a rosbridge server.
         """
-        return parse_address(self.url)
+        url = self.url
+        try:
+            parts = urlsplit(url)
+            (parts.hostname or "").encode("idna")
+            if "\0" in url:
+                raise ValueError("a NUL character")
+        except ValueError as error:  # brackets, or a name that cannot be looked up
+            raise InvalidValue(f"Address {url!r} has an invalid host: {error}. {_EXAMPLE}") from error
+        if parts.scheme not in ("ws", "wss"):
+            raise InvalidValue(f"Address {url!r} has the scheme {parts.scheme!r}. {_EXAMPLE}")
+        if not parts.hostname:
+            raise InvalidValue(f"Address {url!r} names no host. {_EXAMPLE}")
+        if parts.query or parts.fragment or parts.username is not None:
+            raise InvalidValue(f"Address {url!r} has more than host, port and namespace. {_EXAMPLE}")
+        namespace = parts.path.rstrip("/")
+        if not _NAMESPACE.fullmatch(namespace):
+            raise InvalidValue(
+                f"Address {url!r} has the namespace {namespace!r}. "
+                "Expected names of letters, digits and underscores, each after a slash, e.g. /bam_001."
+            )
+        try:
+            port = _DEFAULT_PORT if parts.port is None else parts.port
+            if port == 0:
+                raise ValueError("no server has port 0")
+        except ValueError as error:
+            raise InvalidValue(f"Address {url!r} has an invalid port: {error}. {_EXAMPLE}") from error
+        return Address(parts.hostname, port, parts.scheme == "wss", namespace)
 
     @property
     def headers(self) -> dict[str, str]:
@@ -124,41 +149,3 @@ class Endpoint:
             raise InvalidValue(
                 f"CA file {self.ca_file!r} cannot be used: {error}. Expected certificates in PEM."
             ) from error
-
-
-def parse_address(url: str) -> Address:
-    """The parts of a rosbridge URL; the port is rosbridge's 9090 where it is left out.
-
-    Raises:
-        InvalidValue: It is not such a URL.
-    """
-    try:
-        parts = urlsplit(url)
-        (parts.hostname or "").encode("idna")
-        if "\0" in url:
-            raise ValueError("a NUL character")
-    except ValueError as error:  # brackets, or a name that cannot be looked up
-        raise InvalidValue(f"Address {url!r} has an invalid host: {error}. {_EXAMPLE}") from error
-    if parts.scheme not in ("ws", "wss"):
-        raise InvalidValue(f"Address {url!r} has the scheme {parts.scheme!r}. {_EXAMPLE}")
-    if not parts.hostname:
-        raise InvalidValue(f"Address {url!r} names no host. {_EXAMPLE}")
-    if parts.query or parts.fragment or parts.username is not None:
-        raise InvalidValue(f"Address {url!r} has more than host, port and namespace. {_EXAMPLE}")
-    namespace = parts.path.rstrip("/")
-    if not _NAMESPACE.fullmatch(namespace):
-        raise InvalidValue(
-            f"Address {url!r} has the namespace {namespace!r}. "
-            "Expected names of letters, digits and underscores, each after a slash, e.g. /bam_001."
-        )
-    return Address(parts.hostname, _port(url, parts), parts.scheme == "wss", namespace)
-
-
-def _port(url: str, parts: SplitResult) -> int:
-    try:
-        port = DEFAULT_PORT if parts.port is None else parts.port
-        if port == 0:
-            raise ValueError("no server has port 0")
-        return port
-    except ValueError as error:
-        raise InvalidValue(f"Address {url!r} has an invalid port: {error}. {_EXAMPLE}") from error

@@ -63,12 +63,7 @@ class Sessions:
     def prove(self, tag: Tag, channel: str, content: bytes, caller: Caller, *, anywhere: bool = False) -> Freshness:
         """Check that `content` was signed for `channel` by the session of `tag`; returns what is fresh of the session.
 
-        Args:
-            tag: With its signature.
-            channel: Topic or service.
-            content: What is signed beside the tag.
-            caller: Who sent it.
-            anywhere: Accept it also from another connection than the one that opened the session.
+        It must come over the connection that opened the session, or, with `anywhere`, over any.
 
         Raises:
             RemoteError: The session is not open, or did not send this.
@@ -89,11 +84,7 @@ class Sessions:
         return session.fresh
 
     def require(self, tag: Tag, channel: str, content: bytes, caller: Caller, *, anywhere: bool = False) -> None:
-        """Take note of a message. Arguments as of `prove`.
-
-        Raises:
-            RemoteError: As `prove`; or it is old, as `Freshness.require` says.
-        """
+        """`prove`, then `Freshness.require`: raises as both."""
         self.prove(tag, channel, content, caller, anywhere=anywhere).require(tag, channel)
 
     def left(self, caller: Caller) -> list[str]:

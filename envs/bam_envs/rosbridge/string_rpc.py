@@ -37,15 +37,10 @@ Answer = TypeVar("Answer")
 
 
 class RecentAnswers(Generic[Answer]):
-    """The newest answers by the key of their request, so that one that comes twice is executed once. Any thread.
-
-    Args:
-        size: How many are kept; the oldest goes first.
-    """
+    """The newest answers by the key of their request: one that comes twice is executed once. Any thread."""
 
     def __init__(self, size: int = 32) -> None:
-        self._size = size
-        self._lock = threading.Lock()
+        self._size, self._lock = size, threading.Lock()
         self._futures: OrderedDict[Hashable, Future[Answer]] = OrderedDict()
 
     def claim(self, key: Hashable) -> tuple[Future[Answer], bool]:
@@ -70,7 +65,6 @@ class StringRpc:
 
     def __init__(self, bus: Bus, name: str, tagger: Tagger | None = None) -> None:
         self.name = name
-        """See above."""
         self._bus, self._tagger, self._lock = bus, tagger or Tagger(), threading.Lock()
         self._pending: dict[str, Future[dict[str, Any]]] = {}
         self._unsubscribe: Callable[[], None] | None = None
@@ -84,6 +78,7 @@ class StringRpc:
             LinkLost: The link is down or dropped, or there was no reply in time: whether it was executed is unknown.
             RemoteError: The other end refused or failed; `NotInCommand` if somebody else is in command there.
         """
+        deadline = time.monotonic() + timeout
         tag = self._tagger.next(self._epoch(), timeout)
         identity = f"{tag.session}-{tag.sequence}"
         content = _content(identity, payload, f"A request to {self.name}")
@@ -91,10 +86,19 @@ class StringRpc:
         text = f"{signed[:-1]},{content[1:]}"
         self._open()
         future = self._pending[identity] = Future()
+        epoch = self._epoch()
         try:
-            return self._wait(future, text, time.monotonic() + timeout, timeout)
+            while (left := deadline - time.monotonic()) > 0:
+                self._bus.publish(f"{self.name}/request", {"data": text})
+                try:
+                    reply = future.result(left if self._answered == epoch else min(left, _RESEND))
+                except NoAnswer:
+                    continue
+                self._answered = epoch
+                return self._payload_of(reply)
         finally:
             self._pending.pop(identity, None)
+        raise LinkLost(f"{self.name} did not answer in {timeout:g} s; whether it did what was asked is unknown.")
 
     def close(self) -> None:
         """Unsubscribe; calls under way fail."""
@@ -103,18 +107,6 @@ class StringRpc:
         if unsubscribe is not None:
             unsubscribe()
         self._fail(f"the calls to {self.name} were closed")
-
-    def _wait(self, future: Future[dict[str, Any]], text: str, deadline: float, timeout: float) -> dict[str, Any]:
-        epoch = self._epoch()
-        while (left := deadline - time.monotonic()) > 0:
-            self._bus.publish(f"{self.name}/request", {"data": text})
-            try:
-                reply = future.result(left if self._answered == epoch else min(left, _RESEND))
-            except NoAnswer:
-                continue
-            self._answered = epoch
-            return _payload_of(reply, self.name)
-        raise LinkLost(f"{self.name} did not answer in {timeout:g} s; whether it did what was asked is unknown.")
 
     def _open(self) -> None:
         with self._lock:
@@ -134,6 +126,14 @@ class StringRpc:
         if future is not None:  # the replies to everybody else come here too
             future.set_result(reply)
 
+    def _payload_of(self, reply: dict[str, Any]) -> dict[str, Any]:
+        if "error" in reply:
+            raise (NotInCommand if reply.get("kind") == NotInCommand.__name__ else RemoteError)(str(reply["error"]))
+        payload = reply.get("payload")
+        if not isinstance(payload, dict):
+            raise ProtocolError(f"{self.name}/reply: payload must be an object, not {type(payload).__name__}.")
+        return payload
+
     def _fail(self, reason: str) -> None:
         for identity in list(self._pending):
             future = self._pending.pop(identity, None)
@@ -144,15 +144,6 @@ class StringRpc:
 def _content(identity: str, payload: object, what: str) -> str:
     """What the tag of a request signs."""
     return dump_json({"id": identity, "payload": payload}, what)
-
-
-def _payload_of(reply: dict[str, Any], name: str) -> dict[str, Any]:
-    if "error" in reply:
-        raise (NotInCommand if reply.get("kind") == NotInCommand.__name__ else RemoteError)(str(reply["error"]))
-    payload = reply.get("payload")
-    if not isinstance(payload, dict):
-        raise ProtocolError(f"{name}/reply: payload must be an object, not {type(payload).__name__}.")
-    return payload
 
 
 class StringRpcService:
@@ -167,7 +158,6 @@ class StringRpcService:
 
     def __init__(self, bus: Bus, name: str, handler: Handler, sessions: Sessions | None = None) -> None:
         self.name = name
-        """See above."""
         self._bus, self._handler, self._sessions = bus, handler, sessions
         self._freshness, self._answers = FreshnessCheck(), RecentAnswers[str]()
         self._workers = ThreadPoolExecutor(_WORKERS, thread_name_prefix=f"rpc{name.replace('/', '-')}")

@@ -18,11 +18,7 @@ _PATIENCE = 10.0
 
 
 class LoopThread:
-    """Runs one coroutine to its end in an asyncio loop of its own.
-
-    Args:
-        name: Of the thread.
-    """
+    """Runs one coroutine to its end in an asyncio loop of its own."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -42,7 +38,7 @@ class LoopThread:
     def start(self, main: Callable[[Future[None]], Coroutine[Any, Any, None]]) -> None:
         """Run ``main(ready)`` in the thread; returns when `ready` has its result, or raises its exception."""
         ready: Future[None] = Future()
-        thread = threading.Thread(target=self._run, args=(main, ready), name=self._name, daemon=True)
+        thread = threading.Thread(target=lambda: asyncio.run(self._run(main, ready)), name=self._name, daemon=True)
         thread.start()
         self._thread = thread
         ready.result()
@@ -73,17 +69,21 @@ class LoopThread:
             LinkLost: The loop ended meanwhile.
         """
         done: Future[T] = Future()
-        if self.is_current or not self.post(lambda: _settle(done, work)):
+
+        def settle() -> None:
+            try:
+                done.set_result(work())
+            except Exception as error:  # it is raised where the result is waited for
+                done.set_exception(error)
+
+        if self.is_current or not self.post(settle):
             return work()
         try:
             return done.result(timeout=_PATIENCE)
         except FutureTimeoutError:
             raise LinkLost(f"{self._name}: ended meanwhile.") from None
 
-    def _run(self, main: Callable[[Future[None]], Coroutine[Any, Any, None]], ready: Future[None]) -> None:
-        asyncio.run(self._entered(main, ready))
-
-    async def _entered(self, main: Callable[[Future[None]], Coroutine[Any, Any, None]], ready: Future[None]) -> None:
+    async def _run(self, main: Callable[[Future[None]], Coroutine[Any, Any, None]], ready: Future[None]) -> None:
         self._loop = asyncio.get_running_loop()
         try:
             await main(ready)
@@ -95,21 +95,11 @@ class LoopThread:
             self._loop = None
 
 
-def _settle(done: Future[T], work: Callable[[], T]) -> None:
-    try:
-        done.set_result(work())
-    except Exception as error:  # it is raised where the result is waited for
-        done.set_exception(error)
-
-
 class Workers:
     """A pool of daemon threads.
 
     A `ThreadPoolExecutor` joins its threads when the interpreter exits: one handler that hangs would keep the program.
-
-    Args:
-        most: Largest number of threads; each is started when the others are busy.
-        name: Prefix of their names.
+    There are at most `most`; each is started when the others are busy. `name` is the prefix of their names.
     """
 
     def __init__(self, most: int, name: str) -> None:

@@ -26,12 +26,8 @@ _MOST_ADDRESSES = 4096
 def read_token(path: str | Path, *, private: bool = False) -> str:
     """The secret in a file, without the white space around it.
 
-    Args:
-        path: The file.
-        private: Refuse a file that other users of this computer may read, where the system says so (POSIX).
-
     Raises:
-        InvalidValue: The file cannot be read, is empty, or is not private.
+        InvalidValue: The file cannot be read or is empty; if `private`, also: others may read it (POSIX only).
     """
     try:
         if private and os.name == "posix" and os.stat(path).st_mode & (stat.S_IRWXG | stat.S_IRWXO):
@@ -46,11 +42,7 @@ def read_token(path: str | Path, *, private: bool = False) -> str:
 
 
 class Tokens:
-    """The secrets of one server.
-
-    Args:
-        client: What clients must show; None: nothing.
-        operator: What an operator shows, who may take command from others; None: nobody is one.
+    """The secrets of one server: what clients must show, and operators, who may take command from others; or None.
 
     Raises:
         InvalidValue: One is empty, or both are the same.
@@ -75,25 +67,18 @@ class Tokens:
         found: Role | None = None
         # In constant time: how long a refusal takes must not tell how much of the token was right.
         for text in shown:
-            if _same(text, self._client):
+            data = text.encode("utf-8", "surrogatepass")  # a stranger may send anything, also what is no text
+            if self._client is not None and hmac.compare_digest(data, self._client.encode()):
                 found = found or "client"
-            if _same(text, self._operator):
+            if self._operator is not None and hmac.compare_digest(data, self._operator.encode()):
                 found = "operator"
         return found
-
-
-def _same(shown: str, secret: str | None) -> bool:
-    # A stranger may send anything, also what is no text.
-    return secret is not None and hmac.compare_digest(shown.encode("utf-8", "surrogatepass"), secret.encode())
 
 
 class Guesses:
     """How often wrong tokens are looked at: a few a second from one address, and some more from all together.
 
     An address that was not wrong lately is looked at whatever the others do, so nobody can keep it out. Any thread.
-
-    Args:
-        clock: Steady clock [s].
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -107,7 +92,8 @@ class Guesses:
             now, mine = self._clock(), self._wrong.get(_network(address))
             if mine is None or now - mine[-1] > _LATELY:
                 return True
-            return not (_is_full(mine, _OF_ONE, now) or _is_full(self._all, _OF_ALL, now))
+            # Full queues (4 of one address, 32 of all) whose oldest is not a second old.
+            return not any(len(times) == times.maxlen and now - times[0] < _WINDOW for times in (mine, self._all))
 
     def wrong(self, address: str) -> None:
         """One from there was wrong."""
@@ -119,10 +105,6 @@ class Guesses:
                 times.append(self._clock())
             if len(self._wrong) > _MOST_ADDRESSES:
                 del self._wrong[next(iter(self._wrong))]
-
-
-def _is_full(times: deque[float], most: int, now: float) -> bool:
-    return len(times) == most and now - times[0] < _WINDOW
 
 
 def _network(address: str) -> str:

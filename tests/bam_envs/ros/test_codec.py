@@ -16,7 +16,7 @@ from bam_envs.robots.ur5e import JOINTS
 from bam_envs.ros.codec import (
     RobotInfo,
     decode_command,
-    decode_state,
+    decode_source,
     encode_command,
     encode_state,
     read_info,
@@ -47,6 +47,14 @@ def joint_states(**changes):
     message = {"header": {"stamp": STAMP, "frame_id": ""}, "name": names}
     message |= {"position": [5.0, 4.0, 3.0, 2.0, 1.0, 0.0], "velocity": [0.5, 0.4, 0.3, 0.2, 0.1, 0], "effort": []}
     return message | changes
+
+
+def decode_state(profile, messages):
+    """Signal -> its numbers, from the message that holds it."""
+    return {
+        name: decode_source(profile.source(name), message, len(profile.signal(name).labels))
+        for name, message in messages.items()
+    }
 
 
 def complaint(message, signal="joint_position", profile=ARM):

@@ -65,7 +65,7 @@ def test_what_is_no_image_is_refused(image, kind, text):
 
 def test_depth_is_whole_millimetres():
     depth = np.array([[0.0, 0.0004, 0.0006], [1.2345, 65.535, 70.0], [np.nan, np.inf, -1.0]])
-    decoded = images.decode_depth(images.encode_depth(depth))
+    decoded = images.read_depth_message({"data": images.encode_depth(depth)})
     expected = np.array([[0, 0, 1], [1234, 65535, 65535], [0, 0, 0]]) / np.float32(1000)
     np.testing.assert_array_equal(decoded, expected.astype(np.float32))
     assert decoded.dtype == np.float32
@@ -137,7 +137,7 @@ def test_damaged_files():
     with pytest.raises(ProtocolError, match="A colour image must have 8 bits, not uint16"):
         images.decode_image(images.encode_depth(np.ones((8, 8))))
     with pytest.raises(ProtocolError, match="A depth image must be grey with 16 bits, not uint8"):
-        images.decode_depth(whole)
+        images.read_depth_message({"data": whole})
 
 
 def test_without_a_library(monkeypatch):

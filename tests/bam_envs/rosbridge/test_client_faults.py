@@ -417,7 +417,7 @@ def test_statuses_are_kept_and_told(scripted, link, heard, caplog):
     status = {"op": "status", "level": "error", "msg": "type mismatch on /cmd", "id": "advertise:/cmd"}
     scripted.send(status)
     assert heard.wait() == [status] == list(link.statuses)
-    assert [record.getMessage() for record in caplog.records] == ["a callback of a link failed"]
+    assert [record.getMessage() for record in caplog.records] == ["a callback failed"]
     scripted.send(*({**status, "id": str(number)} for number in range(25)))
     heard.wait(26)
     assert [kept["id"] for kept in link.statuses] == [str(number) for number in range(5, 25)]

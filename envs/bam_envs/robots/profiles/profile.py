@@ -26,7 +26,7 @@ from bam_envs.core.robot import RobotSpec, SignalSpec
 from bam_envs.core.validation import Finite, NonEmpty, Positive, check, read_table, type_hints
 from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.ur5e import arm_spec
-from bam_envs.ros.command_messages import LISTED_TYPES
+from bam_envs.ros.codec import LISTED_TYPES
 from bam_envs.ros.messages import bare_type, has_header
 from bam_envs.ros.profile_tables import CameraSource, ImageType, Readiness, RobotProfile, Sink, Source, Topic
 from bam_envs.safety.guard import BOUNDS, Limits

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import logging
 import ssl
@@ -36,13 +37,7 @@ _logger = logging.getLogger(__name__)
 
 
 class Admission:
-    """Lets clients in, or says why not.
-
-    Args:
-        tokens: What they must show.
-        options: How many there may be, and how long a page has time.
-        present: How many there are.
-    """
+    """Lets clients in, or says why not; `present` says how many there are."""
 
     def __init__(self, tokens: Tokens, options: ServerOptions, present: Callable[[], int]) -> None:
         self._tokens, self._guesses = tokens, Guesses()
@@ -52,7 +47,9 @@ class Admission:
         """The refusal of a request to open a WebSocket, or None; a page may show its token later (`greet`)."""
         if not isinstance(connection, BridgeConnection):
             raise TypeError(f"Expected a BridgeConnection, found {connection!r}.")
-        shown, is_page = _shown(request), "Origin" in request.headers
+        headers, is_page = request.headers.get_all("Authorization"), "Origin" in request.headers
+        shown = [text.partition(" ")[2].strip() for text in headers if text.lower().startswith("bearer ")]
+        shown += parse_qs(urlsplit(request.path).query).get("token", [])
         if shown and self._tokens.exist:
             # Several different tokens would be several guesses.
             refusal = self._judge(connection, shown if len(set(shown)) == 1 else [])
@@ -78,13 +75,11 @@ class Admission:
         if connection.role is not None:
             return
         limit = self._options.token_timeout
-        try:
-            token = _read_auth(await asyncio.wait_for(connection.next_frame(), limit))
-        except asyncio.TimeoutError:
-            token = None
         reason: str | None = _FIRST.format(limit)
-        if token is not None:
-            reason = self._judge(connection, [token])
+        with contextlib.suppress(asyncio.TimeoutError, ProtocolError):
+            message = decode_frame(await asyncio.wait_for(connection.next_frame(), limit))
+            if message.get("op") == "auth" and isinstance(message.get("token"), str):
+                reason = self._judge(connection, [message["token"]])
         if reason is None and self._is_full:
             connection.role, reason = None, self._no_room
         if reason is not None:
@@ -109,22 +104,6 @@ class Admission:
         return f"There are {self._options.max_clients} clients, and no room for more."
 
 
-def _shown(request: Request) -> list[str]:
-    """The tokens that `request` shows."""
-    headers = request.headers.get_all("Authorization")
-    bearers = [text.partition(" ")[2].strip() for text in headers if text.lower().startswith("bearer ")]
-    return bearers + parse_qs(urlsplit(request.path).query).get("token", [])
-
-
-def _read_auth(frame: bytes) -> str | None:
-    try:
-        message = decode_frame(frame)
-    except ProtocolError:
-        return None
-    token = message.get("token")
-    return token if message.get("op") == "auth" and isinstance(token, str) else None
-
-
 def _unauthorized(connection: BridgeConnection) -> Response:
     response = connection.respond(HTTPStatus.UNAUTHORIZED, _NO_TOKEN + "\n")
     response.headers["WWW-Authenticate"] = "Bearer"
@@ -132,21 +111,13 @@ def _unauthorized(connection: BridgeConnection) -> Response:
 
 
 def tls_context(cert: str, key: str | None) -> ssl.SSLContext:
-    """A server's side of TLS.
-
-    Args:
-        cert: File with the certificate chain.
-        key: File with its key; None if it is in the same one.
-
-    Raises:
-        InvalidValue: They cannot be read, or do not fit each other.
-    """
+    """A server's side of TLS, from the files of its certificate chain and of its key (None: in the same one)."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     files = f"{cert} is" if key is None else f"{cert} and {key} are"
     try:
         context.load_cert_chain(cert, key)
     except ssl.SSLError as error:
-        if key is None and _is_only_a_certificate(cert):
+        if key is None and b"PRIVATE KEY" not in (content := Path(cert).read_bytes()) and b"BEGIN CERT" in content:
             raise InvalidValue(f"Certificate: {cert} holds no key; give the file with its key too (--key).") from error
         reason = error.reason or "not PEM"
         raise InvalidValue(f"Certificate: {files} not a certificate with its key in PEM: {reason}.") from error
@@ -154,11 +125,6 @@ def tls_context(cert: str, key: str | None) -> ssl.SSLContext:
         read = cert if key is None else f"{cert} and {key}"
         raise InvalidValue(f"Certificate: {read} cannot be read: {error.strerror}.") from error
     return context
-
-
-def _is_only_a_certificate(path: str) -> bool:
-    content = Path(path).read_bytes()
-    return b"BEGIN CERTIFICATE" in content and b"PRIVATE KEY" not in content
 
 
 def listening_error(host: str, port: int, error: OSError | UnicodeError) -> InvalidValue:

@@ -8,6 +8,7 @@ Longer than other modules, because every operation of the protocol is in it.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 from collections.abc import Callable, Mapping
@@ -17,23 +18,22 @@ from typing import Any, TypeVar
 from bam_envs.core.errors import BamEnvsError, InvalidValue, ProtocolError
 from bam_envs.core.wording import brief
 from bam_envs.ros.interfaces import complete, normal_name, request_type, response_type
-from bam_envs.rosbridge.bus import Caller, Handler, Listener, Message, refusal_of
-from bam_envs.rosbridge.encoding import decode_frame
-from bam_envs.rosbridge.fragments import Id, read_id
+from bam_envs.rosbridge.bus import Caller, Handler, Listener, Message, refusal_of, tell
+from bam_envs.rosbridge.encoding import Id, decode_frame, read_id
 from bam_envs.rosbridge.server.client_session import (
     LEVELS,
     Event,
-    Invoke,
+    Publication,
     Send,
     ServerOptions,
     Session,
     canonical,
+    pack,
     read_name,
     read_number,
     read_text,
     read_wire,
 )
-from bam_envs.rosbridge.server.outgoing import Packet, Publication, pack
 from bam_envs.rosbridge.server.services import Request, Service, Services, checked, packed_response
 from bam_envs.rosbridge.server.topics import Stream, Topic, Topics, Wish
 
@@ -87,7 +87,6 @@ class Bridge:
         self._events: list[Event] = []
         self.topics = Topics(self._events.append)
         self.services = Services(self._events.append)
-        self._sessions: set[Session] = set()
         self._fragmented: set[Session] = set()
         self._leave: list[Callable[[Caller], None]] = []
         self._operations: dict[str, Callable[[Session, Incoming, float], None]] = {
@@ -110,28 +109,18 @@ class Bridge:
 
     def open(self, caller: Caller) -> Session:
         """A client connected."""
-        session = Session(caller, self.options)
-        self._sessions.add(session)
-        return session
+        return Session(caller, self.options)
 
     def lost(self, session: Session) -> None:
         """Its connection ended: everything of it ends."""
-        if session not in self._sessions:
-            return
-        self._sessions.discard(session)
         self._fragmented.discard(session)
         self.services.leave(session)
         self.topics.leave(session)
         for callback in self._leave:
-            _tell(callback, session.caller)
+            tell(callback, session.caller)
 
     def read(self, frame: str | bytes, *, joined: bool = False) -> Incoming:
-        """What a frame says, for `take`. It may be long work, and may be done in any thread.
-
-        Args:
-            frame: Of text, or binary.
-            joined: It is the text of fragments.
-        """
+        """What a frame, or the text `joined` from fragments, says, for `take`: maybe long work, in any thread."""
         try:
             message = decode_frame(frame)
             if joined and message.get("op") == "fragment":
@@ -154,11 +143,11 @@ class Bridge:
         """The type of what a message carries, and what checks it; None where nothing is to be checked."""
         operation = message.get("op")
         if operation == "publish":
-            topic = self.topics.find(read_name(message, "topic"))
+            topic = self.topics.get(read_name(message, "topic"))
             if topic is not None and not topic.is_ours:
                 return topic.kind, lambda: _publication(topic, message.get("msg"))
         elif operation == "call_service":
-            service = self.services.find(read_name(message, "service"))
+            service = self.services.get(read_name(message, "service"))
             if service is not None:
                 return request_type(service.kind), lambda: checked(service.kind, request_type, message.get("args"))
         elif operation == "service_response" and message.get("result", True) is True:
@@ -169,12 +158,7 @@ class Bridge:
         return None
 
     def take(self, session: Session, incoming: Incoming, now: float) -> str | None:
-        """Do what a frame of a client says. Never raises about what the frame holds.
-
-        Args:
-            session: The client.
-            incoming: What `read` made of the frame.
-            now: Any steady clock [s]; the same one everywhere.
+        """Do what a frame of a client says. Never raises about what the frame holds. `now` is any steady clock [s].
 
         Returns:
             The text of a message whose last fragment it was, to be read in turn.
@@ -188,10 +172,14 @@ class Bridge:
             else:
                 name = read_text(message, "op")
                 if name not in self._operations:
-                    raise ProtocolError(self._unknown(name))
+                    unknown = f"Unknown op {name!r:.40}; expected one of {', '.join(self._operations)}, fragment."
+                    raise ProtocolError(_NO_ACTIONS if "action" in name else _NO_AUTH if name == "auth" else unknown)
                 self._operations[name](session, incoming, now)
         except BamEnvsError as error:
-            self._status(session, f"{_title(message, str(error))}: {error}", _id(message))
+            number: Id = None
+            with contextlib.suppress(ProtocolError):
+                number = read_id(message)
+            self._status(session, f"{_title(message, str(error))}: {error}", number)
         return None
 
     def tick(self, now: float) -> None:
@@ -216,15 +204,6 @@ class Bridge:
         self._events.clear()
         return events
 
-    def packed_answer(self, invoke: Invoke) -> Packet | None:
-        """Call the handler, which may take its time: from any thread. For `finish`."""
-        return self.services.packed_answer(invoke)
-
-    def finish(self, invoke: Invoke, packet: Packet | None) -> None:
-        """The answer of a handler."""
-        self.services.finish(invoke.number, packet)
-        self.services.ran(invoke.session)
-
     # ---- this process; names and types as in `Bus`, and a wrong one raises InvalidValue
 
     def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
@@ -237,14 +216,19 @@ class Bridge:
     def publication(self, topic: str, message: Message) -> Publication:
         """A message of this process, checked; from any thread. For `publish`."""
         name = _own(lambda: canonical(topic))
-        found = self.topics.find(name)
+        found = self.topics.get(name)
         if found is None:
             raise InvalidValue(f"Topic {name} does not exist; advertise it with its type first.")
         return _publication(found, message)
 
-    def publish(self, publication: Publication, now: float) -> None:
-        """Send a message of this process to all who want it."""
-        self._spread(publication, None, now)
+    def publish(self, publication: Publication, now: float, publisher: Session | None = None) -> None:
+        """Send a message, of this process unless a client is its `publisher`, to all who want it."""
+        topic = self.topics.get(publication.topic)
+        if topic is None or topic.kind != publication.kind:
+            return
+        self.topics.publish(publication, topic, publisher, now)
+        for listener in tuple(topic.listeners):
+            self._deliver(listener, publication, publisher)
 
     def subscribe(self, topic: str, kind: str, listener: Listener) -> Callable[[], None]:
         """Call `listener` for each message of `topic`, the latched one at once, until what is returned is called."""
@@ -288,7 +272,7 @@ class Bridge:
     def _unadvertise(self, session: Session, incoming: Incoming, now: float) -> None:
         name, number = read_name(incoming.message, "topic"), read_id(incoming.message)
         ids = session.advertised.get(name)
-        topic = self.topics.find(name)
+        topic = self.topics.get(name)
         if ids is None or topic is None or (number is not None and number not in ids):
             raise ProtocolError(f"Topic {name} was not advertised so by this client.")
         ids.discard(number)
@@ -298,11 +282,11 @@ class Bridge:
 
     def _publish(self, session: Session, incoming: Incoming, now: float) -> None:
         name = read_name(incoming.message, "topic")
-        topic = self.topics.find(name)
+        topic = self.topics.get(name)
         if topic is None:
             raise ProtocolError(f"Topic {name} does not exist; advertise it with its type first.")
         _require_not_ours(topic)
-        self._spread(incoming.content_of(topic.kind), session, now)
+        self.publish(incoming.content_of(topic.kind), now, session)
 
     def _subscribe(self, session: Session, incoming: Incoming, now: float) -> None:
         message = incoming.message
@@ -339,7 +323,7 @@ class Bridge:
         # A call is answered by a response also when it is wrong: who called waits for nothing else.
         try:
             name = read_name(message, "service")
-            service = self.services.find(name)
+            service = self.services.get(name)
             if service is None:
                 raise ProtocolError(f"Service {name} does not exist")
             limit = read_number(message, "timeout", 0) or None
@@ -358,7 +342,7 @@ class Bridge:
 
     def _unadvertise_service(self, session: Session, incoming: Incoming, now: float) -> None:
         name = read_name(incoming.message, "service")
-        service = self.services.find(name)
+        service = self.services.get(name)
         if service is None or service.provider is not session:
             raise ProtocolError(f"Service {name} is not offered by this client.")
         self.services.withdraw(service)
@@ -377,13 +361,6 @@ class Bridge:
         result = {"op": "action_result", "action": action, "values": _NO_ACTIONS, "status": aborted, "result": False}
         self._events.append(Send(session, pack({**result, "id": read_id(incoming.message)})))
 
-    def _unknown(self, name: str) -> str:
-        if "action" in name:
-            return _NO_ACTIONS
-        if name == "auth":
-            return _NO_AUTH
-        return f"Unknown op {name!r:.40}; expected one of {', '.join(self._operations)}, fragment."
-
     # ---- rosapi: what time it is, which topics and services there are
 
     def _rosapi(self, clock: Callable[[], float]) -> dict[str, tuple[str, Handler]]:
@@ -391,31 +368,26 @@ class Bridge:
 
         def time_of_day(request: Message, caller: Caller) -> dict[str, Any]:
             now = clock()
-            seconds = int(now)
-            nanoseconds = int((now - seconds) * 1e9)
+            seconds, nanoseconds = int(now), int(now % 1 * 1e9)
             # Both spellings: clients of ROS 1 read the one, clients of ROS 2 the other.
             return {"time": {"sec": seconds, "nanosec": nanoseconds, "secs": seconds, "nsecs": nanoseconds}}
 
+        def type_of(table: Topics | Services, field: str) -> Handler:
+            def answer(request: Message, caller: Caller) -> dict[str, Any]:
+                found = table.get(read_name(request, field))
+                return {"type": found.kind if found else ""}
+
+            return answer
+
         def all_topics(request: Message, caller: Caller) -> dict[str, Any]:
-            return {"topics": [one.name for one in self.topics], "types": [one.kind for one in self.topics]}
-
-        def topic_type(request: Message, caller: Caller) -> dict[str, Any]:
-            topic = self.topics.find(read_name(request, "topic"))
-            return {"type": topic.kind if topic else ""}
-
-        def all_services(request: Message, caller: Caller) -> dict[str, Any]:
-            return {"services": [one.name for one in self.services]}
-
-        def service_type(request: Message, caller: Caller) -> dict[str, Any]:
-            service = self.services.find(read_name(request, "service"))
-            return {"type": service.kind if service else ""}
+            return {"topics": list(self.topics), "types": [one.kind for one in self.topics.values()]}
 
         return {
             "/rosapi/get_time": ("rosapi/GetTime", time_of_day),
             "/rosapi/topics": ("rosapi/Topics", all_topics),
-            "/rosapi/topic_type": ("rosapi/TopicType", topic_type),
-            "/rosapi/services": ("rosapi/Services", all_services),
-            "/rosapi/service_type": ("rosapi/ServiceType", service_type),
+            "/rosapi/topic_type": ("rosapi/TopicType", type_of(self.topics, "topic")),
+            "/rosapi/services": ("rosapi/Services", lambda *_: {"services": list(self.services)}),
+            "/rosapi/service_type": ("rosapi/ServiceType", type_of(self.services, "service")),
         }
 
     # ---- inside
@@ -437,37 +409,31 @@ class Bridge:
         else:
             self._fragmented.discard(session)
 
-    def _spread(self, publication: Publication, publisher: Session | None, now: float) -> None:
-        topic = self.topics.find(publication.topic)
-        if topic is None or topic.kind != publication.kind:
-            return
-        self.topics.publish(publication, topic, publisher, now)
-        for listener in tuple(topic.listeners):
-            self._deliver(listener, publication, publisher)
-
     def _deliver(self, listener: Listener, publication: Publication, publisher: Session | None) -> None:
         try:
             listener(publication.message, publisher.caller if publisher is not None else _PROCESS)
+            return
         except BamEnvsError as error:
-            self._refused(publication, publisher, str(error))
+            text = refusal_of(publication.topic, error)
         # One listener's mistake must not end the connection of the client that published, nor silence other listeners.
         except Exception:
             _logger.exception("A listener of %s failed.", publication.topic)
-            self._refused(publication, publisher, "The receiver failed; its log says more.")
-
-    def _refused(self, publication: Publication, publisher: Session | None, reason: str) -> None:
+            text = refusal_of(publication.topic, "The receiver failed; its log says more.")
         if publisher is None:
-            _logger.warning("%s", refusal_of(publication.topic, reason))
+            _logger.warning("%s", text)
         else:
-            self._status(publisher, refusal_of(publication.topic, reason))
+            self._status(publisher, text)
 
     def _status(self, session: Session, text: str, name: Id = None) -> None:
         self._events.extend(session.status(text, name))
 
 
 def _publication(topic: Topic, content: Any) -> Publication:
-    message = complete(topic.kind, {} if content is None else content)
-    return topic.packed(Publication(topic.name, topic.kind, message))
+    publication = Publication(topic.name, topic.kind, complete(topic.kind, {} if content is None else content))
+    for stream in list(topic.streams.values()):
+        if stream.wish.throttle == 0.0:  # packed here, in any thread: the network thread need not
+            publication.packet(stream.name, stream.wish.wire)
+    return publication
 
 
 def _require_not_ours(topic: Topic) -> None:
@@ -480,16 +446,8 @@ def _require_room(used: int, most: int, what: str) -> None:
         raise ProtocolError(f"A client may have at most {most} {what}.")
 
 
-def _tell(callback: Callable[[Caller], None], caller: Caller) -> None:
-    try:
-        callback(caller)
-    # Callbacks are foreign code, and the others must hear that somebody left.
-    except Exception:
-        _logger.exception("A callback about the end of a connection failed.")
-
-
 def _own(work: Callable[[], T]) -> T:
-    """Do something for this process, whose mistakes are values, not somebody else's protocol."""
+    """Do something for this process, whose mistakes are its own values, not a client's protocol."""
     try:
         return work()
     except ProtocolError as error:
@@ -500,10 +458,3 @@ def _title(message: Mapping[str, Any], said: str) -> str:
     """What a message was about, for the status that says what is wrong with it; no name that is `said` there."""
     names = [name for name in (message.get("topic"), message.get("service")) if f" {name} " not in said]
     return " ".join(part[:80] for part in (message.get("op"), *names) if isinstance(part, str)) or "message"
-
-
-def _id(message: Mapping[str, Any]) -> Id:
-    try:
-        return read_id(message)
-    except ProtocolError:
-        return None

@@ -27,7 +27,6 @@ from bam_envs.rosbridge.bus import Caller, Handler, Listener, Message
 from bam_envs.rosbridge.server.admission import Admission, listening_error, tls_context
 from bam_envs.rosbridge.server.bridge import Bridge, Incoming
 from bam_envs.rosbridge.server.client_session import Invoke, Send, ServerOptions, Session
-from bam_envs.rosbridge.server.outgoing import Publication
 from bam_envs.rosbridge.server.server_connection import BridgeConnection
 from bam_envs.rosbridge.threads import LoopThread, Workers
 from bam_envs.rosbridge.tokens import Tokens
@@ -142,7 +141,7 @@ class BridgeServer:
     # ---- the Bus; see there
 
     def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
-        """Say that `topic` of type `kind` will be published; a latched one repeats its last message to newcomers."""
+        """Say that `topic` of type `kind` will be published."""
         self._do(lambda: self._bridge.advertise(topic, kind, latch=latch))
 
     def publish(self, topic: str, message: Message) -> None:
@@ -152,9 +151,14 @@ class BridgeServer:
     def publish_all(self, messages: Sequence[tuple[str, Message]]) -> None:
         """Send several messages, each with its topic, in this order."""
         publications = [self._bridge.publication(topic, message) for topic, message in messages]
+
+        def publish() -> None:
+            for publication in publications:
+                self._bridge.publish(publication, time.monotonic())
+
         if self._thread.is_current:  # in a listener: what made that run flushes afterwards
-            self._publish(publications)
-        elif not self._post(lambda: self._publish(publications)):
+            publish()
+        elif not self._post(publish):
             raise LinkLost(f"{messages[0][0]}: the server is not running; nothing was sent.")
 
     def subscribe(self, topic: str, kind: str, listener: Listener) -> Callable[[], None]:
@@ -271,11 +275,6 @@ class BridgeServer:
 
     # ---- the thread of the network: doing what the protocol wants done
 
-    def _publish(self, publications: Sequence[Publication]) -> None:
-        now = time.monotonic()
-        for publication in publications:
-            self._bridge.publish(publication, now)
-
     def _flush(self) -> None:
         written: dict[BridgeConnection, None] = {}
         for event in self._bridge.events():
@@ -288,14 +287,6 @@ class BridgeServer:
                 self._workers.submit(functools.partial(self._work, event))
         for connection in written:
             connection.flush()
-        self._set_timer()
-
-    def _work(self, invoke: Invoke) -> None:
-        """In a thread of the pool: answer one call."""
-        packet = self._bridge.packed_answer(invoke)
-        self._post(lambda: self._bridge.finish(invoke, packet))
-
-    def _set_timer(self) -> None:
         deadline = self._bridge.next_deadline
         if deadline is None or (self._timer is not None and self._timer.when() <= deadline):
             return
@@ -303,6 +294,11 @@ class BridgeServer:
             self._timer.cancel()
         # The loop's clock is the monotonic one.
         self._timer = asyncio.get_running_loop().call_at(deadline, self._tick)
+
+    def _work(self, invoke: Invoke) -> None:
+        """In a thread of the pool: answer one call."""
+        packet = self._bridge.services.packed_answer(invoke)
+        self._post(lambda: self._bridge.services.finish(invoke, packet))
 
     def _tick(self) -> None:
         self._timer = None

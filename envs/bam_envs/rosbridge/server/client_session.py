@@ -1,7 +1,8 @@
-"""One client of the rosbridge server: what it may use, what it has declared and asked, and how its fields are read."""
+"""One client of the rosbridge server: what it may use, declared and asked, how its fields are read, what it is sent."""
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections import deque
 from collections.abc import Mapping
@@ -12,15 +13,16 @@ from typing import TYPE_CHECKING, Any
 from bam_envs.core.errors import ProtocolError
 from bam_envs.core.wording import brief
 from bam_envs.rosbridge.bus import Caller, Handler, Message
-from bam_envs.rosbridge.encoding import COMPRESSIONS
-from bam_envs.rosbridge.fragments import Fragments, Id
-from bam_envs.rosbridge.server.outgoing import NEVER_SPLIT, Packet, Wire, pack
+from bam_envs.rosbridge.encoding import COMPRESSIONS, Fragments, Id, dump_json, encode_cbor, encode_png, split
 
 if TYPE_CHECKING:
     from bam_envs.rosbridge.server.topics import Stream
 
 LEVELS = ("none", "error", "warning", "info")
 """Of status messages: each one includes those before it."""
+_NEVER_SPLIT = 2**31
+"""A fragment size above that of every message."""
+_NUMBERS = itertools.count(1)
 _NAME = re.compile(r"/?[A-Za-z_~][\w~]*(?:/[\w~]+)*", re.ASCII)
 _LONGEST = 256
 _LARGEST = 2**53
@@ -70,6 +72,63 @@ class ServerOptions:
 
 
 @dataclass(frozen=True)
+class Wire:
+    """How a client wants a message packed."""
+
+    compression: str = "none"
+    """One of `encoding.COMPRESSIONS`."""
+    fragment_size: int = _NEVER_SPLIT
+    """Most characters of a message in one frame; CBOR is never split."""
+
+
+@dataclass(frozen=True)
+class Packet:
+    """The WebSocket frames of one message."""
+
+    frames: tuple[bytes, ...]
+    text: bool
+    """Whether they are text frames."""
+    stream: str | None = None
+    """What it belongs to, if a newer one of the same may take its place; None for what must arrive."""
+
+    @property
+    def size(self) -> int:
+        """Bytes of all frames."""
+        return sum(map(len, self.frames))
+
+
+def pack(
+    message: Mapping[str, Any], wire: Wire | None = None, *, stream: str | None = None, kind: str | None = None
+) -> Packet:
+    """A protocol message as frames; `kind` is the type of its field ``msg``, for the typed arrays of CBOR."""
+    wire = wire or Wire()
+    if wire.compression == "cbor":
+        return Packet((encode_cbor(message, kind),), text=False, stream=stream)
+    text = dump_json(message)
+    if wire.compression == "png":
+        text = dump_json({"op": "png", "data": encode_png(text)})
+    parts = split(text, wire.fragment_size, f"fragment:{next(_NUMBERS)}")
+    return Packet(tuple(part.encode("ascii") for part in parts), text=True, stream=stream)
+
+
+class Publication:
+    """One checked, complete message of type `kind` on `topic`, on its way to any number of subscribers."""
+
+    def __init__(self, topic: str, kind: str, message: Mapping[str, Any]) -> None:
+        self.topic, self.kind, self.message = topic, kind, message
+        self._packets: dict[tuple[str, str, int], Packet] = {}
+
+    def packet(self, name: str, wire: Wire) -> Packet:
+        """Packed for those who call the topic `name` and want it like `wire`; made once for all of them."""
+        key = (name, wire.compression, wire.fragment_size)  # not `wire`: its hash is made in Python
+        packet = self._packets.get(key)
+        if packet is None:
+            message = {"op": "publish", "topic": name, "msg": self.message}
+            packet = self._packets[key] = pack(message, wire, stream=self.topic, kind=self.kind)
+        return packet
+
+
+@dataclass(frozen=True)
 class Send:
     """To do: send a packet to a client."""
 
@@ -81,7 +140,7 @@ class Send:
 
 @dataclass(frozen=True)
 class Invoke:
-    """To do: call `handler`, off the network's thread, and give what `Bridge.packed_answer` makes of it to `finish`."""
+    """To do: call `Services.packed_answer` off the network's thread, and give what it returns to `Services.finish`."""
 
     session: Session
     number: int
@@ -127,11 +186,7 @@ class Session:
 
 @lru_cache(maxsize=1024)
 def canonical(name: str) -> str:
-    """The name of a topic or service with its leading slash.
-
-    Raises:
-        ProtocolError: It is not such a name.
-    """
+    """The name of a topic or service with its leading slash; `ProtocolError` for what is no such name."""
     if len(name) > _LONGEST or not _NAME.fullmatch(name):
         raise ProtocolError(f"Name: expected one such as '/joint_states', found {brief(name)}.")
     return name if name.startswith("/") else f"/{name}"
@@ -166,7 +221,7 @@ def read_wire(message: Mapping[str, Any]) -> Wire:
     if compression not in COMPRESSIONS:
         expected = ", ".join(COMPRESSIONS)
         raise ProtocolError(f"compression: expected one of {expected}, found {brief(compression)}.")
-    size = read_number(message, "fragment_size", NEVER_SPLIT)
+    size = read_number(message, "fragment_size", _NEVER_SPLIT)
     if size < 1:
         raise ProtocolError(f"fragment_size: expected an integer >= 1, found {brief(size)}.")
-    return Wire(compression, min(int(size), NEVER_SPLIT))
+    return Wire(compression, min(int(size), _NEVER_SPLIT))

@@ -11,8 +11,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.frames import DATA_OPCODES, Frame
 from websockets.protocol import Event, State
 
-from bam_envs.rosbridge.server.client_session import ServerOptions
-from bam_envs.rosbridge.server.outgoing import Outbox, Packet
+from bam_envs.rosbridge.server.client_session import Packet, ServerOptions
 from bam_envs.rosbridge.tokens import Role
 
 TRY_AGAIN_LATER = 1013
@@ -25,14 +24,71 @@ _FRAME = 200
 """About what a frame costs beside what it holds [bytes]."""
 
 
+class Outbox:
+    """A queue for one client that drops the oldest message of a topic for a newer one, and nothing else.
+
+    At most `most_bytes` wait (one message more, of whatever size, is taken when less than that waits), and of one topic
+    at most `most_of_a_stream` messages, unless the client asked for fewer.
+    """
+
+    def __init__(self, most_bytes: int, most_of_a_stream: int) -> None:
+        self.size = 0
+        """Bytes that wait."""
+        self._most_bytes, self._most_of_a_stream = most_bytes, most_of_a_stream
+        self._packets: deque[Packet] = deque()
+        self._waiting: Counter[str] = Counter()
+
+    def __len__(self) -> int:
+        return len(self._packets)
+
+    def add(self, packet: Packet, keep: int = 0) -> bool:
+        """Queue a packet; False if there is no room for one that must arrive.
+
+        Of its stream at most `keep` packets wait; 0 for the usual number.
+        """
+        if packet.stream is not None:
+            most = min(keep or self._most_of_a_stream, self._most_of_a_stream)
+            while self._waiting[packet.stream] >= most and self._drop(packet.stream):
+                pass
+        while self.size >= self._most_bytes and self._drop(None):
+            pass
+        if self.size >= self._most_bytes:
+            return packet.stream is not None
+        self._packets.append(packet)
+        self._count(packet, 1)
+        return True
+
+    def pop(self) -> Packet:
+        """The oldest packet; there must be one."""
+        packet = self._packets.popleft()
+        self._count(packet, -1)
+        return packet
+
+    def _drop(self, stream: str | None) -> bool:
+        """Drop the oldest packet of a stream, or of any; False if there is none."""
+        for place, packet in enumerate(self._packets):
+            if packet.stream is not None and stream in (None, packet.stream):
+                del self._packets[place]
+                self._count(packet, -1)
+                return True
+        return False
+
+    def _count(self, packet: Packet, change: int) -> None:
+        self.size += change * packet.size
+        if packet.stream is not None:
+            self._waiting[packet.stream] += change
+            if not self._waiting[packet.stream]:
+                del self._waiting[packet.stream]
+
+
 class BridgeConnection(ServerConnection):
     """A connection that knows when its socket takes more, and how much of what came is not a message yet.
 
     Args:
-        *args: Of `websockets`.
+        *args: Of `websockets`, as are `options`.
         sockets: Every open socket of the server; this one is added and removed.
         limits: How much may wait, in both directions.
-        **options: Of `websockets`.
+        **options: See `args`.
     """
 
     def __init__(self, *args: Any, sockets: set[BridgeConnection], limits: ServerOptions, **options: Any) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,9 +16,8 @@ from bam_envs.core.errors import BamEnvsError, ProtocolError
 from bam_envs.core.wording import brief
 from bam_envs.ros.interfaces import complete, complete_known, request_type, response_type, variants
 from bam_envs.rosbridge.bus import Handler
-from bam_envs.rosbridge.fragments import Id
-from bam_envs.rosbridge.server.client_session import Event, Invoke, Send, Session
-from bam_envs.rosbridge.server.outgoing import Packet, Wire, pack
+from bam_envs.rosbridge.encoding import Id
+from bam_envs.rosbridge.server.client_session import Event, Invoke, Packet, Send, Session, Wire, pack
 
 _LENIENT = ("bam_msgs/GymAPI",)
 """Types that are still growing: fields of a newer version are ignored, as every transport does."""
@@ -36,7 +35,7 @@ class Service:
     kind: str
     """Normal name of its type."""
     spelling: str
-    """Its name as who offers it spells it."""
+    """Its name as its provider spells it."""
     provider: Session | None = None
     """The client that offers it; None for this process."""
     handler: Handler | None = None
@@ -50,13 +49,10 @@ class Request:
     """What a client asks of a service."""
 
     session: Session
-    """Who asks."""
     id: Id
-    """As the client gave it."""
     name: str
     """Of the service, as the client spells it."""
     wire: Wire = field(default_factory=Wire)
-    """How the answer is packed."""
     timeout: float | None = None
     """How long it waits [s]; None for the usual time."""
 
@@ -74,31 +70,20 @@ class Call:
     """When that is [s], clock of `Bridge`."""
 
 
-class Services:
-    """Every service of a server, and the unanswered calls.
-
-    Args:
-        emit: Takes what is to be done.
-    """
+class Services(dict[str, Service]):
+    """Every service of a server by name, and the unanswered calls; `emit` takes what is to be done."""
 
     def __init__(self, emit: Callable[[Event], None]) -> None:
+        super().__init__()
         self._emit = emit
-        self._services: dict[str, Service] = {}
         self._calls: dict[int, Call] = {}
         self._numbers = itertools.count(1)
         self._look = math.inf  # no call runs out of time before; one that was answered may have set it
-
-    def __iter__(self) -> Iterator[Service]:
-        return iter(self._services.values())
 
     @property
     def deadline(self) -> float | None:
         """When to call `expire` next [s]; None if there is no need."""
         return None if self._look == math.inf else self._look
-
-    def find(self, name: str) -> Service | None:
-        """The service `name`, if there is one."""
-        return self._services.get(name)
 
     def offer(self, service: Service) -> Service | None:
         """Add a service; returns the one of another client whose place it takes.
@@ -108,19 +93,19 @@ class Services:
         Raises:
             ProtocolError: It is offered by this process.
         """
-        before = self._services.get(service.name)
+        before = self.get(service.name)
         if before is not None:
             if before.provider is None:
                 raise ProtocolError(f"Service {service.name} is offered by this server already.")
             self.withdraw(before)
-        self._services[service.name] = service
+        self[service.name] = service
         if service.provider is not None:
             service.provider.services.add(service.name)
         return before if before is not None and before.provider is not service.provider else None
 
     def withdraw(self, service: Service) -> None:
         """Remove a service; who waits for it is told."""
-        del self._services[service.name]
+        del self[service.name]
         if service.provider is not None:
             service.provider.services.discard(service.name)
         for call in [one for one in self._calls.values() if one.service is service]:
@@ -133,16 +118,10 @@ class Services:
         session.calls.clear()
         session.waiting.clear()
         for name in list(session.services):
-            self.withdraw(self._services[name])
+            self.withdraw(self[name])
 
     def call(self, service: Service, request: Request, values: Mapping[str, Any], now: float) -> None:
-        """Pass a request on to who offers `service`.
-
-        Args:
-            service: What is asked.
-            request: By whom, and how.
-            values: Its arguments, complete.
-            now: Clock of `Bridge` [s].
+        """Pass a request with complete `values` on to who offers `service`.
 
         Raises:
             ProtocolError: The client has too many unanswered calls.
@@ -161,8 +140,9 @@ class Services:
             self._emit(Send(service.provider, pack(message)))
         elif service.handler is not None:
             invoke = Invoke(session, call.number, service.handler, values, session.caller)
-            if service.inline:
-                self.finish(call.number, self.packed_answer(invoke))
+            packet = self.packed_answer(invoke) if service.inline else None
+            if packet is not None:
+                self._answer(call, packet)
             else:
                 session.waiting.append(invoke)
                 self._start_waiting(session)
@@ -181,9 +161,9 @@ class Services:
             return None
         try:
             values = invoke.handler(invoke.request, invoke.caller)
-            return _packed(
-                call, values if call.service.inline else checked(call.service.kind, response_type, values), True
-            )
+            if not call.service.inline:  # what /rosapi/get_time answers spells the time for ROS 1 and for ROS 2
+                values = checked(call.service.kind, response_type, values)
+            return _packed(call, values, True)
         except BamEnvsError as error:
             return _packed(call, str(error), False)
         # A caller is always answered, whatever the handler, which is foreign code, does.
@@ -192,16 +172,13 @@ class Services:
             line = " ".join(f"{type(error).__name__}: {error}".split())
             return _packed(call, f"Service {call.service.name} failed: {line}", False)
 
-    def finish(self, number: int, packet: Packet | None) -> None:
-        """Send the packed answer, if the call is still unanswered."""
-        call = self._calls.get(number)
+    def finish(self, invoke: Invoke, packet: Packet | None) -> None:
+        """Send what `packed_answer` returned, if the call is still unanswered; the next call's turn."""
+        call = self._calls.get(invoke.number)
         if call is not None and packet is not None:
             self._answer(call, packet)
-
-    def ran(self, session: Session) -> None:
-        """A handler is done with a call of `session`: the next one's turn."""
-        session.running -= 1
-        self._start_waiting(session)
+        invoke.session.running -= 1
+        self._start_waiting(invoke.session)
 
     def call_named(self, name: object) -> Call | None:
         """The unanswered call with the id `name`. From any thread."""
@@ -209,12 +186,7 @@ class Services:
         return self._calls.get(int(str(name))) if known else None
 
     def respond(self, provider: Session, message: Mapping[str, Any], values: Callable[[str], Any]) -> None:
-        """Pass on what a client answers to a call of its service.
-
-        Args:
-            provider: Who answers.
-            message: Its message ``service_response``.
-            values: Gives the content of the message, complete for a type.
+        """Pass on what a client answers to a call of its service; `values` gives its content, complete for a type.
 
         Raises:
             ProtocolError: Nobody waits for it, or it does not fit.
@@ -267,12 +239,7 @@ def packed_response(request: Request, values: Any, result: bool) -> Packet:
 
 
 def checked(kind: str, part: Callable[[str], str], values: Any) -> dict[str, Any]:
-    """A request or a response of a service of type `kind`, complete.
-
-    Args:
-        kind: Normal name of the type.
-        part: `request_type` or `response_type`.
-        values: By name; of a request also a list in the order of the fields.
+    """A request or a response (`part`) of a service of type `kind`, complete; a request may be a list of its fields.
 
     Raises:
         BamEnvsError: They do not fit.

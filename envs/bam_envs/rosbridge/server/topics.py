@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from bam_envs.core.errors import ProtocolError
 from bam_envs.core.wording import brief
 from bam_envs.ros.interfaces import normal_name
 from bam_envs.rosbridge.bus import Listener
-from bam_envs.rosbridge.encoding import COMPRESSIONS
-from bam_envs.rosbridge.fragments import Id
-from bam_envs.rosbridge.server.client_session import Send, Session
-from bam_envs.rosbridge.server.outgoing import Publication, Wire
+from bam_envs.rosbridge.encoding import COMPRESSIONS, Id
+from bam_envs.rosbridge.server.client_session import Publication, Send, Session, Wire
 
 
 @dataclass(frozen=True)
@@ -32,10 +30,7 @@ class Wish:
 class Stream:
     """All subscriptions of one client to one topic: it gets each message once, as the most demanding of them wants it.
 
-    Args:
-        session: The client.
-        topic: With a leading slash.
-        name: The topic as the client spells it.
+    `name` is the topic as the client spells it.
     """
 
     def __init__(self, session: Session, topic: str, name: str) -> None:
@@ -52,14 +47,15 @@ class Stream:
             self.wishes.pop(name, None)
         else:
             self.wishes[name] = wish
-        if self.wishes:
-            self.wish = _merge(list(self.wishes.values()))
+        wishes = self.wishes.values()
+        if wishes:
+            compression = max((one.wire.compression for one in wishes), key=COMPRESSIONS.index)
+            self.wish = Wish(
+                min(one.throttle for one in wishes),
+                min(one.queue_length for one in wishes),
+                Wire(compression, min(one.wire.fragment_size for one in wishes)),
+            )
             self._waiting = deque(self._waiting, maxlen=max(1, self.wish.queue_length))
-
-    @property
-    def is_prompt(self) -> bool:
-        """Whether it gets every message as it comes."""
-        return self.wish.throttle == 0.0
 
     @property
     def deadline(self) -> float | None:
@@ -68,7 +64,7 @@ class Stream:
 
     def offer(self, publication: Publication, now: float) -> Send | None:
         """A new message: what to send now, if anything. What comes too early waits; the oldest is dropped."""
-        if self.is_prompt:
+        if self.wish.throttle == 0.0:
             return self._send(publication)
         self._waiting.append(publication)
         return self.due(now)
@@ -84,15 +80,6 @@ class Stream:
 
     def _send(self, publication: Publication) -> Send:
         return Send(self.session, publication.packet(self.name, self.wish.wire), self.wish.queue_length)
-
-
-def _merge(wishes: list[Wish]) -> Wish:
-    compression = max((one.wire.compression for one in wishes), key=COMPRESSIONS.index)
-    return Wish(
-        min(one.throttle for one in wishes),
-        min(one.queue_length for one in wishes),
-        Wire(compression, min(one.wire.fragment_size for one in wishes)),
-    )
 
 
 @dataclass(eq=False)
@@ -117,32 +104,17 @@ class Topic:
         """Whether this process publishes it: then no client may, or it could say where the robot is."""
         return None in self.publishers
 
-    def packed(self, publication: Publication) -> Publication:
-        """`publication`, packed for the subscribers that get it at once. In any thread: the network thread need not."""
-        for stream in list(self.streams.values()):
-            if stream.is_prompt:
-                publication.packet(stream.name, stream.wish.wire)
-        return publication
 
+class Topics(dict[str, Topic]):
+    """Every topic of a server by name. A topic has the type of its first user, and ends with its last one.
 
-class Topics:
-    """Every topic of a server. A topic has the type of its first user, and ends with its last one.
-
-    Args:
-        emit: Takes what is to be sent.
+    `emit` takes what is to be sent.
     """
 
     def __init__(self, emit: Callable[[Send], None]) -> None:
+        super().__init__()
         self._emit = emit
-        self._topics: dict[str, Topic] = {}
         self._delayed: set[Stream] = set()
-
-    def __iter__(self) -> Iterator[Topic]:
-        return iter(self._topics.values())
-
-    def find(self, name: str) -> Topic | None:
-        """The topic `name`, if there is one."""
-        return self._topics.get(name)
 
     def require(self, name: str, kind: str | None) -> Topic:
         """The topic `name`; a new one if there is none.
@@ -150,11 +122,11 @@ class Topics:
         Raises:
             ProtocolError: It has another type, or is not there and no type was given.
         """
-        topic = self._topics.get(name)
+        topic = self.get(name)
         if topic is None and kind is None:
             raise ProtocolError(f"Topic {name} does not exist yet; its type is needed.")
         if topic is None:
-            topic = self._topics[name] = Topic(name, normal_name(kind or ""))
+            topic = self[name] = Topic(name, normal_name(kind or ""))
         if kind is not None and normal_name(kind) != topic.kind:
             raise ProtocolError(f"Topic {name} is of type {topic.kind}, found {brief(kind)}.")
         return topic
@@ -168,7 +140,7 @@ class Topics:
     def unsubscribe(self, stream: Stream) -> None:
         """Let a stream have no more messages."""
         self._delayed.discard(stream)
-        topic = self._topics.get(stream.topic)
+        topic = self.get(stream.topic)
         if topic is not None and topic.streams.pop(stream.session, None) is not None:
             self.forget(topic)
 
@@ -200,13 +172,13 @@ class Topics:
     def forget(self, topic: Topic) -> None:
         """Remove a topic that nobody uses."""
         used = topic.publishers or topic.streams or topic.listeners
-        if not used and self._topics.get(topic.name) is topic:
-            del self._topics[topic.name]
+        if not used and self.get(topic.name) is topic:
+            del self[topic.name]
 
     def leave(self, session: Session) -> None:
         """A client left."""
         for name in session.advertised:
-            self.retire(self._topics[name], session)
+            self.retire(self[name], session)
         for stream in session.streams.values():
             self.unsubscribe(stream)
 

@@ -148,7 +148,7 @@ class Fuzzed:
                 if isinstance(event, Send):
                     self.frames += len(event.packet.frames)
                 else:
-                    self.bridge.finish(event, self.bridge.packed_answer(event))
+                    self.bridge.services.finish(event, self.bridge.services.packed_answer(event))
         deadline = self.bridge.next_deadline
         if deadline is not None and deadline <= self.now:
             self.bridge.tick(self.now)
@@ -174,8 +174,8 @@ def test_nonsense_is_survived_and_forgotten(seed):
     assert fuzzed.robot.heard > 50
     assert fuzzed.frames > 10_000
     fuzzed.leave()
-    assert [one.name for one in fuzzed.bridge.topics] == ["/command"]
-    assert [one.name for one in fuzzed.bridge.services if not one.name.startswith("/rosapi/")] == ["/trigger"]
+    assert list(fuzzed.bridge.topics) == ["/command"]
+    assert [name for name in fuzzed.bridge.services if not name.startswith("/rosapi/")] == ["/trigger"]
     assert fuzzed.bridge.next_deadline is None
 
 

@@ -1,6 +1,7 @@
 import pytest
 
-from bam_envs.rosbridge.server.outgoing import Outbox, Packet
+from bam_envs.rosbridge.server.client_session import Packet
+from bam_envs.rosbridge.server.server_connection import Outbox
 
 
 def packet(name, stream=None, size=1):
@@ -28,7 +29,6 @@ def test_a_topic_keeps_its_newest(outbox):
     for name in "abcd":
         outbox.add(packet(name, "/t"))
     outbox.add(packet("x", "/u"))
-    assert outbox.dropped == 1
     assert drain(outbox) == ["b", "c", "d", "x"]
 
 
@@ -45,7 +45,6 @@ def test_topics_give_way_to_what_must_arrive(outbox):
     for name in "ab":
         outbox.add(packet(name, f"/{name}", 5))
     assert outbox.add(packet("must", size=100))
-    assert outbox.dropped == 1
     assert drain(outbox) == ["b", "must"]
 
 
