@@ -27,8 +27,9 @@ def lost(link):
 
 
 def _restart(server, link):
-    epoch = link.epoch
+    epoch, lost = link.epoch, _loss(link)
     server.stop()
+    assert lost.wait(10.0)
     server.start()
     link.wait_up(10.0)
     assert link.epoch == epoch + 1
