@@ -91,6 +91,11 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
     if entry is None or not given:
         return
     options, theirs = entry.options(), ROBO_GYM.get(env.rpartition(":")[2])
+    if theirs and limit is not None and not 1 <= limit <= entry.max_episode_steps:
+        raise SettingsError(
+            f"env_kwargs.max_episode_steps: episodes of {env} have at most {entry.max_episode_steps} steps, "
+            f"found {limit}; use {entry.id} for longer ones"
+        )
     taken, refused = constructor_options(theirs) if theirs else (frozenset(), frozenset())
     own = set(registry.MAKE_OPTIONS) - _NO_SETTINGS
     known = own | taken | options.keys() | {"max_episode_steps"}

@@ -214,7 +214,7 @@ def _once(rows: list[list[str]]) -> list[list[str]]:
     for topic, kind, direction, what in rows:
         joined.setdefault((topic, kind, what), []).append(direction)
     return [
-        [topic, kind, directions[0] if len(directions) == 1 else "to the robot (each way)", what]
+        [topic, kind, directions[0] if len(directions) == 1 else "to the robot (every mode)", what]
         for (topic, kind, what), directions in joined.items()
     ]
 

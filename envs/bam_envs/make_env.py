@@ -5,18 +5,17 @@ Live robots, remote environments and Gymnasium's vector environments are importe
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
 from bam_envs.core.errors import InvalidValue
-from bam_envs.core.registry import ENVIRONMENTS, EnvEntry
+from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.core.validation import PositiveInt, check
 
 if TYPE_CHECKING:
-    from bam_envs.core.robot_env import RobotEnv, RobotVectorEnv
+    from bam_envs.core.robot_env import RobotVectorEnv
     from bam_envs.remote.remote_env import RemoteVectorEnv
 
 
@@ -67,36 +66,14 @@ def make_env(
     task = entry.make_task(1, task_options)
     simulated = entry.make_robot(1, randomize, task_options)
     if robot is None:
-        return limited(RobotEnv(simulated, task, render_mode=render_mode), entry)
+        return RobotEnv(simulated, task, render_mode=render_mode)
     from bam_envs.live.building import live_robot
 
     tool = getattr(simulated, "tool_position", None)  # forward kinematics of an arm that is no UR5e
     live = live_robot(
         robot, simulated.spec, profile=profile, tool_position=tool, ca_file=ca_file, token_file=token_file
     )
-    return limited(RobotEnv(live, task, render_mode=render_mode), entry)
-
-
-def limited(env: RobotEnv, entry: EnvEntry) -> gym.Env[Any, Any]:
-    """`env` with the time limit that Gymnasium does not put around it."""
-    if not entry.variants or getattr(env.task, "ends_by_itself", False) or _gymnasium_limits():
-        return env
-    return gym.wrappers.TimeLimit(env, entry.max_episode_steps)
-
-
-def _gymnasium_limits() -> bool:
-    """Whether `gymnasium.make`, which calls this, was told of a limit, or of -1 for none.
-
-    It keeps its ``max_episode_steps`` to itself, and a limit within would cut what is to be longer. So its frame is
-    asked; where there is none, nobody was told of a limit.
-    """
-    frame: Any = sys._getframe()
-    while frame is not None and frame.f_code is not gym.make.__code__:
-        frame = frame.f_back
-    if frame is None:
-        return False
-    told, registered = frame.f_locals.get("max_episode_steps"), frame.f_locals.get("env_spec")
-    return told is not None or getattr(registered, "max_episode_steps", None) is not None
+    return RobotEnv(live, task, render_mode=render_mode)
 
 
 def _check_place(
@@ -153,12 +130,9 @@ def make_vector_env(
     from bam_envs.core.robot_env import RobotVectorEnv
 
     entry = ENVIRONMENTS[env_id]
-    task = entry.make_task(num_envs, task_options)
-    if max_episode_steps is None and not getattr(task, "ends_by_itself", False):
-        max_episode_steps = entry.max_episode_steps if entry.variants else None  # Gymnasium gives that of the others
     return RobotVectorEnv(
         entry.make_robot(num_envs, randomize, task_options),
-        task,
+        entry.make_task(num_envs, task_options),
         max_episode_steps=max_episode_steps,
         render_mode=render_mode,
     )

@@ -43,10 +43,7 @@ class EnvEntry:
     robot_options: tuple[str, ...] = ()
     """Arguments of the task that its robot takes too."""
     variants: dict[str, str] = field(default_factory=dict)
-    """Flags that plug-ins add, such as ``parity``, and ``"module:Class"`` of the task that each of them makes.
-
-    Such tasks end by themselves: so the time limit of an environment that has any is put around it here, and not by
-    Gymnasium, which would do it in any case."""
+    """Flags that plug-ins add, such as ``parity``, and ``"module:Class"`` of the task that each of them makes."""
 
     def options(self) -> dict[str, Any]:
         """The options of the task, flags of variants among them, with their defaults."""
@@ -178,7 +175,7 @@ ALIASES: dict[str, Alias] = {}
 def register() -> None:
     """Register every environment with Gymnasium; idempotent. Plug-ins add their variants before."""
     for entry in ENVIRONMENTS.values():
-        register_id(entry.id, "bam_envs.make_env", None if entry.variants else entry.max_episode_steps)
+        register_id(entry.id, "bam_envs.make_env", entry.max_episode_steps)
 
 
 def register_alias(env_id: str, alias: Alias, module: str) -> None:

@@ -49,9 +49,8 @@ class Score:
 class Task(Protocol):
     """Observation, command, reward and end of `num_envs` environments: one live robot, or many simulated ones.
 
-    A task may have two more attributes. ``reset_options`` names the options that an environment's `reset` takes; such a
-    task's `sample_initial` has a third argument, ``options``, a mapping of those that were given. ``ends_by_itself`` is
-    True for one that counts its own steps and terminates at its time limit; no time limit is put around it.
+    A task may have one more attribute, ``reset_options``: the names of the options that `reset` of its environment
+    takes. Its `sample_initial` has a third argument then, ``options``, a mapping of those that were given.
     """
 
     num_envs: int

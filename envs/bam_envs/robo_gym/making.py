@@ -38,7 +38,8 @@ def make_env(env_id: str, **options: Any) -> gym.Env[Any, Any]:
     if not isinstance(made, RobotEnv):
         raise TypeError(f"{entry.env_id} is a {type(made).__name__}, and a RobotEnv was expected.")
     env = RoboGymEnv(made.robot, made.task, made.render_mode, is_live=arguments.get("robot") is not None)
-    return ours.limited(env, ENVIRONMENTS[entry.env_id])
+    # robo-gym's ids have no limit at Gymnasium: with parity the task itself terminates at the last step.
+    return env if options.get("parity") else gym.wrappers.TimeLimit(env, ENVIRONMENTS[entry.env_id].max_episode_steps)
 
 
 def make_vector_env(env_id: str, num_envs: int = 1, **options: Any) -> RobotVectorEnv | RemoteVectorEnv:
@@ -56,6 +57,8 @@ def make_vector_env(env_id: str, num_envs: int = 1, **options: Any) -> RobotVect
         return ours.make_vector_env(env_id, num_envs, **arguments)
     if "rs_state_to_info" not in options:
         arguments.pop("rs_state_to_info", None)
+    if not options.get("parity"):
+        arguments.setdefault("max_episode_steps", ENVIRONMENTS[entry.env_id].max_episode_steps)
     return ours.make_vector_env(entry.env_id, num_envs, **arguments)
 
 

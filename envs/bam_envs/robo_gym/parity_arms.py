@@ -26,8 +26,6 @@ _UNSCALED = ("1", "1", "1")
 class UrParity(UrTask):
     """The last step of an episode terminates it, whatever else happened then but a collision."""
 
-    ends_by_itself = True
-
     def observe(self, state: RobotState) -> Floats:
         """See `observation_labels`; nothing is cut to the space. Shape: (n, k) float32."""
         return np.concatenate(self._columns(state), axis=1).astype(np.float32)
@@ -43,8 +41,6 @@ class UrEmptyParity(UrEmptyTask):
 
     With ``parity=True`` joint velocities are in rad/s, and after 300 steps an episode is terminated as "success".
     """
-
-    ends_by_itself = True
 
     def _observation_labels(self) -> tuple[Label, ...]:
         return (
@@ -147,8 +143,6 @@ class IsaacReachParity(UrParity, IsaacReachTask):
 
 class UrObstacleParity(UrObstacleTask):
     """Nothing is scaled, no observation is outside its space, and 1000 steps terminate."""
-
-    ends_by_itself = True
 
     def _observation_labels(self) -> tuple[Label, ...]:
         far = _INF if self.include_polar_to_elbow else 0.0

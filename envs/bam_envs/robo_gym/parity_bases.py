@@ -26,7 +26,6 @@ _CORNERS = np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]]) * np.array(FOOTPRINT) 
 class DriveParity(DriveTask):
     """Metres and radians; the way, but none for the first step; 500 steps terminate."""
 
-    ends_by_itself = True
     success_reward: float
 
     def labels(self) -> tuple[Label, ...]:

@@ -54,7 +54,6 @@ class DriveTask(TaskMemory):
         Label("turn", "speed of turning anticlockwise", "rad/s", f"/ {FASTEST[1]:g}"),
     )
     memory: Mapping[str, str] = {"target": "target", "elapsed": "elapsed", "previous": "_previous"}
-    ends_by_itself = False
     failure: str
     """What ``final_status`` says when something went wrong."""
     draws: int

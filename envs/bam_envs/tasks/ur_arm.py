@@ -55,7 +55,6 @@ class UrTask(TaskMemory):
     """Share of the fastest speed that the joints go at."""
     max_steps: int
     """Steps of an episode."""
-    ends_by_itself = False
 
     def __init__(
         self,
