@@ -7,6 +7,7 @@ first, so that both workers end at about the same time.
 
 import os
 import signal
+import sys
 from typing import Any
 
 import pytest
@@ -67,6 +68,12 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
             return kind if kind in ("ray", "peers") else file
 
     return ByFile(config, log)
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Name a failed test when it fails: the summary never comes if the run is cut off."""
+    if report.failed and "PYTEST_XDIST_WORKER" not in os.environ:
+        sys.stderr.write(f"\nFAILED {report.nodeid} ({report.when}, {report.duration:.0f} s)\n")
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -133,7 +133,7 @@ def always(*action):
 @pytest.mark.parametrize("stem", ["NoObstacleNavigationMir100", "ObstacleAvoidanceMir100"])
 def test_bases_with_random_actions(stem):
     both = Both(stem)
-    ends = [both.play(seed, randomly(seed, hold=1 + 9 * (seed % 3))) for seed in range(8)]
+    ends = [both.play(seed, randomly(seed, hold=1 + 9 * (seed % 3))) for seed in range(5)]
     assert sum(steps for steps, _ in ends) > 300
 
 
@@ -171,10 +171,9 @@ def test_a_base_among_boxes():
 
 
 @pytest.mark.parametrize("stem", UR)
-@pytest.mark.parametrize("seed", range(2))
-def test_arms_with_random_actions(stem, seed):
+def test_arms_with_random_actions(stem):
     both = Both(stem)
-    steps = sum(both.play(seed + i, randomly(seed + i, scale=(0.05, 0.3, 1.0)[i], hold=1 + 9 * i))[0] for i in range(3))
+    steps = sum(both.play(i, randomly(i, scale=(0.05, 0.3, 1.0)[i], hold=1 + 9 * i))[0] for i in range(3))
     assert steps > 200
 
 

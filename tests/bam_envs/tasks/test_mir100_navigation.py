@@ -121,8 +121,8 @@ def test_time_limits(make, make_rows):
         env.reset(seed=1)
         steps = [env.step(np.zeros(2, np.float32))[2:4] for _ in range(500)]
         assert steps[:499] == [(False, False)] * 499
-        assert steps[499] == ((True, False) if parity else (False, True))
-    for parity, ends in ((False, [False, True]), (True, [True, False])):
+        assert steps[499] == ((True, True) if parity else (False, True))
+    for parity, ends in ((False, [False, True]), (True, [True, True])):
         envs = make_rows(ENV, 3, parity=parity)
         envs.reset(seed=1)
         for _ in range(500):

@@ -111,7 +111,7 @@ def test_no_workspace(kind):
 
 def test_not_an_agent():
     with pytest.raises(LoopError) as error:
-        TemporalAgent(print)
+        TemporalAgent(len)
     assert str(error.value) == "TemporalAgent: expected an agent, found builtin_function_or_method."
 
 
