@@ -89,7 +89,12 @@ class Checkpoint:
         with open_zip(self.path) as archive:
             infos = list_members(self.path, archive)
             require_same_members(self.path, set(infos) - {MANIFEST}, set(self.manifest.sha256))
-            _require_memory(self.path, infos[member])
+            size, memory = infos[member].file_size, math.inf
+            if hasattr(os, "sysconf"):
+                memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+            if size > memory / 2:
+                text = f"{member} has {size} bytes, more than half of this computer's memory ({memory})"
+                raise CheckpointError(self.path, f"{text}. Go on with it on a larger one")
             data = unpack(self.path, archive, infos[member])
         require_digest(self.path, member, self.manifest.sha256[member], hashlib.sha256(data).hexdigest())
         return data
@@ -135,20 +140,33 @@ def write_checkpoint(path: str | Path, manifest_fields: Mapping[str, Any], membe
         CheckpointError: A field or member that no checkpoint may have.
     """
     path = Path(path).expanduser()
-    _require_names(path, members)
+    for name, data in members.items():
+        if len(data) > most_bytes(name):
+            found = f"member {name!r} has {len(data)} bytes, expected at most {most_bytes(name)}"
+            raise CheckpointError(path, f"cannot be written: {found}")
+        # stable-baselines3 reads every member that ends in .pth, at any depth
+        if name == MANIFEST or not name or (name.startswith("bam/") and name.endswith(".pth")):
+            raise CheckpointError(path, f"member {name!r} cannot be written: the name is reserved")
     digests = {name: hashlib.sha256(data).hexdigest() for name, data in sorted(members.items())}
-    text = manifest_bytes(path, {**manifest_fields, "sha256": digests})
+    manifest = manifest_bytes(path, {**manifest_fields, "sha256": digests})
     target = Path(os.path.realpath(path))
     try:
         if target.is_dir():
             raise IsADirectoryError(None, "it is a folder; give the name of a file in it")
         target.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(target) as temporary, temporary.open("wb") as file:
-            _write_zip(file, {**members, MANIFEST: text})
+        with (
+            replacing(target) as temporary,
+            temporary.open("wb") as file,
+            zipfile.ZipFile(file, "w") as archive,
+        ):
+            for name, data in {**members, MANIFEST: manifest}.items():
+                info = zipfile.ZipInfo(name)  # its date is 1980, so that equal content makes equal bytes
+                info.external_attr = 0o644 << 16
+                archive.writestr(info, data, zipfile.ZIP_DEFLATED, 1 if len(data) > CHUNK else 6)
     except OSError as error:
         why = error.strerror or error
         raise OutputError(f"{path}: cannot be written: {why}. Choose another place with --out") from error
-    return Checkpoint(path, parse_manifest(path, text))
+    return Checkpoint(path, parse_manifest(path, manifest))
 
 
 def next_free_path(path: str | Path) -> Path:
@@ -159,30 +177,3 @@ def next_free_path(path: str | Path) -> Path:
         number += 1
         free = path.with_name(f"{path.stem}-{number}{path.suffix}")
     return free
-
-
-def _require_memory(path: Path, info: zipfile.ZipInfo) -> None:
-    """Refuse a member that this computer's memory cannot hold, before it is unpacked."""
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else math.inf
-    if info.file_size > memory / 2:
-        text = f"{info.filename} has {info.file_size} bytes, more than half of this computer's memory ({memory})"
-        raise CheckpointError(path, f"{text}. Go on with it on a larger one")
-
-
-def _require_names(path: Path, members: Mapping[str, bytes]) -> None:
-    """Refuse names that would break the file, as SB3 reads every ``.pth`` at any depth, and what could not be read."""
-    for name, data in members.items():
-        if len(data) > most_bytes(name):
-            text = f"member {name!r} has {len(data)} bytes, expected at most {most_bytes(name)}"
-            raise CheckpointError(path, f"cannot be written: {text}")
-        if name == MANIFEST or not name or (name.startswith("bam/") and name.endswith(".pth")):
-            raise CheckpointError(path, f"member {name!r} cannot be written: the name is reserved")
-
-
-def _write_zip(file: Any, members: Mapping[str, bytes]) -> None:
-    with zipfile.ZipFile(file, "w") as archive:
-        for name, data in members.items():
-            info = zipfile.ZipInfo(name)  # its date is 1980, so that equal content makes equal bytes
-            info.external_attr = 0o644 << 16
-            level = 1 if len(data) > CHUNK else 6
-            archive.writestr(info, data, zipfile.ZIP_DEFLATED, level)

@@ -1,8 +1,16 @@
-"""Weights, statistics and golden actions as safetensors: a format in which nothing can be executed."""
+"""Weights, statistics, golden actions and states as safetensors and JSON: formats in which nothing can be executed.
+
+`dump` and `parse` are for arrays. `pack` and `unpack` are for any nested state, as a JSON skeleton and the arrays that
+it names; exact both ways: ints of any size, floats to the last bit (NaN and infinities too), arrays and torch tensors
+with dtype and shape, tuples, and mappings with keys other than text.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import safetensors.numpy
@@ -12,6 +20,7 @@ from bam_train.errors import FormatError
 
 MOST_HEADER = 2**23
 """Most bytes of a file's JSON header, which takes many times as much memory once it is read."""
+_MARKS = {"$array", "$scalar", "$tensor", "$tuple", "$items", "$float"}
 
 
 def dump(arrays: Mapping[str, np.ndarray]) -> bytes:
@@ -46,3 +55,85 @@ def parse(data: bytes) -> dict[str, np.ndarray]:
         raise FormatError(f"not a safetensors file of numbers: dtype {error} is not known") from error
     except (SafetensorError, ValueError, OverflowError) as error:
         raise FormatError(f"not a safetensors file: {error}") from error
+
+
+def pack(tree: Any) -> tuple[bytes, bytes]:
+    """Turn a tree into (JSON skeleton, safetensors).
+
+    Args:
+        tree: None, bool, int, float, str, NumPy scalars and arrays, torch tensors; lists, tuples, mappings of these.
+
+    Raises:
+        FormatError: Something else is in it; names where.
+    """
+    arrays: dict[str, np.ndarray] = {}
+
+    def keep(mark: str, array: np.ndarray, path: str) -> dict[str, str]:
+        name = path or "/"
+        if name in arrays:
+            raise FormatError(f"{name}: two entries of a saved state have this name")
+        arrays[name] = array
+        return {mark: name}
+
+    def put(value: Any, path: str) -> Any:
+        if value is None or isinstance(value, (bool, int, str)):
+            return value
+        if isinstance(value, np.generic):
+            return keep("$scalar", np.asarray(value), path)
+        if isinstance(value, float):
+            return value if math.isfinite(value) else {"$float": repr(value)}
+        if isinstance(value, np.ndarray):
+            return keep("$array", value, path)
+        if hasattr(value, "detach"):
+            return keep("$tensor", value.detach().cpu().numpy().copy(), path)
+        if isinstance(value, (tuple, list)):
+            items = [put(item, f"{path}/{i}") for i, item in enumerate(value)]
+            return items if isinstance(value, list) else {"$tuple": items}
+        if not isinstance(value, Mapping):
+            expected = "expected numbers, text, arrays or nests of them"
+            raise FormatError(f"{path or '/'}: {expected}, found a {type(value).__name__}")
+        if all(isinstance(key, str) for key in value) and not _MARKS & value.keys():
+            return {key: put(item, f"{path}/{key}") for key, item in value.items()}
+        return {"$items": [[put(key, path), put(item, f"{path}/{key}")] for key, item in value.items()]}
+
+    skeleton = put(tree, "")
+    return json.dumps(skeleton, allow_nan=False).encode(), dump(arrays)
+
+
+def unpack(skeleton: bytes, arrays: bytes, to_tensor: Callable[[np.ndarray], Any] | None = None) -> Any:
+    """Turn what `pack` wrote into the tree again.
+
+    Args:
+        skeleton: The JSON.
+        arrays: The safetensors.
+        to_tensor: Makes a torch tensor of an array; tensors stay arrays without it.
+
+    Raises:
+        FormatError: The two do not belong together, or are not as `pack` writes them.
+    """
+
+    def get(value: Any) -> Any:
+        if isinstance(value, list):
+            return [get(item) for item in value]
+        if not isinstance(value, dict):
+            return value
+        mark = next(iter(value)) if len(value) == 1 else None
+        if mark not in _MARKS:
+            return {key: get(item) for key, item in value.items()}
+        inside = value[mark]
+        if mark == "$items":
+            return {get(key): get(item) for key, item in inside}
+        if mark == "$tuple":
+            return tuple(get(item) for item in inside)
+        if mark == "$float":
+            return float(inside)
+        array = found[inside]
+        if mark == "$tensor" and to_tensor is not None:
+            return to_tensor(array)
+        return array[()] if mark == "$scalar" else array
+
+    try:
+        found = parse(arrays)
+        return get(json.loads(skeleton))
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise FormatError(f"a saved state cannot be read: {type(error).__name__}: {error}") from error

@@ -7,8 +7,9 @@ import hashlib
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from bam_train.checkpoint.manifest import AGAIN, MANIFEST, MOST_MANIFEST
 from bam_train.errors import AlteredCheckpoint, NotACheckpoint
@@ -41,7 +42,11 @@ def open_zip(path: Path) -> Iterator[zipfile.ZipFile]:
                 path,
                 "is a folder, expected a checkpoint.zip. Give the file in it; bam-export makes one of RLlib's folders",
             )
-        _require_short_directory(path)
+        with path.open("rb") as file:  # zipfile reads the list of members whole, and has no public way to ask first
+            record: Any = zipfile._EndRecData(file)  # type: ignore[attr-defined]
+        found = record[zipfile._ECD_SIZE] if record else 0  # type: ignore[attr-defined]
+        if found > _MOST_DIRECTORY:
+            raise NotACheckpoint(path, f"lists members in {found} bytes, expected at most {_MOST_DIRECTORY}. {AGAIN}")
         with zipfile.ZipFile(path) as archive:
             yield archive
     except FileNotFoundError as error:
@@ -57,7 +62,7 @@ def open_zip(path: Path) -> Iterator[zipfile.ZipFile]:
 
 
 def list_members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """List the members, refusing what no checkpoint has and what could only exhaust the reader."""
+    """List the members; refuse what no checkpoint has, and sizes that only an attack has, before unpacking any."""
     infos: dict[str, zipfile.ZipInfo] = {}
     for info in archive.infolist():
         name = info.filename
@@ -73,7 +78,19 @@ def list_members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipI
             f"has no {MANIFEST}: not made by bam-train, or not whole. A plain stable-baselines3 file can be run by "
             "bam-eval --trust-pickle --env ... --algo ...",
         )
-    _require_sane_sizes(path, infos)
+    if len(infos) > MOST_MEMBERS:
+        raise NotACheckpoint(path, f"has {len(infos)} members, expected at most {MOST_MEMBERS}. {AGAIN}")
+    size, packed = path.stat().st_size, sum(info.compress_size for info in infos.values())
+    if packed > size:  # members that overlap
+        raise NotACheckpoint(path, f"claims {packed} bytes of members in a file of {size}. {AGAIN}")
+    for name, info in infos.items():
+        if info.file_size > most_bytes(name):
+            text = f"{name} has {info.file_size} bytes, expected at most {most_bytes(name)}. {AGAIN}"
+            raise AlteredCheckpoint(path, name, text)
+    for start, what in (("", "beside those for --resume"), (RESUME, "for --resume")):
+        total = sum(info.file_size for name, info in infos.items() if name.startswith(RESUME) is bool(start))
+        if total > (most := most_bytes(start)):
+            raise NotACheckpoint(path, f"has {total} bytes of members {what}, expected at most {most}. {AGAIN}")
     return infos
 
 
@@ -118,36 +135,7 @@ def _chunks(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Iter
         raise AlteredCheckpoint(path, name, f"{name} has {found} bytes, expected {info.file_size}. {AGAIN}")
 
 
-def _require_short_directory(path: Path) -> None:
-    """Refuse a list of members that takes long to read; zipfile reads it whole."""
-    with path.open("rb") as file:
-        record = zipfile._EndRecData(file)  # type: ignore[attr-defined]  # there is no public way to ask first
-    if record and record[zipfile._ECD_SIZE] > _MOST_DIRECTORY:  # type: ignore[attr-defined]
-        found = record[zipfile._ECD_SIZE]  # type: ignore[attr-defined]
-        raise NotACheckpoint(path, f"lists members in {found} bytes, expected at most {_MOST_DIRECTORY}. {AGAIN}")
-
-
 def most_bytes(name: str) -> int:
     """How many bytes a member of this name may have at most, unpacked."""
     most = next(most for start, most in _MOST_BYTES.items() if name.startswith(start))
     return min(most, _MOST_JSON) if name.endswith(".json") else most
-
-
-def _require_sane_sizes(path: Path, infos: Mapping[str, zipfile.ZipInfo]) -> None:
-    """Refuse overlapping members, and sizes that only an attack has, before anything is unpacked."""
-    if len(infos) > MOST_MEMBERS:
-        raise NotACheckpoint(path, f"has {len(infos)} members, expected at most {MOST_MEMBERS}. {AGAIN}")
-    size = path.stat().st_size
-    packed = sum(info.compress_size for info in infos.values())
-    if packed > size:
-        raise NotACheckpoint(path, f"claims {packed} bytes of members in a file of {size}. {AGAIN}")
-    for name, info in infos.items():
-        if info.file_size > most_bytes(name):
-            text = f"{name} has {info.file_size} bytes, expected at most {most_bytes(name)}. {AGAIN}"
-            raise AlteredCheckpoint(path, name, text)
-    for resumed in (False, True):
-        group = [info.file_size for name, info in infos.items() if name.startswith(RESUME) is resumed]
-        most = most_bytes(RESUME if resumed else "")
-        if sum(group) > most:
-            what = "for --resume" if resumed else "beside those for --resume"
-            raise NotACheckpoint(path, f"has {sum(group)} bytes of members {what}, expected at most {most}. {AGAIN}")

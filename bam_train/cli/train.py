@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from bam_train.settings import TrainSettings
     from bam_train.trainers.base import Trainer
     from bam_train.trainers.best_checkpoint import Output
-    from bam_train.trainers.checkpoint_copies import Copies
-    from bam_train.trainers.run_folder import RunFolder
+    from bam_train.trainers.run_folder import Copies, RunFolder
     from bam_train.trainers.training_run import TrainingRun
 
 _STARTED = time.monotonic()
@@ -60,8 +59,7 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
     from bam_train.cli.train_display import stderr_may_close
     from bam_train.trainers import load_trainer
     from bam_train.trainers.best_checkpoint import choose_output
-    from bam_train.trainers.checkpoint_copies import Copies
-    from bam_train.trainers.run_folder import require_room
+    from bam_train.trainers.run_folder import Copies, require_room
 
     require_room(config.runs.expanduser())
     output = choose_output(settings, config.out, config.force, checkpoint)

@@ -41,12 +41,11 @@ from bam_train.environments import (
 )
 from bam_train.errors import CheckpointMismatch, PolicyError, SettingsError
 from bam_train.policy import FrozenPolicy
-from bam_train.policy.array_specs import array_spec, observation_arrays
-from bam_train.policy.golden_check import TOLERANCE, worst_difference
+from bam_train.policy.frozen_policy import TOLERANCE
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
+from bam_train.trainers.base import origin
 from bam_train.trainers.frozen_network import pack
-from bam_train.trainers.manifest_fields import origin
 from bam_train.trainers.rllib.rllib_freezing import (
     AnySpace,
     FrozenModule,
@@ -383,8 +382,7 @@ def _golden(found: _Policy, parts: PolicyParts) -> tuple[bytes, str]:
 
 def _checked(directory: Directory, policy: FrozenPolicy, arrays: bytes, by: str) -> float:
     """Act on the golden observations; the largest difference."""
-    parts, action = observation_arrays(policy.observation_space), array_spec("action", policy.action_space)
-    worst, _ = worst_difference(policy, parts, action, safetensors_file.parse(arrays))
+    worst, _ = policy.worst_difference(safetensors_file.parse(arrays))
     if not worst <= TOLERANCE:  # NaN too
         text = f"its frozen policy differs by {worst:.3g} from the actions of {by}"
         raise PolicyError(f"{directory.given}: {text}, expected at most {TOLERANCE}: this network cannot be exported")

@@ -25,10 +25,9 @@ class ArraySpec:
     """Without a batch axis."""
     dtype: np.dtype[Any]
     """As the environment gives it."""
-    low: np.ndarray | None
+    low: np.ndarray | None = None
     """Lowest value; None for a MultiBinary."""
-    high: np.ndarray | None
-    """Highest value; None for a MultiBinary."""
+    high: np.ndarray | None = None
 
     def checked(self, value: Any, batch: tuple[int, ...]) -> np.ndarray:
         """Return the value as an array that can be copied into this one.
@@ -40,20 +39,20 @@ class ArraySpec:
         Raises:
             PolicyError: The shape or the kind of number does not fit, or a Discrete is not in its range.
         """
+        shape = (*batch, *self.shape)
         try:
             array = np.asarray(value)
         except ValueError as error:
-            raise PolicyError(f"{self.name}: expected an array of shape {self._shape(batch)}, found {error}") from error
-        if array.shape != (*batch, *self.shape):
-            raise PolicyError(f"{self.name}: expected shape {self._shape(batch)}, found {array.shape}")
+            raise PolicyError(
+                f"{self.name}: expected an array of shape {shape} ({self.dtype}), found {error}"
+            ) from error
+        if array.shape != shape:
+            raise PolicyError(f"{self.name}: expected shape {shape} ({self.dtype}), found {array.shape}")
         if not np.can_cast(array.dtype, self.dtype, "same_kind"):
             raise PolicyError(f"{self.name}: expected numbers of type {self.dtype}, found {array.dtype}")
         if self.kind in ("Discrete", "MultiDiscrete") and not ((array >= self.low) & (array <= self.high)).all():
             raise PolicyError(f"{self.name}: expected {self.low} to {self.high}, found {array}")
         return array
-
-    def _shape(self, batch: tuple[int, ...]) -> str:
-        return f"{(*batch, *self.shape)} ({self.dtype})"
 
 
 def observation_arrays(space: Mapping[str, Any]) -> list[ArraySpec]:
@@ -78,25 +77,20 @@ def array_spec(name: str, space: Mapping[str, Any]) -> ArraySpec:
             f"{name}: a space of type {kind!r} cannot be used; expected {', '.join(_KINDS)} or a Dict of them"
         )
     try:
-        return _array_spec(name, str(kind), space)
+        if kind == "MultiBinary":
+            return ArraySpec(name, kind, tuple(np.atleast_1d(space["n"]).tolist()), np.dtype(np.int8))
+        dtype = np.dtype(space["dtype"])
+        if kind == "Box":
+            shape = tuple(space["shape"])
+            return ArraySpec(name, kind, shape, dtype, _bound(space["low"], shape), _bound(space["high"], shape))
+        counts = np.asarray(space["n" if kind == "Discrete" else "nvec"], np.int64)
+        low = np.broadcast_to(np.asarray(space.get("start", 0), np.int64), counts.shape)
+        return ArraySpec(name, kind, counts.shape, dtype, low, low + counts - 1)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise PolicyError(f"{name}: its space cannot be read ({type(error).__name__}: {error}): {space}") from error
 
 
-def _array_spec(name: str, kind: str, space: Mapping[str, Any]) -> ArraySpec:
-    if kind == "MultiBinary":
-        shape = tuple(np.atleast_1d(space["n"]).tolist())
-        return ArraySpec(name, kind, shape, np.dtype(np.int8), None, None)
-    dtype = np.dtype(space["dtype"])
-    if kind == "Box":
-        shape = tuple(space["shape"])
-        return ArraySpec(name, kind, shape, dtype, _numbers(space["low"], shape), _numbers(space["high"], shape))
-    counts = np.asarray(space["n"] if kind == "Discrete" else space["nvec"], np.int64)
-    low = np.broadcast_to(np.asarray(space.get("start", 0), np.int64), counts.shape)
-    return ArraySpec(name, kind, counts.shape, dtype, low, low + counts - 1)
-
-
-def _numbers(values: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _bound(values: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Read a number or nested lists of them, infinities as text."""
     flat = np.vectorize(float, otypes=[np.float64])(np.array(values, dtype=object))
     return np.broadcast_to(flat, shape)

@@ -11,12 +11,15 @@ import numpy as np
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint
 from bam_train.errors import FormatError, PolicyError
 from bam_train.policy.array_specs import ArraySpec, array_spec, observation_arrays
-from bam_train.policy.golden_check import TOLERANCE, worst_difference
 
 if TYPE_CHECKING:
     from bam_train.policy.onnx_session import OnnxSession
 
-_STATE = "state."
+TOLERANCE = 1e-5
+"""Largest difference from the trainer's own action; a Box wider than 2 is measured in half its range."""
+MOST_GOLDEN = 1024
+"""Golden actions at most; a few hundred are written."""
+_SINGLE = 8  # golden observations that are acted on one by one too
 
 
 class FrozenPolicy:
@@ -40,13 +43,16 @@ class FrozenPolicy:
         self._arrays, self._action = observation_arrays(observation_space), array_spec("action", action_space)
         self._is_dict = observation_space.get("type") == "Dict"
         self._session = session
-        states = {name: tensor for name, tensor in session.inputs.items() if name.startswith(_STATE)}
+        states = {name: tensor for name, tensor in session.inputs.items() if name.startswith("state.")}
         _require_fit(session, self._arrays, states)
         self._zero_state = {name: np.zeros([n or 1 for n in one.shape], one.dtype) for name, one in states.items()}
         self._state: dict[str, np.ndarray] | None = None
         self._outputs = ["action", *(f"next_{name}" for name in states)]
         self.recurrent = bool(states)
-        self._try_once()
+        found = self._act({part.name: np.zeros((2, *part.shape), part.dtype) for part in self._arrays}).shape
+        self._state = None
+        if found != (2, *self._action.shape):
+            raise PolicyError(f"action: expected shape {self._action.shape}, the graph gives {found[1:]}")
         # A plain array of numbers, as most policies take, is copied into an array that is there already.
         plain = not (self.recurrent or self._is_dict) and self._arrays[0].kind == "Box"
         self._shape, self._dtype = self._arrays[0].shape, self._arrays[0].dtype
@@ -54,22 +60,29 @@ class FrozenPolicy:
         self._inputs: dict[str, Any] = {"observation": self._buffer}
 
     @classmethod
-    def load(cls, path: str | Path, *, check_golden: bool = True) -> FrozenPolicy:
+    def load(cls, path: str | Path) -> FrozenPolicy:
         """Load the policy of a checkpoint.zip.
 
         Raises:
             CheckpointError: The file cannot be used.
             PolicyError: The policy cannot run here, or does not act as the trainer did.
         """
-        return cls.from_checkpoint(Checkpoint.open(path), check_golden=check_golden)
+        return cls.from_checkpoint(Checkpoint.open(path))
 
     @classmethod
-    def from_checkpoint(cls, checkpoint: Checkpoint, *, check_golden: bool = True) -> FrozenPolicy:
+    def from_checkpoint(cls, checkpoint: Checkpoint) -> FrozenPolicy:
         """Load the policy of a checkpoint that is open already."""
         manifest = checkpoint.manifest
         policy = cls.from_graph(checkpoint.read(POLICY), manifest.observation_space, manifest.action_space)
-        if check_golden:
-            policy._check_golden(checkpoint)
+        try:
+            worst, row = policy.worst_difference(checkpoint.arrays(GOLDEN))
+        except PolicyError as error:
+            raise PolicyError(f"{checkpoint.path}: {GOLDEN} does not fit the policy: {error}") from error
+        if not worst <= TOLERANCE:  # NaN too
+            raise PolicyError(
+                f"{checkpoint.path}: the frozen policy differs from the trainer's by {worst:.3g} in row {row} of "
+                f"{GOLDEN}, expected at most {TOLERANCE}. Save it again with this version of bam-train"
+            )
         return policy
 
     @classmethod
@@ -128,7 +141,7 @@ class FrozenPolicy:
         """
         buffer = self._buffer
         if buffer is None:
-            return self._act({part.name: value[None] for part, value in self._checked(observation, ())})[0]
+            return self._act({name: value[None] for name, value in self._checked(observation, ()).items()})[0]
         if (
             type(observation) is not np.ndarray
             or observation.dtype is not self._dtype
@@ -157,54 +170,74 @@ class FrozenPolicy:
             first = next(iter(observations.values()))
         if np.ndim(first) == 0 or len(first) == 0:
             raise PolicyError(f"observations: expected one or more, found shape {np.shape(first)}")
-        return self._act({part.name: value for part, value in self._checked(observations, (len(first),))})
+        return self._act(self._checked(observations, (len(first),)))
 
-    def _checked(self, observation: Any, batch: tuple[int, ...]) -> list[tuple[ArraySpec, np.ndarray]]:
+    def _checked(self, observation: Any, batch: tuple[int, ...]) -> dict[str, np.ndarray]:
         if not self._is_dict:
-            return [(self._arrays[0], self._arrays[0].checked(observation, batch))]
+            return {"observation": self._arrays[0].checked(observation, batch)}
         expected = {part.name.removeprefix("observation."): part for part in self._arrays}
         found = sorted(observation) if isinstance(observation, Mapping) else type(observation).__name__
         if found != sorted(expected):
             raise PolicyError(f"observation: expected a mapping with the keys {sorted(expected)}, found {found}")
-        return [(part, part.checked(observation[key], batch)) for key, part in expected.items()]
+        return {part.name: part.checked(observation[key], batch) for key, part in expected.items()}
 
     def _act(self, inputs: dict[str, np.ndarray]) -> np.ndarray:
         """Run the graph on checked inputs, (n, ...) each, and keep the state."""
         inputs = {part.name: inputs[part.name].astype(part.dtype, copy=False) for part in self._arrays}
-        if self.recurrent:
-            inputs |= self._state_of(len(inputs[self._arrays[0].name]))
-        action, *state = self._session.run(inputs, self._outputs)
-        if self.recurrent:
-            self._state = dict(zip(self._zero_state, state, strict=True))
-        return _int64(action)
-
-    def _state_of(self, n: int) -> dict[str, np.ndarray]:
+        if not self.recurrent:
+            return _int64(self._session.run(inputs, self._outputs)[0])
+        n = len(inputs[self._arrays[0].name])
         if self._state is None:
             self._state = {name: np.repeat(zero, n, axis=0) for name, zero in self._zero_state.items()}
         found = len(next(iter(self._state.values())))
         if found != n:
             raise PolicyError(f"observations: expected {found}, found {n}; call reset() before changing the number")
-        return self._state
+        action, *state = self._session.run(inputs | self._state, self._outputs)
+        self._state = dict(zip(self._zero_state, state, strict=True))
+        return _int64(action)
 
-    def _try_once(self) -> None:
-        """Run on zeros: the graph must give an action of the right shape."""
-        zeros = {part.name: np.zeros((2, *part.shape), part.dtype) for part in self._arrays}
-        found = self._act(zeros).shape
-        self._state = None
-        if found != (2, *self._action.shape):
-            raise PolicyError(f"action: expected shape {self._action.shape}, the graph gives {found[1:]}")
+    def worst_difference(self, golden: Mapping[str, np.ndarray]) -> tuple[float, int]:
+        """Act on recorded observations, and compare with the recorded actions; what was seen before is forgotten.
 
-    def _check_golden(self, checkpoint: Checkpoint) -> None:
-        """Act on the recorded observations, and compare with what the trainer did."""
-        try:
-            worst, row = worst_difference(self, self._arrays, self._action, checkpoint.arrays(GOLDEN))
-        except PolicyError as error:
-            raise PolicyError(f"{checkpoint.path}: {GOLDEN} does not fit the policy: {error}") from error
-        if not worst <= TOLERANCE:  # NaN too
-            raise PolicyError(
-                f"{checkpoint.path}: the frozen policy differs from the trainer's by {worst:.3g} in row {row} of "
-                f"{GOLDEN}, expected at most {TOLERANCE}. Save it again with this version of bam-train"
-            )
+        Args:
+            golden: ``action`` and the observations by name, (n, ...) each; of a recurrent policy one episode's steps.
+
+        Returns:
+            The largest difference and its row.
+
+        Raises:
+            PolicyError: The arrays do not fit the policy.
+        """
+        names = {"action", *(part.name for part in self._arrays)}
+        if set(golden) != names:
+            raise PolicyError(f"expected the arrays {sorted(names)}, found {sorted(golden)}")
+        rows = {name: array.shape[:1] for name, array in golden.items()}
+        if len(set(rows.values())) != 1 or rows["action"] in ((), (0,)):
+            raise PolicyError(f"expected as many rows in each array, found {rows}")
+        expected, action = golden["action"], self._action
+        if len(expected) > MOST_GOLDEN:
+            raise PolicyError(f"expected at most {MOST_GOLDEN} rows, found {len(expected)}")
+        if expected.shape[1:] != action.shape:
+            raise PolicyError(f"action: expected shape {action.shape}, found {expected.shape[1:]}")
+        expected = expected.astype(np.float64)
+
+        def observation(chosen: Any) -> Any:
+            parts = {part.name.removeprefix("observation."): golden[part.name][chosen] for part in self._arrays}
+            return parts if self._is_dict else parts["observation"]
+
+        single = len(expected) if self.recurrent else min(_SINGLE, len(expected))
+        self.reset()
+        found = np.array([self.act(observation(k)) for k in range(single)])
+        self.reset()
+        if not self.recurrent:
+            found = np.concatenate([found, self.act_batch(observation(slice(None)))[single:]])
+        unit = np.ones(())  # or half the range of a Box if that is more: float32 rounds relative to it
+        if action.kind == "Box" and action.low is not None and action.high is not None:
+            half = (action.high - action.low) / 2
+            unit = np.maximum(np.where(np.isfinite(half), half, np.abs(expected)), 1.0)
+        worst = (np.abs(found.astype(np.float64) - expected) / unit).reshape(len(expected), -1).max(axis=1)
+        row = int(np.argmax(np.where(np.isnan(worst), np.inf, worst)))
+        return float(worst[row]), row
 
 
 def _int64(array: np.ndarray) -> np.ndarray:

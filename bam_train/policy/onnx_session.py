@@ -7,11 +7,12 @@ no operation of a policy takes longer for other numbers.
 
 from __future__ import annotations
 
+import functools
 import re
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import onnxruntime
@@ -43,26 +44,28 @@ class Tensor:
 class OnnxSession:
     """A graph in onnxruntime.
 
+    Args:
+        onnx: The file, accepted by `require_policy`.
+
     Attributes:
         inputs: What it takes, by name.
         outputs: Names of what it returns.
         most_seconds: Longest time for the first run.
+
+    Raises:
+        PolicyError: onnxruntime cannot run it.
     """
 
     def __init__(self, onnx: bytes) -> None:
-        """Load the graph.
-
-        Args:
-            onnx: The file, accepted by `require_policy`.
-
-        Raises:
-            PolicyError: onnxruntime cannot run it.
-        """
         try:
             self._session = _within(MOST_SECONDS, lambda: _load(onnx))
         except _FAULTS as error:
             raise PolicyError(f"onnxruntime {onnxruntime.__version__} cannot run the policy: {error}") from error
-        self.inputs = {one.name: _tensor(one) for one in self._session.get_inputs()}
+        self.inputs: dict[str, Tensor] = {}
+        for one in self._session.get_inputs():  # described as ``tensor(float)`` and ``['n', 3]``
+            dtype = re.sub(r"^tensor\((\w+)\)$", r"\1", one.type)
+            shape = tuple(n if isinstance(n, int) else None for n in one.shape)
+            self.inputs[one.name] = Tensor(shape, _DTYPES.get(dtype, dtype))
         self.outputs = [one.name for one in self._session.get_outputs()]
         self.most_seconds = MOST_SECONDS
         self._options = onnxruntime.RunOptions()
@@ -71,36 +74,23 @@ class OnnxSession:
     def run(self, inputs: Mapping[str, np.ndarray], outputs: Sequence[str]) -> list[np.ndarray]:
         """Return the named outputs, new arrays (n, ...), for every input by name, (n, ...)."""
         try:
+            # Without options of ours, onnxruntime makes some for each run: 3 us of 13.
             if self._has_run:
-                return self._run(inputs, outputs)
-            results = _within(self.most_seconds, lambda: self._run(inputs, outputs), self._terminate)
+                results: list[np.ndarray] = self._session.run(outputs, inputs, self._options)
+                return results
+            end = functools.partial(setattr, self._options, "terminate", True)  # before its next operation
+            results = _within(self.most_seconds, lambda: self._session.run(outputs, inputs, self._options), end)
         except _FAULTS as error:
             raise PolicyError(f"onnxruntime {onnxruntime.__version__} failed: {error}") from error
         self._has_run = True
         return results
-
-    def _run(self, inputs: Mapping[str, np.ndarray], outputs: Sequence[str]) -> list[np.ndarray]:
-        # Without options of ours, onnxruntime makes some for each run: 3 us of 13.
-        results: list[np.ndarray] = self._session.run(outputs, inputs, self._options)
-        return results
-
-    def _terminate(self) -> None:
-        """End the first run before its next operation."""
-        self._options.terminate = True
-
-
-def _tensor(described: Any) -> Tensor:
-    """Read onnxruntime's description, such as ``tensor(float)`` and ``['n', 3]``."""
-    kind = re.fullmatch(r"tensor\((\w+)\)", described.type)
-    dtype = kind[1] if kind else described.type
-    return Tensor(tuple(n if isinstance(n, int) else None for n in described.shape), _DTYPES.get(dtype, dtype))
 
 
 def _load(onnx: bytes) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.add_session_config_entry("session.use_env_allocators", "1")  # that of `_bound_memory`
+    options.add_session_config_entry("session.use_env_allocators", "1")  # the bounded one, see the end of this file
     options.log_severity_level = 4  # its errors come as exceptions
     return onnxruntime.InferenceSession(
         onnx,
@@ -140,12 +130,10 @@ def _within(seconds: float, call: Callable[[], T], stop: Callable[[], None] = la
     return results[0]
 
 
-def _bound_memory() -> None:
-    """Bound what sessions that ask for it may allocate together; onnxruntime keeps one such setting per process."""
-    info = onnxruntime.OrtMemoryInfo(
+# Bounds what sessions that ask for it may allocate together; onnxruntime keeps one such setting per process.
+onnxruntime.create_and_register_allocator(
+    onnxruntime.OrtMemoryInfo(
         "Cpu", onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, onnxruntime.OrtMemType.DEFAULT
-    )
-    onnxruntime.create_and_register_allocator(info, onnxruntime.OrtArenaCfg({"max_mem": MOST_MEMORY}))
-
-
-_bound_memory()
+    ),
+    onnxruntime.OrtArenaCfg({"max_mem": MOST_MEMORY}),
+)

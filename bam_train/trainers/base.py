@@ -1,14 +1,26 @@
-"""What every trainer is: it trains in steps, saves a whole checkpoint, goes on from one, and freezes its policy."""
+"""What every trainer is: it trains in steps, saves a whole checkpoint, goes on from one, and freezes its policy.
+
+And what each writes into the manifest of its checkpoints.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import datetime
+import functools
+import platform
+import subprocess
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from bam_envs.core.spaces import space_to_json
+
 if TYPE_CHECKING:
+    from gymnasium import Space
     from gymnasium.vector import VectorEnv
     from typing_extensions import Self
 
@@ -113,3 +125,52 @@ class Trainer(Protocol):
 
     def close(self) -> None:
         """Let go of environments and log files."""
+
+
+def manifest(
+    settings: TrainSettings, spaces: tuple[Space[Any], Space[Any]], known: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the manifest's fields.
+
+    Args:
+        settings: Complete ones of the run.
+        spaces: The environment's own, of observations and of actions.
+        known: The fields that only the trainer knows: signals, period, steps and scores.
+    """
+    return {
+        "env": settings.env,
+        "env_kwargs": settings.env_kwargs,
+        "observation_space": space_to_json(spaces[0]),
+        "action_space": space_to_json(spaces[1]),
+        "algorithm": settings.algo,
+        "trainer": settings.trainer,
+        "settings": settings.to_mapping(),
+        "seed": settings.seed,
+        **known,
+        **origin(),
+    }
+
+
+_PACKAGES = ("bam-train", "gymnasium", "numpy", "mujoco", "torch", "stable-baselines3", "sb3-contrib", "ray", "onnx")
+
+
+def origin() -> dict[str, Any]:
+    """What made a checkpoint, and when (UTC, ISO 8601)."""
+    created = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
+    versions, commit = _software()
+    return {"versions": dict(versions), "git_commit": commit, "created": created}
+
+
+@functools.cache
+def _software() -> tuple[dict[str, str], str | None]:
+    """Versions of Python and packages; the commit of a source tree that bam_train is imported from, if git tells."""
+    versions, commit, root = {"python": platform.python_version()}, None, Path(__file__).resolve().parents[2]
+    for package in _PACKAGES:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            versions[package] = metadata.version(package)
+    if (root / ".git").exists():
+        ask = ["git", "-C", str(root), "rev-parse", "HEAD"]
+        with contextlib.suppress(OSError, subprocess.SubprocessError):
+            done = subprocess.run(ask, capture_output=True, text=True, timeout=5, check=True)
+            commit = done.stdout.strip() or None
+    return versions, commit

@@ -12,7 +12,7 @@ from msgspec import Struct
 from bam_train.atomic_file import remove_orphans
 from bam_train.checkpoint import Checkpoint, next_free_path
 from bam_train.checkpoint.manifest import AGAIN
-from bam_train.errors import AlteredCheckpoint, CheckpointError, OutputError, SettingsError
+from bam_train.errors import AlteredCheckpoint, CheckpointError, OutputError
 from bam_train.settings import TrainSettings, file_stem, read_config
 from bam_train.trainers.resolve_settings import CHANGEABLE
 from bam_train.trainers.run_folder import require_writable
@@ -81,39 +81,26 @@ def _own_best(resumed: Checkpoint) -> Output | None:
     Raises:
         AlteredCheckpoint: The notes are not as they are written.
     """
-    noted = _notes(resumed).best
+    try:
+        noted = msgspec.convert(resumed.json(NOTES), _Notes).best if resumed.has(NOTES) else None
+    except msgspec.ValidationError as error:
+        raise AlteredCheckpoint(resumed.path, NOTES, f"{NOTES}: {error}. {AGAIN}") from error
     if noted is None:
         return None
-    path = Path(noted.path)
-    if noted.path != str(resumed.path.resolve()) and not _is_in_own_folder(resumed):
-        return None
+    path, learnt = Path(noted.path), _what(resumed.manifest.settings)
     try:
+        # An untrusted file may note any path: it counts only in a folder where a run of the same settings made it.
+        config = resumed.path.parent / "config.json"
+        if noted.path != str(resumed.path.resolve()) and _what(read_config(config)) != learnt:
+            return None
         there = Checkpoint.open(path).manifest
-    except (CheckpointError, ValueError):  # such as a null byte in its name
+    except (CheckpointError, ValueError):  # no settings there; a path that is none, such as one with a null byte
         return None
-    if there.steps != noted.steps or _what(there.settings) != _what(resumed.manifest.settings):
+    if there.steps != noted.steps or _what(there.settings) != learnt:
         return None
     interval: Any = there.scores.get("success_interval")
     known = noted.steps, noted.success_rate, noted.return_mean, interval and tuple(interval)
     return Output(path.resolve(), Best(*known, there.scores.get("episodes")))
-
-
-def _notes(resumed: Checkpoint) -> _Notes:
-    if not resumed.has(NOTES):
-        return _Notes()
-    try:
-        return msgspec.convert(resumed.json(NOTES), _Notes)
-    except msgspec.ValidationError as error:
-        raise AlteredCheckpoint(resumed.path, NOTES, f"{NOTES}: {error}. {AGAIN}") from error
-
-
-def _is_in_own_folder(resumed: Checkpoint) -> bool:
-    """Whether the file lies where a run here made it: an untrusted file may note any path as its best."""
-    try:
-        settings = read_config(resumed.path.parent / "config.json")
-    except SettingsError:
-        return False
-    return _what(settings) == _what(resumed.manifest.settings)
 
 
 def _what(settings: dict[str, Any]) -> dict[str, Any]:

@@ -46,7 +46,7 @@ class Choice(Layer):
         super().__init__()
         self.single = isinstance(space, spaces.Discrete)
         self.counts: list[int] = [int(space.n)] if isinstance(space, spaces.Discrete) else space.nvec.tolist()
-        self.dtype = torch.int64 if self.single else torch_dtype(space.dtype)
+        self.dtype = torch.int64 if self.single else torch.as_tensor(np.zeros((), space.dtype)).dtype
         self.starts, self.shifted = torch.as_tensor(np.asarray(space.start)), bool(np.any(space.start))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -64,13 +64,9 @@ class Choice(Layer):
 
 
 def zeros(observation: Mapping[str, Any], is_dict: bool) -> dict[str, torch.Tensor]:
-    """Two rows of zeros for every array of an observation, by the name of the frozen policy's input."""
-    return {
-        f"observation.{key}" if is_dict else "observation": torch.zeros(
-            (2, *(space.shape or ())), dtype=torch_dtype(space.dtype)
-        )
-        for key, space in observation.items()
-    }
+    """Two observations of zeros: an array for every input of the frozen policy, by name."""
+    arrays = {key: np.zeros((2, *space.shape), space.dtype) for key, space in observation.items()}
+    return {f"observation.{key}" if is_dict else "observation": torch.as_tensor(one) for key, one in arrays.items()}
 
 
 def to(x: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
@@ -78,12 +74,6 @@ def to(x: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
     return x if x.dtype == dtype else x.to(dtype)
 
 
-def torch_dtype(dtype: Any) -> torch.dtype:
-    """Return torch's name for a NumPy dtype."""
-    return torch.as_tensor(np.zeros((), dtype)).dtype
-
-
-_OPSET = 17
 # The TorchScript exporter says that it will go; it is 20 times as fast as its successor and needs no onnxscript.
 _NOTICES = ("You are using the legacy TorchScript-based ONNX export", "The feature will be removed")
 
@@ -111,7 +101,7 @@ def onnx_file(
             tuple(inputs.values()),
             file,
             dynamo=False,
-            opset_version=_OPSET,
+            opset_version=17,
             input_names=list(inputs),
             output_names=list(outputs),
             dynamic_axes={name: {0: "n"} for name in [*inputs, *outputs]},
@@ -126,12 +116,7 @@ Array = NDArray[Any]
 
 
 def affordable(observation: Iterable[Any], n: int) -> int:
-    """How many rows of these arrays to record: `n`, fewer if they are large.
-
-    Args:
-        observation: Spaces of the arrays.
-        n: Wanted.
-    """
+    """How many of `n` observations to record, of arrays in these spaces: fewer if they are large."""
     size = sum(math.prod(leaf.shape or ()) * np.dtype(leaf.dtype).itemsize for leaf in observation)
     return min(n, max(4, _BUDGET // (size or 1)))
 
@@ -165,11 +150,11 @@ def draw_array(space: Any, n: int, rng: np.random.Generator, moments: tuple[Arra
 
 
 def clearest(module: Any, observations: Mapping[str, Array], n: int) -> dict[str, Array]:
-    """The n rows whose choice is clearest: where two choices tie, rounding decides, and that proves nothing.
+    """The n observations whose choice is clearest: where two choices tie, rounding decides, and that proves nothing.
 
     Args:
         module: The frozen policy as a torch module, with ``scores`` and ``head.margin``.
-        observations: By key, rows of each.
+        observations: By key, (m, ...) each.
         n: At most.
     """
     with torch.no_grad():
@@ -179,11 +164,6 @@ def clearest(module: Any, observations: Mapping[str, Array], n: int) -> dict[str
 
 
 def pack(observations: Mapping[str, Array], actions: Array) -> bytes:
-    """Write the checkpoint's member.
-
-    Args:
-        observations: By key of a Dict, or just ``""``; (n, ...) each.
-        actions: For them, (n, ...).
-    """
+    """Write golden observations, by key of a Dict or just ``""``, and their actions, (n, ...) each, as safetensors."""
     named = {f"observation.{key}" if key else "observation": value for key, value in observations.items()}
     return safetensors_file.dump({**named, "action": actions})

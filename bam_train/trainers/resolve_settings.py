@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
+from bam_envs.core.errors import UnknownName
+from bam_envs.core.registry import entry_of, resolve_id
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import require_no_place
 from bam_train.environments import environment_of, require_env_kwargs
@@ -42,10 +44,15 @@ def resolve(given: Mapping[str, Any]) -> TrainSettings:
     env = resolve_env(given["env"], elsewhere=bool(given.get("transport")))
     trainer = given.get("trainer") or "sb3"
     require_algorithm(trainer, given["algo"])
-    preset = read_preset(_tuned_as(env), given["algo"], trainer)
+    entry = entry_of(env)
+    preset = read_preset(env if entry is None else entry.id, given["algo"], trainer)  # robo-gym's ids are names of ours
     settings = TrainSettings.from_mapping(merge(preset, given, {"env": env}))
     _require_of_trainer(settings)
-    _require_env_kwargs(env, settings.env_kwargs)
+    require_env_kwargs(env, settings.env_kwargs)
+    try:
+        require_no_place(settings.env_kwargs)
+    except ValueError as error:
+        raise SettingsError(f"{error}; leave it out") from error
     if settings.transport and settings.env_kwargs:
         raise SettingsError(
             f"env_kwargs: {', '.join(settings.env_kwargs)}: the environment runs at {settings.place.text}; "
@@ -60,19 +67,11 @@ def resolve(given: Mapping[str, Any]) -> TrainSettings:
 
 def _require_of_trainer(settings: TrainSettings) -> None:
     """Refuse settings that belong to the other trainer."""
-    defaults = {field.name: field.default for field in fields(TrainSettings)}
-    for name in OF_RLLIB if settings.trainer == "sb3" else ():
-        if getattr(settings, name) != defaults[name]:
-            raise SettingsError(f"{name}: the sb3 trainer has no use for it; leave it out, or add --trainer rllib")
-
-
-def _require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
-    """Refuse arguments that an environment does not take, and those that no checkpoint may hold."""
-    require_env_kwargs(env, given)
-    try:
-        require_no_place(given)
-    except ValueError as error:
-        raise SettingsError(f"{error}; leave it out") from error
+    if settings.trainer == "sb3":
+        for field in fields(TrainSettings):
+            if field.name in OF_RLLIB and getattr(settings, field.name) != field.default:
+                text = "the sb3 trainer has no use for it; leave it out, or add --trainer rllib"
+                raise SettingsError(f"{field.name}: {text}")
 
 
 def own_settings(checkpoint: Checkpoint, env: str | None = None, *, elsewhere: bool = False) -> dict[str, Any]:
@@ -90,28 +89,9 @@ def own_settings(checkpoint: Checkpoint, env: str | None = None, *, elsewhere: b
     module = manifest.env.rpartition(":")[0]
     env_id, env_kwargs = environment_of(checkpoint, env if module and not elsewhere else None, elsewhere=elsewhere)
     what = {"env": env_id, "env_kwargs": env_kwargs, "algo": manifest.algorithm, "trainer": manifest.trainer}
-    own = {
-        name: value for name, value in manifest.settings.items() if name != "exported"
-    }  # out of a directory of RLlib
-    return {**own, **NOWHERE, **what}
-
-
-def _require_place(checkpoint: Checkpoint, given: Mapping[str, Any]) -> None:
-    """Ask again where a run computes that did not compute here."""
-    settings = checkpoint.manifest.settings
-    for name, flag, here in (
-        ("transport", "--transport", "--transport '' to go on in the simulation here"),
-        ("address", "--address", "--set address=null to go on here"),
-        ("data", "--data", ""),
-    ):
-        own = settings.get(name)
-        remote = "://" in str(own) if name == "data" else bool(own)
-        if remote and name not in given:
-            raise CheckpointMismatch(
-                checkpoint.path,
-                f"was trained with {flag} {own!r}, and an address is never read from a file: "
-                f"give {flag} again{here and f', or {here}'}",
-            )
+    own = {**manifest.settings, **NOWHERE, **what}
+    own.pop("exported", None)  # of a checkpoint out of a directory of RLlib
+    return own
 
 
 def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSettings:
@@ -122,14 +102,26 @@ def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSe
         SettingsError: An unknown setting, or the run has all its steps already.
     """
     check_names(given, "settings")
-    if set(checkpoint.manifest.settings) == {"exported"}:
+    saved = checkpoint.manifest.settings
+    if set(saved) == {"exported"}:
         text = "was exported from a directory of RLlib and holds the policy alone: training cannot go on from it"
         raise CheckpointMismatch(checkpoint.path, f"{text}. Train anew, or go on with RLlib from its own directory")
-    _require_place(checkpoint, given)
-    own = own_settings(checkpoint, given.get("env"), elsewhere=bool(given.get("transport")))
-    asked = dict(given)
+    for name, here in (
+        ("transport", ", or --transport '' to go on in the simulation here"),
+        ("address", ", or --set address=null to go on here"),
+        ("data", ""),
+    ):
+        remote = "://" in str(saved.get(name)) if name == "data" else bool(saved.get(name))
+        if remote and name not in given:
+            raise CheckpointMismatch(
+                checkpoint.path,
+                f"was trained with --{name} {saved[name]!r}, and an address is never read from a file: "
+                f"give --{name} again{here}",
+            )
+    elsewhere = bool(given.get("transport"))
+    own, asked = own_settings(checkpoint, given.get("env"), elsewhere=elsewhere), dict(given)
     if given.get("env") is not None:
-        asked["env"] = resolve_env(given["env"], elsewhere=bool(given.get("transport")))
+        asked["env"] = resolve_env(given["env"], elsewhere=elsewhere)
     if asked.get("normalize") is True and own.get("normalize"):
         del asked["normalize"]
     settings = TrainSettings.from_mapping(merge(own, asked), str(checkpoint.path))
@@ -139,8 +131,18 @@ def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSe
     _require_of_trainer(settings)
     completed = load_trainer(settings.trainer).complete(settings)  # refuses names that the algorithm does not have
     _require_same(fixed, checkpoint)
-    _require_steps_left(checkpoint, completed)
+    done = checkpoint.manifest.steps
+    if done >= completed.steps:
+        text = f"has trained {done} of {completed.steps} steps already; give a larger total with --steps"
+        raise SettingsError(f"{checkpoint.path}: {text}")
     return completed
+
+
+def _require_same(differing: list[tuple[str, Any, Any]], checkpoint: Checkpoint) -> None:
+    """Refuse the first setting that is asked for otherwise than the checkpoint has it."""
+    for name, wanted, found in differing[:1]:
+        text = f"was trained with {name} {found!r}, not {wanted!r}. Leave {name} out to go on with it, or train anew"
+        raise CheckpointMismatch(checkpoint.path, text)
 
 
 def resolve_env(name: str, *, elsewhere: bool = False) -> str:
@@ -154,36 +156,9 @@ def resolve_env(name: str, *, elsewhere: bool = False) -> str:
         UnknownName: No such environment; it carries the closest match.
         InvalidValue: ``module:Env-v0`` whose module is not there.
     """
-    import bam_envs  # noqa: F401 - registers our environments
-    from bam_envs.core.errors import UnknownName
-    from bam_envs.core.registry import resolve_id
-
     try:
         return resolve_id(name)
     except UnknownName:
         if elsewhere:
             return name  # the server says whether it has it
         raise
-
-
-def _tuned_as(env: str) -> str:
-    """Under which id the presets of `env` are: robo-gym's ids are names of ours."""
-    from bam_envs.core.registry import entry_of
-
-    entry = entry_of(env)
-    return env if entry is None else entry.id
-
-
-def _require_same(differing: list[tuple[str, Any, Any]], checkpoint: Checkpoint) -> None:
-    """Refuse the first setting that is asked for otherwise than the checkpoint has it."""
-    for name, wanted, found in differing[:1]:
-        text = f"was trained with {name} {found!r}, not {wanted!r}. Leave {name} out to go on with it, or train anew"
-        raise CheckpointMismatch(checkpoint.path, text)
-
-
-def _require_steps_left(checkpoint: Checkpoint, settings: TrainSettings) -> None:
-    done = checkpoint.manifest.steps
-    if done >= settings.steps:
-        raise SettingsError(
-            f"{checkpoint.path}: has trained {done} of {settings.steps} steps already; give a larger total with --steps"
-        )

@@ -7,15 +7,19 @@
     tensorboard/        event files
     last.zip            the newest checkpoint; `--resume` goes on from it
     learning-curve.png  return and success over steps
+
+And copies of its best checkpoint at an fsspec address, such as a bucket: what is left of a computer that goes away.
 """
 
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
+import posixpath
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,18 +31,35 @@ LEAST_FREE = 20_000_000
 
 
 class RunFolder:
-    """The folder of one run; made new.
+    """The folder of one run; made new, and what killed runs of the same name left half written is removed.
 
     Args:
         root: The folder that runs are kept in.
-        name: What the run is called; ``-2``, ``-3``, … is added while the name is taken.
+        name: What the run is called; ``-2``, ``-3``, … is added while the name is taken, also by another process.
 
     Attributes:
         path: The folder.
+
+    Raises:
+        OutputError: From the constructor and every method: it cannot be written.
     """
 
     def __init__(self, root: Path, name: str) -> None:
-        self.path = _make_folder(root, name)
+        with _writing(root):
+            root.mkdir(parents=True, exist_ok=True)
+        self.path, number = root / name, 1
+        while True:
+            try:
+                with _writing(self.path):
+                    self.path.mkdir()
+                break
+            except OutputError as error:
+                if not isinstance(error.__cause__, FileExistsError):
+                    raise
+            for checkpoint in ("last.zip", "best.zip"):
+                remove_orphans(self.path / checkpoint)
+            number += 1
+            self.path = root / f"{name}-{number}"
         self.last = self.path / "last.zip"
         self.tensorboard = self.path / "tensorboard"
         self.curve = self.path / "learning-curve.png"
@@ -56,10 +77,8 @@ class RunFolder:
 
     def records(self) -> list[dict[str, Any]]:
         """All records so far, but for lines that a full disk cut off."""
-        if not self._progress.exists():
-            return []
         records = []
-        for line in self._progress.read_text(encoding="utf-8").splitlines():
+        for line in self._progress.read_text(encoding="utf-8").splitlines() if self._progress.exists() else ():
             with contextlib.suppress(ValueError):
                 records.append(json.loads(line))
         return records
@@ -70,18 +89,13 @@ class RunFolder:
             path.unlink(missing_ok=True)
 
 
-class _writing:  # noqa: N801 - reads as `with _writing(path)`
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[None]:
     """Maps failures to write `path` to `OutputError`."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __enter__(self) -> None:
-        return
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        if isinstance(error, OSError) and not isinstance(error, OutputError):
-            raise unwritable(self.path, error, "--runs") from error
+    try:
+        yield
+    except OSError as error:
+        raise unwritable(path, error, "--runs") from error
 
 
 def unwritable(path: Path, error: Exception, flag: str) -> OutputError:
@@ -98,29 +112,6 @@ def unwritable(path: Path, error: Exception, flag: str) -> OutputError:
         in_the_way = next((one for one in (path, *path.parents) if one.is_file()), None)
         why = f"{in_the_way or path} is a file, expected a folder"
     return OutputError(f"{path}: cannot be written: {why}. Choose another place with {flag}")
-
-
-def _make_folder(root: Path, name: str) -> Path:
-    """Make the first folder of name, name-2, name-3, … that is not there; two programs never get the same one.
-
-    From those that are there, what killed runs left half written is removed.
-    """
-    with _writing(root):
-        root.mkdir(parents=True, exist_ok=True)
-    number = 1
-    while True:
-        path = root / (name if number == 1 else f"{name}-{number}")
-        try:
-            with _writing(path):
-                path.mkdir()
-        except OutputError as error:
-            if not isinstance(error.__cause__, FileExistsError):
-                raise
-            for checkpoint in ("last.zip", "best.zip"):
-                remove_orphans(path / checkpoint)
-            number += 1
-            continue
-        return path
 
 
 def require_writable(path: Path) -> None:
@@ -180,8 +171,19 @@ def draw_curve(records: Sequence[dict[str, Any]], title: str, path: Path) -> Non
     figure = Figure(figsize=(8, 2.6 * len(names) + 0.8), layout="constrained")
     FigureCanvasAgg(figure)
     plots = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    styles: dict[str, Any] = {
+        "training": {"linewidth": 1, "alpha": 0.7},
+        "evaluation": {"marker": "o", "markersize": 4},
+    }
     for axes, name in zip(plots, names, strict=True):
-        _draw(axes, records, name)
+        for kind, style in styles.items():
+            known = [record for record in records if record["kind"] == kind and record.get(name) is not None]
+            if known:
+                axes.plot([one["steps"] for one in known], [one[name] for one in known], label=kind, **style)
+        axes.set_ylabel({"return_mean": "mean return", "success_rate": "success rate"}[name])
+        if name == "success_rate":
+            axes.set_ylim(-0.03, 1.03)
+        axes.grid(alpha=0.3)
     plots[0].set_title(title)
     if plots[0].get_legend_handles_labels()[0]:
         plots[0].legend(loc="lower right")
@@ -192,12 +194,45 @@ def draw_curve(records: Sequence[dict[str, Any]], title: str, path: Path) -> Non
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def _draw(axes: Any, records: Sequence[dict[str, Any]], name: str) -> None:
-    for kind, style in (("training", {"linewidth": 1, "alpha": 0.7}), ("evaluation", {"marker": "o", "markersize": 4})):
-        rows = [(row["steps"], row[name]) for row in records if row["kind"] == kind and row.get(name) is not None]
-        if rows:
-            axes.plot(*zip(*rows, strict=True), label=kind, **style)
-    axes.set_ylabel({"return_mean": "mean return", "success_rate": "success rate"}[name])
-    if name == "success_rate":
-        axes.set_ylim(-0.03, 1.03)
-    axes.grid(alpha=0.3)
+class Copies:
+    """Where checkpoints are copied to.
+
+    Args:
+        url: An fsspec address, such as ``s3://bucket/runs/`` or ``file:///mnt/share/pick.zip``. One that ends in
+            ``.zip`` is the copy's own; any other is a folder.
+
+    Raises:
+        OutputError: It is no address, there is no such kind of address, or a package that it needs is missing.
+    """
+
+    def __init__(self, url: str) -> None:
+        self.url = url
+        if "://" not in url:
+            raise OutputError(f"{url}: --copy-to expects an address, such as s3://bucket/runs/, or a file's: file:///…")
+        try:
+            fsspec: Any = importlib.import_module("fsspec.core")
+        except ModuleNotFoundError as error:
+            raise OutputError("--copy-to needs fsspec, which is not installed. Run: pip install fsspec") from error
+        try:
+            self._files, self._path = fsspec.url_to_fs(url)
+        except (ImportError, ValueError) as error:  # a package that is missing, a protocol that is not known
+            raise OutputError(f"{url}: cannot be copied to: {' '.join(str(error).split())}") from error
+
+    def copy(self, checkpoint: Path) -> None:
+        """Copy a checkpoint there, over an earlier copy.
+
+        Raises:
+            OutputError: It could not be copied.
+        """
+        target = self._path if self._path.endswith(".zip") else posixpath.join(self._path, checkpoint.name)
+        try:
+            if "file" not in self._files.protocol:
+                self._files.put_file(str(checkpoint), target)
+                return
+            # A bucket shows a file when all of it is there; a folder shows it from its first byte on.
+            self._files.makedirs(posixpath.dirname(target), exist_ok=True)
+            self._files.put_file(str(checkpoint), f"{target}.tmp")
+            self._files.mv(f"{target}.tmp", target)
+        except Exception as error:  # every kind of storage has errors of its own
+            why = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            raise OutputError(f"{self.url}: {checkpoint} could not be copied there: {why}") from error

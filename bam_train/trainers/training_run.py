@@ -22,8 +22,7 @@ from bam_train.errors import EnvironmentFailed, OutputError, ProcessesLost, Trai
 from bam_train.evaluation import BatchPolicy, EvaluationReport, evaluate
 from bam_train.settings import TrainSettings
 from bam_train.trainers.base import Progress, Statistics, Trainer
-from bam_train.trainers.checkpoint_copies import Copies
-from bam_train.trainers.run_folder import RunFolder, unwritable
+from bam_train.trainers.run_folder import Copies, RunFolder, unwritable
 
 SAVE_EVERY = 30.0
 """Seconds between two saves at least, unless an evaluation comes first."""
@@ -128,11 +127,11 @@ class TrainingRun:
     ) -> None:
         self.trainer, self.folder, self.out, self.watcher, self.best = trainer, folder, out, watcher, best
         self.settings: TrainSettings = trainer.settings
+        self.done = False
         self._clock, self._copies = clock, copies
         self._start = self._recorded = self._saved = clock()
         self._first_step = trainer.steps
         self._save_pause = FIRST_SAVE
-        self.done = False
         self._stop = self._reached = False
         self._evaluated_at = trainer.steps if best else 0
         self._report: EvaluationReport | None = None
@@ -162,16 +161,15 @@ class TrainingRun:
             self.trainer.train(self.settings.steps, self._between)
             if not self._stop and self._evaluated_at < self.trainer.steps:
                 self._evaluate()
-        except ProcessesLost as error:
+        except (ProcessesLost, RobotFault) as error:  # what was learnt so far is good
             self._save_last()
-            raise TrainingFailed(f"at step {self.trainer.steps}: {error}. {self._learnt}") from error
-        except TrainingFailed as error:
-            raise TrainingFailed(f"{error}; {self._last_good}") from error
-        except EnvironmentFailed as error:  # in the middle of an update, which is not saved
-            raise TrainingFailed(f"at step {self.trainer.steps}: {error}; {self._last_good}") from error
-        except RobotFault as error:  # what was learnt so far is not lost with the link
-            self._save_last()
-            raise TrainingFailed(f"at step {self.trainer.steps}: {error} {self._learnt}") from error
+            kept = f"go on with --resume {self.folder.last}" if self._last_steps else "nothing had been learnt yet"
+            text = f"at step {self.trainer.steps}: {str(error).rstrip('.')}. What was learnt is kept: {kept}"
+            raise TrainingFailed(text) from error
+        except (TrainingFailed, EnvironmentFailed) as error:  # in the middle of an update, which is not saved
+            where = "" if isinstance(error, TrainingFailed) else f"at step {self.trainer.steps}: "
+            good = f"the last good checkpoint is {self.last}" if self.last else "no checkpoint had been saved yet"
+            raise TrainingFailed(f"{where}{error}; {good}") from error
         self._save_last()
         if self._stop and self._kept is None and not self.out.exists():
             self._kept = self.out if self._write(self.out, None, "--out") else None  # the newest: none was evaluated
@@ -179,29 +177,23 @@ class TrainingRun:
         if "copy" in self._failures:
             self._copy()  # what was in the way may be gone
         self.done = True
-        return self._outcome()
-
-    @property
-    def _last_good(self) -> str:
-        return f"the last good checkpoint is {self.last}" if self.last else "no checkpoint had been saved yet"
-
-    @property
-    def _learnt(self) -> str:
-        """What is left of a run that something outside it ended."""
-        kept = f"go on with --resume {self.folder.last}" if self._last_steps else "nothing had been learnt yet"
-        return f"What was learnt is kept: {kept}"
-
-    def _outcome(self) -> Outcome:
-        reason = "stopped" if self._stop else "success" if self._reached else "steps"
-        seconds = self._clock() - self._start
-        last = self.folder.last if self._last_steps else None
-        failure = next(iter(self._failures.values()), None)
-        best, kept, scores = self.best, self._kept, self._best_scores
-        return Outcome(reason, self.trainer.steps, seconds, best, scores, kept, last, self._last_steps, failure)
+        return Outcome(
+            reason="stopped" if self._stop else "success" if self._reached else "steps",
+            steps=self.trainer.steps,
+            seconds=self._clock() - self._start,
+            best=self.best,
+            scores=self._best_scores,
+            checkpoint=self._kept,
+            last=self.folder.last if self._last_steps else None,
+            last_steps=self._last_steps,
+            failure=next(iter(self._failures.values()), None),
+        )
 
     def _between(self, progress: Progress) -> bool:
         """What happens between two updates; False ends training."""
-        self._note()
+        for notice in self.trainer.notices[self._noted :]:
+            self.watcher.note(notice)
+        self._noted = len(self.trainer.notices)
         if self._stop:
             return False
         self._record(progress)
@@ -211,13 +203,6 @@ class TrainingRun:
         elif self._clock() - self._saved > self._save_pause:
             self._save_last()
         return not (self._stop or self._reached)
-
-    def _note(self) -> None:
-        """Pass on what the trainer wants known since the last time."""
-        notices = self.trainer.notices
-        for notice in notices[self._noted :]:
-            self.watcher.note(notice)
-        self._noted = len(notices)
 
     def _due(self, progress: Progress) -> bool:
         """Whether to evaluate: every so many steps, and early once training itself succeeds as often as wanted."""
@@ -236,7 +221,17 @@ class TrainingRun:
         statistics = progress.statistics()
         rate = (progress.steps - self._first_step) / max(now - self._start, 1e-9)
         left = (progress.total - progress.steps) / rate if rate > 0 else None
-        self._add(_training_record(progress.steps, now - self._start, rate, statistics))
+        record = {
+            "kind": "training",
+            "steps": progress.steps,
+            "seconds": round(now - self._start, 3),
+            "steps_per_second": round(rate, 1),
+            "episodes": statistics.episodes,
+            "return_mean": statistics.return_mean,
+            "length_mean": statistics.length_mean,
+            "success_rate": statistics.success_rate,
+        }
+        self._add({**record, **statistics.metrics})
         self.watcher.training(progress, statistics, rate, left)
 
     def _evaluate(self) -> None:
@@ -311,8 +306,12 @@ class TrainingRun:
 
     def _write(self, path: Path, kept: Path | None, flag: str) -> bool:
         """Write a checkpoint, which notes that the best one is at `kept`; whether it could be."""
+        notes: dict[str, Any] = {"best": None}  # what a resumed run needs to go on keeping the best in the same file
+        if (best := self.best) is not None and kept is not None:
+            noted = {"steps": best.steps, "success_rate": best.success_rate, "return_mean": best.return_mean}
+            notes = {"best": {**noted, "path": str(kept.resolve())}}  # the rest is among the scores of that file
         try:
-            self.trainer.save(path, self._scores(), self._notes(kept))
+            self.trainer.save(path, self._scores(), notes)
         except OutputError as error:
             self._failures[path.name] = unwritable(path, error, flag)
             self.watcher.note(f"{self._failures[path.name]}{'. Training goes on' if self._goes_on else ''}")
@@ -327,28 +326,6 @@ class TrainingRun:
     def _scores(self) -> dict[str, Any]:
         """The newest evaluation and the steps at which it was made, for a manifest."""
         return {} if self._report is None else {**self._report.to_json(), "steps": self._evaluated_at}
-
-    def _notes(self, kept: Path | None) -> dict[str, Any]:
-        """What a resumed run needs to go on keeping the best in the same file."""
-        if self.best is None or kept is None:
-            return {"best": None}
-        best = self.best  # the rest is among the scores of the file itself
-        noted = {"steps": best.steps, "success_rate": best.success_rate, "return_mean": best.return_mean}
-        return {"best": {**noted, "path": str(kept.resolve())}}
-
-
-def _training_record(steps: int, seconds: float, rate: float, statistics: Statistics) -> dict[str, Any]:
-    return {
-        "kind": "training",
-        "steps": steps,
-        "seconds": round(seconds, 3),
-        "steps_per_second": round(rate, 1),
-        "episodes": statistics.episodes,
-        "return_mean": statistics.return_mean,
-        "length_mean": statistics.length_mean,
-        "success_rate": statistics.success_rate,
-        **statistics.metrics,
-    }
 
 
 EVALUATION_SEED = 2_000_000
@@ -375,27 +352,21 @@ def evaluate_for_success(
     Returns:
         The report (the worse of two), and whether ``until_success`` was reached.
     """
+
+    def play(first: int, count: int) -> EvaluationReport:
+        seed = EVALUATION_SEED + settings.seed + first
+        return evaluate(policy, settings.env, settings.env_kwargs, episodes=count, seed=seed, env=envs)
+
     episodes, wanted = settings.eval_episodes, settings.until_success
     if wanted is None:
-        return _episodes(policy, settings, 0, episodes, envs), False
+        return play(0, episodes), False
     if not last:
-        look = _episodes(policy, settings, 0, math.ceil(episodes / 4), envs)
-        if _failures(look) > (1 - wanted) * episodes + 1e-9:
+        look = play(0, math.ceil(episodes / 4))
+        if look.successes is not None and look.episodes - look.successes > (1 - wanted) * episodes + 1e-9:
             return look, False
-    report = _episodes(policy, settings, 0, episodes, envs)
+    report = play(0, episodes)
     if report.success_rate is None or report.success_rate < wanted:
         return report, False
-    again = _episodes(policy, settings, episodes, episodes, envs)
+    again = play(episodes, episodes)
     worse = min(report, again, key=lambda one: one.success_rate or 0.0)
     return worse, again.success_rate is not None and again.success_rate >= wanted
-
-
-def _episodes(
-    policy: BatchPolicy, settings: TrainSettings, skip: int, count: int, envs: VectorEnv[Any, Any, Any] | None
-) -> EvaluationReport:
-    seed = EVALUATION_SEED + settings.seed + skip
-    return evaluate(policy, settings.env, settings.env_kwargs, episodes=count, seed=seed, env=envs)
-
-
-def _failures(report: EvaluationReport) -> int:
-    return 0 if report.successes is None else report.episodes - report.successes

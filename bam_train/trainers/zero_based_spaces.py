@@ -13,8 +13,9 @@ _Counted = (spaces.Discrete, spaces.MultiDiscrete)
 
 def from_zero(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
     """The environment with every Discrete and MultiDiscrete counted from 0; itself if they all are already."""
-    shifted = _shifted(env.action_space) or _shifted(env.observation_space)
-    return FromZero(env) if shifted else env
+    wrapped = FromZero(env)
+    same = (wrapped.observation_space, wrapped.action_space) == (env.observation_space, env.action_space)
+    return env if same else wrapped
 
 
 class FromZero(gym.Wrapper[Any, Any, Any, Any]):
@@ -50,22 +51,12 @@ def less_start(space: spaces.Space[Any], value: Any) -> Any:
     return value - space.start if isinstance(space, _Counted) else value
 
 
-def _shifted(space: spaces.Space[Any]) -> bool:
-    if isinstance(space, spaces.Dict):
-        return any(_shifted(leaf) for leaf in space.spaces.values())
-    return isinstance(space, _Counted) and bool(np.any(space.start))
-
-
 def _from_zero(space: spaces.Space[Any]) -> spaces.Space[Any]:
     if isinstance(space, spaces.Dict):
         return spaces.Dict({key: _from_zero(leaf) for key, leaf in space.spaces.items()})
+    if not isinstance(space, _Counted):
+        return space
+    dtype: Any = np.dtype(space.dtype).type
     if isinstance(space, spaces.Discrete):
-        return spaces.Discrete(int(space.n), dtype=_integer(space))
-    if isinstance(space, spaces.MultiDiscrete):
-        return spaces.MultiDiscrete(space.nvec, dtype=_integer(space))
-    return space
-
-
-def _integer(space: Any) -> type[np.integer[Any]]:
-    dtype: type[np.integer[Any]] = np.dtype(space.dtype).type
-    return dtype
+        return spaces.Discrete(int(space.n), dtype=dtype)
+    return spaces.MultiDiscrete(space.nvec, dtype=dtype)

@@ -30,8 +30,7 @@ from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
-from bam_train.trainers.base import OnProgress, Progress, Statistics
-from bam_train.trainers.manifest_fields import manifest
+from bam_train.trainers.base import OnProgress, Progress, Statistics, manifest
 from bam_train.trainers.resolve_settings import own_settings
 from bam_train.trainers.rllib import rllib_state
 from bam_train.trainers.rllib.algorithm_config import envs_each, make_config, refusals
@@ -247,17 +246,10 @@ class RLlibTrainer:
                 "bam/golden.safetensors": golden(parts, self._run_by_rllib(module)),
                 **rllib_state.members(self.algorithm, notes),
             }
-        return write_checkpoint(path, self._manifest(scores), members)
-
-    def _manifest(self, scores: Mapping[str, Any]) -> dict[str, Any]:
-        return manifest(
-            self.settings,
-            (self._seen.observation_space, self._seen.action_space),
-            signals=self._seen.signals,
-            period=self._seen.period,
-            steps=self.steps,
-            scores=scores,
-        )
+        seen = self._seen
+        spaces = seen.observation_space, seen.action_space
+        known = {"signals": seen.signals, "period": seen.period, "steps": self.steps, "scores": scores}
+        return write_checkpoint(path, manifest(self.settings, spaces, known), members)
 
     def freeze(self) -> FrozenPolicy:
         """The policy as it is now."""

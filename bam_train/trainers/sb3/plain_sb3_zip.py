@@ -66,14 +66,10 @@ def load_trusted(path: Path, algo: str, env_id: str, env_kwargs: Mapping[str, An
         model = algorithm.load(path, env=from_zero(env), device="cpu")
         graph = freeze(model, None, env.observation_space, env.action_space)
     except (*_MISFIT, *_DAMAGE) as error:
-        text = f"{algorithm.__name__}.load cannot use it with {env_id}: {_sentence(error)} Check --algo and --env"
+        why = textwrap.shorten(str(error) or type(error).__name__, 160, placeholder=" ...")
+        why = why if why.endswith("...") else f"{why.rstrip('.')}."
+        text = f"{algorithm.__name__}.load cannot use it with {env_id}: {why} Check --algo and --env"
         raise CheckpointMismatch(path, text) from error
     policy = FrozenPolicy.from_graph(graph, space_to_json(env.observation_space), space_to_json(env.action_space))
     env.close()  # type: ignore[no-untyped-call]
     return ForeignModel(policy, int(model.num_timesteps))
-
-
-def _sentence(error: Exception, most: int = 160) -> str:
-    """What an error says, as one line; what is too long ends at a word and with dots."""
-    text = textwrap.shorten(str(error) or type(error).__name__, most, placeholder=" ...")
-    return text if text.endswith("...") else f"{text.rstrip('.')}."

@@ -6,6 +6,8 @@ the CPU: the model is not touched and no random number is drawn.
 
 Inputs are ``observation`` (``observation.<key>`` of a Dict) in the environment's own dtype and layout, and for
 recurrent policies ``state.<name>``; outputs are ``action`` and ``next_state.<name>``; the first axis is the batch.
+
+Golden actions are what the trainer itself does on some observations; the graph is checked against them.
 """
 
 from __future__ import annotations
@@ -20,12 +22,25 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecNormalize, VecTransposeImage, unwrap_vec_wrapper
 from torch import nn
 
 from bam_train.errors import PolicyError
-from bam_train.trainers.frozen_network import Choice, Layer, OneHot, onnx_file, to, zeros
+from bam_train.trainers.frozen_network import (
+    Choice,
+    Layer,
+    OneHot,
+    affordable,
+    clearest,
+    draw_array,
+    onnx_file,
+    pack,
+    to,
+    zeros,
+)
+from bam_train.trainers.zero_based_spaces import less_start, plus_start
 
+_GOLDEN = 256  # golden actions, fewer if observations are large
 _KINDS = "Box, Discrete, MultiDiscrete or MultiBinary"
 
 
@@ -54,9 +69,7 @@ class _Numbers(Layer):
         return x / 255.0 if self.pixels else x
 
 
-def encoder(
-    key: str, raw: spaces.Space[Any], seen: spaces.Space[Any], statistics: Any, scale_images: bool
-) -> nn.Module:
+def _encoder(key: str, raw: spaces.Space[Any], seen: spaces.Space[Any], statistics: Any, scale: bool) -> nn.Module:
     """Return what turns one raw array into what the policy's feature extractor takes.
 
     Args:
@@ -64,7 +77,7 @@ def encoder(
         raw: As the environment gives it.
         seen: As the policy was built for; its image's channels may have been moved to the front.
         statistics: Mean, standard deviation and limit of VecNormalize, or None.
-        scale_images: Whether the policy divides images by 255.
+        scale: Whether the policy divides images by 255.
     """
     if isinstance(raw, (spaces.Discrete, spaces.MultiDiscrete)):
         return OneHot(raw)
@@ -75,7 +88,7 @@ def encoder(
         raise PolicyError(
             f"observation {key!r}: the policy takes shape {seen.shape}, the environment gives {raw.shape}"
         )
-    return _Numbers(statistics, channels_last, scale_images and is_image_space(seen))
+    return _Numbers(statistics, channels_last, scale and is_image_space(seen))
 
 
 # Network
@@ -100,7 +113,13 @@ class _Lstm(Layer):
         if lstm.bidirectional or lstm.proj_size or not lstm.bias:
             raise PolicyError("an LSTM that is bidirectional, projects or has no bias cannot be frozen")
         self.sizes = [lstm.hidden_size] * lstm.num_layers
-        self.gates = nn.ModuleList(_gates(lstm, layer) for layer in range(lstm.num_layers))
+        self.gates = nn.ModuleList()  # of each layer, one linear layer from (input, hidden) to the four gates
+        for weights in lstm.all_weights:
+            w_input, w_hidden, b_input, b_hidden = (weight.detach() for weight in weights)
+            weight = torch.cat([w_input, w_hidden], 1)
+            gates = nn.utils.skip_init(nn.Linear, weight.shape[1], weight.shape[0])
+            gates.weight.data, gates.bias.data = weight, b_input + b_hidden
+            self.gates.append(gates)
 
     def forward(self, x: torch.Tensor, state: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, list[torch.Tensor]]:
         following = []
@@ -113,16 +132,7 @@ class _Lstm(Layer):
         return x, following
 
 
-def _gates(lstm: nn.LSTM, layer: int) -> nn.Linear:
-    """Return one linear layer from (input, hidden) to the four gates."""
-    w_input, w_hidden, b_input, b_hidden = (weight.detach() for weight in lstm.all_weights[layer])
-    weight = torch.cat([w_input, w_hidden], 1)
-    gates = nn.utils.skip_init(nn.Linear, weight.shape[1], weight.shape[0])
-    gates.weight.data, gates.bias.data = weight, b_input + b_hidden
-    return gates
-
-
-def network(policy: BasePolicy) -> tuple[Any, nn.Module, nn.Module, nn.Module | None]:
+def _network(policy: BasePolicy) -> tuple[Any, nn.Module, nn.Module, nn.Module | None]:
     """Return the module that owns the network, and copies of its feature extractor, its layers and its LSTM if any."""
     lstm = None
     if isinstance(policy, ActorCriticPolicy):
@@ -139,11 +149,8 @@ def network(policy: BasePolicy) -> tuple[Any, nn.Module, nn.Module, nn.Module | 
         layers = nn.Sequential(getattr(owner, "latent_pi", nn.Identity()), owner.mu)
     else:
         raise PolicyError(f"policy {type(policy).__name__} cannot be frozen; expected one of stable-baselines3's own")
-    return owner, _copy(extractor), _copy(layers), None if lstm is None else _Lstm(_copy(lstm))
-
-
-def _copy(module: Any) -> Any:
-    return copy.deepcopy(module).cpu().eval().requires_grad_(False)
+    extractor, layers = (copy.deepcopy(one).cpu().eval().requires_grad_(False) for one in (extractor, layers))
+    return owner, extractor, layers, None if lstm is None else _Lstm(copy.deepcopy(lstm).cpu())
 
 
 def _mean_of_quantiles(layers: nn.Sequential, quantiles: int) -> nn.Sequential:
@@ -193,23 +200,20 @@ class _Switches(Layer):
         return scores.abs().amin(1)
 
 
-def head(space: spaces.Space[Any], policy: BasePolicy) -> nn.Module:
+def _head(space: spaces.Space[Any], policy: BasePolicy) -> nn.Module:
     """Return what turns the network's output into an action of the environment's space."""
-    if isinstance(space, spaces.Box):
-        return _Continuous(space, _has_tanh(policy), policy.squash_output)
     if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
         return Choice(space)
     if isinstance(space, spaces.MultiBinary):
         return _Switches()
-    raise PolicyError(f"action space {space}: expected {_KINDS}")
-
-
-def _has_tanh(policy: BasePolicy) -> bool:
-    """Whether a tanh follows the last layer that `network` returns; TD3 and DDPG have theirs among the layers."""
+    if not isinstance(space, spaces.Box):
+        raise PolicyError(f"action space {space}: expected {_KINDS}")
     if isinstance(policy, ActorCriticPolicy):
         distribution = policy.action_dist
-        return isinstance(distribution, StateDependentNoiseDistribution) and distribution.bijector is not None
-    return hasattr(policy.actor, "latent_pi")
+        tanh = isinstance(distribution, StateDependentNoiseDistribution) and distribution.bijector is not None
+    else:  # TD3 and DDPG have theirs among the layers of `_network`
+        tanh = hasattr(policy.actor, "latent_pi")
+    return _Continuous(space, tanh, policy.squash_output)
 
 
 def freeze(
@@ -230,7 +234,9 @@ def freeze(
         PolicyError: The policy or a space is of a kind that cannot be frozen.
     """
     module = FrozenModule(model, normaliser, observation_space, action_space)
-    inputs = module.example_inputs()
+    inputs = zeros(module.raw, module.is_dict)
+    for layer, size in enumerate(module.lstm.sizes if module.lstm is not None else []):
+        inputs |= {f"state.{name}_{layer}": torch.zeros(2, size) for name in ("hidden", "cell")}
     outputs = ["action", *(f"next_{name}" for name in inputs if name.startswith("state."))]
     return onnx_file(module, inputs, outputs)
 
@@ -247,26 +253,19 @@ class FrozenModule(Layer):
     ) -> None:
         super().__init__()
         policy = model.policy
-        self.raw = leaves(observation_space)
-        seen = leaves(policy.observation_space)
+        self.is_dict = isinstance(observation_space, spaces.Dict)
+        self.raw, seen = leaves(observation_space), leaves(policy.observation_space)
         if set(seen) != set(self.raw):
             raise PolicyError(f"observation: the policy takes {sorted(seen)}, the environment gives {sorted(self.raw)}")
-        owner, extractor, layers, self.lstm = network(policy)
-        scale = owner.normalize_images
-        self.encoders = nn.ModuleList(
-            encoder(key, space, seen[key], _statistics(normaliser, key), scale) for key, space in self.raw.items()
-        )
-        self.is_dict = isinstance(observation_space, spaces.Dict)
-        self.extractor, self.layers = extractor, layers
-        self.head = head(action_space, policy)
+        owner, self.extractor, self.layers, self.lstm = _network(policy)
+        self.encoders = nn.ModuleList()
+        for key, space in self.raw.items():
+            moments, statistics = _moments(normaliser, key), None
+            if normaliser is not None and moments is not None:
+                statistics = *map(torch.as_tensor, moments), float(normaliser.clip_obs)
+            self.encoders.append(_encoder(key, space, seen[key], statistics, owner.normalize_images))
+        self.head = _head(action_space, policy)
         self.eval()
-
-    def example_inputs(self) -> dict[str, torch.Tensor]:
-        """Two rows of zeros for every input, by name."""
-        inputs = zeros(self.raw, self.is_dict)
-        for layer, size in enumerate(self.lstm.sizes if self.lstm is not None else []):
-            inputs |= {f"state.{name}_{layer}": torch.zeros(2, size) for name in ("hidden", "cell")}
-        return inputs
 
     def scores(self, *observation: torch.Tensor) -> torch.Tensor:
         """Return what the action is made of, (n, outputs) float32: means, logits or values; not if recurrent."""
@@ -285,12 +284,78 @@ class FrozenModule(Layer):
         return self.extractor(dict(zip(self.raw, encoded, strict=True)) if self.is_dict else encoded[0])
 
 
-def _statistics(normaliser: VecNormalize | None, key: str) -> Any:
-    """Return mean, standard deviation (float64) and limit of one leaf; None if it is not normalised."""
-    if normaliser is None or not normaliser.norm_obs:
-        return None
-    if key and key not in normaliser.norm_obs_keys:
+def _moments(normaliser: VecNormalize | None, key: str) -> tuple[np.ndarray, np.ndarray] | None:
+    """Mean and standard deviation (float64) that one leaf is normalised with; None if it is not."""
+    if normaliser is None or not normaliser.norm_obs or (key and key not in normaliser.norm_obs_keys):
         return None
     rms = normaliser.obs_rms[key] if key else normaliser.obs_rms
-    deviation = np.sqrt(rms.var + normaliser.epsilon)
-    return torch.as_tensor(rms.mean), torch.as_tensor(deviation), float(normaliser.clip_obs)
+    return rms.mean, np.sqrt(rms.var + normaliser.epsilon)
+
+
+# Golden actions
+
+
+def golden(
+    model: BaseAlgorithm,
+    normaliser: VecNormalize | None,
+    observation_space: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+) -> bytes:
+    """Draw observations, always the same, and record ``model.predict(..., deterministic=True)``.
+
+    The arguments are those of `freeze`. The model is left as it was, and no random number of torch, NumPy or SB3 is
+    drawn.
+
+    Returns:
+        A safetensors file with ``observation`` (or ``observation.<key>``), (n, ...), and ``action``, (n, ...); of a
+        recurrent policy the steps of one episode.
+    """
+    recurrent = hasattr(model.policy, "lstm_actor")
+    n = affordable(leaves(observation_space).values(), _GOLDEN)
+    observations = draw(observation_space, n if recurrent else 2 * n, np.random.default_rng(0), normaliser)
+    if not recurrent:
+        observations = clearest(FrozenModule(model, normaliser, observation_space, action_space), observations, n)
+    actions = trainer_actions(model, normaliser, observation_space, action_space, observations)
+    return pack(observations, actions)
+
+
+def draw(
+    space: spaces.Space[Any], n: int, rng: np.random.Generator, normaliser: VecNormalize | None = None
+) -> dict[str, np.ndarray]:
+    """Draw n observations; the keys are those of a Dict, or just ``""``.
+
+    Normalised numbers are drawn about their running mean, so that few of them end at the normaliser's limits.
+    """
+    return {key: draw_array(leaf, n, rng, _moments(normaliser, key)) for key, leaf in leaves(space).items()}
+
+
+def trainer_actions(
+    model: BaseAlgorithm,
+    normaliser: VecNormalize | None,
+    observation_space: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+    observations: dict[str, np.ndarray],
+) -> np.ndarray:
+    """Return the trainer's own actions for raw observations, in the environment's action space."""
+    is_dict = isinstance(observation_space, spaces.Dict)
+    seen = less_start(observation_space, observations if is_dict else observations[""])
+    if normaliser is not None:
+        transpose = unwrap_vec_wrapper(normaliser, VecTransposeImage)
+        seen = normaliser.normalize_obs(seen if transpose is None else transpose.transpose_observations(seen))
+    modes = [(module, module.training) for module in model.policy.modules()]
+    try:
+        if hasattr(model.policy, "lstm_actor"):  # one episode, an observation a step
+            state, each = None, []
+            for t in range(len(next(iter(observations.values())))):
+                one = {key: array[t : t + 1] for key, array in seen.items()} if is_dict else seen[t : t + 1]
+                action, state = model.predict(one, state, episode_start=np.array([t == 0]), deterministic=True)
+                each.append(action[0])
+            actions = np.stack(each)
+        else:
+            actions = model.predict(seen, deterministic=True)[0]
+    finally:  # `predict` switches to evaluation mode
+        for module, training in modes:
+            module.training = training
+    if isinstance(action_space, spaces.MultiBinary):
+        return actions.astype(np.int8)
+    return np.asarray(plus_start(action_space, actions))

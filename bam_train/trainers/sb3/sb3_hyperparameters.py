@@ -12,7 +12,7 @@ import inspect
 import operator
 import re
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -81,11 +81,7 @@ def complete(algorithm: Algorithm, given: Mapping[str, Any], observation_space: 
     Raises:
         SettingsError: An unknown name (with the closest match) or a wrong type.
     """
-    parameters = {
-        name: parameter
-        for name, parameter in inspect.signature(algorithm.load().__init__).parameters.items()
-        if name not in ELSEWHERE
-    }
+    parameters = _parameters(algorithm.load(), ELSEWHERE)
     for name in given:
         _require_known(name, parameters, f"{algorithm.name} hyperparameter", NAMES)
     values: dict[str, Any] = {"policy": default_policy(algorithm, observation_space)}
@@ -98,7 +94,9 @@ def complete(algorithm: Algorithm, given: Mapping[str, Any], observation_space: 
     if policy not in policies:
         raise SettingsError(f"policy: unknown policy {policy!r} of {algorithm.name}. {did_you_mean(policy, policies)}")
     values["policy_kwargs"] = _checked_policy(policies[policy], values["policy_kwargs"] or {})
-    _check_noise(values.get("action_noise"))
+    text = values.get("action_noise")
+    if text is not None and not _NOISE.fullmatch(text):
+        raise SettingsError(f'action_noise: expected "normal_0.1" or "ornstein-uhlenbeck_0.1", found {text!r}')
     _check_ranges(values)
     return values
 
@@ -117,8 +115,7 @@ def complete_normalize(given: bool | Mapping[str, Any], gamma: float) -> bool | 
     """Check the arguments of `VecNormalize`; its gamma is the algorithm's unless given."""
     if isinstance(given, bool):
         return {"gamma": gamma} if given else False
-    parameters = inspect.signature(VecNormalize.__init__).parameters
-    known = {name: row for name, row in parameters.items() if name not in ("self", "venv", "training")}
+    known = _parameters(VecNormalize, ("self", "venv", "training"))
     for name in given:
         _require_known(name, known, "normalize argument")
     fitted = {name: fit(f"normalize.{name}", value, known[name].annotation) for name, value in given.items()}
@@ -134,14 +131,32 @@ def over_the_whole_run(values: Mapping[str, Any]) -> list[str]:
 
 def build(values: Mapping[str, Any], action_space: spaces.Space[Any]) -> dict[str, Any]:
     """Turn complete hyperparameters into the arguments that the constructor takes; `values` is left as it is."""
-    arguments = {name: _built(value) for name, value in copy.deepcopy(dict(values)).items()}
-    if arguments.get("action_noise") is not None:
-        arguments["action_noise"] = _action_noise(arguments["action_noise"], action_space)
+    arguments = copy.deepcopy(dict(values))
+    for name, value in arguments.items():
+        if isinstance(value, str) and (start := linear_start(value)) is not None:  # to 0 over the run
+            schedule: Any = getattr(utils, "LinearSchedule", None) or utils.get_linear_fn
+            arguments[name] = schedule(start, 0.0, 1.0)
+        elif isinstance(value, list) and len(value) == 2 and value[1] in ("step", "episode"):
+            arguments[name] = tuple(value)
+    text = arguments.get("action_noise")
+    if text is not None:
+        match = _NOISE.fullmatch(text)
+        if match is None or action_space.shape is None:
+            raise SettingsError(f"action_noise: {text!r} does not fit a {type(action_space).__name__} action space")
+        mean, sigma = np.zeros(action_space.shape), np.full(action_space.shape, float(match["sigma"]))
+        kind = noise.NormalActionNoise if match["kind"] == "normal" else noise.OrnsteinUhlenbeckActionNoise
+        arguments["action_noise"] = kind(mean, sigma)
     policy = arguments["policy_kwargs"]
     for name, table in CLASSES.items():
         if name in policy:
             policy[name] = table[policy[name].lower()]
     return arguments
+
+
+def _parameters(kind: Any, but: Container[str]) -> dict[str, inspect.Parameter]:
+    """Parameters of a class's constructor by name, other than some."""
+    parameters = inspect.signature(kind.__init__).parameters
+    return {name: parameter for name, parameter in parameters.items() if name not in but}
 
 
 def _require_known(name: str, parameters: Mapping[str, Any], what: str, others: Iterable[str] = ()) -> None:
@@ -170,47 +185,11 @@ def _check_ranges(values: Mapping[str, Any]) -> None:
 
 
 def _checked_policy(policy: Any, given: Mapping[str, Any]) -> dict[str, Any]:
-    parameters = {
-        name: row
-        for name, row in inspect.signature(policy.__init__).parameters.items()
-        if name not in _POLICY_ELSEWHERE
-    }
-    values: dict[str, Any] = {}
+    parameters, values = _parameters(policy, _POLICY_ELSEWHERE), {}
     for name, value in given.items():
         _require_known(name, parameters, "policy_kwargs argument")
         values[name] = fit(f"policy_kwargs.{name}", value, _written(parameters[name].annotation))
         if name in CLASSES and values[name].lower() not in CLASSES[name]:
-            raise SettingsError(
-                f"policy_kwargs.{name}: unknown {value!r}. {did_you_mean(value.lower(), CLASSES[name])}"
-            )
+            close = did_you_mean(value.lower(), CLASSES[name])
+            raise SettingsError(f"policy_kwargs.{name}: unknown {value!r}. {close}")
     return values
-
-
-def _check_noise(text: str | None) -> None:
-    if text is not None and not _NOISE.fullmatch(text):
-        raise SettingsError(f'action_noise: expected "normal_0.1" or "ornstein-uhlenbeck_0.1", found {text!r}')
-
-
-def _action_noise(text: str, action_space: spaces.Space[Any]) -> noise.ActionNoise:
-    match = _NOISE.fullmatch(text)
-    if match is None or action_space.shape is None:
-        raise SettingsError(f"action_noise: {text!r} does not fit a {type(action_space).__name__} action space")
-    mean, sigma = np.zeros(action_space.shape), np.full(action_space.shape, float(match["sigma"]))
-    kind = noise.NormalActionNoise if match["kind"] == "normal" else noise.OrnsteinUhlenbeckActionNoise
-    return kind(mean, sigma)
-
-
-def _built(value: Any) -> Any:
-    """Schedules out of text, tuples out of ``[1, "step"]``; everything else as it is."""
-    if isinstance(value, str):
-        start = linear_start(value)
-        return value if start is None else linear(start)
-    if isinstance(value, list) and len(value) == 2 and value[1] in ("step", "episode"):
-        return tuple(value)
-    return value
-
-
-def linear(start: float) -> Any:
-    """A schedule from `start` to 0 over the run, which stable-baselines3 alone can load again."""
-    schedule = getattr(utils, "LinearSchedule", None) or utils.get_linear_fn
-    return schedule(start, 0.0, 1.0)

@@ -8,47 +8,37 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import io
 import math
+import threading
+import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from gymnasium import Space
 from gymnasium.vector import VectorEnv
-from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint, write_checkpoint
-from bam_train.environments import make_env, make_vector_env, require_fit
+from bam_train.environments import control_period, make_env, make_vector_env, require_fit
 from bam_train.errors import TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import SB3_ALGORITHMS
-from bam_train.trainers.base import OnProgress, Progress, Statistics
-from bam_train.trainers.manifest_fields import manifest
+from bam_train.trainers.base import OnProgress, Progress, Statistics, manifest
 from bam_train.trainers.resolve_settings import own_settings
 from bam_train.trainers.sb3 import sb3_hyperparameters as hyperparameters
 from bam_train.trainers.sb3 import sb3_resume as resume
-from bam_train.trainers.sb3.sb3_freezing import freeze
-from bam_train.trainers.sb3.sb3_golden import golden
-from bam_train.trainers.sb3.sb3_model import library_notices, make_model, meaning, one_env, refusals, sb3_members
+from bam_train.trainers.sb3.sb3_freezing import freeze, golden
+from bam_train.trainers.sb3.sb3_model import make_model
 from bam_train.trainers.sb3.sb3_resume import all_finite, refused_distribution, undisturbed
-from bam_train.trainers.sb3.sb3_tensorboard import ForgivingTensorBoard
-from bam_train.trainers.sb3.sb3_vec_env import BatchVecEnv, make_training_env
+from bam_train.trainers.sb3.sb3_vec_env import BatchVecEnv, make_training_env, one_env
 
 _FINITE = "expected finite numbers: try a smaller learning_rate"
-
-
-def _look(settings: TrainSettings) -> tuple[int, Space[Any], Space[Any]]:
-    """How many environments there are, as many as the servers have where they run elsewhere; what they see and do."""
-    if settings.transport:
-        with contextlib.closing(make_vector_env(settings.env, {}, 1, settings.place)) as envs:
-            return envs.num_envs, envs.single_observation_space, envs.single_action_space
-    with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
-        return settings.num_envs, env.observation_space, env.action_space
 
 
 class _Stop(Exception):  # noqa: N818 - never leaves this module
@@ -61,7 +51,13 @@ class SB3Trainer:
     def __init__(self, settings: TrainSettings, model: Any, venv: VecEnv) -> None:
         self.settings, self.model, self.venv = settings, model, venv
         self.notices: list[str] = []
-        self._signals, self._period = meaning(venv)
+        env = one_env(venv)
+        describe = getattr(env.unwrapped, "describe", None)
+        self._signals, self._period = describe() if describe else {}, control_period(env)
+        # The environment's own, before normalisation, image transposition and counting from 0.
+        self._spaces: tuple[Any, Any] = env.observation_space, env.action_space
+        if isinstance(venv, BatchVecEnv):
+            self._spaces = env.single_observation_space, env.single_action_space
         self._normaliser: VecNormalize | None = model.get_vec_normalize_env()
         self._waiting: resume.Waiting | None = None
         self._on_progress: OnProgress = lambda progress: True
@@ -70,11 +66,16 @@ class SB3Trainer:
 
     @classmethod
     def complete(cls, settings: TrainSettings) -> TrainSettings:
-        """Check the algorithm's own settings and fill in its defaults."""
+        """Check the algorithm's own settings and fill in its defaults; where servers run it, count its environments."""
+        if settings.transport:
+            with contextlib.closing(make_vector_env(settings.env, {}, 1, settings.place)) as envs:
+                num_envs, seen, acted = envs.num_envs, envs.single_observation_space, envs.single_action_space
+        else:
+            with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
+                num_envs, seen, acted = settings.num_envs, env.observation_space, env.action_space
         algorithm = SB3_ALGORITHMS[settings.algo]
-        num_envs, observation_space, action_space = _look(settings)
-        algorithm.require_actions(settings.env, type(action_space).__name__)
-        values = hyperparameters.complete(algorithm, settings.hyperparameters, observation_space)
+        algorithm.require_actions(settings.env, type(acted).__name__)
+        values = hyperparameters.complete(algorithm, settings.hyperparameters, seen)
         normalize = hyperparameters.complete_normalize(settings.normalize, values["gamma"])
         eval_every = settings.eval_every or max(1000, settings.steps // 20)
         return dataclasses.replace(
@@ -86,8 +87,7 @@ class SB3Trainer:
         """Set up a new run of complete settings."""
         torch.set_num_threads(settings.threads)
         venv = make_training_env(settings.env, settings.env_kwargs, settings.num_envs, settings.place)
-        with library_notices() as notices, refusals(settings):
-            model = make_model(settings, venv)
+        model, notices = make_model(settings, venv)
         model.set_logger(Logger(None, []))
         trainer = cls(settings, model, venv)
         trainer.notices += notices
@@ -115,7 +115,7 @@ class SB3Trainer:
 
     def log_to(self, folder: Path) -> None:
         """Write TensorBoard files into a folder from now on."""
-        self.model.set_logger(Logger(str(folder), [ForgivingTensorBoard(folder)]))
+        self.model.set_logger(Logger(str(folder), [_ForgivingTensorBoard(folder)]))
 
     @property
     def steps(self) -> int:
@@ -127,10 +127,13 @@ class SB3Trainer:
         if steps <= self.steps:
             return
         self._on_progress, self._total, self._reported = on_progress, steps, self.steps
+        log_interval = max(4, self.settings.num_envs)  # episodes, or rollouts, between two entries of the log
+        if SB3_ALGORITHMS[self.settings.algo].on_policy:
+            log_interval = int(max(1, 2048 // (self.model.n_steps * self.settings.num_envs)))
         with contextlib.suppress(_Stop), self._finite_distributions():
             # reset_num_timesteps=False: the total is what is left, and a restored episode goes on.
             with np.errstate(over="ignore", invalid="ignore"):  # NaN is looked for, and said once
-                self.model.learn(steps - self.steps, log_interval=self._log_interval(), reset_num_timesteps=False)
+                self.model.learn(steps - self.steps, log_interval=log_interval, reset_num_timesteps=False)
             self._between()
 
     @contextlib.contextmanager
@@ -145,12 +148,6 @@ class SB3Trainer:
                 f"the policy's weights or actions are NaN or infinite after step {self.steps}; {_FINITE}"
             ) from error
 
-    def _log_interval(self) -> int:
-        """Rollouts (on-policy) or episodes between two entries of the log."""
-        if SB3_ALGORITHMS[self.settings.algo].on_policy:
-            return int(max(1, 2048 // (self.model.n_steps * self.settings.num_envs)))
-        return max(4, self.settings.num_envs)
-
     def _roll_out(self, collect: Any, *arguments: Any, **named: Any) -> Any:
         """Stands before the algorithm's own `collect_rollouts`, where nothing is half done."""
         if self._waiting is not None:
@@ -162,16 +159,13 @@ class SB3Trainer:
 
     def _between(self) -> None:
         self._reported = self.steps
-        self._require_finite_losses()
+        for name, value in self.model.logger.name_to_value.items():
+            if "loss" in name and not math.isfinite(value):
+                raise TrainingFailed(f"{name} is {value} at step {self.steps}; {_FINITE}")
         if SB3_ALGORITHMS[self.settings.algo].on_policy:
             self._require_finite_weights()
         if not self._on_progress(Progress(self.steps, self._total, self._statistics)):
             raise _Stop
-
-    def _require_finite_losses(self) -> None:
-        for name, value in self.model.logger.name_to_value.items():
-            if "loss" in name and not math.isfinite(value):
-                raise TrainingFailed(f"{name} is {value} at step {self.steps}; {_FINITE}")
 
     def _require_finite_weights(self) -> None:
         if not all_finite(self.model):
@@ -192,40 +186,23 @@ class SB3Trainer:
     def save(self, path: Path, scores: Mapping[str, Any], notes: Mapping[str, Any]) -> Checkpoint:
         """Write a checkpoint that can be resumed and deployed."""
         self._require_finite_weights()
-        spaces = self._spaces()
         with undisturbed(self.model), self._finite_distributions():
-            members = {
-                **sb3_members(self.model),
-                "bam/policy.onnx": freeze(self.model, self._normaliser, *spaces),
-                "bam/golden.safetensors": golden(self.model, self._normaliser, *spaces),
-            }
+            theirs = io.BytesIO()  # what stable-baselines3 writes, so that its own `load` opens the checkpoint
+            self.model.save(theirs, exclude=["collect_rollouts"])
+            with zipfile.ZipFile(theirs) as archive:
+                members = {name: archive.read(name) for name in archive.namelist()}
+            members["bam/policy.onnx"] = freeze(self.model, self._normaliser, *self._spaces)
+            members["bam/golden.safetensors"] = golden(self.model, self._normaliser, *self._spaces)
         members |= resume.members(self.model, self.venv, self._normaliser, self._waiting, notes)
-        return write_checkpoint(path, self._manifest(scores), members)
-
-    def _manifest(self, scores: Mapping[str, Any]) -> dict[str, Any]:
-        return manifest(
-            self.settings,
-            self._spaces(),
-            signals=self._signals,
-            period=self._period,
-            steps=self.steps,
-            scores=scores,
-        )
-
-    def _spaces(self) -> tuple[Any, Any]:
-        """The environment's own, before normalisation, image transposition and counting from 0."""
-        env = one_env(self.venv)
-        if isinstance(self.venv, BatchVecEnv):
-            return env.single_observation_space, env.single_action_space
-        return env.observation_space, env.action_space
+        known = {"signals": self._signals, "period": self._period, "steps": self.steps, "scores": scores}
+        return write_checkpoint(path, manifest(self.settings, self._spaces, known), members)
 
     def freeze(self) -> FrozenPolicy:
         """The policy as it is now."""
         self._require_finite_weights()
-        observation_space, action_space = self._spaces()
         with undisturbed(self.model):
-            graph = freeze(self.model, self._normaliser, observation_space, action_space)
-        return FrozenPolicy.from_graph(graph, space_to_json(observation_space), space_to_json(action_space))
+            graph = freeze(self.model, self._normaliser, *self._spaces)
+        return FrozenPolicy.from_graph(graph, *map(space_to_json, self._spaces))
 
     @contextlib.contextmanager
     def undisturbed(self) -> Iterator[None]:
@@ -241,14 +218,11 @@ class SB3Trainer:
             return
         try:
             yield one_env(self.venv)
-        finally:
-            self.venv.interrupt(self._last_observation())
-
-    def _last_observation(self) -> Any:
-        """What training observed last, before normalisation; None before its first step."""
-        if self.model._last_obs is None or self._normaliser is None:
-            return self.model._last_obs
-        return self._normaliser.get_original_obs()
+        finally:  # with what training observed last, before normalisation; None before its first step
+            last, normaliser = self.model._last_obs, self._normaliser
+            if last is not None and normaliser is not None:
+                last = normaliser.get_original_obs()
+            self.venv.interrupt(last)
 
     def log(self, metrics: Mapping[str, float]) -> None:
         """Put numbers next to the trainer's own in TensorBoard."""
@@ -260,3 +234,32 @@ class SB3Trainer:
         self.model.logger.dump(self.steps)
         self.model.logger.close()
         self.model.env.close()
+
+
+class _ForgivingTensorBoard(KVWriter):  # type: ignore[misc]
+    """Writes TensorBoard's event files into a folder until it cannot: a full disk ends them, not the run."""
+
+    def __init__(self, folder: Path) -> None:
+        self._files: TensorBoardOutputFormat | None = TensorBoardOutputFormat(str(folder))
+        self._hook = threading.excepthook
+        threading.excepthook = self._thread_failed
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        try:
+            if self._files is not None:
+                self._files.write(key_values, key_excluded, step)
+        except OSError:
+            self.close()
+
+    def close(self) -> None:
+        files, self._files = self._files, None
+        if files is None:
+            return
+        with contextlib.suppress(OSError):
+            files.close()
+        threading.excepthook = self._hook
+
+    def _thread_failed(self, failed: threading.ExceptHookArgs) -> None:
+        """TensorBoard's own thread says on standard error what `write` is told too: leave that out."""
+        if not (isinstance(failed.exc_value, OSError) and type(failed.thread).__module__.startswith("tensorboard.")):
+            self._hook(failed)

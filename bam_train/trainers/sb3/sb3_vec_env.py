@@ -18,7 +18,7 @@ from bam_train.env_location import HERE, Place
 from bam_train.environments import is_batched, make_env, make_vector_env
 from bam_train.errors import SettingsError
 from bam_train.finite_envs import FiniteEnv, FiniteVectorEnv
-from bam_train.trainers.zero_based_spaces import from_zero
+from bam_train.trainers.zero_based_spaces import FromZero, from_zero
 
 Observations = Any
 """An array (n, …), or a mapping of them."""
@@ -32,11 +32,18 @@ def make_training_env(env_id: str, env_kwargs: Mapping[str, Any], num_envs: int,
     """
     if is_batched(env_id) or place.transport:
         return BatchVecEnv(make_vector_env(env_id, env_kwargs, num_envs, place), env_id)
+    envs = (FiniteEnv(make_env(env_id, env_kwargs), env_id, index) for index in range(num_envs))
+    return DummyVecEnv([functools.partial(Monitor, from_zero(env)) for env in envs])
 
-    def make_one(index: int) -> Monitor:
-        return Monitor(from_zero(FiniteEnv(make_env(env_id, env_kwargs), env_id, index)))
 
-    return DummyVecEnv([functools.partial(make_one, index) for index in range(num_envs)])
+def one_env(venv: VecEnv) -> Any:
+    """What stands behind `venv`: our vector environment, or the first of the others."""
+    if isinstance(venv, BatchVecEnv):
+        return venv.batch
+    env = venv.envs[0]
+    while isinstance(env, (Monitor, FromZero)):
+        env = env.env
+    return env
 
 
 class BatchVecEnv(VecEnv):  # type: ignore[misc]
@@ -95,26 +102,19 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
 
     def step_wait(self) -> tuple[Observations, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         """Step all environments. Shapes: observations (n, …), rewards (n,) float32, done (n,) bool, n infos."""
-        if self._interrupted is not None:
-            return self._begin_anew()
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        if self._interrupted is not None:  # the actions are not sent, and no episode is counted
+            last, observations = self._interrupted, self.reset()
+            for row, info in enumerate(infos):
+                info |= {"terminal_observation": self._of(last, row), "TimeLimit.truncated": True}
+            return observations, np.zeros(self.num_envs, np.float32), np.ones(self.num_envs, dtype=bool), infos
         observations, rewards, terminated, truncated, extra = self.batch.step(self._actions)
         done = terminated | truncated
         self._returns += rewards
         self._lengths += 1
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for index in np.flatnonzero(done):
             infos[index] = self._end(int(index), bool(terminated[index]), extra)
         return self._own(observations), np.asarray(rewards, dtype=np.float32), done, infos
-
-    def _begin_anew(self) -> tuple[Observations, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """The step after `interrupt`: the actions are not sent, and no episode is counted."""
-        last = self._interrupted
-        observations = self.reset()
-        infos = [
-            {"terminal_observation": self._of(last, index), "TimeLimit.truncated": True}
-            for index in range(self.num_envs)
-        ]
-        return observations, np.zeros(self.num_envs, np.float32), np.ones(self.num_envs, dtype=bool), infos
 
     def _end(self, index: int, terminated: bool, extra: Mapping[str, Any]) -> dict[str, Any]:
         """The info of an environment whose episode ended, in the words of stable-baselines3; its sums begin again."""

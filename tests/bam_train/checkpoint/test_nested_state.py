@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from bam_train.checkpoint.nested_state import pack, unpack
+from bam_train.checkpoint.safetensors_file import pack, unpack
 from bam_train.errors import FormatError
 
 

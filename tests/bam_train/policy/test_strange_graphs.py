@@ -15,8 +15,6 @@ from onnx import TensorProto, helper, numpy_helper
 
 from bam_train.errors import FormatError, PolicyError
 from bam_train.policy import FrozenPolicy
-from bam_train.policy.array_specs import array_spec, observation_arrays
-from bam_train.policy.golden_check import worst_difference
 from bam_train.policy.onnx_graph import MOST_NODES, require_policy
 from bam_train.policy.onnx_session import OnnxSession
 
@@ -180,7 +178,7 @@ def test_more_golden_actions_than_anybody_writes_are_refused():
     policy = FrozenPolicy.from_graph(of(node("Tanh", ["observation"], ["action"])), BOX, BOX)
     arrays = dict.fromkeys(("observation", "action"), np.zeros((2000, 4), np.float32))
     with pytest.raises(PolicyError, match="expected at most 1024 rows, found 2000"):
-        worst_difference(policy, observation_arrays(BOX), array_spec("action", BOX), arrays)
+        policy.worst_difference(arrays)
 
 
 def test_a_weight_in_another_file_is_refused_however_it_is_named():

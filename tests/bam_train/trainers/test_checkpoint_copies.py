@@ -9,7 +9,7 @@ import pytest
 fsspec = pytest.importorskip("fsspec")
 
 from bam_train.errors import OutputError  # noqa: E402
-from bam_train.trainers.checkpoint_copies import Copies  # noqa: E402
+from bam_train.trainers.run_folder import Copies  # noqa: E402
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from stable_baselines3 import PPO
 from bam_train.cli.eval import main
 from bam_train.environments import make_env
 from bam_train.errors import CheckpointMismatch
-from bam_train.trainers.sb3.plain_sb3_zip import _sentence, is_plain_sb3, load_trusted
+from bam_train.trainers.sb3.plain_sb3_zip import is_plain_sb3, load_trusted
 
 
 @pytest.fixture(scope="module")
@@ -72,14 +72,6 @@ def test_a_damaged_member_is_one_line(plain, tmp_path):
         CheckpointMismatch, match=r"PPO\.load cannot use it with CartPole-v1: .*Check --algo and --env$"
     ):
         load_trusted(path, "ppo", "CartPole-v1")
-
-
-def test_a_long_reason_ends_at_a_word():
-    text = _sentence(ValueError("spaces\n do not match: " + "-0.125 " * 100))
-    assert text.endswith(" -0.125 ...")
-    assert len(text) <= 160
-    assert _sentence(ValueError("short.")) == "short."
-    assert _sentence(EOFError()) == "EOFError."
 
 
 def test_the_frozen_policy_acts_as_the_model(plain):

@@ -25,8 +25,7 @@ from bam_train.checkpoint import safetensors_file, write_checkpoint
 from bam_train.errors import PolicyError
 from bam_train.policy import FrozenPolicy
 from bam_train.policy.onnx_session import OnnxSession
-from bam_train.trainers.sb3.sb3_freezing import FrozenModule, freeze
-from bam_train.trainers.sb3.sb3_golden import draw, golden, trainer_actions
+from bam_train.trainers.sb3.sb3_freezing import FrozenModule, draw, freeze, golden, trainer_actions
 
 ROWS = 200
 VECTOR = spaces.Box(-1, 1, (6,))
