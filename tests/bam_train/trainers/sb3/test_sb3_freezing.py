@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import random
 import subprocess
@@ -18,7 +19,7 @@ from sb3_contrib import QRDQN, TQC, TRPO, CrossQ, RecurrentPPO
 from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import safetensors_file, write_checkpoint
@@ -109,139 +110,97 @@ def assert_parity(
     normaliser: VecNormalize | None,
     observation_space: gym.Space[Any],
     action_space: gym.Space[Any],
-    rows: int = ROWS,
-) -> FrozenPolicy:
+) -> None:
     policy = freeze_it(model, normaliser, observation_space, action_space)
-    drawn = shaded(draw(observation_space, rows, np.random.default_rng(2), normaliser))
+    drawn = shaded(draw(observation_space, ROWS, np.random.default_rng(2), normaliser))
     expected = trainer_actions(model, normaliser, observation_space, action_space, drawn)
-    single = [policy.act(row(observation_space, drawn, k)) for k in range(rows)]
+    single = [policy.act(row(observation_space, drawn, k)) for k in range(ROWS)]
     batch = policy.act_batch(row(observation_space, drawn, slice(None)))
     unit = np.maximum((action_space.high - action_space.low) / 2, 1) if isinstance(action_space, spaces.Box) else 1
     unit = np.where(np.isfinite(unit), unit, 1)
     for found in (np.array(single), batch):
-        assert found.shape == (rows, *action_space.shape)
+        assert found.shape == (ROWS, *action_space.shape)
         np.testing.assert_array_less(np.abs(found.astype(np.float64) - expected) / unit, 1e-5)
     assert all(action_space.contains(action) for action in single)
+    assert (np.asarray(single[0]).dtype, batch.dtype) == (action_space.dtype, action_space.dtype)
     assert len(np.unique(expected, axis=0)) > 1, "the actions must depend on the observations"
-    return policy
 
 
-@pytest.mark.parametrize("normalise", [None, {}], ids=["raw", "normalised"])
-@pytest.mark.parametrize("algorithm", [PPO, A2C, TRPO, SAC, TD3, DDPG, TQC, CrossQ])
-def test_continuous_actions(algorithm: type[BaseAlgorithm], normalise: dict[str, Any] | None):
-    assert_parity(*make(algorithm, VECTOR, ARM, normalise), VECTOR, ARM)
+SMALL_CNN = {"network": "Cnn", "policy_kwargs": {"features_extractor_kwargs": {"features_dim": 16}}}
+SMALL_CNNS = {"policy_kwargs": {"features_extractor_kwargs": {"cnn_output_dim": 16}}}
+FOUR = spaces.Discrete(4)
+NUMBERS = spaces.Dict({key: MIXED[key] for key in ("joints", "mode", "switches", "tool")})
+OBSERVED = [
+    spaces.Discrete(5),
+    spaces.Discrete(5, start=-2),
+    spaces.MultiDiscrete([3, 2, 4]),
+    spaces.MultiDiscrete([3, 2], start=[4, 5]),
+    spaces.MultiBinary(6),
+    spaces.MultiBinary([2, 3]),
+    spaces.Box(-1, 1, (2, 2, 2)),
+    spaces.Box(-np.inf, np.inf, (4,), np.float64),
+    spaces.Box(-3.4e38, 3.4e38, (4,), np.float32),
+    spaces.Box(0, 200, (3,), np.uint8),
+    spaces.Box(-9, 9, (3,), np.int64),
+]
+BOXES = [
+    spaces.Box(np.array([-1, 0.1]), np.array([3, 7.3]), dtype=np.float64),
+    spaces.Box(-0.3, 0.7, (2, 2)),
+    spaces.Box(-1000, 1000, (2,)),
+]
+CHOICES = [
+    spaces.MultiDiscrete([3, 1, 4]),
+    spaces.MultiBinary(3),
+    spaces.Discrete(3, start=5),
+    spaces.MultiDiscrete([3, 2], start=[7, -1], dtype=np.int32),
+]
+CASES = [
+    *((one, VECTOR, ARM, None, {}) for one in (PPO, A2C, TRPO, SAC, TD3, DDPG, TQC, CrossQ)),
+    *((one, VECTOR, ARM, {}, {}) for one in (PPO, SAC, TD3, CrossQ)),
+    *((one, VECTOR, FOUR, None, {}) for one in (PPO, A2C, TRPO, DQN, QRDQN)),
+    *((one, VECTOR, FOUR, {"clip_obs": 2.0}, {}) for one in (PPO, DQN, QRDQN)),
+    *((PPO, VECTOR, space, None, {}) for space in CHOICES),
+    *((one, space, ARM, None, {}) for space in OBSERVED for one in (PPO, SAC)),
+    *((one, VECTOR, space, None, {}) for space in BOXES for one in (PPO, SAC, TD3)),
+    # noise that depends on the state
+    *(
+        (PPO, VECTOR, ARM, None, {"use_sde": True, "policy_kwargs": {"squash_output": squash}})
+        for squash in (True, False)
+    ),
+    (A2C, VECTOR, ARM, None, {"use_sde": True, "policy_kwargs": {"squash_output": True, "full_std": False}}),
+    *((one, VECTOR, ARM, None, {"use_sde": True}) for one in (SAC, TQC)),
+    # other networks
+    *(
+        (PPO, VECTOR, ARM, None, {"policy_kwargs": {"activation_fn": getattr(torch.nn, name)}})
+        for name in ("ReLU", "ELU", "LeakyReLU", "SiLU", "Sigmoid", "Softplus")
+    ),
+    (PPO, VECTOR, ARM, None, {"policy_kwargs": {"net_arch": []}}),
+    (PPO, VECTOR, ARM, None, {"policy_kwargs": {"share_features_extractor": False}}),
+    # images: channels last, channels first, one channel, through dense layers, among other arrays
+    *((one, IMAGE, ARM, None, SMALL_CNN) for one in (PPO, SAC, TD3, TQC)),
+    *((one, IMAGE, FOUR, None, SMALL_CNN) for one in (DQN, QRDQN)),
+    *((one, spaces.Box(0, 255, (3, 36, 40), np.uint8), ARM, None, SMALL_CNN) for one in (PPO, SAC)),
+    *((one, spaces.Box(0, 255, (36, 36, 1), np.uint8), ARM, None, SMALL_CNN) for one in (PPO, SAC)),
+    (PPO, IMAGE, ARM, None, {}),
+    *((one, MIXED, ARM, None, SMALL_CNNS) for one in (PPO, SAC)),
+    *((one, MIXED, ARM, {"norm_obs_keys": ["joints", "tool"]}, SMALL_CNNS) for one in (PPO, SAC)),
+    (DQN, MIXED, FOUR, {"norm_obs_keys": ["joints", "tool"]}, SMALL_CNNS),
+    *((one, NUMBERS, ARM, {"norm_obs_keys": ["tool"]}, {}) for one in (PPO, TD3, TRPO, A2C, DDPG, TQC)),
+    (
+        PPO,
+        spaces.Dict(front=spaces.Box(0, 255, (3, 36, 40), np.uint8), tool=VECTOR),
+        ARM,
+        {"norm_obs_keys": ["tool"]},
+        SMALL_CNNS,
+    ),
+]
 
 
-@pytest.mark.parametrize("normalise", [None, {"clip_obs": 2.0}], ids=["raw", "normalised"])
-@pytest.mark.parametrize("algorithm", [PPO, A2C, TRPO, DQN, QRDQN])
-def test_discrete_actions(algorithm: type[BaseAlgorithm], normalise: dict[str, Any] | None):
-    policy = assert_parity(*make(algorithm, VECTOR, spaces.Discrete(4), normalise), VECTOR, spaces.Discrete(4))
-    assert isinstance(policy.act(np.zeros(6, np.float32)), np.int64)
-
-
-@pytest.mark.parametrize("space", [spaces.MultiDiscrete([3, 1, 4]), spaces.MultiBinary(3)], ids=str)
-@pytest.mark.parametrize("algorithm", [PPO, A2C, TRPO])
-def test_several_choices(algorithm: type[BaseAlgorithm], space: gym.Space[Any]):
-    assert_parity(*make(algorithm, VECTOR, space), VECTOR, space)
-
-
-@pytest.mark.parametrize(
-    "space", [spaces.Discrete(3, start=5), spaces.MultiDiscrete([3, 2], start=[7, -1], dtype=np.int32)], ids=str
-)
-def test_choices_that_do_not_start_at_zero(space: Any):
-    policy = assert_parity(*make(PPO, VECTOR, space), VECTOR, space)
-    assert policy.act_batch(np.zeros((3, 6), np.float32)).dtype == space.dtype
-
-
-@pytest.mark.parametrize(
-    "space",
-    [
-        spaces.Discrete(5),
-        spaces.Discrete(5, start=-2),
-        spaces.MultiDiscrete([3, 2, 4]),
-        spaces.MultiDiscrete([3, 2], start=[4, 5]),
-        spaces.MultiBinary(6),
-        spaces.MultiBinary([2, 3]),
-        spaces.Box(-1, 1, (2, 2, 2)),
-        spaces.Box(-np.inf, np.inf, (4,), np.float64),
-        spaces.Box(-3.4e38, 3.4e38, (4,), np.float32),
-        spaces.Box(0, 200, (3,), np.uint8),
-        spaces.Box(-9, 9, (3,), np.int64),
-    ],
-    ids=str,
-)
-@pytest.mark.parametrize("algorithm", [PPO, SAC])
-def test_observations(algorithm: type[BaseAlgorithm], space: gym.Space[Any]):
-    assert_parity(*make(algorithm, space, ARM), space, ARM)
-
-
-@pytest.mark.parametrize(
-    "space",
-    [
-        spaces.Box(np.array([-1, 0.1]), np.array([3, 7.3]), dtype=np.float64),
-        spaces.Box(-0.3, 0.7, (2, 2)),
-        spaces.Box(-1000, 1000, (2,)),
-    ],
-    ids=str,
-)
-@pytest.mark.parametrize("algorithm", [PPO, SAC, TD3])
-def test_action_boxes(algorithm: type[BaseAlgorithm], space: spaces.Box):
-    policy = assert_parity(*make(algorithm, VECTOR, space), VECTOR, space)
-    assert policy.act(VECTOR.sample()).dtype == space.dtype
-
-
-@pytest.mark.parametrize(
-    ("algorithm", "network"),
-    [
-        (PPO, {"squash_output": True}),
-        (PPO, {}),
-        (A2C, {"squash_output": True, "full_std": False}),
-        (SAC, {}),
-        (TQC, {}),
-    ],
-)
-def test_state_dependent_noise(algorithm: type[BaseAlgorithm], network: dict[str, Any]):
-    assert_parity(*make(algorithm, VECTOR, ARM, use_sde=True, policy_kwargs=network), VECTOR, ARM)
-
-
-@pytest.mark.parametrize("activation", ["Tanh", "ReLU", "ELU", "LeakyReLU", "SiLU", "Sigmoid", "Softplus"])
-def test_activations(activation: str):
-    network = {"activation_fn": getattr(torch.nn, activation)}
-    assert_parity(*make(PPO, VECTOR, ARM, policy_kwargs=network), VECTOR, ARM)
-
-
-@pytest.mark.parametrize("network", [{"net_arch": []}, {"share_features_extractor": False}])
-def test_other_networks(network: dict[str, Any]):
-    assert_parity(*make(PPO, VECTOR, ARM, policy_kwargs=network), VECTOR, ARM)
-
-
-@pytest.mark.parametrize("shape", [(40, 36, 3), (3, 36, 40), (36, 36, 1)])
-@pytest.mark.parametrize("algorithm", [PPO, SAC, TD3, DQN, QRDQN, TQC])
-def test_images(algorithm: type[BaseAlgorithm], shape: tuple[int, ...]):
-    space = spaces.Box(0, 255, shape, np.uint8)
-    action_space = spaces.Discrete(4) if algorithm in (DQN, QRDQN) else ARM
-    network = {"features_extractor_kwargs": {"features_dim": 16}}
-    model, _ = make(algorithm, space, action_space, network="Cnn", policy_kwargs=network)
-    assert isinstance(model.get_env(), VecTransposeImage) == (shape[2] < 4)
-    assert_parity(model, None, space, action_space)
-
-
-def test_an_image_through_dense_layers():
-    assert_parity(*make(PPO, IMAGE, ARM), IMAGE, ARM, rows=200)
-
-
-@pytest.mark.parametrize("normalise", [None, {"norm_obs_keys": ["joints", "tool"]}], ids=["raw", "normalised"])
-@pytest.mark.parametrize("algorithm", [PPO, SAC, DQN])
-def test_dicts(algorithm: type[BaseAlgorithm], normalise: dict[str, Any] | None):
-    action_space = spaces.Discrete(4) if algorithm is DQN else ARM
-    network = {"features_extractor_kwargs": {"cnn_output_dim": 16}}
-    assert_parity(*make(algorithm, MIXED, action_space, normalise, policy_kwargs=network), MIXED, action_space)
-
-
-@pytest.mark.parametrize("algorithm", [PPO, TD3, TRPO, A2C, DDPG, TQC])
-def test_dicts_without_images(algorithm: type[BaseAlgorithm]):
-    space = spaces.Dict({key: MIXED[key] for key in ("joints", "mode", "switches", "tool")})
-    assert_parity(*make(algorithm, space, ARM, {"norm_obs_keys": ["tool"]}), space, ARM)
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case[0].__name__}-{case[1]}-{case[2]}".replace("\n", " "))
+def test_it_acts_as_the_trainer_does(case: Any):
+    algorithm, observation_space, action_space, normalise, settings = case
+    model, normaliser = make(algorithm, observation_space, action_space, normalise, **copy.deepcopy(settings))
+    assert_parity(model, normaliser, observation_space, action_space)
 
 
 def test_numbers_far_from_zero_are_normalised_in_float64():
@@ -251,18 +210,12 @@ def test_numbers_far_from_zero_are_normalised_in_float64():
     assert_parity(model, normaliser, space, ARM)
 
 
-def test_dicts_of_images_with_channels_first():
-    space = spaces.Dict(front=spaces.Box(0, 255, (3, 36, 40), np.uint8), tool=VECTOR)
-    network = {"features_extractor_kwargs": {"cnn_output_dim": 16}}
-    assert_parity(*make(PPO, space, ARM, {"norm_obs_keys": ["tool"]}, policy_kwargs=network), space, ARM)
-
-
 def test_normalised_images():
     space = spaces.Box(0, 255, (3, 36, 40), np.uint8)
-    network = {"normalize_images": False, "features_extractor_kwargs": {"features_dim": 16}}
+    network = {"normalize_images": False, **SMALL_CNN["policy_kwargs"]}
     model, normaliser = make(PPO, space, ARM, {}, network="Cnn", policy_kwargs=network)
     normaliser.obs_rms.mean, normaliser.obs_rms.var = normaliser.obs_rms.mean + 120, normaliser.obs_rms.var * 4000
-    assert_parity(model, normaliser, space, ARM, rows=200)
+    assert_parity(model, normaliser, space, ARM)
 
 
 def test_a_normaliser_of_rewards_only_changes_nothing():
@@ -277,12 +230,7 @@ RECURRENT = {
     "two layers": (VECTOR, ARM, None, {"policy_kwargs": {"n_lstm_layers": 2}}),
     "shared": (VECTOR, ARM, None, {"policy_kwargs": {"shared_lstm": True, "enable_critic_lstm": False}}),
     "discrete": (spaces.Discrete(5), spaces.Discrete(3), None, {}),
-    "image": (
-        IMAGE,
-        ARM,
-        None,
-        {"network": "Cnn", "policy_kwargs": {"features_extractor_kwargs": {"features_dim": 16}}},
-    ),
+    "image": (IMAGE, ARM, None, SMALL_CNN),
     "dict": (spaces.Dict(joints=MIXED["joints"], mode=MIXED["mode"]), ARM, {"norm_obs_keys": ["joints"]}, {}),
 }
 
@@ -290,7 +238,7 @@ RECURRENT = {
 @pytest.mark.parametrize("case", RECURRENT.values(), ids=RECURRENT)
 def test_recurrent_policies_carry_their_state_and_forget_it(case: Any):
     observation_space, action_space, normalise, settings = case
-    model, normaliser = make(RecurrentPPO, observation_space, action_space, normalise, **settings)
+    model, normaliser = make(RecurrentPPO, observation_space, action_space, normalise, **copy.deepcopy(settings))
     policy = freeze_it(model, normaliser, observation_space, action_space)
     assert policy.recurrent
     drawn = draw(observation_space, ROWS, np.random.default_rng(2), normaliser)
@@ -347,8 +295,7 @@ def test_freezing_draws_no_random_number_and_leaves_the_model_as_it_was():
 
 
 def test_the_graph_says_what_it_takes_and_nothing_of_this_machine():
-    network = {"features_extractor_kwargs": {"cnn_output_dim": 16}}
-    graph_bytes = freeze(make(PPO, MIXED, ARM, policy_kwargs=network)[0], None, MIXED, ARM)
+    graph_bytes = freeze(make(PPO, MIXED, ARM, **copy.deepcopy(SMALL_CNNS))[0], None, MIXED, ARM)
     session = OnnxSession(graph_bytes)
     assert [(name, one.dtype, one.shape) for name, one in session.inputs.items()] == [
         (f"observation.{key}", space.dtype, (None, *space.shape)) for key, space in MIXED.items()
@@ -475,8 +422,7 @@ print(policy.act(np.zeros({shape!r}, {dtype!r})).tolist())
 
 
 def test_a_process_without_torch_runs_a_policy(tmp_path: Path):
-    settings = {"network": "Cnn", "policy_kwargs": {"features_extractor_kwargs": {"features_dim": 16}}}
-    model, _ = make(PPO, IMAGE, ARM, **settings)
+    model, _ = make(PPO, IMAGE, ARM, **copy.deepcopy(SMALL_CNN))
     path = save(tmp_path / "a.zip", model, None, IMAGE, ARM)
     blocked = ["torch", "gymnasium", "bam_envs", "onnx", "stable_baselines3", "cloudpickle", "tyro", "rich"]
     script = BLOCK.format(blocked=blocked, path=str(path), shape=IMAGE.shape, dtype=str(IMAGE.dtype))
