@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -131,7 +131,8 @@ def make_remote_env(env_id: str, transport: Where, **options: Any) -> RemoteEnv:
     Raises:
         InvalidValue: A URL that is none, or an option that its transport does not have.
     """
-    return RemoteEnv(_opened(env_id, transport, options))
+    opened = open_transport(transport, env_id=env_id, **options) if isinstance(transport, str) else transport
+    return RemoteEnv(opened)
 
 
 def make_remote_vector_env(
@@ -140,20 +141,14 @@ def make_remote_vector_env(
     """The environments `env_id` that run at `transport`, stepped together; connects on first use.
 
     Args:
-        env_id: As for `make_remote_env`.
+        env_id: As for `make_remote_env`, as are the errors.
         transport: One, or several, which are stepped at the same time.
         num_envs: Environments in all, if they must be so many; one transport may have many.
         options: As for `make_remote_env`.
-
-    Raises:
-        InvalidValue: A URL that is none, or an option that its transport does not have.
     """
     several = [transport] if isinstance(transport, (str, Transport)) else transport
-    return RemoteVectorEnv([_opened(env_id, one, options) for one in several], num_envs)
-
-
-def _opened(env_id: str, transport: Where, options: Mapping[str, Any]) -> Transport:
-    return open_transport(transport, env_id=env_id, **options) if isinstance(transport, str) else transport
+    opened = [open_transport(one, env_id=env_id, **options) if isinstance(one, str) else one for one in several]
+    return RemoteVectorEnv(opened, num_envs)
 
 
 def open_transport(
@@ -194,24 +189,16 @@ def open_transport(
         schemes = ", ".join(f"{one}://" for one in _CLASSES)
         raise InvalidValue(f"{url}: {UnknownName('transport', scheme, _CLASSES)} It must be one of {schemes}.")
     endpoint = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file)
-    for name, value in (("ca_file", ca_file), ("timeout", timeout)):
-        if value is not None:
-            options = {**options, name: value}
-    if token_file is not None:
-        options = {**options, "token": endpoint.token}
+    given = {"ca_file": ca_file, "token": endpoint.token, "timeout": timeout}
+    options |= {name: value for name, value in given.items() if value is not None}
     module, _, name = _CLASSES[scheme].partition(":")
     make: Any = getattr(importlib.import_module(module), name)
-    _require_options(url, make, options)
-    transport: Transport = make(url, env_id=env_id, **options)
-    return transport
-
-
-def _require_options(url: str, make: type[Transport], options: Mapping[str, Any]) -> None:
-    """Refuse an option that the transport's class does not take."""
     # A class that hands options on to its parent takes those of the parent.
     signatures = [inspect.signature(kind) for kind in make.__mro__ if "__init__" in vars(kind) and kind is not object]
-    names = dict.fromkeys(name for signature in signatures for name in signature.parameters)
-    known = [name for name in names if name not in ("url", "env_id", "options")]
+    known = dict.fromkeys(name for signature in signatures for name in signature.parameters)
+    names = [name for name in known if name not in ("url", "env_id", "options")]
     for name in options:
-        if name not in known:
-            raise InvalidValue(f"{url} takes no {name}; its options are {', '.join(known)}.")
+        if name not in names:
+            raise InvalidValue(f"{url} takes no {name}; its options are {', '.join(names)}.")
+    transport: Transport = make(url, env_id=env_id, **options)
+    return transport

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from functools import cached_property
 from itertools import accumulate
 from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import Space
+from gymnasium import Space, spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space, iterate
 from numpy.typing import NDArray
@@ -19,25 +19,17 @@ from numpy.typing import NDArray
 from bam_envs.core.close_at_exit import close_at_exit
 from bam_envs.core.errors import InvalidValue, ResetNeeded
 from bam_envs.core.spaces import space_to_json
-from bam_envs.remote.batches import join_final, join_infos, join_observations
 from bam_envs.remote.transport import EnvSpecMessage, Info, Seed, Transport
+from bam_envs.remote.values import stack
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Seeds = list[int | None]
 
 
-@dataclass(frozen=True)
-class Stepped:
-    """One step of the environments of a rack; each list has one entry for each."""
-
-    observations: list[Any]
-    """Where an episode ended, the first one of the next."""
-    rewards: list[float]
-    terminated: list[bool]
-    truncated: list[bool]
-    infos: list[Info]
-    """Where an episode ended, the info of the next one, with ``final_obs`` and ``final_info``."""
+Results = tuple[list[Any], list[float], list[bool], list[bool], list[Info]]
+"""Of a step: observations (where an episode ended, the first of the next), rewards, terminated, truncated and infos
+(where an episode ended, of the next one, with ``final_obs`` and ``final_info``), each for every environment."""
 
 
 class Rack:
@@ -67,46 +59,41 @@ class Rack:
         """
         if not mask.any():
             return before, [{}] * len(mask)
-        if not self.spec.vector or not self.spec.autoreset:
-            return self._begin(self._one_seed(seeds, mask), options)
-        if not mask.all():
-            options = {**(options or {}), "reset_mask": mask}
-        seeded = any(seed is not None for seed in seeds)
-        observations, infos = self.transport.reset(seeds if seeded else None, options)
-        return observations, infos
-
-    def step(self, actions: list[Any]) -> Stepped:
-        """Step every environment; those whose episode ended are reset."""
-        if not self.spec.vector:
-            return self._restarted(Stepped(*([one] for one in self.transport.step(actions[0]))))
-        stepped = Stepped(*self.transport.step(actions))
-        return stepped if self.spec.autoreset else self._restarted(stepped)
-
-    def _restarted(self, last: Stepped) -> Stepped:
-        """All episodes of this rack end once one has ended, for there is one reset for all of them."""
-        if not any(last.terminated) and not any(last.truncated):
-            return last
-        first, infos = self._begin(None, None)
-        infos = [
-            {**begun, "final_obs": observation, "final_info": info}
-            for begun, observation, info in zip(infos, last.observations, last.infos, strict=True)
-        ]
-        # For an episode that was not at its end, the end of another one is a time limit.
-        cut = [not ended or late for ended, late in zip(last.terminated, last.truncated, strict=True)]
-        return Stepped(first, last.rewards, last.terminated, cut, infos)
-
-    def _begin(self, seed: int | None, options: Info | None) -> tuple[list[Any], list[Info]]:
-        observation, info = self.transport.reset(seed, options)
-        return (observation, info) if self.spec.vector else ([observation], [info])
-
-    def _one_seed(self, seeds: Seeds, mask: NDArray[np.bool_]) -> int | None:
-        """The seed for all environments: that of the first, from which those of the others go on."""
+        if self.spec.vector and self.spec.autoreset:
+            if not mask.all():
+                options = {**(options or {}), "reset_mask": mask}
+            seeded = any(seed is not None for seed in seeds)
+            observations, infos = self.transport.reset(seeds if seeded else None, options)
+            return observations, infos
         first, those = seeds[0], f"The {len(seeds)} environments of {self.spec.env_id} begin together"
         if not mask.all():
             raise InvalidValue(f"{those}; reset_mask must hold all of them or none.")
         if seeds != [None if first is None else first + number for number in range(len(seeds))]:
             raise InvalidValue(f"{those}, from one seed s that stands for s, s + 1, …; not from {seeds}.")
-        return first
+        return self._begin(first, options)
+
+    def step(self, actions: list[Any]) -> Results:
+        """Step every environment; those whose episode ended are reset."""
+        if self.spec.vector:
+            results = self.transport.step(actions)
+        else:
+            observation, reward, late, cut, info = self.transport.step(actions[0])
+            results = [observation], [reward], [late], [cut], [info]
+        last, rewards, terminated, truncated, infos = results
+        if (self.spec.vector and self.spec.autoreset) or not (any(terminated) or any(truncated)):
+            return results
+        # There is one reset for all, so all episodes end; that of another one is a time limit to those that go on.
+        truncated = [not ended or late for ended, late in zip(terminated, truncated, strict=True)]
+        first, begun = self._begin(None, None)
+        infos = [
+            {**info, "final_obs": final_obs, "final_info": final_info}
+            for info, final_obs, final_info in zip(begun, last, infos, strict=True)
+        ]
+        return first, rewards, terminated, truncated, infos
+
+    def _begin(self, seed: int | None, options: Info | None) -> tuple[list[Any], list[Info]]:
+        observation, info = self.transport.reset(seed, options)
+        return (observation, info) if self.spec.vector else ([observation], [info])
 
 
 class Described:
@@ -158,7 +145,6 @@ class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
         self._process = 0
         self._observations: list[Any] | None = None
         """The last observation of each environment; None while a reset is needed."""
-        self._batched: tuple[Space[Any], Space[Any]] | None = None
         if not self.transports:
             raise InvalidValue("There must be at least one transport.")
         close_at_exit(self)
@@ -172,7 +158,14 @@ class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
         """
         if not self._racks:
             specs = self._at_once(lambda transport: transport.connect(), self.transports)
-            _require_alike(specs)
+            for number, spec in enumerate(specs[1:], start=2):
+                for name in ("observation_space", "action_space"):
+                    first, other = getattr(specs[0], name), getattr(spec, name)
+                    if space_to_json(other) != space_to_json(first):
+                        raise InvalidValue(
+                            f"The {name} of transport {number} is {other}, and that of the first {first}; environments "
+                            f"of one batch must be alike."
+                        )
             firsts = [0, *accumulate(spec.num_envs for spec in specs)]
             if self._wanted not in (None, firsts[-1]):
                 raise InvalidValue(f"num_envs must be {firsts[-1]}, as many as there are, not {self._wanted}.")
@@ -201,18 +194,17 @@ class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
     @property
     def observation_space(self) -> Space[Any]:  # type: ignore[override]
         """The observation space of all environments."""
-        return self._spaces()[0]
+        return self._spaces[0]
 
     @property
     def action_space(self) -> Space[Any]:  # type: ignore[override]
         """The action space of all environments."""
-        return self._spaces()[1]
+        return self._spaces[1]
 
+    @cached_property
     def _spaces(self) -> tuple[Space[Any], Space[Any]]:
-        if self._batched is None:
-            there, size = self._there, self.num_envs
-            self._batched = batch_space(there.observation_space, size), batch_space(there.action_space, size)
-        return self._batched
+        there, size = self._there, self.num_envs
+        return batch_space(there.observation_space, size), batch_space(there.action_space, size)
 
     def reset(self, *, seed: Seed = None, options: Info | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in every environment, or in those of ``options["reset_mask"]`` (n,) bool.
@@ -222,7 +214,12 @@ class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
                 of its first arm.
             options: ``reset_mask``, and what the other ends take.
         """
-        seeds = self._seeds(seed)
+        if seed is None or isinstance(seed, (int, np.integer)):
+            seeds: Seeds = [None if seed is None else int(seed) + number for number in range(self.num_envs)]
+        elif len(seed) != self.num_envs:
+            raise InvalidValue(f"seed must be one number or {self.num_envs} of them, not {len(seed)}.")
+        else:
+            seeds = list(seed)
         rest = {key: value for key, value in (options or {}).items() if key != "reset_mask"} or None
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)), dtype=bool)
         if mask.shape != (self.num_envs,):
@@ -234,16 +231,8 @@ class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
             lambda rack: rack.reset(seeds[rack.part], mask[rack.part], rest, before[rack.part]), self._racks
         )
         self._observations = [one for observations, _ in parts for one in observations]
-        return self._joined(self._observations), join_infos([info for _, infos in parts for info in infos])
-
-    def _seeds(self, seed: Seed) -> Seeds:
-        if seed is None:
-            return [None] * self.num_envs
-        if isinstance(seed, (int, np.integer)):
-            return [int(seed) + number for number in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise InvalidValue(f"seed must be one number or {self.num_envs} of them, not {len(seed)}.")
-        return list(seed)
+        joined = stack(self.single_observation_space, self._observations)
+        return joined, join_infos([info for _, infos in parts for info in infos])
 
     def step(
         self, actions: Any
@@ -251,32 +240,28 @@ class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
         """Step every environment; those whose episode ended are reset."""
         if self._observations is None:
             raise ResetNeeded("No episode is running. Call reset() first.")
-        each = self._each_action(actions)
+        if not isinstance(self.action_space, spaces.Box):
+            each = list(iterate(self.action_space, actions))
+        elif np.shape(actions) == self.action_space.shape:
+            each = list(np.asarray(actions))
+        else:
+            raise InvalidValue(f"The actions must have shape {self.action_space.shape}, not {np.shape(actions)}.")
+        if len(each) != self.num_envs:
+            raise InvalidValue(f"There must be one action for each of {self.num_envs} environments, not {len(each)}.")
         self._observations = None  # until it went well
-        steps = self._at_once(lambda rack: rack.step(each[rack.part]), self._racks)
-        self._observations = [one for step in steps for one in step.observations]
-        infos = [info for step in steps for info in step.infos]
-        joined = join_infos(infos)
+        results = self._at_once(lambda rack: rack.step(each[rack.part]), self._racks)
+        columns: Any = ([one for result in results for one in result[place]] for place in range(5))
+        self._observations, rewards, terminated, truncated, infos = columns
+        joined, space = join_infos(infos), self.single_observation_space
         if "final_obs" in joined:
-            joined["final_obs"] = join_final(self.single_observation_space, self._observations, infos)
-        rewards = np.array([reward for step in steps for reward in step.rewards], np.float64)
-        terminated = np.array([flag for step in steps for flag in step.terminated], np.bool_)
-        truncated = np.array([flag for step in steps for flag in step.truncated], np.bool_)
-        return self._joined(self._observations), rewards, terminated, truncated, joined
-
-    def _each_action(self, actions: Any) -> list[Any]:
-        if isinstance(self.action_space, gym.spaces.Box):
-            array = np.asarray(actions)
-            if array.shape != self.action_space.shape:
-                raise InvalidValue(f"The actions must have shape {self.action_space.shape}, not {array.shape}.")
-            return list(array)
-        each, size = list(iterate(self.action_space, actions)), self.num_envs
-        if len(each) != size:
-            raise InvalidValue(f"There must be one action for each of {size} environments, not {len(each)}.")
-        return each
-
-    def _joined(self, each: list[Any]) -> Any:
-        return join_observations(self.single_observation_space, each)
+            joined["final_obs"] = join_final(space, self._observations, infos)
+        return (
+            stack(space, self._observations),
+            np.array(rewards, np.float64),
+            np.array(terminated, np.bool_),
+            np.array(truncated, np.bool_),
+            joined,
+        )
 
     def _at_once(self, call: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
         """`call` of every item at the same time; the first fault, once all have ended."""
@@ -299,13 +284,32 @@ class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
             threads.shutdown()
 
 
-def _require_alike(specs: Sequence[EnvSpecMessage]) -> None:
-    """Refuse racks that take or give different things."""
-    for name in ("observation_space", "action_space"):
-        first = getattr(specs[0], name)
-        for number, spec in enumerate(specs[1:], start=2):
-            if space_to_json(getattr(spec, name)) != space_to_json(first):
-                raise InvalidValue(
-                    f"The {name} of transport {number} is {getattr(spec, name)}, and that of the first {first}; "
-                    f"environments of one batch must be alike."
-                )
+def join_infos(each: Sequence[Info]) -> dict[str, Any]:
+    """Vector infos with Gymnasium's masks, of one info for each environment."""
+    infos: dict[str, Any] = {}
+    for key in dict.fromkeys(key for info in each for key in info):
+        mask = np.array([key in info for info in each])
+        values = [info[key] for info in each if key in info]
+        if all(isinstance(one, Mapping) for one in values):
+            infos[key] = join_infos([info.get(key, {}) for info in each])
+        else:
+            plain = all(isinstance(one, (bool, int, float, np.generic, np.ndarray)) for one in values)
+            kinds = {(array.dtype, array.shape) for array in map(np.asarray, values)} if plain else set()
+            infos[key] = np.full(len(each), None, dtype=object)
+            if len(kinds) == 1:
+                dtype, shape = kinds.pop()
+                infos[key] = np.zeros((len(each), *shape), dtype)
+            for i, value in zip(np.flatnonzero(mask), values, strict=True):
+                infos[key][i] = value
+        infos["_" + key] = mask
+    return infos
+
+
+def join_final(space: Space[Any], last: Sequence[Any], infos: Sequence[Info]) -> Any:
+    """``final_obs`` of a batch: the last observation of each episode that ended, or of the step where it goes on."""
+    if isinstance(space, spaces.Box):
+        return stack(space, [info.get("final_obs", seen) for info, seen in zip(infos, last, strict=True)])
+    column = np.full(len(infos), None, dtype=object)
+    for i, info in enumerate(infos):
+        column[i] = info.get("final_obs")
+    return column

@@ -23,7 +23,12 @@ _KIND = re.compile(r"(?P<package>[A-Za-z]\w*)/(?:(?:msg|srv)/)?(?P<name>[A-Za-z]
 _LIST = re.compile(r"sequence<(?P<open>.+?)(?:, \d+)?>|(?P<fixed>.+)\[\d+\]")
 _BYTES = {"uint8", "octet", "byte"}
 _FLOATS = {"float": "f", "double": "d"}
-_INTEGERS = {f"{sign}int{bits}": (sign, bits) for sign in ("", "u") for bits in (8, 16, 32, 64)}
+_INTEGERS = {
+    **{f"int{bits}": (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) for bits in (8, 16, 32, 64)},
+    **{f"uint{bits}": (0, 2**bits - 1) for bits in (8, 16, 32, 64)},
+    "octet": (0, 255),
+}
+"""The smallest and largest number of each type."""
 _INSTALL = "pip install 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-std-msgs ros-jazzy-sensor-msgs ros-jazzy-geometry-msgs"
 
 
@@ -54,11 +59,7 @@ class RclpyBus:
         self._threads: list[threading.Thread] = []
 
     def start(self) -> None:
-        """Create the node. Signals stay the program's own.
-
-        Raises:
-            InvalidValue: rclpy is not here.
-        """
+        """Create the node; raises InvalidValue if rclpy is not here. Signals stay the program's own."""
         rclpy = need_rclpy("A ROS 2 node")
         from rclpy.context import Context
         from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
@@ -122,23 +123,29 @@ class RclpyBus:
 
     def subscribe(self, topic: str, kind: str, listener: Listener) -> Callable[[], None]:
         """Call `listener` for each message, until what is returned is called."""
-        said = ""  # a refusal is logged once, however often it comes in a row
+        said = ""  # a refusal is logged once, however often it comes in a row: ROS cannot tell the sender
 
         def receive(message: Any) -> None:
             nonlocal said
-            refusal = _refusal(listener, to_dict(message))
+            refusal = ""
+            try:
+                listener(to_dict(message), UNKNOWN_CALLER)
+            except BamEnvsError as error:
+                refusal = str(error)
+            except Exception as error:  # it must not end the thread of every topic, among them the one that halts
+                _log.exception("a listener failed")
+                refusal = f"{type(error).__name__}: {error}"
             if refusal and refusal != said:
                 _log.warning("%s", refusal_of(topic, refusal))
             said = refusal
 
-        node = self._require_node()
-        made = node.create_subscription(interface(kind, "msg"), topic, receive, _DEPTH)
-        return lambda: self._destroy(made)
+        def stop() -> None:
+            with self._lock:
+                if self._node is not None:
+                    self._node.destroy_subscription(made)
 
-    def _destroy(self, subscription: Any) -> None:
-        with self._lock:
-            if self._node is not None:
-                self._node.destroy_subscription(subscription)
+        made = self._require_node().create_subscription(interface(kind, "msg"), topic, receive, _DEPTH)
+        return stop
 
     def serve(self, service: str, kind: str, handler: Handler) -> None:
         """Answer `service`, also when the handler fails: ROS has no failed responses, and a client waits for ever.
@@ -159,7 +166,9 @@ class RclpyBus:
                 return to_message(types.Response, handler(to_dict(request), UNKNOWN_CALLER), service)
             except Exception as error:  # a handler that fails must not end the node
                 _log.warning("%s: %s", service, error, exc_info=not isinstance(error, BamEnvsError))
-                return _with_text(response, str(error))
+                if "message" in response.get_fields_and_field_types():
+                    response.message = str(error)
+                return response
 
         self._require_node()
         self._caller.create_service(types, service, answer, callback_group=ReentrantCallbackGroup())
@@ -197,7 +206,7 @@ class RclpyBus:
             types = interface(kind, "msg").get_fields_and_field_types()
         except InvalidValue:
             return {}
-        return {name: is_list(type_name) for name, type_name in types.items()}
+        return {name: _element(type_name) is not None for name, type_name in types.items()}
 
     def is_offered(self, service: str) -> bool:
         """Whether some node offers `service`."""
@@ -230,23 +239,13 @@ class RclpyBus:
         for thread in threads:
             thread.join()
         for executor in executors:
-            _end_workers(executor)
+            # Its own shutdown leaves the threads of a MultiThreadedExecutor waiting for ever.
+            if (workers := getattr(executor, "_executor", None)) is not None:
+                workers.shutdown()
         for node in nodes:
             node.destroy_node()
         if self._context is not None:
             self._context.try_shutdown()
-
-
-def _refusal(listener: Listener, message: Message) -> str:
-    """Why `listener` refuses `message`, empty if it does not; ROS cannot tell the sender."""
-    try:
-        listener(message, UNKNOWN_CALLER)
-    except BamEnvsError as error:
-        return str(error)
-    except Exception as error:  # it must not end the thread of every topic, among them the one that halts
-        _log.exception("a listener failed")
-        return f"{type(error).__name__}: {error}"
-    return ""
 
 
 def _spin(executor: Any) -> None:
@@ -258,26 +257,8 @@ def _spin(executor: Any) -> None:
         _log.info("the node was shut down")
 
 
-def _end_workers(executor: Any) -> None:
-    """Its own shutdown leaves the threads of a MultiThreadedExecutor waiting for ever."""
-    pool = getattr(executor, "_executor", None)
-    if pool is not None:
-        pool.shutdown()
-
-
-def _with_text(response: Any, text: str) -> Any:
-    """`response` with `text` in its field `message`, which many types have."""
-    if "message" in response.get_fields_and_field_types():
-        response.message = text
-    return response
-
-
 def need_rclpy(purpose: str) -> Any:
-    """The package rclpy.
-
-    Raises:
-        InvalidValue: It is not here.
-    """
+    """The package rclpy; raises InvalidValue if it is not here."""
     try:
         return importlib.import_module("rclpy")
     except ModuleNotFoundError as error:
@@ -288,11 +269,7 @@ def need_rclpy(purpose: str) -> Any:
 
 
 def interface(kind: str, family: str) -> Any:
-    """The class of `kind`, such as ``std_msgs/String``; `family` is ``msg`` or ``srv``.
-
-    Raises:
-        InvalidValue: It is no such name, or its package is not here.
-    """
+    """The class of `kind`, such as ``std_msgs/String``; `family` is ``msg`` or ``srv``. Raises InvalidValue."""
     match = _KIND.fullmatch(kind)
     if match is None:
         raise InvalidValue(f"A ROS type is called pkg/Type, not {kind!r}.")
@@ -313,24 +290,17 @@ def _plain(value: Any, kind: str) -> Any:
     element = _element(kind)
     if element in _BYTES:
         return b"".join(value) if element == "octet" else bytes(value)
+    if element is not None and "/" in element:
+        return [to_dict(one) for one in value]
     if element is not None:
-        return [_plain(one, element) for one in value] if "/" in element else _listed(value)
+        return value.tolist() if hasattr(value, "tolist") else list(value)
     if "/" in kind:
         return to_dict(value)
     return value[0] if isinstance(value, bytes) else value
 
 
-def _listed(value: Any) -> list[Any]:
-    return value.tolist() if hasattr(value, "tolist") else list(value)
-
-
-def is_list(kind: str) -> bool:
-    """Whether fields of the type `kind`, as ROS 2 writes it, are lists."""
-    return _element(kind) is not None
-
-
 def _element(kind: str) -> str | None:
-    """What a list type is a list of; None for what is no list."""
+    """What a list type, as ROS 2 writes it, is a list of; None for what is no list."""
     match = _LIST.fullmatch(kind)
     return None if match is None else match["open"] or match["fixed"]
 
@@ -339,7 +309,7 @@ def to_message(make: Any, fields: Mapping[str, Any], where: str) -> Any:
     """A message of the class `make`; fields that `fields` has not are as ROS makes them.
 
     Raises:
-        InvalidValue: A field that the type has not, or a value that does not fit or is not finite.
+        InvalidValue: `make` has not such a field, or a value does not fit or is not finite.
     """
     message = make()
     types = make.get_fields_and_field_types()
@@ -369,24 +339,14 @@ def _single(value: Any, kind: str, make: Any, where: str) -> Any:
         if not isinstance(value, Mapping):
             raise InvalidValue(f"{where} must be an object with the fields of {kind}, not {value!r}.")
         return to_message(make, value, where)
-    if kind in _FLOATS and _is_number(value):
-        return float(value)
-    if kind in _INTEGERS and _is_number(value) and value == int(value) and _fits(int(value), kind):
-        return int(value)
+    if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
+        if kind in _FLOATS:
+            return float(value)
+        low, high = _INTEGERS.get(kind, (1, 0))
+        if value == int(value) and low <= value <= high:
+            return bytes([int(value)]) if kind == "octet" else int(value)
     if kind == "boolean" and isinstance(value, bool):
         return value
     if kind.startswith(("string", "wstring")) and isinstance(value, str):
         return value
-    if kind == "octet" and _is_number(value) and _fits(int(value), "uint8"):
-        return bytes([int(value)])
     raise InvalidValue(f"{where} must be a {'finite ' if kind in _FLOATS else ''}{kind}, not {value!r}.")
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _fits(value: int, kind: str) -> bool:
-    sign, bits = _INTEGERS[kind]
-    low, high = (0, 2**bits) if sign == "u" else (-(2 ** (bits - 1)), 2 ** (bits - 1))
-    return bool(low <= value < high)

@@ -26,9 +26,6 @@ class RclpyTransport(RosbridgeTransport):
         channel: ``"topics"``, a pair of std_msgs/String, or ``"service"``, for racks; that needs the package bam_msgs.
         domain: ROS domain; None for that of the environment variable ROS_DOMAIN_ID.
         options: What else `RosbridgeTransport` takes, but for certificates and token.
-
-    Raises:
-        InvalidValue: The URL or an option is not possible.
     """
 
     def __init__(
@@ -55,9 +52,9 @@ class RclpyLink(RclpyBus):
 
     Args:
         url: ``ros2://namespace``.
-        channel: Where the environment must be: ``"topics"`` or ``"service"``.
-        timeout: How long `connect` looks for it [s].
-        domain: ROS domain; None for that of the environment.
+        channel: Where `connect` looks for the environment: ``"topics"`` or ``"service"``.
+        timeout: How long it looks [s].
+        domain: ROS domain; None for that of the environment variable ROS_DOMAIN_ID.
     """
 
     def __init__(self, url: str, channel: str, *, timeout: float = 3.0, domain: int | None = None) -> None:
@@ -77,12 +74,7 @@ class RclpyLink(RclpyBus):
         return self.epoch > 0 and self._node is not None
 
     def connect(self) -> None:
-        """Join the graph, and see that the environment is in it.
-
-        Raises:
-            NoServer: It is not.
-            InvalidValue: rclpy is not here.
-        """
+        """Join the graph; raises NoServer if the environment is not in it."""
         if self.is_up:
             return
         by_service = self._channel == "service"
@@ -102,11 +94,7 @@ class RclpyLink(RclpyBus):
         self.epoch = 1
 
     def wait_up(self, timeout: float) -> None:
-        """There is nothing to wait for: a graph is there, or the link was closed.
-
-        Raises:
-            LinkLost: It was closed.
-        """
+        """Raise LinkLost if the link was closed; there is nothing to wait for."""
         if not self.is_up:
             raise LinkLost(f"{self.url}: the node has left the graph.")
 

@@ -9,11 +9,12 @@ import time
 from contextlib import suppress
 from typing import Any, Literal
 
+import gymnasium as gym
 from gymnasium import Space
 
 from bam_envs.core.errors import LinkLost, NoServer, ProtocolError, RemoteError, UnknownName
-from bam_envs.core.validation import check
-from bam_envs.remote.foreign_rack import ForeignRack, LastKnown
+from bam_envs.core.registry import resolve_id
+from bam_envs.core.validation import PositiveInt, check
 from bam_envs.remote.gymapi.gymapi_codec import DEFAULT, EnvCodec
 from bam_envs.remote.gymapi.gymapi_messages import (
     KIND,
@@ -27,6 +28,7 @@ from bam_envs.remote.gymapi.gymapi_messages import (
     whole_request,
     write_request,
 )
+from bam_envs.remote.gymapi.versions import version_named
 from bam_envs.remote.transport import EnvSpecMessage, Info, Seed, plain_seed, spec_from_json, spec_to_json
 from bam_envs.ros.freshness import Tagger
 from bam_envs.rosbridge.bus import namespaces_with
@@ -58,8 +60,14 @@ class RosbridgeTransport:
         ca_file: PEM file of the authorities to trust instead of the system's.
         token: The server's shared secret, if it has one.
         take: Take command from the client that has it.
-        observation_space: Of another rack; see `ForeignRack`.
-        action_space, num_envs, period, action_type, gymapi_version, autoreset: Likewise.
+        observation_space: Of a single environment, of a rack whose server is not of bam-train.
+        action_space: Likewise.
+        num_envs: Of another rack: environments (arms), which begin their episodes together.
+        period: Of another rack: time between two actions [s]; None if nobody knows.
+        action_type: Of another rack's actions: 1 default, 2 pick and lift, 3 pick and place, 4 open, 5 fold.
+        gymapi_version: Version of another rack's messages; None to find out by its first answer.
+        autoreset: Whether another rack begins the next episode in the step that ends one; None: as racks of its version
+            do, from June on.
 
     Raises:
         InvalidValue: The URL or an option is not possible.
@@ -88,16 +96,13 @@ class RosbridgeTransport:
         self.endpoint = Endpoint(url, ca_file, token, connect_timeout, timeout)
         self.channel = check(channel, Literal["service", "topics"], "channel")
         self.url, self.env_id, self.timeout, self.take = url, env_id, timeout, take
-        self._rack = ForeignRack(
-            observation_space, action_space, num_envs, period, action_type, gymapi_version, autoreset
-        )
-        self._version, self._last_known = self._rack.version, LastKnown()
+        self._spaces, self._num_envs = (observation_space, action_space), check(num_envs, PositiveInt, "num_envs")
+        self._period, self._action_type, self._autoreset = period, action_type, autoreset
+        self._version = None if gymapi_version is None else version_named(gymapi_version)
         self._name, self._lock, self._closed = name, threading.Lock(), False
-        self._there: EnvCodec | None = None
         self._described_epoch: int | None = None
         self._known_epoch: int | None = None  # of the connection on which the state over there is known
-        self._link = self._make_link()
-        self._base = base_name(self._link.namespace)
+        self._last: Any = None  # the last observation, or a list of them
         self._begin_process()
 
     def connect(self) -> EnvSpecMessage:
@@ -121,7 +126,7 @@ class RosbridgeTransport:
             response = self._ask(RequestType.RESET, seed=plain, options=options, take=self.take)
             observation, *_, info = there.read_result(response)
             self._known_epoch = epoch
-            self._last_known.begin(observation)
+            self._last = observation
             return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
@@ -133,11 +138,34 @@ class RosbridgeTransport:
         with self._lock:
             there = self._there
             if there is None or self._closed or self._known_epoch != self._link.epoch or os.getpid() != self._pid:
-                raise LinkLost(f"{self.url}: {self._why_unknown()}, and nothing was sent. Call reset() first.")
+                reason = "the link was lost, so what the environment did since is unknown"
+                if self._closed:
+                    reason = "this transport is closed"
+                elif there is None or os.getpid() != self._pid:
+                    reason = "the link is not open"
+                raise LinkLost(f"{self.url}: {reason}, and nothing was sent. Call reset() first.")
             result = there.read_result(self._ask(RequestType.STEP, actions=there.write_actions(action)))
-            if there.foreign and self._rack.begins_next(self._version):
-                return self._last_known.instead(result, there.spec.vector)
+            june = self._version is not None and self._version.june
+            if there.foreign and (june if self._autoreset is None else self._autoreset):
+                return self._with_last_known(result, there.spec.vector)
             return result
+
+    def _with_last_known(self, result: tuple[Any, Any, Any, Any, Any], vector: bool) -> tuple[Any, Any, Any, Any, Any]:
+        """A step's result of a rack that begins the next episode in the step that ends one.
+
+        It then observes the first observation of the next episode, and the last one of the old never comes: that of the
+        step before stands in its place, and `info` has ``stale_observation``.
+        """
+        before, (observation, reward, terminated, truncated, info) = self._last, result
+        self._last = observation
+        if not vector:
+            if terminated or truncated:
+                observation, info = before, {**info, "stale_observation": True}
+            return observation, reward, terminated, truncated, info
+        ended = [done or cut for done, cut in zip(terminated, truncated, strict=True)]
+        observation = [before[i] if end else observation[i] for i, end in enumerate(ended)]
+        info = [{**info[i], "stale_observation": True} if end else info[i] for i, end in enumerate(ended)]
+        return observation, reward, terminated, truncated, info
 
     def close(self) -> None:
         """Release the environment there and drop the link; a request under way ends with `LinkLost`."""
@@ -155,88 +183,84 @@ class RosbridgeTransport:
         self._rpc.close()
         self._link.close()
 
-    def _why_unknown(self) -> str:
-        if self._closed:
-            return "this transport is closed"
-        if self._there is None or os.getpid() != self._pid:
-            return "the link is not open"
-        return "the link was lost, so what the environment did since is unknown"
-
     def _make_link(self) -> Any:
         return RosbridgeLink(self.endpoint, name="gymapi")
 
     def _begin_process(self) -> None:
-        self._pid, self._tagger = os.getpid(), Tagger()
+        self._pid, self._tagger, self._link = os.getpid(), Tagger(), self._make_link()
+        self._there: EnvCodec | None = None
+        self._base = base_name(self._link.namespace)
         self._rpc = StringRpc(self._link, self._base, self._tagger)
 
     def _connect(self) -> EnvCodec:
         if self._closed:
             raise LinkLost(f"{self.url}: this transport is closed; make a new one.")
         if os.getpid() != self._pid:  # after a fork the link is the parent's, which must not notice
-            self._link, self._there = self._make_link(), None
             self._begin_process()
-        if self._there is None:
+        before = self._there
+        if before is None:
             self._link.connect()
         else:
             self._link.wait_up(self.endpoint.connect_timeout)
-        if self._there is None or self._described_epoch != self._link.epoch:
-            self._there = self._described()
-            if self.channel == "topics" and not self._there.foreign and not self._tagger.signs:
-                self._open_session()
-        return self._there
-
-    def _open_session(self) -> None:
-        """Everybody can read requests on topics: they are signed."""
-        service = f"{self._base}/session"
-        try:
-            answer = self._link.call(service, "std_srvs/Trigger", {}, self.endpoint.connect_timeout)
-        except RemoteError:  # an older server
-            return
-        self._sign_with(read_session(answer, service))
+        if before is not None and self._described_epoch == self._link.epoch:
+            return before
+        epoch = self._link.epoch
+        there = self._asked() if None in self._spaces else self._rack()
+        if before is not None and spec_to_json(before.spec) != spec_to_json(there.spec):
+            raise ProtocolError(f"{self.url}: it serves another environment than before: {there.spec.env_id}.")
+        self._there, self._described_epoch, self._known_epoch = there, epoch, epoch
+        if self.channel == "topics" and not there.foreign and not self._tagger.signs:
+            # Everybody can read requests on topics: they are signed.
+            service = f"{self._base}/session"
+            with suppress(RemoteError):  # an older server
+                answer = self._link.call(service, "std_srvs/Trigger", {}, self.endpoint.connect_timeout)
+                self._sign_with(read_session(answer, service))
+        return there
 
     def _sign_with(self, tagger: Tagger) -> None:
         self._rpc.close()
         self._tagger = tagger
         self._rpc = StringRpc(self._link, self._base, tagger)
 
-    def _described(self) -> EnvCodec:
-        """The environment on this connection, which must be that of the connection before."""
-        epoch, before = self._link.epoch, self._there
-        there = self._rack.codec(self.env_id) if self._rack.is_described else self._asked()
-        if before is not None and spec_to_json(before.spec) != spec_to_json(there.spec):
-            raise ProtocolError(f"{self.url}: it serves another environment than before: {there.spec.env_id}.")
-        self._described_epoch = self._known_epoch = epoch
-        return there
+    def _rack(self) -> EnvCodec:
+        """How values travel to another rack; spaces that were not given are those of `env_id` registered here."""
+        observation_space, action_space = self._spaces
+        if observation_space is None or action_space is None:
+            env: gym.Env[Any, Any] = gym.make(resolve_id(self.env_id))
+            observation_space, action_space = env.observation_space, env.action_space
+            env.close()  # type: ignore[no-untyped-call]
+        spec = EnvSpecMessage(
+            self.env_id or "rack",
+            observation_space,
+            action_space,
+            self._num_envs,
+            vector=self._num_envs > 1,
+            autoreset=False,
+            period=self._period,
+        )
+        return EnvCodec(spec, foreign=True, action_type=self._action_type)
 
     def _asked(self) -> EnvCodec:
-        """Ask the server for its description; an answer without one is that of another rack."""
-        try:
-            response = self._introduction()
-        except RemoteError as error:  # no such service, or a rack that fails at what it does not know
-            return self._foreign(str(error))
-        except LinkLost as error:
-            raise NoServer(self.url, f"rosbridge is there, and {self._where()} is silent: {error}") from error
+        """Ask the server for its description, which moves nothing; an answer without one is that of another rack."""
+        limit, questions = max(self.endpoint.connect_timeout, 1.0) / _QUESTIONS, _QUESTIONS
+        while True:
+            try:
+                response = self._exchange(RequestType.NONE, None, timeout=limit)
+                break
+            except RemoteError as error:
+                if not is_over(error):  # no such service, or a rack that fails at what it does not know
+                    return self._foreign(str(error))
+                self._sign_with(Tagger())
+            except LinkLost as error:
+                questions -= 1
+                if not questions:
+                    raise NoServer(self.url, f"rosbridge is there, and {self._where()} is silent: {error}") from error
         if response.error is not None and response.ours:
             raise NoServer(self.url, str(response.error)) from response.error
         spec = response.exact[0].get("spec") if response.exact else None
         if spec is None:
             return self._foreign(str(response.error or "it does not describe its environment"))
         return EnvCodec(spec_from_json(spec))
-
-    def _introduction(self, questions: int = _QUESTIONS) -> GymResponse:
-        """Ask for the description, again while no answer comes: that moves nothing."""
-        try:
-            limit = max(self.endpoint.connect_timeout, 1.0) / _QUESTIONS
-            return self._exchange(RequestType.NONE, None, timeout=limit)
-        except RemoteError as error:
-            if not is_over(error):
-                raise
-            self._sign_with(Tagger())
-            return self._introduction(questions)
-        except LinkLost:
-            if questions == 1:
-                raise
-        return self._introduction(questions - 1)
 
     def _foreign(self, reason: str) -> EnvCodec:
         namespace = f" --namespace {self._link.namespace.strip('/')}" if self._link.namespace else ""
@@ -245,7 +269,7 @@ class RosbridgeTransport:
             elsewhere = namespaces_with(self._link, "services", service_name(""))
             raise NoServer(self.url, f"{reason}.{elsewhere} {remedy}")
         try:
-            return self._rack.codec(self.env_id)
+            return self._rack()
         except UnknownName as error:
             raise NoServer(
                 self.url,

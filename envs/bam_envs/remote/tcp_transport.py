@@ -24,7 +24,6 @@ from bam_envs.remote.tcp_wire import (
     encode,
     pack_action,
     read_result,
-    tag_message,
 )
 from bam_envs.remote.transport import EnvSpecMessage, Info, Seed, plain_seed, spec_from_json, spec_to_json
 from bam_envs.remote.values import Tree, plain_info
@@ -65,7 +64,15 @@ class TcpTransport:
     ) -> None:
         self.endpoint = Endpoint(url, None, token, connect_timeout, timeout)
         self.url, self.env_id, self.timeout, self.take = url, env_id, timeout, take
-        self._host, self._port = _address(url)
+        try:
+            parts = urlsplit(url)
+            host, port = parts.hostname, parts.port
+            (host or "").encode("idna")
+        except ValueError as error:  # brackets, the port, or a name that cannot be looked up
+            raise InvalidValue(f"{url!r} is not a TCP address: {error}.") from error
+        if parts.scheme != "tcp" or not host or not port or parts.path.strip("/"):
+            raise InvalidValue(f"A TCP address is tcp://host:port, such as tcp://10.0.0.5:5555, not {url!r}.")
+        self._host, self._port = host, port
         self._name = name
         self._tagger, self._epoch = Tagger(), 0
         self._lock = threading.Lock()
@@ -106,46 +113,40 @@ class TcpTransport:
         self._closed = True
         if self._lock.acquire(blocking=False):
             try:
-                self._leave()
+                if self._is_up():
+                    with suppress(LinkLost, ProtocolError, RemoteError):  # the server notices that a link is gone
+                        self._ask(Leave(self._tag(min(self.timeout, _LEAVE_TIMEOUT))))
+                self._drop()
             finally:
                 self._lock.release()
-        self._drop()
-
-    def _leave(self) -> None:
-        if self._is_up():
-            with suppress(LinkLost, ProtocolError, RemoteError):  # the server notices by itself that a link is gone
-                self._ask(Leave(self._tag(min(self.timeout, _LEAVE_TIMEOUT))))
+        elif (frames := self._frames) is not None and self._pid == os.getpid():
+            frames.hang_up()  # the thread of the request closes it
 
     def _is_up(self) -> bool:
         return self._frames is not None and self._pid == os.getpid()
 
     def _connected(self) -> EnvSpecMessage:
         """Connect if the link is down; the environment there."""
-        if self._closed:
-            raise LinkLost(f"{self.url}: this transport is closed; make a new one.")
-        if self._spec is not None and self._is_up():
+        if self._spec is not None and not self._closed and self._is_up():
             return self._spec
-        self._forget_parent()
+        if self._frames is not None and not self._closed:  # after a fork: the link and the session are the parent's
+            self._frames.abandon()
+            self._frames, self._tagger, self._epoch = None, Tagger(), 0
         try:
+            self._require_open()
             spec = self._open()
+            if self._spec is not None and spec_to_json(self._spec) != spec_to_json(spec):
+                raise ProtocolError(f"{self.url}: it serves another environment than before: {spec.env_id}.")
+            self._require_open()  # another thread may have closed it meanwhile, when there was no link to drop
         except BaseException:
             self._drop()
             raise
-        if self._spec is not None and spec_to_json(self._spec) != spec_to_json(spec):
-            self._drop()
-            raise ProtocolError(f"{self.url}: it serves another environment than before: {spec.env_id}.")
-        if self._closed:  # meanwhile, by another thread, which found no link to drop
-            self._drop()
-            raise LinkLost(f"{self.url}: this transport is closed; make a new one.")
         self._spec = spec
         return spec
 
-    def _forget_parent(self) -> None:
-        """After a fork, forget the link and the session of the parent, and leave them open."""
-        frames, self._frames = self._frames, None
-        if frames is not None:
-            frames.abandon()
-            self._tagger, self._epoch = Tagger(), 0
+    def _require_open(self) -> None:
+        if self._closed:
+            raise LinkLost(f"{self.url}: this transport is closed; make a new one.")
 
     def _open(self) -> EnvSpecMessage:
         deadline = time.monotonic() + self.endpoint.connect_timeout
@@ -153,7 +154,16 @@ class TcpTransport:
         try:
             self._frames = FrameSocket(_dial(self._host, self._port, deadline))
         except OSError as error:
-            raise NoServer(self.url, f"{self._unreachable(error)}. Start one: {start} {self._port}") from error
+            if isinstance(error, ConnectionRefusedError):
+                reason = "nobody listens there (is the port open?)"
+            elif isinstance(error, TimeoutError):
+                limit = f"{self.endpoint.connect_timeout:g} s"
+                reason = f"no answer within {limit} (is the address right, and no firewall between?)"
+            elif isinstance(error, socket.gaierror):
+                reason = f"no computer is known by the name {self._host!r}"
+            else:
+                reason = error.strerror or str(error)
+            raise NoServer(self.url, f"{reason}. Start one: {start} {self._port}") from error
         self._pid, self._epoch = os.getpid(), self._epoch + 1
         name = self._name or f"{socket.gethostname()}:{self._pid}"
         hello = Hello(self._tagger.session, self._epoch, name, self.endpoint.token or "", self.env_id)
@@ -166,19 +176,9 @@ class TcpTransport:
             remedy = f"If it is rosbridge, use ws://; else start one at a free port: {start} PORT"
             raise NoServer(self.url, f"not a bam-serve TCP server: {error}. {remedy}") from error
 
-    def _unreachable(self, error: OSError) -> str:
-        if isinstance(error, ConnectionRefusedError):
-            return "nobody listens there (is the port open?)"
-        if isinstance(error, TimeoutError):
-            return (
-                f"no answer within {self.endpoint.connect_timeout:g} s (is the address right, and no firewall between?)"
-            )
-        if isinstance(error, socket.gaierror):
-            return f"no computer is known by the name {self._host!r}"
-        return error.strerror or str(error)
-
     def _tag(self, limit: float) -> TagMessage:
-        return tag_message(self._tagger.next(self._epoch, limit))
+        tag = self._tagger.next(self._epoch, limit)
+        return TagMessage(tag.session, tag.epoch, tag.sequence, tag.sent, tag.deadline)
 
     def _ask(self, request: Request) -> Tree:
         """Send a request and return the content of its answer; after any other outcome the link is down."""
@@ -194,16 +194,18 @@ class TcpTransport:
             raise
         except LinkLost as error:
             self._drop()
-            kind = type(request).__name__.lower()
-            raise LinkLost(f"{self.url}: {self._cause(error, deadline, kind, limit)}.") from error
+            reason = str(error)
+            if self._closed:
+                reason = "this transport was closed meanwhile"
+            elif time.monotonic() >= deadline:
+                reason = f"no answer to {type(request).__name__.lower()} within {limit:g} s"
+            raise LinkLost(f"{self.url}: {reason}.") from error
         except BaseException:  # also Ctrl-C: the answer may still come, and be taken for that of the next request
             self._drop()
             raise
-
-    def _cause(self, error: LinkLost, deadline: float, kind: str, limit: float) -> str:
-        if self._closed:
-            return "this transport was closed meanwhile"
-        return f"no answer to {kind} within {limit:g} s" if time.monotonic() >= deadline else str(error)
+        finally:
+            if self._closed:  # by another thread, which only hung up
+                self._drop()
 
     def _result(self, spec: EnvSpecMessage, tree: Tree, size: int) -> tuple[Any, ...]:
         try:
@@ -226,15 +228,3 @@ def _dial(host: str, port: int, deadline: float) -> socket.socket:
         except OSError as error:  # noqa: PERF203 - the next address may answer
             refusal = error
     raise refusal
-
-
-def _address(url: str) -> tuple[str, int]:
-    try:
-        parts = urlsplit(url)
-        host, port = parts.hostname, parts.port
-        (host or "").encode("idna")
-    except ValueError as error:  # brackets, the port, or a name that cannot be looked up
-        raise InvalidValue(f"{url!r} is not a TCP address: {error}.") from error
-    if parts.scheme != "tcp" or not host or not port or parts.path.strip("/"):
-        raise InvalidValue(f"A TCP address is tcp://host:port, such as tcp://10.0.0.5:5555, not {url!r}.")
-    return host, port

@@ -49,7 +49,6 @@ from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NotInComm
 from bam_envs.core.wording import brief
 from bam_envs.remote.transport import EnvSpecMessage
 from bam_envs.remote.values import Tree, exact, number_dtype, pack
-from bam_envs.ros.freshness import Tag
 
 MARK, VERSION = b"bam", 1
 MAX_FRAME = 256 * 1024 * 1024
@@ -99,20 +98,6 @@ class TagMessage(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fi
         """Time from its sending to its deadline [s]."""
         return self.deadline - self.sent
 
-    @property
-    def number(self) -> tuple[str, int, int]:
-        """Which request of which connection it is."""
-        return self.session, self.epoch, self.sequence
-
-    def to_tag(self) -> Tag:
-        """What a `FreshnessCheck` takes."""
-        return Tag(self.session, self.epoch, self.sequence, self.sent, self.deadline)
-
-
-def tag_message(tag: Tag) -> TagMessage:
-    """`tag` as it travels."""
-    return TagMessage(tag.session, tag.epoch, tag.sequence, tag.sent, tag.deadline)
-
 
 class Reset(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="reset"):
     """Begin an episode."""
@@ -145,7 +130,7 @@ _Answer = tuple[int, str, Any]
 
 
 def refusal(sequence: int, error: BamEnvsError) -> Tree:
-    """The answer that something went wrong."""
+    """The answer that a request failed."""
     text = str(error).encode(errors="replace").decode()  # halves of surrogate pairs cannot be sent
     return [sequence, "NotInCommand" if isinstance(error, NotInCommand) else "RemoteError", text]
 
@@ -154,8 +139,7 @@ def content_of(answer: Tree, sequence: int) -> Tree:
     """The content of `answer`, which must be that to request number `sequence`.
 
     Raises:
-        NotInCommand: The answer is that another client is in command.
-        RemoteError: The answer is that something went wrong.
+        RemoteError: The answer is a `refusal`; `NotInCommand` if another client is in command.
         ProtocolError: It is no answer, or one to another request.
     """
     try:
@@ -170,7 +154,7 @@ def content_of(answer: Tree, sequence: int) -> Tree:
 
 
 def action_size(spec: EnvSpecMessage) -> int:
-    """What an action holds at most, of all environments [bytes]; about, where its space does not say."""
+    """About the most that the actions of all environments hold [bytes]."""
     try:
         return 8 * spaces.flatdim(spec.action_space) * spec.num_envs
     except (NotImplementedError, ValueError):  # sequences may be of any length
@@ -201,11 +185,7 @@ def _pack_each(spec: EnvSpecMessage, space: spaces.Space[Any], values: Any, name
 
 
 def read_result(spec: EnvSpecMessage, tree: Tree, size: int) -> tuple[Any, ...]:
-    """The result of `size` values that `pack_result` was given.
-
-    Raises:
-        ProtocolError: It is something else.
-    """
+    """The result of `size` values that `pack_result` was given. Raises ProtocolError if it is something else."""
     if not isinstance(tree, list) or len(tree) != size:
         raise ProtocolError(f"Expected a result of {size} values, found {brief(tree)}.")
     observation, *between, info = tree
@@ -235,46 +215,36 @@ def encode(message: Tree) -> list[bytes | memoryview]:
     Raises:
         ProtocolError: The frame would be larger than `MAX_FRAME`, or something in it cannot be sent.
     """
-    body = _Body()
-    try:
-        header = msgspec.msgpack.encode(message, enc_hook=body.add)
-    except (ValueError, OverflowError, RecursionError) as error:
-        raise ProtocolError(f"A message cannot be sent: {str(error).rstrip('.')}.") from error
-    if len(header) + body.size > MAX_FRAME:
-        raise ProtocolError(f"A message of {len(header) + body.size} bytes is too large; {MAX_FRAME} are allowed.")
-    parts = [_PREFIX.pack(MARK, VERSION, len(header), body.size), header, *body.parts]
-    return [b"".join(parts)] if body.size <= _SMALL else parts
+    arrays: list[bytes | memoryview] = []
+    size = 0
 
-
-class _Body:
-    """Collects the arrays of a tree."""
-
-    def __init__(self) -> None:
-        self.parts: list[bytes | memoryview] = []
-        self.size = 0
-
-    def add(self, value: Any) -> Ext:
-        """What stands for `value` in the header."""
+    def add(value: Any) -> Ext:
+        """What stands for `value` in the header; arrays go into the body."""
+        nonlocal size
         if isinstance(value, np.generic):
             return Ext(_SCALAR, msgspec.msgpack.encode([value.dtype.str, value.tobytes()]))
         if not isinstance(value, np.ndarray):
             raise ProtocolError(f"{brief(value)} cannot be sent.")
-        content = msgspec.msgpack.encode([value.dtype.str, value.shape, self.size])
+        content = msgspec.msgpack.encode([value.dtype.str, value.shape, size])
         if value.size:
-            self.parts.append(value.reshape(-1).view(np.uint8).data)
             padding = -value.nbytes % _ALIGN
-            if padding:
-                self.parts.append(bytes(padding))
-            self.size += value.nbytes + padding
+            arrays.append(value.reshape(-1).view(np.uint8).data)
+            arrays.extend([bytes(padding)] if padding else [])
+            size += value.nbytes + padding
         return Ext(_ARRAY, content)
+
+    try:
+        header = msgspec.msgpack.encode(message, enc_hook=add)
+    except (ValueError, OverflowError, RecursionError) as error:
+        raise ProtocolError(f"A message cannot be sent: {str(error).rstrip('.')}.") from error
+    if len(header) + size > MAX_FRAME:
+        raise ProtocolError(f"A message of {len(header) + size} bytes is too large; {MAX_FRAME} are allowed.")
+    parts = [_PREFIX.pack(MARK, VERSION, len(header), size), header, *arrays]
+    return [b"".join(parts)] if size <= _SMALL else parts
 
 
 def read_prefix(prefix: bytes | bytearray) -> tuple[int, int]:
-    """Sizes of header and body.
-
-    Raises:
-        ForeignPeer: The other end speaks another protocol, or another version of this.
-    """
+    """Sizes of header and body; raises `ForeignPeer` if the other end speaks another protocol or another version."""
     mark, version, header, body = _PREFIX.unpack(prefix)
     if mark != MARK:
         hint = "; rosbridge servers have ws:// URLs" if bytes(prefix).startswith((b"HTTP", b"<")) else ""
@@ -287,11 +257,7 @@ def read_prefix(prefix: bytes | bytearray) -> tuple[int, int]:
 
 
 def decode(header: bytes | memoryview, body: NDArray[np.uint8], kind: Any = Any) -> Any:
-    """The message of the type `kind` in a frame; its arrays lie in `body`.
-
-    Raises:
-        ProtocolError: It is damaged, or of another type.
-    """
+    """The message of the type `kind` in a frame; its arrays lie in `body`. Raises ProtocolError if it is damaged."""
 
     def restore(code: int, data: memoryview) -> Any:
         if code == _SCALAR:
@@ -339,8 +305,10 @@ class FrameSocket:
         try:
             while parts:
                 self._set_timeout(deadline)
-                sent = self._socket.sendmsg(parts[:_MOST_PARTS])
-                parts = _rest(parts, sent)
+                sent, done = self._socket.sendmsg(parts[:_MOST_PARTS]), 0
+                while done < len(parts) and sent >= len(parts[done]):
+                    sent, done = sent - len(parts[done]), done + 1
+                parts = [memoryview(parts[done])[sent:], *parts[done + 1 :]] if done < len(parts) else []
         except OSError as error:
             raise LinkLost(error.strerror or str(error)) from error
 
@@ -388,29 +356,21 @@ class FrameSocket:
             filled += count
 
     def _set_timeout(self, deadline: float) -> None:
-        if deadline == math.inf:
-            self._socket.settimeout(None)
-            return
         left = deadline - time.monotonic()
         if left <= 0:
             raise TimeoutError("timed out")
-        self._socket.settimeout(left)
+        self._socket.settimeout(left if left < math.inf else None)
 
     def abandon(self) -> None:
         """Close it here after a fork; the connection is the parent's and stays up."""
         self._socket.close()
 
-    def close(self) -> None:
-        """Close it; a thread that waits for a frame gets `LinkLost`. Idempotent, from any thread."""
+    def hang_up(self) -> None:
+        """End the connection; a thread that waits for a frame gets `LinkLost`. Idempotent, from any thread."""
         with suppress(OSError):  # it was closed before, by either end
             self._socket.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        """End the connection, in the thread that uses it: another one could wait on a number that is given anew."""
+        self.hang_up()
         self._socket.close()
-
-
-def _rest(parts: list[bytes | memoryview], sent: int) -> list[bytes | memoryview]:
-    """What is left of `parts` after `sent` bytes."""
-    for i, part in enumerate(parts):
-        if sent < len(part):
-            return [memoryview(part)[sent:], *parts[i + 1 :]]
-        sent -= len(part)
-    return []

@@ -44,17 +44,10 @@ class EnvSpecMessage:
     """What `describe()` of the environment there returns; empty if the other end does not say."""
 
     def each(self, action: Any) -> list[Any]:
-        """The action of each environment.
-
-        Raises:
-            InvalidValue: There are too many or too few.
-        """
+        """The action of each environment. Raises InvalidValue if there are too many or too few."""
         if not self.vector:
             return [action]
-        try:
-            each = list(action)
-        except TypeError:  # a number, or an array without an axis
-            each = []
+        each = list(action) if np.iterable(action) else []
         if len(each) != self.num_envs:
             raise InvalidValue(
                 f"There must be one action for each of {self.num_envs} environments, not {brief(action)}."
@@ -63,11 +56,7 @@ class EnvSpecMessage:
 
 
 def plain_seed(seed: Any, largest: float = math.inf) -> Seed:
-    """A seed, or one for each environment, as Python's numbers.
-
-    Raises:
-        InvalidValue: It is not a whole number from 0 to `largest`.
-    """
+    """A seed, or one for each environment, as Python's numbers. Raises InvalidValue if it is beyond 0 to `largest`."""
     if seed is None:
         return None
     if isinstance(seed, (list, tuple, np.ndarray)):
@@ -93,11 +82,7 @@ def spec_to_json(spec: EnvSpecMessage) -> dict[str, Any]:
 
 
 def spec_from_json(value: Mapping[str, Any]) -> EnvSpecMessage:
-    """The environment that `spec_to_json` described.
-
-    Raises:
-        ProtocolError: `value` is no such description.
-    """
+    """The environment that `spec_to_json` described. Raises ProtocolError if `value` is something else."""
     try:
         return EnvSpecMessage(
             env_id=str(value["env_id"]),

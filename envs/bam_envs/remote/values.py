@@ -23,7 +23,7 @@ from __future__ import annotations
 import base64
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -35,25 +35,52 @@ from bam_envs.core.errors import InvalidValue, ProtocolError, UnknownName
 from bam_envs.core.wording import brief
 
 Tree = Any
+_KINDS = ("Box", "Dict", "Discrete", "MultiBinary", "MultiDiscrete", "Sequence", "Text", "Tuple")
 _INT64 = range(-(2**63), 2**63)
 _DTYPE = re.compile("[<>|=]?[biuf][0-9]{1,2}")
 
 
 def pack(space: Space[Any], value: Any, name: str = "value") -> Tree:
-    """Check `value` and return its tree.
-
-    Args:
-        space: What the value must be one of.
-        value: As the space has it, or its tree.
-        name: What errors call it.
+    """Check `value`, which may be a tree already, and return its tree.
 
     Raises:
         InvalidValue: It does not fit; the text names the place, such as ``action['arm'][2]``.
+        UnknownName: No value of such a space can be sent.
     """
-    for kind, pack_one in _PACKERS:
-        if isinstance(space, kind):
-            return pack_one(space, value, name)
-    raise UnknownName("kind of space", type(space).__name__, [kind.__name__ for kind, _ in _PACKERS])
+    if isinstance(space, spaces.Box):
+        return _finite(space, _array(space, value, name), name)
+    if isinstance(space, spaces.Discrete):
+        plain = value.item() if isinstance(value, (np.generic, np.ndarray)) and value.size == 1 else value
+        if isinstance(plain, bool) or not isinstance(plain, int) or not 0 <= plain - int(space.start) < int(space.n):
+            last = int(space.start) + int(space.n) - 1
+            raise InvalidValue(f"{name} must be a whole number from {space.start} to {last}, not {brief(value)}.")
+        return plain
+    if isinstance(space, spaces.Dict):
+        _require_keys(space, value, name)
+        return {key: pack(one, value[key], f"{name}[{key!r}]") for key, one in space.spaces.items()}
+    if isinstance(space, (spaces.MultiDiscrete, spaces.MultiBinary)):
+        array = _array(space, value, name)
+        if not space.contains(array):
+            raise InvalidValue(f"{name} must be one of {space}, not {brief(value)}.")
+        return array
+    if isinstance(space, spaces.Text):
+        if not isinstance(value, str) or not space.contains(value):
+            raise InvalidValue(
+                f"{name} must be {space.min_length} to {space.max_length} of the characters "
+                f"{brief(''.join(space.character_list))}, not {brief(value)}."
+            )
+        return str(value)
+    if isinstance(space, spaces.Tuple):
+        _require_length(space, value, name)
+        return [pack(one, part, f"{name}[{i}]") for i, (one, part) in enumerate(zip(space.spaces, value, strict=True))]
+    if isinstance(space, spaces.Sequence):
+        # Gymnasium stacks arrays, dicts and tuples; a list is the list of items of a tree.
+        stacked = space.stack and not isinstance(value, list)
+        items = _unstacked(space.feature_space, value, name) if stacked else value
+        if not isinstance(items, (tuple, list)):
+            raise InvalidValue(f"{name} must be a tuple of any length, not {brief(value)}.")
+        return [pack(space.feature_space, one, f"{name}[{i}]") for i, one in enumerate(items)]
+    raise UnknownName("kind of space", type(space).__name__, _KINDS)
 
 
 def exact(space: Space[Any], value: Any, name: str = "value") -> Any:
@@ -72,50 +99,44 @@ def _unpacked(space: Space[Any], tree: Tree) -> Any:
     if not isinstance(space, spaces.Sequence):
         return tree
     items = tuple(_unpacked(space.feature_space, one) for one in tree)
-    if not space.stack:
-        return items
-    empty = create_empty_array(space.feature_space, len(items))
-    return concatenate(space.feature_space, items, empty) if items else empty
+    return stack(space.feature_space, items) if space.stack else items
 
 
-def _pack_box(space: spaces.Box, value: Any, name: str) -> NDArray[Any]:
-    array = _array(space, value, name)
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
-        _refuse_not_finite(space, array, name)
-    return array
+def stack(space: Space[Any], each: Sequence[Any]) -> Any:
+    """One batch of several values of `space`, in arrays of its own."""
+    empty = create_empty_array(space, len(each))
+    return concatenate(space, each, empty) if each else empty
 
 
 def _array(space: Space[Any], value: Any, name: str) -> NDArray[Any]:
-    """`value` with the dtype and shape of `space`."""
+    """`value` with the dtype and shape of `space`: rounding floats is allowed, changing anything else is not."""
     if not isinstance(value, np.ndarray):
         try:
             value = np.asarray(value)
-        except ValueError as error:  # rows of different lengths
+        except ValueError as error:  # lists of different lengths
             raise InvalidValue(f"{name} must be an array, not {brief(value)}.") from error
         if value.dtype.kind not in "biuf":
             raise InvalidValue(f"{name} must be numbers, not {brief(value.tolist())}.")
     if value.shape != space.shape:
         raise InvalidValue(f"{name} must have shape {space.shape}, not {value.shape}.")
-    if value.dtype != space.dtype:
-        return _cast(value, np.dtype(space.dtype), name)
-    return value if value.flags.c_contiguous else np.array(value, order="C")
-
-
-def _cast(array: NDArray[Any], dtype: np.dtype[Any], name: str) -> NDArray[Any]:
-    """To `dtype`: rounding floats is allowed, changing anything else is not."""
-    if array.dtype.kind not in "biuf" or (array.dtype.kind == "f" and dtype.kind != "f"):
-        raise InvalidValue(f"{name} must be of dtype {dtype}, not {array.dtype}.")
+    dtype = np.dtype(space.dtype)
+    if value.dtype == dtype:
+        return value if value.flags.c_contiguous else np.array(value, order="C")
+    if value.dtype.kind not in "biuf" or (value.dtype.kind == "f" and dtype.kind != "f"):
+        raise InvalidValue(f"{name} must be of dtype {dtype}, not {value.dtype}.")
     with np.errstate(over="ignore"):
-        cast: NDArray[Any] = np.ascontiguousarray(array, dtype=dtype).reshape(array.shape)
-    changed = np.isinf(cast) & np.isfinite(array) if dtype.kind == "f" else cast != array
+        cast: NDArray[Any] = np.ascontiguousarray(value, dtype=dtype).reshape(value.shape)
+    changed = np.isinf(cast) & np.isfinite(value) if dtype.kind == "f" else cast != value
     if changed.any():
-        place, found = _first(changed, array, name)
+        place, found = _first(changed, value, name)
         raise InvalidValue(f"{place} is {found}, which {dtype} cannot hold.")
     return cast
 
 
-def _refuse_not_finite(space: spaces.Box, array: NDArray[Any], name: str) -> None:
-    """Refuse NaN, and infinity beyond a finite bound."""
+def _finite(space: spaces.Box, array: NDArray[Any], name: str) -> NDArray[Any]:
+    """`array`, without NaN, and without infinity beyond a finite bound."""
+    if array.dtype.kind != "f" or np.isfinite(array).all():
+        return array
     bad = np.isnan(array)
     if bad.any():
         raise InvalidValue(f"{_first(bad, array, name)[0]} is NaN; only numbers are sent.")
@@ -123,68 +144,24 @@ def _refuse_not_finite(space: spaces.Box, array: NDArray[Any], name: str) -> Non
     if bad.any():
         place, found = _first(bad, array, name)
         raise InvalidValue(f"{place} is {found}, where the space has a finite bound.")
+    return array
 
 
 def _first(bad: NDArray[np.bool_], array: NDArray[Any], name: str) -> tuple[str, Any]:
     """Name and value of the first element that is `bad`."""
     index = tuple(int(one) for one in np.argwhere(bad)[0])
-    place = f"{name}[{', '.join(map(str, index))}]" if index else name
-    return place, array[index]
+    return f"{name}[{', '.join(map(str, index))}]" if index else name, array[index]
 
 
-def _pack_integers(space: Space[Any], value: Any, name: str) -> NDArray[Any]:
-    array = _array(space, value, name)
-    if not space.contains(array):
-        raise InvalidValue(f"{name} must be one of {space}, not {brief(value)}.")
-    return array
-
-
-def _pack_discrete(space: spaces.Discrete[Any], value: Any, name: str) -> int:
-    plain = value.item() if isinstance(value, (np.generic, np.ndarray)) and value.size == 1 else value
-    if isinstance(plain, bool) or not isinstance(plain, int) or not 0 <= plain - int(space.start) < int(space.n):
-        last = int(space.start) + int(space.n) - 1
-        raise InvalidValue(f"{name} must be a whole number from {space.start} to {last}, not {brief(value)}.")
-    return plain
-
-
-def _pack_text(space: spaces.Text, value: Any, name: str) -> str:
-    if not isinstance(value, str) or not space.contains(value):
-        raise InvalidValue(
-            f"{name} must be {space.min_length} to {space.max_length} of the characters "
-            f"{brief(''.join(space.character_list))}, not {brief(value)}."
-        )
-    return str(value)
-
-
-def _pack_tuple(space: spaces.Tuple, value: Any, name: str) -> list[Tree]:
-    parts = _parts(space, value, name)
-    return [pack(one, part, f"{name}[{i}]") for i, (one, part) in enumerate(zip(space.spaces, parts, strict=True))]
-
-
-def _parts(space: spaces.Tuple, value: Any, name: str) -> Any:
+def _require_length(space: spaces.Tuple, value: Any, name: str) -> None:
     if not isinstance(value, (tuple, list, np.ndarray)) or len(value) != len(space.spaces):
         raise InvalidValue(f"{name} must be {len(space.spaces)} values, not {brief(value)}.")
-    return value
-
-
-def _pack_dict(space: spaces.Dict, value: Any, name: str) -> dict[str, Tree]:
-    _require_keys(space, value, name)
-    return {key: pack(one, value[key], f"{name}[{key!r}]") for key, one in space.spaces.items()}
 
 
 def _require_keys(space: spaces.Dict, value: Any, name: str) -> None:
-    found = list(value) if isinstance(value, Mapping) else brief(value)
     if not isinstance(value, Mapping) or value.keys() != space.spaces.keys():
+        found = list(value) if isinstance(value, Mapping) else brief(value)
         raise InvalidValue(f"{name} must have the keys {list(space.spaces)}, not {found}.")
-
-
-def _pack_sequence(space: spaces.Sequence, value: Any, name: str) -> list[Tree]:
-    feature = space.feature_space
-    # Gymnasium stacks arrays, dicts and tuples; a list is the list of items of a tree.
-    items = _unstacked(feature, value, name) if space.stack and not isinstance(value, list) else value
-    if not isinstance(items, (tuple, list)):
-        raise InvalidValue(f"{name} must be a tuple of any length, not {brief(value)}.")
-    return [pack(feature, one, f"{name}[{i}]") for i, one in enumerate(items)]
 
 
 def _unstacked(feature: Space[Any], value: Any, name: str) -> list[Any]:
@@ -192,31 +169,19 @@ def _unstacked(feature: Space[Any], value: Any, name: str) -> list[Any]:
     if isinstance(feature, spaces.Dict):
         _require_keys(feature, value, name)
         columns = [_unstacked(one, value[key], f"{name}[{key!r}]") for key, one in feature.spaces.items()]
-        return [dict(zip(feature.spaces, row, strict=True)) for row in _zipped(columns, name)]
-    if isinstance(feature, spaces.Tuple):
-        parts = _parts(feature, value, name)
-        return _zipped([_unstacked(one, part, name) for one, part in zip(feature.spaces, parts, strict=True)], name)
-    if not isinstance(value, (np.ndarray, tuple, list)):
+    elif isinstance(feature, spaces.Tuple):
+        _require_length(feature, value, name)
+        columns = [_unstacked(one, part, name) for one, part in zip(feature.spaces, value, strict=True)]
+    elif isinstance(value, (np.ndarray, tuple, list)):
+        return list(value)
+    else:
         raise InvalidValue(f"{name} must be an array of any length, not {brief(value)}.")
-    return list(value)
-
-
-def _zipped(columns: list[list[Any]], name: str) -> list[Any]:
     if len({len(column) for column in columns}) > 1:
         raise InvalidValue(f"The parts of {name} must have one length, not {[len(one) for one in columns]}.")
-    return list(zip(*columns, strict=True))
-
-
-_PACKERS: tuple[tuple[type[Space[Any]], Callable[..., Tree]], ...] = (
-    (spaces.Box, _pack_box),
-    (spaces.Discrete, _pack_discrete),
-    (spaces.Dict, _pack_dict),
-    (spaces.MultiDiscrete, _pack_integers),
-    (spaces.MultiBinary, _pack_integers),
-    (spaces.Text, _pack_text),
-    (spaces.Tuple, _pack_tuple),
-    (spaces.Sequence, _pack_sequence),
-)
+    items = list(zip(*columns, strict=True))
+    return (
+        [dict(zip(feature.spaces, item, strict=True)) for item in items] if isinstance(feature, spaces.Dict) else items
+    )
 
 
 def plain_info(value: Any) -> Tree:
@@ -248,9 +213,9 @@ def tree_to_json(tree: Tree) -> Any:
     infinities ``{"float": "nan"}``. A dict with one of these keys alone is ``{"dict": …}``.
     """
     if isinstance(tree, np.ndarray):
-        return {"array": [tree.dtype.str, list(tree.shape), _base64(tree)]}
+        return {"array": [tree.dtype.str, list(tree.shape), base64.b64encode(tree.tobytes()).decode()]}
     if isinstance(tree, np.generic):
-        return {"scalar": [tree.dtype.str, _base64(tree)]}
+        return {"scalar": [tree.dtype.str, base64.b64encode(tree.tobytes()).decode()]}
     if isinstance(tree, float):
         return tree if math.isfinite(tree) else {"float": repr(tree)}
     if isinstance(tree, Mapping):
@@ -262,11 +227,7 @@ def tree_to_json(tree: Tree) -> Any:
 
 
 def tree_from_json(value: Any) -> Tree:
-    """The tree that `tree_to_json` was given.
-
-    Raises:
-        ProtocolError: An array in it is not one.
-    """
+    """The tree that `tree_to_json` was given. Raises ProtocolError where an array in it is not one."""
     if isinstance(value, list):
         return [tree_from_json(one) for one in value]
     if not isinstance(value, Mapping):
@@ -283,10 +244,6 @@ def tree_from_json(value: Any) -> Tree:
     return {key: tree_from_json(one) for key, one in value.items()}
 
 
-def _base64(array: NDArray[Any] | np.generic) -> str:
-    return base64.b64encode(array.tobytes()).decode()
-
-
 def _array_of(content: Any) -> NDArray[Any]:
     dtype, shape, data = content
     flat = np.frombuffer(bytearray(base64.b64decode(data, validate=True)), number_dtype(dtype))
@@ -301,11 +258,7 @@ _MARKS: dict[str, Callable[[Any], Any]] = {
 
 
 def number_dtype(text: Any) -> np.dtype[Any]:
-    """The dtype in a message, which must be of numbers: no objects, no records.
-
-    Raises:
-        ValueError: It is not.
-    """
+    """The dtype in a message. Raises ValueError unless it is of numbers: no objects, no records."""
     if not isinstance(text, str) or not _DTYPE.fullmatch(text):
         raise ValueError(f"{brief(text)} is no dtype of numbers")
     return np.dtype(text)

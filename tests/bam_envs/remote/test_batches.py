@@ -3,7 +3,9 @@
 import numpy as np
 from gymnasium import spaces
 
-from bam_envs.remote.batches import join_final, join_infos, join_observations, split_infos
+from bam_envs.remote.remote_vector_env import join_final, join_infos
+from bam_envs.remote.serve.env_server import split_infos
+from bam_envs.remote.values import stack
 
 ROWS = [
     {"x": 0.5, "n": 1, "ok": True, "in": {"a": 2}, "arr": np.int8([1, 2])},
@@ -53,10 +55,10 @@ def test_nothing_is_nothing():
 
 def test_observations_are_joined_in_arrays_of_their_own():
     rows = [np.float32([1, 2]), np.float32([3, 4])]
-    joined = join_observations(spaces.Box(-9, 9, (2,)), rows)
+    joined = stack(spaces.Box(-9, 9, (2,)), rows)
     rows[0][:] = 0
     assert joined.tolist() == [[1, 2], [3, 4]]
-    assert join_observations(spaces.Text(3), ["a", "b"]) == ("a", "b")
+    assert stack(spaces.Text(3), ["a", "b"]) == ("a", "b")
 
 
 def test_last_observations():

@@ -332,7 +332,7 @@ def test_closing_wakes_who_waits(pair):
 
     waiting = threading.Thread(target=wait)
     waiting.start()
-    pair[0].close()
-    pair[0].close()
+    pair[0].hang_up()
+    pair[0].hang_up()
     waiting.join(PATIENCE)
     assert told == [True]

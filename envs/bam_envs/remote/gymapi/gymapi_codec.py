@@ -78,11 +78,7 @@ class ActionCodec:
         self._poses = Lists("pose_names", "pose_action", poses)
 
     def encode(self, action: Any) -> dict[str, Any]:
-        """The message of `action`; fields at their defaults are left out.
-
-        Raises:
-            InvalidValue: It is not one of the space, or NaN is in it.
-        """
+        """The message of `action`, without fields at their defaults; raises InvalidValue if it does not fit."""
         value = exact(self.space, action, "action")
         fields: dict[str, Any] = {}
         if not all(self._write(leaf, leaf.of(value), fields) for leaf in self._leaves):
@@ -181,7 +177,6 @@ class ObservationCodec:
                 for leaf in self._leaves
                 if leaf.name in trees
             }
-            self._read_depth(feedback, values)
             self._read_images(feedback, values)
             numbers, poses = self._missing(NUMBERS, values), self._missing(POSE, values)
             if numbers:
@@ -199,16 +194,14 @@ class ObservationCodec:
     def _missing(self, kind: str, values: Values) -> tuple[Leaf, ...]:
         return tuple(leaf for leaf in self._leaves if leaf.kind == kind and leaf.path not in values)
 
-    def _read_depth(self, feedback: Mapping[str, Any], values: Values) -> None:
-        """Read the depth images that there are; what is not an image may be in the lists."""
-        names = set(feedback["observation_names"])
-        wanted = [leaf for leaf in self._leaves if is_depth(leaf.space) and leaf.path not in values]
-        wanted = [leaf for leaf in wanted if not names & set(leaf.labels)]
-        images = [read_depth_message(one) for one in _listed(feedback["depth_img"])] if wanted else []
-        for leaf, image in zip(wanted, (one for one in images if one is not None), strict=False):
-            values[leaf.path] = _shaped(leaf, image, "depth_img").astype(leaf.space.dtype)
-
     def _read_images(self, feedback: Mapping[str, Any], values: Values) -> None:
+        """Read the depth images that there are (what is not an image may be in the lists), and every colour image."""
+        named = set(feedback["observation_names"])
+        fitting = [leaf for leaf in self._leaves if is_depth(leaf.space) and leaf.path not in values]
+        wanted = [leaf for leaf in fitting if not named & set(leaf.labels)]
+        depths = [read_depth_message(one) for one in _listed(feedback["depth_img"])] if wanted else []
+        for leaf, depth in zip(wanted, (one for one in depths if one is not None), strict=False):
+            values[leaf.path] = _shaped(leaf, depth, "depth_img").astype(leaf.space.dtype)
         leaves, images = self._missing(IMAGE, values), _listed(feedback["color_img"])
         names = [one["header"]["frame_id"] for one in images]
         if all(leaf.name in names for leaf in leaves):
@@ -271,12 +264,7 @@ class EnvCodec:
         return tuple(self._actions.encode(one) for one in self.spec.each(action))
 
     def read_actions(self, messages: Sequence[Mapping[str, Any]]) -> Any:
-        """The action in complete, checked messages.
-
-        Raises:
-            InvalidValue: There are too many or too few.
-            ProtocolError: One does not fit.
-        """
+        """The action in complete, checked messages. Raises InvalidValue or ProtocolError if they do not fit."""
         size = self.spec.num_envs
         if len(messages) != size:
             raise InvalidValue(f"A step must have {size} actions, one for each environment, not {len(messages)}.")
@@ -284,12 +272,7 @@ class EnvCodec:
         return actions if self.spec.vector else actions[0]
 
     def write_result(
-        self,
-        result: tuple[Any, ...],
-        stamp: Mapping[str, int],
-        version: Version = JUNE_22,
-        *,
-        executed: bool = True,
+        self, result: tuple[Any, ...], stamp: Mapping[str, int], version: Version = JUNE_22, *, executed: bool = True
     ) -> list[dict[str, Any]]:
         """The feedback of a reset or step: (observation, info), or with reward, terminated and truncated between.
 
@@ -300,29 +283,21 @@ class EnvCodec:
             executed: Whether the action was done.
         """
         observation, *ends, info = result
-        columns: Any = (observation, *(ends or (0.0, False, False)), info)
+        size, space = self.spec.num_envs, self.spec.observation_space
+        each: Any = [(observation, *(ends or (0.0, False, False)), info)]
         if self.spec.vector:
-            size = self.spec.num_envs
-            ends = ends or [[0.0] * size, [False] * size, [False] * size]
-            columns = zip(observation, *ends, map(self._packed_final, info), strict=True)
+            each = zip(observation, *(ends or [[0.0] * size, [False] * size, [False] * size]), info, strict=True)
         feedback = []
-        for observed, reward, terminated, truncated, told in columns if self.spec.vector else [columns]:
+        for observed, reward, terminated, truncated, told in each:
+            if self.spec.vector and "final_obs" in told:
+                told = {**told, "final_obs": pack(space, told["final_obs"], "final_obs")}
             fields, trees = self._observations.encode(observed, stamp, version)
             flags = (reward, terminated, truncated)
             feedback.append(write_feedback(fields, trees, flags, told, version, executed=executed))
         return feedback
 
-    def _packed_final(self, info: Info) -> Info:
-        if "final_obs" not in info:
-            return info
-        return {**info, "final_obs": pack(self.spec.observation_space, info["final_obs"], "final_obs")}
-
     def read_result(self, response: GymResponse) -> tuple[Any, Any, Any, Any, Any]:
-        """(observation, reward, terminated, truncated, info).
-
-        Raises:
-            ProtocolError: There is too much or too little feedback, or it does not fit.
-        """
+        """(observation, reward, terminated, truncated, info). Raises ProtocolError if the feedback does not fit."""
         size, found = self.spec.num_envs, len(response.feedback)
         if found != size:
             raise ProtocolError(f"The response must have {size} feedback, one for each environment, not {found}.")

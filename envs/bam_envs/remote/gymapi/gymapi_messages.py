@@ -37,15 +37,8 @@ _MOST_READABLE = 64
 _UNREAD = ("camera_info", "detections", "masks", "segments")
 """Fields that no space asks for."""
 _NO_OBSERVATION = (
-    "ns",
-    "duplicate_obs_ns",
-    "duplicate_obs",
-    "duplicate_index",
-    "executed",
-    "reward",
-    "terminated",
-    "truncated",
-    "info",
+    *("ns", "duplicate_obs_ns", "duplicate_obs", "duplicate_index"),
+    *("executed", "reward", "terminated", "truncated", "info"),
 )
 """Fields of a feedback that are not its observation."""
 _NOWHERE = {"pose": {"position": dict.fromkeys("xyz", math.nan), "orientation": dict.fromkeys("xyzw", math.nan)}}
@@ -154,11 +147,7 @@ def whole_request(message: Message, version: Version | None) -> dict[str, Any]:
 
 
 def refuse_foreign(seed: Seed, options: Info | None) -> None:
-    """Refuse what only our own servers understand.
-
-    Raises:
-        InvalidValue: A seed or an option for which GymAPI has no field.
-    """
+    """Raise InvalidValue for a seed or an option for which GymAPI has no field."""
     if options:
         raise InvalidValue(f"GymAPI has no field for options of reset, and this rack is not of bam-train: {options}.")
     if isinstance(seed, list):
@@ -174,7 +163,7 @@ def read_request(message: object) -> GymRequest:
     """The request in `message`, of any client.
 
     Raises:
-        InvalidValue: A field is of the wrong kind: its name, what was expected, what was found.
+        InvalidValue: A field is of the wrong kind.
         ProtocolError: The text in ``prefix`` cannot be read.
     """
     whole = complete_known(request_type(KIND), message)
@@ -182,8 +171,16 @@ def read_request(message: object) -> GymRequest:
     if header["request_type"] not in list(RequestType):
         known = ", ".join(f"{one.value} {one.name}" for one in RequestType)
         raise InvalidValue(f"{KIND}: header.request_type must be one of {known}, not {header['request_type']}.")
-    kind = RequestType(header["request_type"])
-    seed, options = _seed_and_options(whole) if kind is RequestType.RESET else (None, None)
+    kind, seed, options = RequestType(header["request_type"]), None, None
+    if kind is RequestType.RESET:
+        seed = whole["seed"] or (0 if header["frame_id"].endswith(_SEED_ZERO) else None)
+        prefix = whole["action"][0]["prefix"] if whole["action"] else ""
+        if prefix.startswith(PREFIX):
+            words = load_json(prefix.removeprefix(PREFIX), "prefix")
+            beside, options = tree_from_json(words.get("seed")), tree_from_json(words.get("options"))
+            if not (options is None or isinstance(options, dict)):
+                raise ProtocolError(f"The options of a reset must be an object, not {options!r}.")
+            seed = seed if beside is None else beside
     return GymRequest(
         type=kind,
         client_id=header["client_id"],
@@ -194,18 +191,6 @@ def read_request(message: object) -> GymRequest:
         tag=read_tag(header["frame_id"]),
         take=header["force_priority"],
     )
-
-
-def _seed_and_options(whole: Message) -> tuple[Seed, Info | None]:
-    in_field = whole["seed"] or (0 if whole["header"]["frame_id"].endswith(_SEED_ZERO) else None)
-    prefix = whole["action"][0]["prefix"] if whole["action"] else ""
-    if not prefix.startswith(PREFIX):
-        return in_field, None
-    words = load_json(prefix.removeprefix(PREFIX), "prefix")
-    beside, options = tree_from_json(words.get("seed")), tree_from_json(words.get("options"))
-    if not (options is None or isinstance(options, dict)):
-        raise ProtocolError(f"The options of a reset must be an object, not {options!r}.")
-    return (in_field if beside is None else beside), options
 
 
 def write_feedback(
@@ -226,9 +211,6 @@ def write_feedback(
         info: Gymnasium's, as a tree.
         version: Of the messages.
         executed: Whether the action was done.
-
-    Raises:
-        InvalidValue: The reward is not finite.
     """
     reward, terminated, truncated = ends
     if not math.isfinite(reward):
@@ -258,27 +240,35 @@ def write_failure(error: BamEnvsError, duration: float, stamp: Message, version:
 
 
 def read_response(message: object) -> GymResponse:
-    """The answer in `message`, of any server.
-
-    Raises:
-        ProtocolError: A field is of the wrong kind.
-    """
+    """The answer in `message`, of any server. Raises ProtocolError if a field is of the wrong kind."""
     told = message.get("feedback") if isinstance(message, Mapping) else None
     told = told if isinstance(told, (list, tuple)) else ()
-    given = {**message, "feedback": [_readable(one) for one in told]} if told else message  # type: ignore[dict-item]
+    given = {**message, "feedback": [_without_nulls(one) for one in told]} if told else message  # type: ignore[dict-item]
     try:
         whole = complete_known(response_type(KIND), given)
     except InvalidValue as error:
         raise ProtocolError(str(error)) from error
-    feedback = [_with_gaps(*pair) for pair in zip(whole["feedback"], told, strict=True)]
+    # NaN in place of each null: no space takes that.
+    feedback = [
+        {**checked, **_filled(checked, one, math.nan, _NOWHERE)}
+        for checked, one in zip(whole["feedback"], told, strict=True)
+    ]
     read = [read_info(one["info"]) for one in feedback]
     infos, ours = tuple(info for info, _ in read), tuple(bam for _, bam in read)
-    failure = _error(whole["header"]["error_code"]["value"], whole["header"]["error_msg"], ours[0] if ours else {})
-    filled = tuple(_with_observation(feedback, at) for at in range(len(feedback)))
+    code, text, failure = whole["header"]["error_code"]["value"], whole["header"]["error_msg"], None
+    if code != ErrorCode.SUCCESS:
+        name = ErrorCode(code).name if code in list(ErrorCode) else "not in the list"
+        refused = bool(ours) and ours[0].get("error") == NotInCommand.__name__
+        failure = (NotInCommand if refused else RemoteError)(text or f"The rack answered error code {code} ({name}).")
+    # An entry that is marked as equal to another one gets the observation of that.
+    filled = tuple(
+        {**feedback[_source(feedback, at)], **{key: one[key] for key in _NO_OBSERVATION}}
+        for at, one in enumerate(feedback)
+    )
     return GymResponse(failure, filled, infos, ours, version_of_response(message))
 
 
-def _readable(feedback: Any) -> Any:
+def _without_nulls(feedback: Any) -> Any:
     """A feedback as it came, with zeros for numbers and poses that are null.
 
     Every rosbridge writes NaN as null: the joint without a sensor, the cup that was not found, the camera without a
@@ -287,15 +277,10 @@ def _readable(feedback: Any) -> Any:
     if not isinstance(feedback, Mapping):
         return feedback
     kept = {name: value for name, value in feedback.items() if name not in _UNREAD}
-    return {**kept, **_filled_gaps(feedback, feedback, 0.0, {})}
+    return {**kept, **_filled(feedback, feedback, 0.0, {})}
 
 
-def _with_gaps(checked: Message, told: Message) -> Message:
-    """A checked feedback with NaN where null was told; no space takes that."""
-    return {**checked, **_filled_gaps(checked, told, math.nan, _NOWHERE)}
-
-
-def _filled_gaps(values: Message, told: Message, number: float, pose: Message) -> dict[str, Any]:
+def _filled(values: Message, told: Message, number: float, pose: Message) -> dict[str, Any]:
     """The lists of `values` with a number or pose in place of each entry that was told as null, or holds one."""
     filled: dict[str, Any] = {}
     for field, unknown in (("observation", number), ("pose", pose)):
@@ -313,20 +298,6 @@ def _has_null(value: Any, depth: int = 3) -> bool:
     return value is None
 
 
-def _error(code: int, text: str, bam: Info) -> RemoteError | None:
-    if code == ErrorCode.SUCCESS:
-        return None
-    name = ErrorCode(code).name if code in list(ErrorCode) else "not in the list"
-    kind = NotInCommand if bam.get("error") == NotInCommand.__name__ else RemoteError
-    return kind(text or f"The rack answered error code {code} ({name}).")
-
-
-def _with_observation(feedback: Sequence[Message], at: int) -> Message:
-    """The feedback at `at`; one that is marked as equal to another one gets the observation of that."""
-    own = {key: feedback[at][key] for key in _NO_OBSERVATION}
-    return {**feedback[_source(feedback, at)], **own}
-
-
 def _source(feedback: Sequence[Message], at: int) -> int:
     """The place of the observation of the entry at `at`, which names it, or says that it is in its ``ns``."""
     one, path = feedback[at], [at]
@@ -341,12 +312,8 @@ def _source(feedback: Sequence[Message], at: int) -> int:
         path.append(place)
     if not one["duplicate_obs_ns"]:
         return path[-1]
-    same = (
-        place
-        for place, other in enumerate(feedback)
-        if other["ns"] == one["ns"] and not (other["duplicate_obs"] or other["duplicate_obs_ns"])
-    )
-    return next(same, path[-1])
+    own = [place for place, other in enumerate(feedback) if not (other["duplicate_obs"] or other["duplicate_obs_ns"])]
+    return next((place for place in own if feedback[place]["ns"] == one["ns"]), path[-1])
 
 
 def write_info(info: Mapping[str, Any], bam: Mapping[str, Any]) -> str:

@@ -82,28 +82,28 @@ def joined(space: Space[Any], values: Mapping[Path, Any], path: Path = ()) -> An
 
 
 def _walk(space: Space[Any], path: Path, name: str, gripper: bool) -> list[Leaf]:
-    parts = _parts(space)
-    if _is_pose(space, gripper) or not parts:
-        return [_leaf(space, path, "/".join(map(str, path)) or name)]
-    return [leaf for key, part in parts.items() for leaf in _walk(part, (*path, key), name, gripper)]
+    parts, is_pose = _parts(space), _is_pose(space, gripper)
+    if parts and not is_pose:
+        return [leaf for key, part in parts.items() for leaf in _walk(part, (*path, key), name, gripper)]
+    name, shape, dtype = "/".join(map(str, path)) or name, space.shape or (), space.dtype
+    if is_pose:
+        return [Leaf(POSE, name, path, space)]
+    flat = not isinstance(space, spaces.Box) or dtype != np.uint8 or len(shape) not in (2, 3)
+    if not flat and min(shape[:2]) >= _SMALLEST_IMAGE and shape[2:] in _CHANNELS:
+        return [Leaf(IMAGE, name, path, space)]
+    arrays = isinstance(space, (spaces.Box, spaces.MultiDiscrete, spaces.MultiBinary))
+    fits = arrays and 0 < np.prod(shape) <= _MOST_NUMBERS and np.dtype(dtype).itemsize <= 8
+    if not fits and not isinstance(space, spaces.Discrete):
+        return [Leaf(EXACT, name, path, space)]
+    indices = np.ndindex(*shape)
+    labels = tuple(f"{name}[{', '.join(map(str, index))}]" if index else name for index in indices)
+    return [Leaf(NUMBERS, name, path, space, labels)]
 
 
 def _parts(space: Space[Any]) -> Mapping[Any, Space[Any]]:
     if isinstance(space, spaces.Dict) and all(isinstance(key, str) for key in space.spaces):
         return space.spaces
     return dict(enumerate(space.spaces)) if isinstance(space, spaces.Tuple) else {}
-
-
-def _leaf(space: Space[Any], path: Path, name: str) -> Leaf:
-    if _is_pose(space, gripper=True):
-        return Leaf(POSE, name, path, space)
-    if _is_image(space):
-        return Leaf(IMAGE, name, path, space)
-    if not _is_numbers(space):
-        return Leaf(EXACT, name, path, space)
-    indices = np.ndindex(*(space.shape or ()))
-    labels = tuple(f"{name}[{', '.join(map(str, index))}]" if index else name for index in indices)
-    return Leaf(NUMBERS, name, path, space, labels)
 
 
 def _is_pose(space: Space[Any], gripper: bool) -> bool:
@@ -120,24 +120,9 @@ def _is_float_box(space: Space[Any]) -> bool:
     return isinstance(space, spaces.Box) and dtype.kind == "f" and dtype.itemsize <= 8
 
 
-def _is_image(space: Space[Any]) -> bool:
-    if not isinstance(space, spaces.Box) or space.dtype != np.uint8 or len(space.shape) not in (2, 3):
-        return False
-    return min(space.shape[:2]) >= _SMALLEST_IMAGE and space.shape[2:] in _CHANNELS
-
-
 def is_depth(space: Space[Any]) -> bool:
     """Whether values of `space` may be depth images: floats, (height, width) or (height, width, 1)."""
     return _is_float_box(space) and len(space.shape or ()) in (2, 3) and (space.shape or ())[2:] in ((), (1,))
-
-
-def _is_numbers(space: Space[Any]) -> bool:
-    if isinstance(space, spaces.Discrete):
-        return True
-    if not isinstance(space, (spaces.Box, spaces.MultiDiscrete, spaces.MultiBinary)):
-        return False
-    size = int(np.prod(space.shape))
-    return 0 < size <= _MOST_NUMBERS and np.dtype(space.dtype).itemsize <= 8
 
 
 @dataclass(frozen=True)
@@ -163,11 +148,7 @@ class Lists:
         return True
 
     def read(self, message: Mapping[str, Any]) -> list[tuple[Leaf, list[Any]]]:
-        """Each leaf with its numbers, or with its one pose, in a complete, checked message.
-
-        Raises:
-            ProtocolError: One is missing, or there is one too many.
-        """
+        """Each leaf with its numbers, or with its one pose. Raises ProtocolError for one missing or one too many."""
         ordered, at = self.in_order(message[self.values], message[self.names]), 0
         parts = []
         for leaf in self.leaves:
@@ -212,11 +193,7 @@ def _numbers(value: Any) -> list[Any] | None:
 
 
 def read_numbers(leaf: Leaf, numbers: Sequence[Any]) -> Any:
-    """The value of `leaf` that was written as `numbers`, which are checked and finite or NaN.
-
-    Raises:
-        ProtocolError: One of them does not fit the dtype.
-    """
+    """The value of `leaf` that was written as `numbers`. Raises ProtocolError if one does not fit the dtype."""
     dtype = np.dtype(leaf.space.dtype)
     wide = np.asarray(numbers, np.float64)
     with np.errstate(over="ignore", invalid="ignore"):

@@ -18,6 +18,7 @@ Where the types are compiled (ROS 2), a field that the version there lacks is re
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -59,11 +60,7 @@ VERSIONS = {one.name: one for one in (MAY_24, JUNE_17, JUNE_22)}
 
 
 def version_named(name: str) -> Version:
-    """The version of that day.
-
-    Raises:
-        InvalidValue: There is none.
-    """
+    """The version of that day. Raises InvalidValue if there is none."""
     if name not in VERSIONS:
         raise InvalidValue(f"A version of GymAPI must be one of {', '.join(VERSIONS)}, not {name!r}.")
     return VERSIONS[name]
@@ -82,42 +79,31 @@ def version_of_response(message: object) -> Version | None:
     return MAY_24 if "duration" in header else None
 
 
-def version_of_bus(bus: Bus) -> Version | None:
-    """The version of the types that `bus` was compiled with; None where it has none, or does not say."""
-    fields = getattr(bus, "fields", None)  # of a ROS 2 node
-    if fields is not None:
-        return _version_of_fields(fields(_FEEDBACK))
-    call = getattr(bus, "call", None)  # of a link to a rosbridge server
-    if call is None:
-        return None
-    try:
-        found = call(_DETAILS, "", {"type": _FEEDBACK}, _LOOK)
-    except (RemoteError, LinkLost, ProtocolError):  # no rosapi there
-        return None
-    return _version_of_fields(_lists_by_name(found))
-
-
 def _header(message: object) -> Mapping[str, Any]:
     header = message.get("header") if isinstance(message, Mapping) else None
     return header if isinstance(header, Mapping) else {}
 
 
-def _lists_by_name(details: Mapping[str, Any]) -> dict[str, bool]:
-    """Whether each field is a list, of the first type in an answer of rosapi: there a length of -1 is no list."""
-    definitions = details.get("typedefs")
-    first = definitions[0] if isinstance(definitions, list) and definitions else None
-    if not isinstance(first, Mapping):
-        return {}
-    names, lengths = first.get("fieldnames"), first.get("fieldarraylen")
-    if not isinstance(names, list) or not isinstance(lengths, list):
-        return {}
-    return {name: length != -1 for name, length in zip(names, lengths, strict=False) if isinstance(name, str)}
-
-
-def _version_of_fields(fields: Mapping[str, bool]) -> Version | None:
-    """The version whose GymFeedback has these fields; to each, whether it is a list."""
+def version_of_bus(bus: Bus) -> Version | None:
+    """The version of the types that `bus` was compiled with; None where it has none, or does not say."""
+    fields: Mapping[str, bool] = {}  # of GymFeedback; to each, whether it is a list
+    if hasattr(bus, "fields"):  # a ROS 2 node
+        fields = bus.fields(_FEEDBACK)
+    elif hasattr(bus, "call"):  # a link to a rosbridge server
+        with suppress(RemoteError, LinkLost, ProtocolError):  # no rosapi there
+            fields = _fields_told(bus.call(_DETAILS, "", {"type": _FEEDBACK}, _LOOK))
     if fields.get("color_img"):
         return JUNE_22
     if "duplicate_obs" in fields:
         return JUNE_17
     return MAY_24 if "duplicate_obs_ns" in fields else None
+
+
+def _fields_told(details: Mapping[str, Any]) -> dict[str, bool]:
+    """Whether each field is a list, of the first type in an answer of rosapi: there a length of -1 is no list."""
+    definitions = details.get("typedefs")
+    first = definitions[0] if isinstance(definitions, list) and definitions else None
+    names, lengths = (first.get("fieldnames"), first.get("fieldarraylen")) if isinstance(first, Mapping) else (0, 0)
+    if not isinstance(names, list) or not isinstance(lengths, list):
+        return {}
+    return {name: length != -1 for name, length in zip(names, lengths, strict=False) if isinstance(name, str)}

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from bam_envs.core.errors import NotInCommand
+from bam_envs.rosbridge.bus import UNKNOWN_CALLER
 
 Change = Callable[[str | None, str | None], None]
 """Called with who was in command and who is, as others are told; None is nobody."""
 LEASE_SECONDS = 2.0
 """Usual time without a sign of life after which another client may take command [s]."""
-
-
-def _unknown() -> float:
-    return math.inf
 
 
 class CommandLease:
@@ -36,7 +32,7 @@ class CommandLease:
         self._clock, self._lock = clock, threading.Lock()
         self._holder: str | None = None
         self._shown: str | None = None  # what the holder is called where others read it
-        self._heard, self._silence = 0.0, _unknown
+        self._heard, self._silence = 0.0, UNKNOWN_CALLER.silence
         self._running = 0
         self._listeners: list[Change] = []
 
@@ -55,7 +51,7 @@ class CommandLease:
         *,
         force: bool = False,
         shown: str | None = None,
-        silence: Callable[[], float] = _unknown,
+        silence: Callable[[], float] = UNKNOWN_CALLER.silence,
     ) -> bool:
         """Put `client` in command; whether it was not before.
 
@@ -78,7 +74,8 @@ class CommandLease:
                 return False
             before, self._shown = self._shown, shown or client
             self._holder, self._running = client, 0
-        self._notify(before, shown or client)
+        for listener in self._listeners:
+            listener(before, shown or client)
         return True
 
     def renew(self, client: str) -> None:
@@ -88,11 +85,7 @@ class CommandLease:
                 self._heard = self._clock()
 
     def require(self, client: str) -> None:
-        """Record a sign of life of `client`.
-
-        Raises:
-            NotInCommand: It is not in command: another client is, or nobody.
-        """
+        """Record a sign of life of `client`; raises NotInCommand if it is not in command."""
         with self._lock:
             self._require(client)
 
@@ -121,7 +114,8 @@ class CommandLease:
                 return False
             before, self._shown = self._shown, None
             self._holder, self._running = None, 0
-        self._notify(before, None)
+        for listener in self._listeners:
+            listener(before, None)
         return True
 
     def _refusal(self, client: str) -> str:
@@ -131,7 +125,3 @@ class CommandLease:
             f"{self._shown} is in command, not {client}; it passes on when {self._shown} leaves or is silent for "
             f"{self.seconds:g} s."
         )
-
-    def _notify(self, before: str | None, after: str | None) -> None:
-        for listener in self._listeners:
-            listener(before, after)

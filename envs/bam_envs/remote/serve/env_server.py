@@ -24,10 +24,9 @@ from bam_envs.core.errors import InvalidValue, NotInCommand, RemoteError, ResetN
 from bam_envs.core.registry import ALIASES
 from bam_envs.core.spaces import space_to_json
 from bam_envs.core.timing import Pacer
-from bam_envs.remote.batches import join_observations, split_infos
 from bam_envs.remote.serve.command_lease import LEASE_SECONDS, CommandLease
 from bam_envs.remote.transport import EnvSpecMessage, Info, Seed
-from bam_envs.remote.values import exact, plain_info
+from bam_envs.remote.values import exact, plain_info, stack
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
 
 Env = gym.Env[Any, Any] | VectorEnv[Any, Any, Any]
@@ -57,26 +56,18 @@ def describe_env(env: Env, env_id: str | None = None) -> EnvSpecMessage:
         space_to_json(space)
     limit = env.spec.max_episode_steps if env.spec is not None else None
     inner: Any = env.unwrapped
+    period, rate = getattr(inner, "period", None), env.metadata.get("render_fps")
     return EnvSpecMessage(
         env_id or (env.spec.id if env.spec is not None else type(inner).__name__),
         single,
         action,
         num_envs=env.num_envs if isinstance(env, VectorEnv) else 1,
         vector=vector,
-        period=_period(env),
+        period=float(period) if period is not None else 1.0 / float(rate) if rate else None,
         # A vector environment may truncate episodes itself, which Gymnasium does not know.
         max_episode_steps=getattr(inner, "max_episode_steps", limit) if vector else limit,
         signals=inner.describe() if hasattr(inner, "describe") else {},
     )
-
-
-def _period(env: Env) -> float | None:
-    """Time between two actions [s]: the environment's `period`, else one frame of its ``render_fps``, else None."""
-    period = getattr(env.unwrapped, "period", None)
-    if period is not None:
-        return float(period)
-    rate = env.metadata.get("render_fps")
-    return 1.0 / float(rate) if rate else None
 
 
 def same_name(one: str, other: str) -> bool:
@@ -85,22 +76,18 @@ def same_name(one: str, other: str) -> bool:
     ``PickPlace``, ``pick-place``, ``bam/pick-place`` and ``bam/pick-place-v0`` are one; so are robo-gym's names and
     ours of one environment.
     """
-    return _bare(one) == _bare(other)
+    one, other = (_other_names().get(name, name) for name in (_plain_name(one), _plain_name(other)))
+    return one == other
 
 
-def _bare(name: str) -> str:
-    spelt = _spelt(name)
-    return _other_names().get(spelt, spelt)
+def _plain_name(name: str) -> str:
+    last = re.split("[/:]", name)[-1]
+    return re.sub("[^a-z0-9]", "", re.sub(r"-v\d+$", "", last).lower())
 
 
 @cache
 def _other_names() -> dict[str, str]:
-    return {_spelt(env_id): _spelt(alias.variant or alias.env_id) for env_id, alias in ALIASES.items()}
-
-
-def _spelt(name: str) -> str:
-    last = re.split("[/:]", name)[-1]
-    return re.sub("[^a-z0-9]", "", re.sub(r"-v\d+$", "", last).lower())
+    return {_plain_name(env_id): _plain_name(alias.variant or alias.env_id) for env_id, alias in ALIASES.items()}
 
 
 class EnvServer:
@@ -135,10 +122,12 @@ class EnvServer:
         self.lease = lease if isinstance(lease, CommandLease) else CommandLease(lease, clock)
         self.lock = threading.RLock()
         """Held while the environment runs, and by everything else that moves its robot."""
-        self._spec = spec = describe_env(env, env_id)
-        if realtime and spec.period is None:
-            raise InvalidValue(f"{spec.env_id} does not say its period, so it has no real time; serve it with --fast.")
-        self._pacer = Pacer(spec.period, now=clock, sleep=sleep) if realtime else None
+        self._spec = describe_env(env, env_id)
+        if realtime and self._spec.period is None:
+            raise InvalidValue(
+                f"{self._spec.env_id} does not say its period, so it has no real time; serve it with --fast."
+            )
+        self._pacer = Pacer(self._spec.period, now=clock, sleep=sleep) if realtime else None
         self._clock, self._ended, self._closed = clock, False, False
         self._episode: str | None = None  # whose is running
         self._over: str | None = None  # whose came to its end
@@ -183,11 +172,20 @@ class EnvServer:
             NotInCommand: Another client is in command.
             RemoteError: The environment failed.
         """
-        self._take(client, take, caller, shown)
+        before = self.lease.holder
+        try:
+            changed = self.lease.take(client, force=take and caller.operator, shown=shown, silence=caller.silence)
+        except NotInCommand as error:
+            raise NotInCommand(f"{error} {_NO_FORCE}") if take else error from None
+        if changed and before is not None:
+            self._halt()
         with self.lease.busy(client), self._turn(client, deadline):
             self._episode = self._over = None
-            given = self._run(lambda: self.env.reset(seed=seed, options=self._options(options)))  # type: ignore[arg-type]
-            begun: tuple[Any, Any] = self._run(lambda: self._begun(*given))
+            with _errors_of_environment():
+                given = None if options is None else dict(options)  # environments may change it
+                if given and "reset_mask" in given:
+                    given["reset_mask"] = np.asarray(given["reset_mask"], dtype=bool)
+                begun = self._begun(*self.env.reset(seed=seed, options=given))  # type: ignore[arg-type]
             self._episode = client
         if self._pacer is not None:
             self._pacer.start()
@@ -214,11 +212,14 @@ class EnvServer:
             with self._turn(client, deadline):
                 if self._episode != client:
                     raise ResetNeeded(_NO_EPISODE)
-                checked = self._action(action)
+                space, vector = self._spec.action_space, self._spec.vector
+                each = enumerate(self._spec.each(action)) if vector else ()
+                many = [exact(space, one, f"action of environment {i}") for i, one in each]
+                checked = stack(space, many) if vector else exact(space, action, "action")
                 self._episode = None  # until it went well
-                given = self._run(lambda: self.env.step(checked))
-                stepped: tuple[Any, Any, Any, Any, Any] = self._run(lambda: self._stepped(*given))
-                goes_on = self._spec.vector or not (stepped[2] or stepped[3])
+                with _errors_of_environment():
+                    stepped = self._stepped(*self.env.step(checked))
+                goes_on = vector or not (stepped[2] or stepped[3])
                 self._episode, self._over = (client, None) if goes_on else (None, client)
             if self._pacer is not None:
                 self._pacer.wait()
@@ -228,22 +229,10 @@ class EnvServer:
         """Whether `client` is in command, and its last episode came to its end."""
         return self._over == client
 
-    def _take(self, client: str, force: bool, caller: Caller, shown: str | None) -> None:
-        """Put `client` in command; the robot of the client before it halts."""
-        before = self.lease.holder
-        try:
-            changed = self.lease.take(client, force=force and caller.operator, shown=shown, silence=caller.silence)
-        except NotInCommand as error:
-            raise NotInCommand(f"{error} {_NO_FORCE}") if force else error from None
-        if changed and before is not None:
-            with self.lock:
-                self._halt()
-
     def leave(self, client: str) -> None:
         """Release command, if `client` has it: the robot halts and another client may take command."""
         if self.lease.release(client):
-            with self.lock:
-                self._halt()
+            self._halt()
 
     def end(self) -> None:
         """Refuse every request from now on; returns when the one that runs is done."""
@@ -260,9 +249,10 @@ class EnvServer:
                 self.env.close()  # type: ignore[no-untyped-call]
 
     def _halt(self) -> None:
-        halt = getattr(getattr(self.env.unwrapped, "robot", None), "halt", None)
-        if halt is not None:
-            halt()
+        with self.lock:
+            halt = getattr(getattr(self.env.unwrapped, "robot", None), "halt", None)
+            if halt is not None:
+                halt()
 
     @contextmanager
     def _turn(self, client: str, deadline: float | None) -> Iterator[None]:
@@ -275,60 +265,41 @@ class EnvServer:
                 raise RemoteError("The environment is closed.")
             yield
 
-    def _action(self, action: Any) -> Any:
-        """`action` for the environment: checked, a batch for a vector environment."""
-        space = self._spec.action_space
-        if not self._spec.vector:
-            return exact(space, action, "action")
-        each = self._spec.each(action)
-        return join_observations(space, [exact(space, one, f"action of environment {i}") for i, one in enumerate(each)])
-
     def _begun(self, observation: Any, info: Any) -> tuple[Any, Any]:
         """The result of a reset, checked and with a list in place of a batch."""
+        space = self._spec.observation_space
         if not self._spec.vector:
-            return self._observation(observation), plain_info(info)
-        return self._each_observation(observation), self._each_info(info)
+            return exact(space, observation, "observation"), plain_info(info)
+        each = enumerate(iterate(self.env.observation_space, observation))
+        infos = []
+        for i, told in enumerate(split_infos(info, self._spec.num_envs)):
+            last = told.pop("final_obs", None)
+            infos.append(plain_info(told))
+            if last is not None:
+                infos[i]["final_obs"] = exact(space, last, f"final_obs of environment {i}")
+        return [exact(space, one, f"observation of environment {i}") for i, one in each], infos
 
-    def _stepped(self, observation: Any, reward: Any, terminated: Any, truncated: Any, info: Any) -> Any:
+    def _stepped(
+        self, observation: Any, reward: Any, terminated: Any, truncated: Any, info: Any
+    ) -> tuple[Any, Any, Any, Any, Any]:
         """The result of a step, checked and with lists in place of batches."""
-        begun = self._begun(observation, info)
+        seen, told = self._begun(observation, info)
         if not self._spec.vector:
-            return begun[0], _reward(reward), bool(terminated), bool(truncated), begun[1]
+            return seen, _reward(reward), bool(terminated), bool(truncated), told
         rewards = [_reward(one, f"reward of environment {i}") for i, one in enumerate(reward)]
-        return begun[0], rewards, [bool(one) for one in terminated], [bool(one) for one in truncated], begun[1]
-
-    def _observation(self, value: Any, name: str = "observation") -> Any:
-        return exact(self._spec.observation_space, value, name)
-
-    def _each_observation(self, batch: Any) -> list[Any]:
-        each = iterate(self.env.observation_space, batch)
-        return [self._observation(one, f"observation of environment {i}") for i, one in enumerate(each)]
-
-    def _each_info(self, infos: Any) -> list[Info]:
-        each = []
-        for i, info in enumerate(split_infos(infos, self._spec.num_envs)):
-            plain: Info = plain_info({key: value for key, value in info.items() if key != "final_obs"})
-            if "final_obs" in info:
-                plain["final_obs"] = self._observation(info["final_obs"], f"final_obs of environment {i}")
-            each.append(plain)
-        return each
-
-    def _run(self, work: Callable[[], Any]) -> Any:
-        """What `work` returns. The client is told what the environment raises, and the server goes on."""
-        try:
-            return work()
-        except Exception as error:  # environments are other people's code and raise anything
-            raise RemoteError(f"{type(error).__name__}: {' '.join(str(error).split())}") from error
-
-    def _options(self, options: Mapping[str, Any] | None) -> Info | None:
-        """A copy, which environments may change, with the mask as the array that they expect."""
-        if options is None:
-            return None
-        mask = {key: np.asarray(options[key], dtype=bool) for key in options.keys() & {"reset_mask"}}
-        return {**options, **mask}
+        return seen, rewards, [bool(one) for one in terminated], [bool(one) for one in truncated], told
 
     def _end_episode(self, before: str | None, after: str | None) -> None:
         self._episode = self._over = None
+
+
+@contextmanager
+def _errors_of_environment() -> Iterator[None]:
+    """Tell the client what the environment raises; the server goes on."""
+    try:
+        yield
+    except Exception as error:  # environments are other people's code and raise anything
+        raise RemoteError(f"{type(error).__name__}: {' '.join(str(error).split())}") from error
 
 
 def _reward(value: Any, name: str = "reward") -> float:
@@ -336,3 +307,20 @@ def _reward(value: Any, name: str = "reward") -> float:
     if reward != reward:
         raise InvalidValue(f"{name} is NaN; only numbers are sent.")
     return reward
+
+
+def split_infos(infos: Mapping[str, Any], num_envs: int) -> list[Info]:
+    """The info of each environment out of Gymnasium's vector infos: i has `key` where ``infos["_" + key][i]``."""
+    each: list[Info] = [{} for _ in range(num_envs)]
+    for key, value in infos.items():
+        if key.startswith("_") and key[1:] in infos:
+            continue
+        mask = infos.get("_" + key)
+        if isinstance(value, Mapping):
+            value = split_infos(value, num_envs)
+        elif not isinstance(value, (np.ndarray, list, tuple)) or len(value) != num_envs:
+            value = [value] * num_envs
+        for i, info in enumerate(each):
+            if mask is None or mask[i]:
+                info[key] = value[i]
+    return each

@@ -81,8 +81,7 @@ class GymApiService:
         clock: Callable[[], float] = time.time,
     ) -> None:
         self.env, self.bus, self.namespace = env, bus, namespace
-        self._spec = env.spec()
-        self._codec = EnvCodec(self._spec, image_format=image_format, depth=depth)
+        self._codec = EnvCodec(env.spec(), image_format=image_format, depth=depth)
         self._clock = clock
         self._version = None if version is None else version_named(version)
         self._freshness, self._answers = FreshnessCheck(), RecentAnswers[Feedback](_ANSWERS)
@@ -145,16 +144,26 @@ class GymApiService:
         self, request: GymRequest, version: Version, caller: Caller, deadline: float | None, *, published: bool = False
     ) -> Feedback:
         self.env.require_name(request.env_name)
-        client = self._client(request, caller, published)
+        name = request.client_id[:_LONGEST_NAME] or "somebody"
+        # The same client when it comes back on another connection: the session in the tag of a service call is known to
+        # nobody else, so others are never told of it.
+        mark = (caller.session or caller.name) if published or request.tag is None else request.tag.session
+        client = f"{name}#{mark}" if mark else name
+        shown = f"{name} ({caller.address})" if caller.address else name
         if request.type is RequestType.STEP:
             action = self._codec.read_actions(request.actions)
             if request.tag is None and self.env.has_ended(client):  # clients of racks do not call reset themselves
-                begun = self.env.reset(client, caller=caller, shown=_shown(request, caller))
+                begun = self.env.reset(client, caller=caller, shown=shown)
                 return self._codec.write_result(begun, self._stamp(), version, executed=False)
             stepped = self.env.step(client, action, deadline=deadline)
             return self._codec.write_result(stepped, self._stamp(), version)
         if request.type is RequestType.RESET:
-            self._remember(client, caller)
+            if caller.name:  # it leaves when the connection ends on which it began its episode
+                with self._lock:
+                    self._connections[client] = caller.name
+                    self._connections.move_to_end(client)
+                    if len(self._connections) > _MOST_CLIENTS:
+                        self._connections.popitem(last=False)
             begun = self.env.reset(
                 client,
                 request.seed,
@@ -162,35 +171,17 @@ class GymApiService:
                 take=request.take,
                 deadline=deadline,
                 caller=caller,
-                shown=_shown(request, caller),
+                shown=shown,
             )
             return self._codec.write_result(begun, self._stamp(), version)
         if request.type is RequestType.CLOSE:
             self.env.leave(client)
             return []
-        return [{**version.no_images, "info": write_info({}, {"spec": spec_to_json(self._spec)})}]
+        return [{**version.no_images, "info": write_info({}, {"spec": spec_to_json(self.env.spec())})}]
 
     def _stamp(self) -> dict[str, int]:
         stamp: Callable[[float], dict[str, int]] = getattr(self.bus, "stamp", write_stamp)
         return stamp(self._clock())
-
-    def _client(self, request: GymRequest, caller: Caller, published: bool) -> str:
-        """The name of the client, the same when it comes back on another connection.
-
-        The session in the tag of a service call is known to nobody else, so others are never told of it.
-        """
-        tag, name = None if published else request.tag, _name(request)
-        mark = (caller.session or caller.name) if tag is None else tag.session
-        return f"{name}#{mark}" if mark else name
-
-    def _remember(self, client: str, caller: Caller) -> None:
-        """Record the connection on which `client` began its episode: it leaves when that ends."""
-        if caller.name:
-            with self._lock:
-                self._connections[client] = caller.name
-                self._connections.move_to_end(client)
-                if len(self._connections) > _MOST_CLIENTS:
-                    self._connections.popitem(last=False)
 
     def _on_leave(self, caller: Caller) -> None:
         self._sessions.left(caller)
@@ -199,19 +190,6 @@ class GymApiService:
             clients = [client for client, name in self._connections.items() if name == caller.name]
             for client in clients:
                 del self._connections[client]
-        # In another thread: it waits for a step that runs, and this is the thread of the network.
-        with suppress(RuntimeError):  # closed meanwhile
-            self._leaving.submit(self._let_go, clients)
-
-    def _let_go(self, clients: list[str]) -> None:
-        for client in clients:
-            self.env.leave(client)
-
-
-def _name(request: GymRequest) -> str:
-    return request.client_id[:_LONGEST_NAME] or "somebody"
-
-
-def _shown(request: GymRequest, caller: Caller) -> str:
-    """The name of the client that others are told."""
-    return f"{_name(request)} ({caller.address})" if caller.address else _name(request)
+                # In another thread: it waits for a step that runs, and this is the thread of the network.
+                with suppress(RuntimeError):  # closed meanwhile
+                    self._leaving.submit(self.env.leave, client)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import Space, spaces
-from numpy.typing import NDArray
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, RemoteError
 from bam_envs.remote.serve.env_server import Env, EnvServer
@@ -37,13 +37,15 @@ class LocalTransport:
 
     def reset(self, seed: Seed = None, options: Info | None = None) -> tuple[Any, Any]:
         """Begin an episode; (observation, info)."""
-        begun: tuple[Any, Any] = self._asked(lambda: self.server.reset(self.client, seed, options))
-        return begun
+        self._require_open()
+        with _as_over_a_network():
+            return self.server.reset(self.client, seed, options)
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
         """(observation, reward, terminated, truncated, info)."""
-        stepped: tuple[Any, Any, Any, Any, Any] = self._asked(lambda: self.server.step(self.client, action))
-        return stepped
+        self._require_open()
+        with _as_over_a_network():
+            return self.server.step(self.client, action)
 
     def close(self) -> None:
         """Release the environment; one that no server shares is closed."""
@@ -52,18 +54,20 @@ class LocalTransport:
         if self._owned:
             self.server.close()
 
-    def _asked(self, call: Callable[[], Any]) -> Any:
-        self._require_open()
-        try:
-            return call()
-        except (RemoteError, InvalidValue):
-            raise
-        except BamEnvsError as error:  # as it would come back over a network
-            raise RemoteError(str(error)) from error
-
     def _require_open(self) -> None:
         if self._closed:
             raise LinkLost("This transport is closed; make a new one.")
+
+
+@contextmanager
+def _as_over_a_network() -> Iterator[None]:
+    """Raise the errors of the server as the client of another transport gets them."""
+    try:
+        yield
+    except (RemoteError, InvalidValue):
+        raise
+    except BamEnvsError as error:
+        raise RemoteError(str(error)) from error
 
 
 class FakeEnv(gym.Env[Any, Any]):
@@ -96,8 +100,7 @@ class FakeEnv(gym.Env[Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
         """One step; the info holds the number of the step, also as an array."""
         self.elapsed += 1
-        steps: NDArray[np.int32] = np.array([self.elapsed], np.int32)
-        info = {"elapsed": self.elapsed, "steps": steps}
+        info = {"elapsed": self.elapsed, "steps": np.array([self.elapsed], np.int32)}
         return self.observation_space.sample(), float(self.elapsed), self.elapsed >= self.episode_steps, False, info
 
 

@@ -16,6 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -143,11 +144,12 @@ class RobotService:
         for topic, kind in {(one.topic, one.type) for one in self._profile.state if one.signal in measured}:
             self._bus.advertise(self._namespace + topic, kind)
         for topic, kind in {(sink.topic, sink.type) for mode in self._profile.commands.values() for sink in mode}:
-            self._listen(topic, kind, self._command_listener(topic))
+            self._listen(topic, kind, partial(self._on_command, topic))
         self._listen(HALT_TOPIC, "std_msgs/Empty", self._on_halt)
         self._listen(LEASE_TOPIC, "std_msgs/String", self._on_lease)
         self._bus.serve(self._namespace + SESSION_SERVICE, "std_srvs/Trigger", self._sessions.open)
-        self._bus.serve(self._namespace + INFO_SERVICE, "std_srvs/Trigger", self._say_who)
+        answer = {"success": True, "message": self.info.to_json()}
+        self._bus.serve(self._namespace + INFO_SERVICE, "std_srvs/Trigger", lambda request, caller: answer)
         self._bus.on_leave(self._on_leave)
         self._lease.on_change(self._on_change)
         if self._scene is not None:
@@ -166,23 +168,33 @@ class RobotService:
     def _listen(self, topic: str, kind: str, listener: Listener) -> None:
         self._unsubscribe.append(self._bus.subscribe(self._namespace + topic, kind, listener))
 
-    def _command_listener(self, topic: str) -> Listener:
-        def listen(message: Message, caller: Caller) -> None:
-            places, values, tag, content = decode_command(self._profile, self._robot.spec, topic, message)
-            told = values.tolist()
-            self._require_within(topic, places, told)
-            if self._robot.fault is not None:
-                raise RemoteError(f"{self._profile.name} failed, and needs a reset: {self._robot.fault}")
-            if tag is not None:
-                self._sessions.require(tag, topic, content, caller)
-                caller = replace(caller, session=tag.session)
-            self._lease.take(caller.client, shown=caller.shown, silence=caller.silence)
-            echo, complete = "" if tag is None else tag.echo, topic in self._completing
-            self._slot.put(caller.client, places, told, complete=complete, tag=echo)
-            if complete and self.info.lockstep:
-                self._go_on()
-
-        return listen
+    def _on_command(self, topic: str, message: Message, caller: Caller) -> None:
+        command = self._robot.spec.command
+        places, values, tag, content = decode_command(self._profile, self._robot.spec, topic, message)
+        told = values.tolist()
+        for place, value in zip(places, told, strict=True):  # how fast the robot goes there is its own affair
+            low, high = command.low[place], command.high[place]
+            if not low - _ROUNDING <= value <= high + _ROUNDING:
+                label, unit = command.labels[place], command.units[place]
+                raise ProtocolError(f"{topic}: {label} must be {low:g} to {high:g} {unit}, not {value:g} {unit}.")
+        if self._robot.fault is not None:
+            raise RemoteError(f"{self._profile.name} failed, and needs a reset: {self._robot.fault}")
+        if tag is not None:
+            self._sessions.require(tag, topic, content, caller)
+            caller = replace(caller, session=tag.session)
+        self._lease.take(caller.client, shown=caller.shown, silence=caller.silence)
+        echo, complete = "" if tag is None else tag.echo, topic in self._completing
+        self._slot.put(caller.client, places, told, complete=complete, tag=echo)
+        if not (complete and self.info.lockstep):
+            return
+        # A period in this thread, if it is short and nobody is at it, or in the clock's.
+        if self._took > self._quick or not self._ticking.acquire(blocking=False):
+            self.clock.wake()
+            return
+        try:
+            self._pass_period()
+        finally:
+            self._ticking.release()
 
     def _on_lease(self, message: Message, caller: Caller) -> None:
         """The client in command says that it is there, or leaves, over any of its connections."""
@@ -197,15 +209,6 @@ class RobotService:
         else:
             self._sessions.end(tag.session)
             self._lease.release(client)
-
-    def _require_within(self, topic: str, places: list[int], values: list[float]) -> None:
-        """Refuse numbers outside the range of the command; how fast the robot goes there is its own affair."""
-        command = self._robot.spec.command
-        for place, value in zip(places, values, strict=True):
-            low, high = command.low[place], command.high[place]
-            if not low - _ROUNDING <= value <= high + _ROUNDING:
-                label, unit = command.labels[place], command.units[place]
-                raise ProtocolError(f"{topic}: {label} must be {low:g} to {high:g} {unit}, not {value:g} {unit}.")
 
     def _on_halt(self, message: Message, caller: Caller) -> None:
         """Halt, for any client; waits only for the part of a period that is being computed.
@@ -234,13 +237,19 @@ class RobotService:
             self._rest()
             self._answered = ""
 
-    def _say_who(self, request: Message, caller: Caller) -> Message:
-        return {"success": True, "message": self.info.to_json()}
-
     def _set_scene(self, request: Message, caller: Caller) -> Message:
-        pose, seeds = _pose(request.get("object_pose")), _seeds(request.get("seeds"))
+        """Place the object (x, y [m], yaw [rad]; None leaves it) and seed the robot, as the client in command."""
+        pose: Any = request.get("object_pose")
+        if pose is not None:
+            pose = numbers(_only_one(pose), "object_pose")[None]
+            if pose.shape[1] != 3:
+                raise ProtocolError(f"object_pose must be 3 numbers (x, y [m], yaw [rad]), not {pose.shape[1]}.")
+        seeds = request.get("seeds")
+        seed = 0 if seeds is None else _only_one(seeds)
+        if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
+            raise ProtocolError(f"seeds must be one number, 0 or more, not {seeds!r}.")
         self._lease.take(caller.client, shown=caller.shown, silence=caller.silence)
-        self._robot.place_object(pose, seeds)
+        self._robot.place_object(pose, np.array([seed], dtype=np.int64))
         return {}
 
     def tick(self) -> None:
@@ -256,16 +265,6 @@ class RobotService:
                 self._answered = order.tag
         self._robot.tick()
         self._publish()
-
-    def _go_on(self) -> None:
-        """A complete command came: a period in this thread, if it is short and nobody is at it, or in the clock's."""
-        if self._took > self._quick or not self._ticking.acquire(blocking=False):
-            self.clock.wake()
-            return
-        try:
-            self._pass_period()
-        finally:
-            self._ticking.release()
 
     def _pass_period(self) -> None:
         """A whole period, if a command is there; else the state that has not changed."""
@@ -302,24 +301,6 @@ class RobotService:
             if self._connected:
                 _log.warning("%s: %s", self._profile.name, error)
             self._connected = False
-
-
-def _pose(value: object) -> Any:
-    """x, y [m] and yaw [rad] of the object, or None if it is to stay. Shape: (1, 3)."""
-    if value is None:
-        return None
-    pose = numbers(_only_one(value), "object_pose")
-    if len(pose) != 3:
-        raise ProtocolError(f"object_pose must be 3 numbers (x, y [m], yaw [rad]), not {len(pose)}.")
-    return pose[None]
-
-
-def _seeds(value: object) -> Any:
-    """The seed of the one robot; 0 if none is given. Shape: (1,) int64."""
-    seed = _only_one(0 if value is None else value)
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
-        raise ProtocolError(f"seeds must be one number, 0 or more, not {value!r}.")
-    return np.array([seed], dtype=np.int64)
 
 
 def _only_one(value: object) -> object:

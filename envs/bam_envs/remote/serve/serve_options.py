@@ -56,11 +56,7 @@ class ServeOptions:
     """Version of bam_msgs/GymAPI, where clients do not show theirs: 2025-05-24, 2025-06-17 or 2025-06-22 (default)."""
 
     def require_sane(self) -> None:
-        """Refuse values that are not possible, and flags that exclude each other.
-
-        Raises:
-            InvalidValue: Names the flags.
-        """
+        """Raise InvalidValue, with the flags, for values that are not possible and flags that exclude each other."""
         check_fields(self, as_flag)
         for one, other in _EXCLUDE:
             if getattr(self, one) and getattr(self, other):
@@ -95,7 +91,11 @@ class ServeOptions:
     @property
     def _is_open(self) -> bool:
         """Whether other computers reach it."""
-        return self.listens and not _is_loopback(self.bind)
+        try:
+            loopback = ipaddress.ip_address(self.bind).is_loopback
+        except ValueError:  # a name: only this one is sure to stay on this computer
+            loopback = self.bind == "localhost"
+        return self.listens and not loopback
 
     @property
     def _place(self) -> str:
@@ -116,10 +116,3 @@ class ServeOptions:
         """What stands before every name: ``/bam_001``, or nothing."""
         stripped = self.namespace.strip("/")
         return f"/{stripped}" if stripped else ""
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:  # a name: only this one is sure to stay on this computer
-        return host == "localhost"

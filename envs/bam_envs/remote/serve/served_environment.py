@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from types import TracebackType
 from typing import Any
 
-from bam_envs.core.errors import InvalidValue, LinkLost, RemoteError
+from bam_envs.core.errors import InvalidValue, RemoteError
 from bam_envs.remote.gymapi.gymapi_messages import base_name, service_name
 from bam_envs.remote.ros2_node import RclpyBus
 from bam_envs.remote.serve.command_lease import CommandLease
@@ -60,7 +60,7 @@ class ServedEnvironment:
         """The TCP transport, if there is one."""
         self._tell, self._stack = tell, ExitStack()
         self._robot_service: RobotService | None = None
-        self._refusals: Refusals | None = None
+        self._refusals: dict[str, str] = {}  # id of a declaration -> why the server of `via` does not carry it
         self._token, self._operator_token = (
             None if path is None else read_token(path, private=private)
             for path, private in ((options.token_file, options.listens), (options.operator_token_file, True))
@@ -92,31 +92,35 @@ class ServedEnvironment:
             raise RemoteError("The clock of the robot stands still.")
 
     def _start(self, started: ExitStack) -> None:
-        profile = _profile_of(self.env)
-        realtime = self.options.realtime or (profile is not None and not self.options.fast)
+        options, profile = self.options, _profile_of(self.env)
+        realtime = options.realtime or (profile is not None and not options.fast)
         robot = None if profile is None else _take_robot(self.env, profile, realtime)
         server = EnvServer(self.env, lease=self.lease, realtime=realtime and robot is None)
         started.callback(server.close)
-        self.lease.on_change(self._say_command)
-        if self.options.warning is not None:
-            self._tell(self.options.warning)
+        self.lease.on_change(
+            lambda before, after: self._tell(f"{after} is in command" if after else f"{before} is no longer in command")
+        )
+        if options.warning is not None:
+            self._tell(options.warning)
         self.bus = bus = self._open_bus(started)
         if robot is not None and profile is not None:
-            self._require_own_names(bus)
+            if isinstance(bus, RosbridgeLink):
+                self._require_own_names(bus)
             self._robot_service = RobotService(robot, profile, bus, self.lease, namespace=self.prefix)
             started.callback(self._robot_service.close)
             self._robot_service.start()
         started.callback(server.end)  # while the robot's clock still ticks: a step that runs waits for it
-        options, name, pace = self.options, server.spec().env_id, "real time" if realtime else "fast"
-        version = options.gymapi_version
-        service = GymApiService(server, bus, self.prefix, image_format=options.image_format, version=version)
+        service = GymApiService(
+            server, bus, self.prefix, image_format=options.image_format, version=options.gymapi_version
+        )
         started.callback(service.close)
         service.start()
+        name, pace = server.spec().env_id, "real time" if realtime else "fast"
         offered = self._offered(profile, self._not_offered())
         if offered:
-            node = (
-                f"the ROS 2 graph as the node {bus.name}" if isinstance(bus, RclpyBus) else getattr(bus, "url", "a bus")
-            )
+            node = getattr(bus, "url", "a bus")
+            if isinstance(bus, RclpyBus):
+                node = f"the ROS 2 graph as the node {bus.name}"
             self.endpoints.append(f"{name} on {node}, {pace}: {offered}")
         if options.tcp is not None:
             token, operator = self._token, self._operator_token
@@ -141,8 +145,10 @@ class ServedEnvironment:
         if options.via is not None:
             link = RosbridgeLink(Endpoint(options.via, options.ca_file, self._token), name="serve")
             started.callback(link.close)
-            link.on_down(self._say_down)
-            self._refusals = Refusals(link)
+            link.on_down(
+                lambda error: self._tell(f"{error} It is tried again until it is back; the robot rests meanwhile.")
+            )
+            link.on_status(self._keep_refusal)
             link.connect()
             return link
         server = BridgeServer(
@@ -156,13 +162,11 @@ class ServedEnvironment:
         started.callback(server.close)
         return server.start()
 
-    def _require_own_names(self, bus: Bus) -> None:
+    def _require_own_names(self, link: RosbridgeLink) -> None:
         """Refuse names that another robot has: both would do what a client tells one of them."""
-        if not isinstance(bus, RosbridgeLink):
-            return
         service = self.prefix + INFO_SERVICE
         try:
-            bus.call(service, "", {}, _LOOK)
+            link.call(service, "", {}, _LOOK)
         except RemoteError:  # there is none
             return
         raise InvalidValue(
@@ -170,22 +174,43 @@ class ServedEnvironment:
             "Give this one names of its own: --namespace NAME."
         )
 
-    def _not_offered(self) -> frozenset[str]:
-        """Names that the server of ``--via``, or ROS 2 here, does not carry; people are told why."""
-        if isinstance(self.bus, RclpyBus):
-            for name, reason in self.bus.refused.items():
-                self._tell(f"{name} is not offered: {reason}")
-            return frozenset(self.bus.refused)
-        if self._refusals is None:
-            return frozenset()
-        refused = self._refusals.look()
-        for line in refusal_lines(str(self.options.via), refused):
-            self._tell(line)
-        if self._refusals.unchecked:
-            self._tell(f"{self.options.via} does not say what it carries: rosapi, which lists it, does not run there.")
-        return frozenset(refused)
+    def _keep_refusal(self, status: Mapping[str, Any]) -> None:
+        """Keep what a server says in a `status` message of a declaration that it does not carry."""
+        if status.get("level") == "error":
+            self._refusals[str(status.get("id"))] = str(status.get("msg"))
 
-    def _offered(self, profile: RobotProfile | None, refused: frozenset[str]) -> str:
+    def _not_offered(self) -> set[str]:
+        """Names that the server of ``--via``, or ROS 2 here, does not carry; people are told why and what helps.
+
+        One kind of rosbridge server says so in `status` messages. The other kinds say nothing, and what they carry is
+        what rosapi lists.
+        """
+        bus = self.bus
+        if isinstance(bus, RclpyBus):
+            for name, reason in bus.refused.items():
+                self._tell(f"{name} is not offered: {reason}")
+            return set(bus.refused)
+        if not isinstance(bus, RosbridgeLink):
+            return set()
+        unlisted = _unlisted(bus)
+        reasons = dict.fromkeys(unlisted or (), "rosapi does not list it") | self._refusals
+        refused = {name: (kind, reasons[one]) for one, (name, kind) in bus.declared.items() if one in reasons}
+        packages: dict[str, list[str]] = {}
+        for name, (kind, _) in refused.items():
+            packages.setdefault(kind.partition("/")[0], []).append(name)
+        for package, names in packages.items():
+            how = f"Install {package} beside the bridge (apt install ros-$ROS_DISTRO-{package.replace('_', '-')})"
+            if package == "bam_msgs":
+                build = "colcon build --packages-select bam_msgs"
+                how = f"Build it beside the bridge from ros/bam_msgs of this project ({build})"
+            what = ", ".join(f"{name} ({refused[name][0]})" for name in names)
+            head = f"{self.options.via} does not carry {what}: {refused[names[0]][1]}."
+            self._tell(f"{head} {how}, source it, and start the bridge again.")
+        if unlisted is None and not refused:
+            self._tell(f"{self.options.via} does not say what it carries: rosapi, which lists it, does not run there.")
+        return set(refused)
+
+    def _offered(self, profile: RobotProfile | None, refused: set[str]) -> str:
         """What is offered, without what is `refused`, in words.
 
         Raises:
@@ -195,17 +220,15 @@ class ServedEnvironment:
         offered = [service_name(prefix)] if service_name(prefix) not in refused else []
         if not offered and not refused & {f"{base}/request", f"{base}/reply"}:
             offered = [f'{base}/request and reply (channel="topics")']
-        if profile is not None and _is_usable(profile, prefix, refused):
-            offered.append(f"a {profile.name}'s topics{f' under {prefix}' if prefix else ''}")
+        if profile is not None:
+            # A robot is of use if every state gets out, and commands get in by one mode at least.
+            modes = [{prefix + sink.topic for sink in mode} for mode in profile.commands.values()]
+            states = {prefix + source.topic for source in profile.state}
+            if not states & refused and any(not mode & refused for mode in modes):
+                offered.append(f"a {profile.name}'s topics{f' under {prefix}' if prefix else ''}")
         if not offered and self.options.tcp is None:
             raise RemoteError(f"{self.options.via or 'ROS 2 here'} carries nothing of use of what is served here.")
         return " and ".join(offered)
-
-    def _say_command(self, before: str | None, after: str | None) -> None:
-        self._tell(f"{before} is no longer in command" if after is None else f"{after} is in command")
-
-    def _say_down(self, error: LinkLost) -> None:
-        self._tell(f"{error} It is tried again until it is back; the robot rests meanwhile.")
 
 
 def _profile_of(env: Env) -> RobotProfile | None:
@@ -230,80 +253,19 @@ def _take_robot(env: Env, profile: RobotProfile, realtime: bool) -> ServedRobot:
     return robot
 
 
-def _is_usable(profile: RobotProfile, prefix: str, refused: frozenset[str]) -> bool:
-    """Whether every state gets out, and commands get in by one mode at least."""
-    modes = [{prefix + sink.topic for sink in mode} for mode in profile.commands.values()]
-    states = {prefix + source.topic for source in profile.state}
-    return not states & refused and any(not mode & refused for mode in modes)
-
-
-class Refusals:
-    """Collects what a rosbridge server that is not ours does not carry of what is offered through it.
-
-    One kind of server says so in a `status` message with the id of the declaration. The other kinds say nothing, and
-    what they carry is what rosapi lists.
-
-    Args:
-        link: To the server; not connected yet.
-
-    Attributes:
-        unchecked: Whether the server said nothing, and has no rosapi that could be asked; known after `look`.
-    """
-
-    def __init__(self, link: RosbridgeLink) -> None:
-        self._link, self._said = link, dict[str, str]()
-        self.unchecked = False
-        link.on_status(self._hear)
-
-    def _hear(self, status: Mapping[str, Any]) -> None:
-        if status.get("level") == "error":
-            self._said[str(status.get("id"))] = str(status.get("msg"))
-
-    def look(self) -> dict[str, tuple[str, str]]:
-        """What is not carried: name -> type and reason. Waits until the server has answered.
-
-        Raises:
-            LinkLost: The link dropped.
-        """
-        unlisted = self._unlisted()
-        said = {one: reason for one, reason in self._said.items() if one in self._link.declared}
-        self.unchecked = unlisted is None and not said
-        reasons = {**dict.fromkeys(unlisted or (), "rosapi does not list it"), **said}
-        return {name: (kind, reasons[one]) for one, (name, kind) in self._link.declared.items() if one in reasons}
-
-    def _unlisted(self) -> list[str] | None:
-        """Ids of the declarations that rosapi does not know after a while; None if there is no rosapi."""
-        deadline = time.monotonic() + _WITHIN
-        while True:
-            try:
-                known = {
-                    what: self._link.call(f"/rosapi/{what}", f"rosapi/{what.capitalize()}", {}, _ANSWER).get(what)
-                    for what in ("topics", "services")
-                }
-            except RemoteError:
-                return None
-            names = {name for listed in known.values() if isinstance(listed, list) for name in listed}
-            missing = [one for one, (name, _) in self._link.declared.items() if name not in names]
-            if not missing or time.monotonic() > deadline:
-                return missing
-            time.sleep(_AGAIN)
-
-
-def refusal_lines(url: str, refused: Mapping[str, tuple[str, str]]) -> list[str]:
-    """One line for each package, for people: what is not carried, why, and what helps."""
-    packages: dict[str, list[str]] = {}
-    for name, (kind, _) in refused.items():
-        packages.setdefault(kind.partition("/")[0], []).append(name)
-    lines = []
-    for package, names in packages.items():
-        whole = ", ".join(f"{name} ({refused[name][0]})" for name in names)
-        lines.append(f"{url} does not carry {whole}: {refused[names[0]][1]}. {_remedy(package)}")
-    return lines
-
-
-def _remedy(package: str) -> str:
-    if package == "bam_msgs":
-        how = "Build it beside the bridge from ros/bam_msgs of this project (colcon build --packages-select bam_msgs)"
-    else:
-        how = f"Install {package} beside the bridge (apt install ros-$ROS_DISTRO-{package.replace('_', '-')})"
-    return f"{how}, source it, and start the bridge again."
+def _unlisted(link: RosbridgeLink) -> list[str] | None:
+    """Ids of the declarations that rosapi does not know after a while; None if there is no rosapi."""
+    deadline = time.monotonic() + _WITHIN
+    while True:
+        try:
+            known = {
+                what: link.call(f"/rosapi/{what}", f"rosapi/{what.capitalize()}", {}, _ANSWER).get(what)
+                for what in ("topics", "services")
+            }
+        except RemoteError:
+            return None
+        names = {name for listed in known.values() if isinstance(listed, list) for name in listed}
+        missing = [one for one, (name, _) in link.declared.items() if name not in names]
+        if not missing or time.monotonic() > deadline:
+            return missing
+        time.sleep(_AGAIN)

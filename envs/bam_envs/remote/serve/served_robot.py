@@ -59,7 +59,8 @@ class ServedRobot:
         self._changed = threading.Condition(threading.RLock())
         self._target: Array = np.zeros((self.num_robots, len(robot.spec.command.labels)))
         self._expires = -math.inf  # when the command times out; never while a step is waited for
-        self._resting = True
+        self.resting = True
+        """Whether the robot executes no command."""
         self._parts: Iterator[RobotState] = iter(())
         self._left = 0  # parts of this period still to come
         self._midway = False  # whether the last period was not executed to its end
@@ -88,7 +89,7 @@ class ServedRobot:
             self._drop_parts()
             self.fault = None
             self.state = self._robot.reset(env_ids, initial)
-            self._target, self._resting, self._expires = self.state.command.copy(), True, -math.inf
+            self._target, self.resting, self._expires = self.state.command.copy(), True, -math.inf
             return self.state
 
     def step(self, command: Array) -> RobotState:
@@ -100,7 +101,13 @@ class ServedRobot:
         with self._changed:
             command = checked_command(command, self._target.shape)
             if not self.realtime:
-                return self._step_now(command)
+                try:
+                    self.state = self._robot.step(command)
+                except RobotFault as fault:
+                    self.fault = fault
+                    raise
+                self._target, self.resting = command, False
+                return self.state
             self.follow(command)
             self._expires, order = math.inf, self._orders
             if not self._changed.wait_for(
@@ -114,15 +121,6 @@ class ServedRobot:
                 raise ResetNeeded("The served robot was closed.")
             return self.state
 
-    def _step_now(self, command: Array) -> RobotState:
-        try:
-            self.state = self._robot.step(command)
-        except RobotFault as fault:
-            self.fault = fault
-            raise
-        self._target, self._resting = command, False
-        return self.state
-
     def follow(self, command: Array, *, at_once: bool = True) -> None:
         """Execute `command` (n, m) from the next tick on, at most for the command timeout.
 
@@ -132,16 +130,11 @@ class ServedRobot:
         """
         with self._changed:
             self._target = command
-            self._expires, self._resting = self._now() + self.command_timeout, False
+            self._expires, self.resting = self._now() + self.command_timeout, False
             self._orders += 1
             # With one part to go, a command that came a little early is not worth losing that part for.
             if at_once and self._left != 1:
                 self._drop_parts()
-
-    @property
-    def resting(self) -> bool:
-        """Whether the robot executes no command."""
-        return self._resting
 
     def target(self) -> Array:
         """A copy of what the robot is told to do now. Shape: (n, m)."""
@@ -153,11 +146,16 @@ class ServedRobot:
         with self._changed:
             if self.state is None or self.fault is not None:
                 return
-            if not self._resting and self._now() > self._expires:
+            if not self.resting and self._now() > self._expires:
                 self.halt()
             try:
                 if not self._left:
-                    self._begin_period()
+                    slices, command = getattr(self._robot, "slices", None), self._reachable()
+                    if slices is None:
+                        self._parts, self._left = (self._robot.step(command) for _ in range(1)), 1
+                    else:
+                        self._parts, self._left = iter(slices(command, PARTS)), PARTS
+                    self._begun, self._midway = self._orders, False
                 self._left -= 1
                 self.state = next(self._parts)
             except RobotFault as fault:
@@ -166,29 +164,17 @@ class ServedRobot:
                 self._done = self._begun
                 self._changed.notify_all()
 
-    def _begin_period(self) -> None:
-        slices, command = getattr(self._robot, "slices", None), self._reachable()
-        if slices is None:
-            self._parts, self._left = (self._robot.step(command) for _ in range(1)), 1
-        else:
-            self._parts, self._left = iter(slices(command, PARTS)), PARTS
-        self._begun, self._midway = self._orders, False
-
     def _reachable(self) -> Array:
         """The target, no farther than the robot may go in a period from where it is.
 
         The robot itself counts from its last command, which one that comes early finds half executed.
         """
-        rate, setpoint = self.spec.command.max_rate, self._setpoint()
+        rate, setpoint = self.spec.command.max_rate, getattr(self._robot, "setpoint", None)
         if not self._midway or rate is None or setpoint is None:
             return self._target
         reach = np.array(rate) * self.spec.period
         near: Array = np.clip(self._target, setpoint - reach, setpoint + reach)
         return near
-
-    def _setpoint(self) -> Array | None:
-        """Where the controllers of the robot pull now, if it says so. Shape: (n, m)."""
-        return getattr(self._robot, "setpoint", None)
 
     def _drop_parts(self) -> None:
         """Drop the rest of this period; a step that waits for it ends with the next one."""
@@ -214,20 +200,20 @@ class ServedRobot:
     def halt(self) -> None:
         """Rest: where it is, or at speed zero. Time goes on, and a step that is waited for ends in time."""
         with self._changed:
-            if self._resting:
+            if self.resting:
                 return  # each time it would begin from where gravity has pulled it since
             self._robot.halt()
             if self.state is None:
                 return
             self._drop_parts()
-            self._target, self._resting = self._rest(self.state), True
+            self._target, self.resting = self._rest(self.state), True
 
     def _rest(self, state: RobotState) -> Array:
         """The command that keeps the robot as it was halted. Shape: (n, m)."""
         if self._zero_rests:
             return np.zeros_like(self._target)
-        setpoint = self._setpoint()  # which also says how hard a gripper holds
-        if setpoint is not None:
+        setpoint: Array | None = getattr(self._robot, "setpoint", None)  # where its controllers pull now
+        if setpoint is not None:  # it also says how hard a gripper holds
             return setpoint
         # What is measured, in place of what was commanded.
         measured = {

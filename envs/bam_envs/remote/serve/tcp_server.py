@@ -16,8 +16,8 @@ from bam_envs.remote.tcp_wire import (
     FrameSocket,
     Greeting,
     Hello,
+    Leave,
     Request,
-    Reset,
     Step,
     action_size,
     encode,
@@ -26,7 +26,7 @@ from bam_envs.remote.tcp_wire import (
 )
 from bam_envs.remote.transport import spec_to_json
 from bam_envs.remote.values import Tree
-from bam_envs.ros.freshness import FreshnessCheck
+from bam_envs.ros.freshness import FreshnessCheck, Tag
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
 from bam_envs.rosbridge.tokens import Guesses, Tokens
 
@@ -165,7 +165,16 @@ class TcpServer:
         Raises:
             RemoteError: It does not know the token, wants another environment, or there is no room.
         """
-        operator = self._is_operator(hello, connection)
+        role = None
+        if self._tokens.needed or (hello.token and self._tokens.exist):
+            if not self._guesses.may_try(connection.host):
+                raise RemoteError("Too many wrong tokens came from this address; try again in a second.")
+            role = self._tokens.role([hello.token])
+            if role is None:
+                if hello.token:
+                    self._guesses.wrong(connection.host)
+                what = "wrong" if hello.token else "missing"
+                raise RemoteError(f"The token is {what}; give the one that the server was started with (--token-file).")
         self.server.require_name(hello.env_id)
         with self._lock:
             older = [one for one in self._connections if one is not connection and one.session == hello.session]
@@ -173,28 +182,11 @@ class TcpServer:
             if present >= self.max_clients:
                 raise RemoteError(f"All {self.max_clients} places for clients are taken; try again when one has left.")
             # As long as the connection is there, the system at its other end is: that is its sign of life.
-            connection.caller = Caller(connection.client, connection.client, operator=operator, silence=lambda: 0.0)
+            name, operator = connection.client, role == "operator"
+            connection.caller = Caller(name, name, operator=operator, silence=lambda: 0.0)
         for one in older:
             one.drop()
             self.server.leave(one.client)
-
-    def _is_operator(self, hello: Hello, connection: _Connection) -> bool:
-        """Whether the token is the operator's.
-
-        Raises:
-            RemoteError: It is none that lets anybody in.
-        """
-        if not (self._tokens.needed or (hello.token and self._tokens.exist)):
-            return False
-        if not self._guesses.may_try(connection.host):
-            raise RemoteError("Too many wrong tokens came from this address; try again in a second.")
-        role = self._tokens.role([hello.token])
-        if role is None:
-            if hello.token:
-                self._guesses.wrong(connection.host)
-            what = "wrong" if hello.token else "missing"
-            raise RemoteError(f"The token is {what}; give the one that the server was started with (--token-file).")
-        return role == "operator"
 
     def forget(self, connection: _Connection) -> None:
         """A connection has ended."""
@@ -214,11 +206,15 @@ class _Connection:
         self.thread = threading.Thread(target=self._run, name=f"bam-tcp {self.client}", daemon=True)
 
     def drop(self) -> None:
-        self._frames.close()
+        self._frames.hang_up()
 
     def _run(self) -> None:
         try:
-            self._greet()
+            _, hello = self._frames.receive(time.monotonic() + _HELLO_TIMEOUT, _HELLO_LIMIT, kind=Greeting)
+            self.client = f"{hello.name} ({self.client})"
+            self._owner.admit(hello, self)
+            self.session = hello.session
+            self._send(encode([0, "ok", spec_to_json(self._owner.server.spec())]))
             while True:
                 request = self._frames.receive(limit=self._owner.most, patience=self._owner.patience, kind=Request)
                 self._send(self._answer(request))
@@ -228,15 +224,8 @@ class _Connection:
         except LinkLost:
             pass  # it went away
         finally:
-            self.drop()
+            self._frames.close()
             self._owner.forget(self)
-
-    def _greet(self) -> None:
-        _, hello = self._frames.receive(time.monotonic() + _HELLO_TIMEOUT, _HELLO_LIMIT, kind=Greeting)
-        self.client = f"{hello.name} ({self.client})"
-        self._owner.admit(hello, self)
-        self.session = hello.session
-        self._send(encode([0, "ok", spec_to_json(self._owner.server.spec())]))
 
     def _send(self, parts: list[bytes | memoryview]) -> None:
         self._frames.send(parts, time.monotonic() + self._owner.patience)
@@ -244,24 +233,23 @@ class _Connection:
     def _answer(self, request: Request) -> list[bytes | memoryview]:
         """The frame that answers `request`; one that came before gets the answer of before, and nothing moves."""
         tag = request.tag
-        if self._answered is not None and self._answered[0] == tag.number:
+        number = (tag.session, tag.epoch, tag.sequence)
+        if self._answered is not None and self._answered[0] == number:
             return self._answered[1]
         try:
-            self._owner.freshness.require(tag.to_tag())
+            self._owner.freshness.require(Tag(tag.session, tag.epoch, tag.sequence, tag.sent, tag.deadline))
             parts = encode([tag.sequence, "ok", self._do(request)])
         except BamEnvsError as error:
             parts = encode(refusal(tag.sequence, error))
-        self._answered = (tag.number, parts)
+        self._answered = (number, parts)
         return parts
 
     def _do(self, request: Request) -> Tree:
         server, deadline = self._owner.server, time.monotonic() + request.tag.lifetime
-        if isinstance(request, Reset):
-            caller, take = self.caller or UNKNOWN_CALLER, request.take is True
-            begun = server.reset(
-                self.client, request.seed, request.options, take=take, deadline=deadline, caller=caller
-            )
-            return pack_result(server.spec(), begun)
+        if isinstance(request, Leave):
+            return server.leave(self.client)
         if isinstance(request, Step):
             return pack_result(server.spec(), server.step(self.client, request.action, deadline=deadline))
-        return server.leave(self.client)
+        options, take, caller = request.options, request.take is True, self.caller or UNKNOWN_CALLER
+        begun = server.reset(self.client, request.seed, options, take=take, deadline=deadline, caller=caller)
+        return pack_result(server.spec(), begun)

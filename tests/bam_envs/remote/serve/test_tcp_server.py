@@ -331,10 +331,10 @@ class Large(FakeEnv):
     """Its observations are more than sockets keep for a client that does not read."""
 
     def __init__(self):
-        super().__init__(spaces.Box(0, 255, (20_000_000,), np.uint8))
+        super().__init__(spaces.Box(0, 255, (12_000_000,), np.uint8))
 
     def reset(self, *, seed=None, options=None):
-        return np.zeros(20_000_000, np.uint8), {}
+        return np.zeros(12_000_000, np.uint8), {}
 
 
 def test_a_client_that_never_reads_is_dropped_and_holds_up_nobody():
@@ -348,7 +348,7 @@ def test_a_client_that_never_reads_is_dropped_and_holds_up_nobody():
         assert left.wait(PATIENCE)
         other = TcpTransport(server.url)
         other.connect()
-        assert other.reset()[0].shape == (20_000_000,)
+        assert other.reset()[0].shape == (12_000_000,)
         other.close()
         deaf.frames.close()
 
