@@ -1,4 +1,4 @@
-"""Connecting a live robot: who it is, whether its topics are what the profile says, and whether it is ready to move.
+"""Connecting a live robot: who it is, whether its topics fit the profile, whether it is ready to move; its session.
 
 A rosbridge server does not report a wrong topic or type. So each one is checked by its effect: by its type if the
 server can tell it (rosapi), and by the first message of every source.
@@ -6,17 +6,21 @@ server can tell it (rosapi), and by the first message of every source.
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from bam_envs.core.errors import InvalidValue, LinkLost, ProtocolError, RemoteError, StaleState
+from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, ProtocolError, RemoteError, StaleState
 from bam_envs.core.timing import Deadline
 from bam_envs.live.state import LiveState, Mailbox
 from bam_envs.ros.codec import INFO_SERVICE, RobotInfo, has_room, read_info
+from bam_envs.ros.freshness import Tagger
 from bam_envs.ros.messages import bare_type, same_type
 from bam_envs.ros.profile_tables import Readiness, RobotProfile, Sink
 from bam_envs.rosbridge.bus import Listener, namespaces_with
+from bam_envs.rosbridge.sessions import LEASE_TOPIC, LEAVE, RENEW, SESSION_SERVICE, read_session
 
 if TYPE_CHECKING:
     from bam_envs.rosbridge.client import RosbridgeLink
@@ -30,6 +34,9 @@ _STATES = 5
 FIRST_WITHIN = 0.3
 """Longest wait for the latched topics by which a robot says whether it is ready [s]."""
 _ANSWER_WITHIN = 2.0
+_RENEW_EVERY, _RENEWAL_LIFE = 0.5, 1.0
+"""Time between two renewals of the lease, and how long each is valid [s]; the robot's side waits for several of them
+(`CommandLease`)."""
 _ACTIVE = ("active", "running")
 """The states of a controller that takes commands, in ROS 2 and in ROS 1."""
 
@@ -87,19 +94,6 @@ def tagged_sinks(profile: RobotProfile, mode: str | None, info: RobotInfo) -> tu
     return profile.sinks(mode)
 
 
-def require_period(info: RobotInfo, period: float) -> None:
-    """Check that a robot in lockstep advances by the task's `period` [s].
-
-    Raises:
-        InvalidValue: It advances by another one.
-    """
-    if info.lockstep and info.period is not None and info.period != period:
-        raise InvalidValue(
-            f"{info.name} goes on {info.period:g} s with each command, and the task's period is {period:g} s. "
-            "Serve the environment that the task is of."
-        )
-
-
 class TopicTypes:
     """Asks a server for the types of its topics, if it offers rosapi.
 
@@ -128,12 +122,6 @@ class TopicTypes:
         found = self._found(topic)
         return same_type(found, kind) if found else not self._answers
 
-    def _misfit(self, topic: str, expected: str, found: str) -> ProtocolError:
-        return ProtocolError(
-            f"{topic} is a {found} there, and {expected} was expected. "
-            f"Correct the topic or its type in the profile of {self._profile.name}."
-        )
-
     def check_listened(self, topic: str, sink: Sink) -> str:
         """As `check`, for the `topic` of `sink`, which somebody must listen to, with or without stamp as expected.
 
@@ -153,6 +141,12 @@ class TopicTypes:
         if bare_type(found) != bare_type(expected):  # reading ignores a stamp, writing does not
             raise self._misfit(topic, expected, found)
         return found
+
+    def _misfit(self, topic: str, expected: str, found: str) -> ProtocolError:
+        return ProtocolError(
+            f"{topic} is a {found} there, and {expected} was expected. "
+            f"Correct the topic or its type in the profile of {self._profile.name}."
+        )
 
     def _found(self, topic: str) -> str:
         """The type of `topic` there; empty if the server does not know."""
@@ -186,13 +180,14 @@ def await_first(link: RosbridgeLink, state: LiveState, profile: RobotProfile, ti
         LinkLost: The link dropped.
         StaleState: A source is silent; names its topic, its type, and the last status of the server.
     """
-    wanted = {source.signal for source in state.sources}
-    arrived = state.mailbox.wait_for(lambda slots: wanted <= slots.keys() or not link.is_up, timeout)
+    wanted = {source.signal: f"{link.namespace}{source.topic} ({source.type})" for source in state.sources}
+    arrived = state.mailbox.wait_for(lambda slots: wanted.keys() <= slots.keys() or not link.is_up, timeout)
     if not link.is_up:
         raise LinkLost(f"{link.url}: the link dropped while the robot's topics were looked at.")
     if arrived:
         return
-    silent = dict.fromkeys(f"{link.namespace}{source.topic} ({source.type})" for source in state.silent())
+    newest = state.mailbox.newest()
+    silent = dict.fromkeys(topic for signal, topic in wanted.items() if signal not in newest)
     said = [str(status.get("msg")) for status in link.statuses]
     raise StaleState(
         f"{', '.join(silent)}: no message in {timeout:g} s. Does it run, and is the topic called so? "
@@ -213,37 +208,31 @@ class LiveReadiness:
 
     def __init__(self, profile: RobotProfile, sinks: tuple[Sink, ...], types: TopicTypes) -> None:
         self._profile, self._types = profile, types
-        self._controllers = tuple(dict.fromkeys(sink.controller for sink in sinks if sink.controller))
-        self._mailbox = Mailbox()
+        self.mailbox = Mailbox()
+        """Messages by topic; to be cleared when the link is down."""
         self._heard: tuple[Readiness, ...] = ()
-        self._states: Mapping[str, str] | None = None
-        self._answers = bool(self._controllers and profile.controllers)
+        named = dict.fromkeys(sink.controller for sink in sinks if sink.controller)
+        self._controllers = tuple(named) if profile.controllers else ()
+        self._states: Mapping[str, str] | None = None  # of the controllers, by name
+        self._answers = bool(self._controllers)  # whether the server has the service that lists them
 
     def begin(self, link: RosbridgeLink) -> None:
         """Subscribe to the topics, wait a little for their latched messages, and ask for the controllers."""
         if not self._heard:  # on a later connection the link subscribes again by itself
-            self._listen(link)
+            every = self._profile.readiness
+            self._heard = tuple(one for one in every if self._types.may_be(link.namespace + one.topic, one.type))
+            for one in self._heard:
+                link.subscribe(link.namespace + one.topic, one.type, self._listener(one.topic))
         topics = {one.topic for one in self._heard}
-        self._mailbox.wait_for(lambda slots: topics <= slots.keys() or not link.is_up, FIRST_WITHIN)
+        self.mailbox.wait_for(lambda slots: topics <= slots.keys() or not link.is_up, FIRST_WITHIN)
         self._ask(link)
 
-    def _listen(self, link: RosbridgeLink) -> None:
-        self._heard = tuple(
-            one for one in self._profile.readiness if self._types.may_be(link.namespace + one.topic, one.type)
-        )
-        for one in self._heard:
-            link.subscribe(link.namespace + one.topic, one.type, self._listener(one.topic))
-
     def _listener(self, topic: str) -> Listener:
-        return lambda message, caller: self._mailbox.put([topic], message)
+        return lambda message, caller: self.mailbox.put([topic], message)
 
     def owns(self, status: Mapping[str, Any], namespace: str) -> bool:
         """Whether a `status` of the server is about these topics: it is no error if the server cannot offer one."""
         return status.get("id") in {f"subscribe:{namespace}{one.topic}" for one in self._heard}
-
-    def forget(self) -> None:
-        """Drop what was heard: the link is down."""
-        self._mailbox.clear()
 
     def fault(self, *, moving: bool) -> str | None:
         """Why the robot is not ready, by the newest messages; None if nothing says so. Any thread.
@@ -251,7 +240,7 @@ class LiveReadiness:
         Args:
             moving: Leave out measured numbers (`at_least`), which may dip while the robot moves.
         """
-        letters = self._mailbox.newest()
+        letters = self.mailbox.newest()
         for one in self._heard:
             if one.topic in letters and not (moving and one.at_least is not None):
                 trouble = one.trouble(letters[one.topic].message)
@@ -262,10 +251,14 @@ class LiveReadiness:
     def not_ready(self, link: RosbridgeLink) -> str | None:
         """As `fault`, including the controllers, which are asked for now."""
         said = self.fault(moving=False)
-        if said is None:
-            self._ask(link)
-            said = self._controller_fault()
-        return said
+        if said is not None:
+            return said
+        self._ask(link)
+        for name in self._controllers:
+            state = "active" if self._states is None else self._states.get(name, "not loaded")
+            if state not in _ACTIVE:
+                return f"the controller {name} is {state}: ros2 control switch_controllers --activate {name}"
+        return None
 
     def _ask(self, link: RosbridgeLink) -> None:
         """Ask for the states of the controllers; a server without that service is not asked again."""
@@ -275,36 +268,76 @@ class LiveReadiness:
             answer = link.call(link.namespace + self._profile.controllers, "", {}, _ANSWER_WITHIN)
         except (RemoteError, ProtocolError):
             self._answers = False
+            return
         except LinkLost:  # what was known may have changed
             self._states = None
-        else:
-            self._states = _states_of(answer)
-
-    def _controller_fault(self) -> str | None:
-        if self._states is None:
-            return None
-        for name in self._controllers:
-            state = self._states.get(name, "not loaded")
-            if state not in _ACTIVE:
-                return f"the controller {name} is {state}: ros2 control switch_controllers --activate {name}"
-        return None
+            return
+        listed: Any = answer.get("controller")
+        readable = isinstance(listed, list) and all(isinstance(one, Mapping) for one in listed)
+        self._states = {str(one.get("name")): str(one.get("state")) for one in listed} if readable else None
 
     @property
     def unknown(self) -> tuple[str, ...]:
         """Topics, and the service of the controllers, that gave nothing readable."""
-        letters = self._mailbox.newest()
+        letters = self.mailbox.newest()
         topics = (
             one.topic
             for one in self._profile.readiness
             if one.topic not in letters or one.value(letters[one.topic].message) is None
         )
-        asked = bool(self._controllers and self._profile.controllers)
-        return (*topics, *([self._profile.controllers] if asked and self._states is None else []))
+        return (*topics, *([self._profile.controllers] if self._controllers and self._states is None else []))
 
 
-def _states_of(answer: Mapping[str, Any]) -> dict[str, str] | None:
-    """State of each controller by its name, from the answer of ``list_controllers``; None if it is malformed."""
-    rows = answer.get("controller")
-    if not isinstance(rows, list) or not all(isinstance(row, Mapping) for row in rows):
-        return None
-    return {str(row.get("name")): str(row.get("state")) for row in rows}
+class DrivingSession:
+    """The session of a client: opened by a service call, kept alive while it drives, left at the end.
+
+    Signs commands, and renews the lease in a thread of its own: a slow driver must not lose it.
+    """
+
+    def __init__(self) -> None:
+        self.tagger = Tagger()
+        """Signs for the open session; without a session, as for robots that are not served by us, it signs nothing."""
+        self._link: RosbridgeLink | None = None  # of the open session
+        self._thread: threading.Thread | None = None
+        self._left = threading.Event()
+
+    def open(self, link: RosbridgeLink) -> None:
+        """Leave the session that is open, and open a new one on `link` if the robot's side has sessions.
+
+        Raises:
+            LinkLost: No answer.
+            ProtocolError: The answer is malformed.
+        """
+        link.advertise(link.namespace + LEASE_TOPIC, "std_msgs/String")
+        self.leave()
+        answer = ask(link, link.namespace + SESSION_SERVICE)
+        if answer is not None:
+            self.tagger, self._link = read_session(answer, SESSION_SERVICE), link
+
+    def drive(self) -> None:
+        """Renew the lease from now on."""
+        if self._link is not None and self._thread is None:
+            self._left = threading.Event()
+            self._thread = threading.Thread(target=self._renew, args=(self._left,), name="bam-lease", daemon=True)
+            self._thread.start()
+
+    def leave(self) -> None:
+        """Give the lease back at once. Idempotent; never raises."""
+        self._left.set()
+        if self._thread is not None:
+            self._thread.join()
+        self._say(LEAVE)
+        self._link = self._thread = None
+
+    def _renew(self, left: threading.Event) -> None:
+        while not left.wait(_RENEW_EVERY):
+            self._say(RENEW)
+
+    def _say(self, word: str) -> None:
+        link = self._link
+        if link is None:
+            return
+        tag = self.tagger.next(link.epoch, _RENEWAL_LIFE)
+        text = f"{word} {self.tagger.sign(tag, LEASE_TOPIC, word.encode())}"
+        with suppress(BamEnvsError):  # a link that is down is reported by the next command
+            link.publish(link.namespace + LEASE_TOPIC, {"data": text})

@@ -48,7 +48,10 @@ def live_robot(
     """
     require_robot_address(url)
     endpoint = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file)
-    chosen = _profile(profile, spec)
+    if profile is None:
+        chosen = load_profile(DEFAULT_PROFILE) if spec is None else profile_for(spec)
+    else:
+        chosen = profile if isinstance(profile, RobotProfile) else load_profile(profile)
     robot = RosbridgeRobot(endpoint, chosen, spec=spec, command=command)
     return SafeRobot(robot, limits=limits or profile_limits(chosen), tool_position=tool_position)
 
@@ -57,14 +60,6 @@ def profile_limits(profile: RobotProfile) -> Limits:
     """How far the guards let the robot of `profile` go."""
     limits = Limits.of(profile.limits)
     return limits if limits.max_age is not None else replace(limits, max_age=profile.max_age)
-
-
-def _profile(profile: RobotProfile | str | Path | None, spec: RobotSpec | None) -> RobotProfile:
-    if isinstance(profile, RobotProfile):
-        return profile
-    if profile is not None:
-        return load_profile(profile)
-    return load_profile(DEFAULT_PROFILE) if spec is None else profile_for(spec)
 
 
 def require_robot_address(url: str) -> None:

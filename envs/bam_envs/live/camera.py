@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import ProtocolError, ResetNeeded, StaleState
-from bam_envs.live.state import Letter, Mailbox, SourceAge
+from bam_envs.live.state import Mailbox, SourceAge
 from bam_envs.ros.images import message_bytes, read_color_message, read_depth_message
-from bam_envs.ros.messages import read_stamp, require_message
 from bam_envs.ros.profile_tables import CameraSource
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
@@ -67,12 +66,8 @@ class LiveCamera:
         self.source, self.url = source, self._endpoint.url
         self._topic, self._clock = self._endpoint.address.namespace + source.topic, clock
         self._link: RosbridgeLink | None = None
-        self._forget()
-
-    def _forget(self) -> None:
-        self._mailbox = Mailbox(self._clock)
+        self._mailbox, self._age = Mailbox(clock), SourceAge(0.0)
         self._decoded: CameraImage | None = None
-        self._age, self._judged = SourceAge(0.0), 0  # and the number of the image whose age was judged last
 
     def connect(self) -> None:
         """Open a connection for this camera, and wait for its first image. Idempotent.
@@ -83,8 +78,9 @@ class LiveCamera:
         """
         if self._link is not None:
             return
-        self._forget()
-        link, mailbox = RosbridgeLink(self._endpoint, name="camera"), self._mailbox
+        self._mailbox = mailbox = Mailbox(self._clock)
+        self._age, self._decoded = SourceAge(0.0), None
+        link = RosbridgeLink(self._endpoint, name="camera")
         link.subscribe(
             self._topic, self.source.type, lambda message, caller: mailbox.put([_SLOT], message), compression="cbor"
         )
@@ -113,25 +109,16 @@ class LiveCamera:
         letter = None if self._link is None else self._mailbox.newest().get(_SLOT)
         if letter is None:
             raise ResetNeeded(f"The camera {self.source.name} at {self.url} is not connected. Call connect() first.")
-        self._judge(letter)
+        # Compared with the quickest image by their stamps: a link that hung delivers old images late.
+        self._age.look(letter, self._topic, None)
         age, limit = self._age.at(self._clock()), self.source.max_age
         if age > limit:
             what = f"{self._topic}: the newest image is {age:.3f} s old, and at most {limit:g} s are allowed."
             raise StaleState(what, age, limit)
         if self._decoded is None or self._decoded.number != letter.number:
-            self._decoded = self._decode(letter)
+            pixels = decode_pixels(letter.message, self._topic)
+            self._decoded = CameraImage(pixels, self._age.stamp, letter.number)
         return self._decoded
-
-    def _judge(self, letter: Letter) -> None:
-        """Judge the age by the stamp, compared with the quickest image: a link that hung delivers old images late."""
-        if letter.number != self._judged:
-            stamp = read_stamp(require_message(letter.message, self._topic), self._topic)
-            self._age.look(letter.arrived, stamp, None)
-            self._judged = letter.number
-
-    def _decode(self, letter: Letter) -> CameraImage:
-        message = require_message(letter.message, self._topic)
-        return CameraImage(decode_pixels(message, self._topic), read_stamp(message, self._topic), letter.number)
 
     def close(self) -> None:
         """Drop the connection. Idempotent."""

@@ -33,16 +33,15 @@ from bam_envs.core.robot import EnvIds, Initial, RobotSpec, RobotState
 from bam_envs.core.timing import Pacer
 from bam_envs.live.bringup import (
     TIMEOUT,
+    DrivingSession,
     LiveReadiness,
     TopicTypes,
     ask_info,
     await_first,
     info_by_profile,
-    require_period,
     tagged_sinks,
     throttle,
 )
-from bam_envs.live.session import DrivingSession
 from bam_envs.live.state import Letter, LiveState
 from bam_envs.ros.codec import HALT_TOPIC, SCENE_TOPIC, RobotInfo, encode_sink, has_room
 from bam_envs.ros.freshness import Tag
@@ -154,7 +153,7 @@ class RosbridgeRobot:
             return
         control = RosbridgeLink(self._endpoint, name="control")
         halting = RosbridgeLink(self._endpoint, name="halt", lost_after=_LOST_AFTER)
-        self._state.restart()
+        self._state.mailbox.clear()
         try:
             self._open(control, halting)
             self._begin(control)
@@ -174,19 +173,21 @@ class RosbridgeRobot:
         self._describes_itself, self._info = said is not None, said or info_by_profile(self.url, self.profile)
         if said is not None:
             self._sinks = tagged_sinks(self.profile, self._mode, said)
-            require_period(said, self.spec.period)
+            if said.lockstep and said.period is not None and said.period != self.spec.period:
+                raise InvalidValue(
+                    f"{said.name} goes on {said.period:g} s with each command, and the task's period is "
+                    f"{self.spec.period:g} s. Serve the environment that the task is of."
+                )
             tagged = all(sink.tag and has_room(sink.type) for sink in self._sinks)
             self._answers = tagged and not said.lockstep
         self._state.server_offset = lambda: control.clock_offset
         types = TopicTypes(control, self.profile, self._timeout)
         self._declare(control, halting, types)
-        self._readiness = None
-        if said is None:
-            self._readiness = LiveReadiness(self.profile, self._sinks, types)
+        self._readiness = LiveReadiness(self.profile, self._sinks, types) if said is None else None
 
     def _declare(self, control: RosbridgeLink, halting: RosbridgeLink, types: TopicTypes) -> None:
         """Subscribe states and advertise commands, with the types that they have there."""
-        for topic, kind in self._state.topics.items():
+        for topic, kind in {source.topic: source.type for source in self._state.sources}.items():
             name = self.namespace + topic
             # A robot that describes itself sends no more than is needed; in lockstep each state answers a command.
             least = 0 if self._describes_itself else throttle(self.profile, topic, self.spec.period)
@@ -223,7 +224,7 @@ class RosbridgeRobot:
         self._cut.set()
         self._state.mailbox.clear()
         if self._readiness is not None:
-            self._readiness.forget()
+            self._readiness.mailbox.clear()
 
     def _on_status(self, status: Mapping[str, Any]) -> None:
         """The server, or the robot's side behind it, reports an error."""
@@ -336,9 +337,7 @@ class RosbridgeRobot:
         self._session.drive()
 
     def _await_answer(self, tag: Tag) -> None:
-        def stopped() -> bool:
-            return self._cut.is_set() or bool(self._refusals)
-
+        stopped = lambda: self._cut.is_set() or bool(self._refusals)  # noqa: E731
         if not self._state.await_answer(tag.echo, stopped, self._answer_timeout):
             raise StaleState(
                 f"{self.url}: no state answered the command in {self._answer_timeout:g} s. Does the simulation run?",
@@ -356,7 +355,7 @@ class RosbridgeRobot:
         """
         self._connected()
         signals, stamp = self._state.read()
-        command = _rest_command(self.spec, self._sinks, signals) if self._sent is None else self._sent
+        command = self._at_rest(signals) if self._sent is None else self._sent
         return RobotState(signals, np.array([stamp]), command[None].copy())
 
     def age(self) -> float:
@@ -386,7 +385,9 @@ class RosbridgeRobot:
             return
         first = self._sending.acquire(timeout=_HALT_WAITS)
         try:
-            self._publish_halt(halting)
+            halting.publish(self.namespace + HALT_TOPIC, {})
+            if not self._describes_itself:
+                self._publish_hold(halting)
             self._halt_failed = False
         except BamEnvsError as error:  # reported once: several threads and `close` try it too
             if not self._halt_failed:
@@ -396,31 +397,43 @@ class RosbridgeRobot:
             if first:
                 self._sending.release()
 
-    def _publish_halt(self, halting: RosbridgeLink) -> None:
-        halting.publish(self.namespace + HALT_TOPIC, {})
-        if self._describes_itself:
-            return
-        hold = self._hold()
-        tag = self._session.tagger.next(self._epoch, self._command_life)
-        for sink in self._sinks:
-            if np.isfinite(hold[_places(self.spec, sink)]).all():  # what is unknown is not commanded
-                topic, _, message = encode_sink(sink, self.spec, hold, tag, ros1=halting.ros == "ros1")
-                halting.publish(self.namespace + topic, message)
-
-    def _hold(self) -> Array:
-        """What a halt sends, NaN for nothing. Shape: (m,)."""
+    def _publish_hold(self, halting: RosbridgeLink) -> None:
+        """Send a robot that hears no halts what it holds with; what is not known is not commanded."""
         try:
             # Going back to where the robot was some time ago would be a motion.
             signals = self._state.signals() if self._state.age() <= self.profile.max_age else {}
         except BamEnvsError:  # the measurement cannot be read: hold what was sent
             signals = {}
-        hold = _hold_command(self.spec, self._sinks, signals, self._sent)
-        if self._sent is None or self._clock() - self._sent_at > _CANNOT_BE_FAR:
-            return hold
-        joints = np.array([unit == "rad" for unit in self.spec.command.units])
-        if (np.abs(hold - self._sent)[joints] > _FAR).any():  # no guard lets it get so far: wrongly measured
-            hold[joints] = self._sent[joints]
-        return hold
+        hold, sent = self._at_rest(signals), self._sent
+        for sink in self._sinks:
+            places = self._places(sink)
+            if sent is None and sink.hold == "last":
+                hold[places] = np.nan
+            elif sent is not None and (sink.hold == "last" or not np.isfinite(hold[places]).all()):
+                hold[places] = sent[places]
+        if sent is not None and self._clock() - self._sent_at <= _CANNOT_BE_FAR:
+            joints = np.array([unit == "rad" for unit in self.spec.command.units])
+            if (np.abs(hold - sent)[joints] > _FAR).any():  # no guard lets it get so far: wrongly measured
+                hold[joints] = sent[joints]
+        tag = self._session.tagger.next(self._epoch, self._command_life)
+        for sink in self._sinks:
+            if np.isfinite(hold[self._places(sink)]).all():
+                topic, _, message = encode_sink(sink, self.spec, hold, tag, ros1=halting.ros == "ros1")
+                halting.publish(self.namespace + topic, message)
+
+    def _at_rest(self, signals: Mapping[str, Array]) -> Array:
+        """The command of a robot at rest: speeds 0, the rest as measured, NaN where it is not. Shape: (m,)."""
+        rest = np.full(len(self.spec.command.labels), np.nan)
+        for place, name, column in measured_places(self.spec, self.spec.command.units) if signals else ():
+            rest[place] = signals[name][0, column]
+        for sink in self._sinks:
+            if sink.hold == "zero":
+                rest[self._places(sink)] = 0.0
+        return rest
+
+    def _places(self, sink: Sink) -> list[int]:
+        """Indices of the numbers of `sink` in a command."""
+        return [self.spec.command.labels.index(label) for label in sink.labels]
 
     def close(self) -> None:
         """Halt if anything was commanded from here, then drop both connections. Idempotent."""
@@ -471,38 +484,3 @@ class RosbridgeRobot:
             refusal = self._refusals[0]
             self._refusals.clear()
             raise refusal
-
-
-def _rest_command(spec: RobotSpec, sinks: tuple[Sink, ...], signals: Mapping[str, Array]) -> Array:
-    """The command of a robot at rest: speeds 0, the rest as measured, NaN where it is not. Shape: (m,)."""
-    rest = np.full(len(spec.command.labels), np.nan)
-    for place, name, column in measured_places(spec, spec.command.units) if signals else ():
-        rest[place] = signals[name][0, column]
-    for sink in sinks:
-        if sink.hold == "zero":
-            rest[_places(spec, sink)] = 0.0
-    return rest
-
-
-def _hold_command(spec: RobotSpec, sinks: tuple[Sink, ...], signals: Mapping[str, Array], sent: Array | None) -> Array:
-    """What a halt sends, NaN for nothing: each sink of the profile says how it holds. Shape: (m,).
-
-    Args:
-        spec: Of the robot.
-        sinks: Where commands go.
-        signals: The newest state; empty if it cannot be read.
-        sent: What was sent last. Shape: (m,). None if nothing was.
-    """
-    hold = _rest_command(spec, sinks, signals)
-    for sink in sinks:
-        places = _places(spec, sink)
-        if sent is None and sink.hold == "last":
-            hold[places] = np.nan
-        elif sent is not None and (sink.hold == "last" or not np.isfinite(hold[places]).all()):
-            hold[places] = sent[places]
-    return hold
-
-
-def _places(spec: RobotSpec, sink: Sink) -> list[int]:
-    """Indices of the numbers of `sink` in a command."""
-    return [spec.command.labels.index(label) for label in sink.labels]

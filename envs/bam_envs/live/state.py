@@ -89,53 +89,50 @@ class Mailbox:
 
 
 class SourceAge:
-    """How old the newest message of one topic is.
+    """The newest message of one topic: its stamp, its tag, and how old it is.
 
     Args:
         wall_ahead: Our wall clock minus our monotonic one [s].
     """
 
     def __init__(self, wall_ahead: float) -> None:
+        self.stamp: float | None = None
+        """When it was measured, as it says [s]; None without a stamp, and before the first message."""
+        self.tag: object = None
+        """What it says of the command that it answers; see `bam_envs.ros.freshness.read_echo`."""
         self._quickest, self._wall_ahead = ClockOffset(), wall_ahead
-        self._stamp = -math.inf
-        self._measured = -math.inf
+        self._number, self._newest, self._measured = 0, -math.inf, -math.inf
 
-    def look(self, arrived: float, stamp: float | None, server_offset: float | None) -> None:
-        """Note a message.
+    def look(self, letter: Letter, where: str, server_offset: float | None) -> None:
+        """Read stamp and tag of a message, if it is new.
 
         Args:
-            arrived: When it arrived [s], our monotonic clock.
-            stamp: When it was measured, as it says [s]; None without a stamp.
+            letter: The message.
+            where: Its topic.
             server_offset: Our wall clock minus the server's [s]; None if it is not known.
+
+        Raises:
+            ProtocolError: The stamp cannot be read.
         """
+        if letter.number == self._number:
+            return
+        message, arrived = require_message(letter.message, where), letter.arrived
+        stamp = read_stamp(message, where)
         if stamp is None:
             self._measured = arrived
-        elif stamp != self._stamp:  # a stamp that stands still is stale, however many messages repeat it
-            self._stamp, self._measured = stamp, arrived - self._delay(arrived, stamp, server_offset)
-
-    def _delay(self, arrived: float, stamp: float, server_offset: float | None) -> float:
-        """How long the message took to arrive [s]."""
-        if stamp < _SIMULATED_BEFORE:
-            return 0.0
-        delay = self._quickest.age(stamp, arrived)
-        if server_offset is None:
-            return delay
-        absolute = arrived + self._wall_ahead - stamp - server_offset
-        return max(delay, absolute) if abs(absolute) < _OTHER_CLOCK else delay
+        elif stamp != self._newest:  # a stamp that stands still is stale, however many messages repeat it
+            delay = 0.0
+            if stamp >= _SIMULATED_BEFORE:
+                delay = self._quickest.age(stamp, arrived)
+                absolute = math.inf if server_offset is None else arrived + self._wall_ahead - stamp - server_offset
+                if abs(absolute) < _OTHER_CLOCK:
+                    delay = max(delay, absolute)
+            self._newest, self._measured = stamp, arrived - delay
+        self.stamp, self.tag, self._number = stamp, tag_text(message), letter.number
 
     def at(self, now: float) -> float:
         """Age [s] at `now`, our monotonic clock; infinite if nothing came."""
         return now - self._measured
-
-
-@dataclass(frozen=True)
-class _Seen:
-    """What was read from the newest message of a topic."""
-
-    number: int
-    stamped: bool
-    stamp: float
-    tag: object
 
 
 class LiveState:
@@ -165,53 +162,36 @@ class LiveState:
         """Our wall clock minus the server's [s], where it is known."""
         self._clock, self._wall = clock, wall
         self._sizes = {signal.name: len(signal.labels) for signal in spec.signals}
-        self._heads = {(source.topic, source.names): source for source in reversed(self.sources)}
-        self._extra = self._allowed_extra(profile)
-        self._ages: dict[str, SourceAge] = {}
-        self._seen: dict[str, _Seen] = {}
-
-    def _allowed_extra(self, profile: RobotProfile) -> dict[str, float]:
-        """How much older than `max_age` the messages of each head may be [s]."""
-        extra: dict[str, float] = {}
+        self._heads: dict[tuple[str, tuple[str, ...]], Source] = {}  # the first signal of each message
+        self._extra: dict[str, float] = {}  # how much older than `max_age` these messages may be [s]
         for source in self.sources:
-            head = self._heads[source.topic, source.names].signal
+            head = self._heads.setdefault((source.topic, source.names), source).signal
             more = max(0.0, profile.age_limit(source) - profile.max_age)
-            extra[head] = min(extra.get(head, more), more)
-        return extra
-
-    @property
-    def topics(self) -> dict[str, str]:
-        """Topic -> type."""
-        return {source.topic: source.type for source in self.sources}
-
-    def listener(self, topic: str) -> Listener:
-        """The listener to subscribe `topic` with."""
-        mine = [source for source in self.sources if source.topic == topic]
-        always = [source.signal for source in mine if not source.partial]
-        shared = [source for source in mine if source.partial]
-
-        def listen(message: Message, caller: Caller) -> None:
-            self.mailbox.put([*always, *(source.signal for source in shared if _is_ours(source, message))], message)
-
-        return listen
-
-    def restart(self) -> None:
-        """Forget all messages and ages."""
-        self.mailbox.clear()
+            self._extra[head] = min(self._extra.get(head, more), more)
         self.forget_ages()
 
     def forget_ages(self) -> None:
         """Forget ages: behind another connection there may be other clocks."""
-        self._ages.clear()
-        self._seen.clear()
+        ahead = self._wall() - self._clock()
+        self._ages = {head.signal: SourceAge(ahead) for head in self._heads.values()}
 
-    def silent(self) -> list[Source]:
-        """Sources without a message."""
-        letters = self.mailbox.newest()
-        return [source for source in self.sources if source.signal not in letters]
+    def listener(self, topic: str) -> Listener:
+        """The listener to subscribe `topic` with."""
+        mine = [source for source in self.sources if source.topic == topic]
+
+        def listen(message: Message, caller: Caller) -> None:
+            names: Any = message.get("name") if isinstance(message, Mapping) else None
+            # On a shared topic the names say whose message it is; a malformed one counts for every source.
+            named = isinstance(names, Sequence)
+            ours = [one for one in mine if not (one.partial and named) or any(name in one.names for name in names)]
+            self.mailbox.put([source.signal for source in ours], message)
+
+        return listen
 
     def read(self) -> tuple[dict[str, Array], float]:
         """The newest values [SI] of each signal, shape (1, k), and the stamp of the first source that has one [s].
+
+        Without any stamp it is when the newest message arrived.
 
         Raises:
             StaleState: A signal has no message.
@@ -219,7 +199,9 @@ class LiveState:
         """
         letters = self._letters()
         self._look(letters)
-        return self._decode(letters), self._stamp(letters)
+        stamps = [self._ages[head.signal].stamp for head in self._heads.values()]
+        arrived = max(letter.arrived for letter in letters.values())
+        return self._decode(letters), next((stamp for stamp in stamps if stamp is not None), arrived)
 
     def signals(self) -> dict[str, Array]:
         """As `read`, without the stamp. Any thread."""
@@ -248,14 +230,18 @@ class LiveState:
         Returns:
             Whether that happened within `timeout` [s], or `stop` became true; `Mailbox.wake` has it checked.
         """
-        return self.mailbox.wait_for(lambda slots: stop() or self._is_answer(slots, tag), timeout)
 
-    def _is_answer(self, letters: Mapping[str, Letter], tag: str) -> bool:
-        if len(letters) < len(self.sources):
-            return False
-        self._look(letters)
-        stamps = [seen.stamp for seen in self._seen.values() if seen.tag == tag]
-        return bool(stamps) and all(seen.stamp >= stamps[0] for seen in self._seen.values() if seen.stamped)
+        def is_answered(letters: Mapping[str, Letter]) -> bool:
+            if stop():
+                return True
+            if len(letters) < len(self.sources):
+                return False
+            self._look(letters)
+            answers = [age.stamp or 0.0 for age in self._ages.values() if age.tag == tag]
+            stamps = [age.stamp for age in self._ages.values() if age.stamp is not None]
+            return bool(answers) and all(stamp >= answers[0] for stamp in stamps)
+
+        return self.mailbox.wait_for(is_answered, timeout)
 
     def _letters(self) -> dict[str, Letter]:
         letters = self.mailbox.newest()
@@ -271,28 +257,5 @@ class LiveState:
         }
 
     def _look(self, letters: Mapping[str, Letter]) -> None:
-        """Read stamps and tags of the messages that are new."""
         for source in self._heads.values():
-            letter, seen = letters[source.signal], self._seen.get(source.signal)
-            if seen is None or seen.number != letter.number:
-                message = require_message(letter.message, source.topic)
-                stamp = read_stamp(message, source.topic)
-                self._seen[source.signal] = _Seen(letter.number, stamp is not None, stamp or 0.0, tag_text(message))
-                self._age(source.signal).look(letter.arrived, stamp, self.server_offset())
-
-    def _age(self, signal: str) -> SourceAge:
-        if signal not in self._ages:
-            self._ages[signal] = SourceAge(self._wall() - self._clock())
-        return self._ages[signal]
-
-    def _stamp(self, letters: Mapping[str, Letter]) -> float:
-        """The stamp of the first source that has one, else the arrival of the newest message [s]."""
-        heads = (self._heads[source.topic, source.names] for source in self.sources)
-        stamps = (self._seen[head.signal] for head in heads)
-        return next((seen.stamp for seen in stamps if seen.stamped), max(one.arrived for one in letters.values()))
-
-
-def _is_ours(source: Source, message: Any) -> bool:
-    """Whether a message of a shared topic comes from the publisher of `source`; a malformed one counts as such."""
-    names = message.get("name") if isinstance(message, Mapping) else None
-    return not isinstance(names, Sequence) or any(name in source.names for name in names)
+            self._ages[source.signal].look(letters[source.signal], source.topic, self.server_offset())

@@ -18,19 +18,9 @@ from numpy.typing import NDArray
 from bam_envs.core import kinematics
 from bam_envs.core.errors import UnknownName
 from bam_envs.core.kinematics import ArmGeometry
-from bam_envs.core.robot import RobotSpec, SignalSpec
-from bam_envs.robots.ur5e import COMMAND, JOINTS, arm_spec
-
-__all__ = [
-    "DEFAULT_MODEL",
-    "JOINTS",
-    "START",
-    "UR_MODELS",
-    "ArmOutline",
-    "UrModel",
-    "ur_model",
-    "ur_spec",
-]
+from bam_envs.core.robot import RobotSpec
+from bam_envs.robots.ur5e import COMMAND, arm_spec
+from bam_envs.robots.ur5e import JOINTS as JOINTS
 
 Array = NDArray[np.float64]
 DEFAULT_MODEL = "ur5"
@@ -86,30 +76,18 @@ def _model(
     return UrModel(name, geometry, limits, speeds, *workspace, outline)
 
 
-UR_MODELS: dict[str, UrModel] = {
-    model.name: model
-    for model in (
-        _model("ur3", kinematics.UR3, (180, 360), (0.45, 0.2), ArmOutline(0.1198, 0.0273, 0.060, 0.048, 0.040, 0.0315)),
-        _model(
-            "ur3e", kinematics.UR3E, (180, 360), (0.45, 0.2), ArmOutline(0.1200, 0.0270, 0.060, 0.048, 0.040, 0.0315)
-        ),
-        _model(
-            "ur5", kinematics.UR5, (180, 180), (0.75, 0.2), ArmOutline(0.13585, 0.0165, 0.070, 0.054, 0.042, 0.0375)
-        ),
-        _model(
-            "ur5e", kinematics.UR5E, (180, 180), (0.75, 0.2), ArmOutline(0.1380, 0.0070, 0.070, 0.054, 0.042, 0.0375)
-        ),
-        _model(
-            "ur10", kinematics.UR10, (120, 180), (1.3, 0.3), ArmOutline(0.220941, 0.049041, 0.085, 0.075, 0.055, 0.045)
-        ),
-        _model(
-            "ur10e", kinematics.UR10E, (120, 180), (1.3, 0.3), ArmOutline(0.1762, 0.0393, 0.085, 0.075, 0.055, 0.045)
-        ),
-        _model(
-            "ur16e", kinematics.UR16E, (120, 180), (0.8, 0.3), ArmOutline(0.1760, 0.0390, 0.085, 0.075, 0.055, 0.045)
-        ),
-    )
-}
+_SMALL, _MIDDLE, _LARGE = (0.060, 0.048, 0.040, 0.0315), (0.070, 0.054, 0.042, 0.0375), (0.085, 0.075, 0.055, 0.045)
+"""Radii of base, upper arm, forearm and wrists [m]."""
+_MODELS = [
+    _model("ur3", kinematics.UR3, (180, 360), (0.45, 0.2), ArmOutline(0.1198, 0.0273, *_SMALL)),
+    _model("ur3e", kinematics.UR3E, (180, 360), (0.45, 0.2), ArmOutline(0.1200, 0.0270, *_SMALL)),
+    _model("ur5", kinematics.UR5, (180, 180), (0.75, 0.2), ArmOutline(0.13585, 0.0165, *_MIDDLE)),
+    _model("ur5e", kinematics.UR5E, (180, 180), (0.75, 0.2), ArmOutline(0.1380, 0.0070, *_MIDDLE)),
+    _model("ur10", kinematics.UR10, (120, 180), (1.3, 0.3), ArmOutline(0.220941, 0.049041, *_LARGE)),
+    _model("ur10e", kinematics.UR10E, (120, 180), (1.3, 0.3), ArmOutline(0.1762, 0.0393, *_LARGE)),
+    _model("ur16e", kinematics.UR16E, (120, 180), (0.8, 0.3), ArmOutline(0.1760, 0.0390, *_LARGE)),
+]
+UR_MODELS: dict[str, UrModel] = {model.name: model for model in _MODELS}
 """Name to model."""
 
 
@@ -126,13 +104,8 @@ def ur_model(name: str) -> UrModel:
 
 def ur_spec(model: UrModel, period: float, with_object: bool) -> RobotSpec:
     """The signals of an arm, and of a tracked object where there is one."""
-    known = {signal.name: signal for signal in arm_spec(model.name, with_object=True).signals}
+    position, velocity, _, *tracked = arm_spec(model.name, with_object=with_object).signals  # no gripper
     speeds = tuple(model.max_velocity.tolist())
-    signals: list[SignalSpec] = [
-        known["joint_position"],
-        replace(known["joint_velocity"], low=tuple(-speed for speed in speeds), high=speeds),
-    ]
-    if with_object:
-        signals += [known["object_position"], known["object_quaternion"]]
+    velocity = replace(velocity, low=tuple(-speed for speed in speeds), high=speeds)
     command = replace(COMMAND.part(JOINTS), max_rate=speeds)
-    return RobotSpec(model.name, tuple(signals), command, period)
+    return RobotSpec(model.name, (position, velocity, *tracked), command, period)

@@ -122,20 +122,15 @@ class JointFollowing(Following):
         reach = self._reach(tick)
         near = np.clip(wanted, explained - reach, explained + reach)
         if (jump > np.abs(wanted - tick.last[self._joints]) + self._tolerance).any():
-            near = self._slow_tool(explained, near)
+            for _ in range(_ROUNDS):  # only as far from there as the tool may go in a period
+                travel = self._travel(explained, near)
+                if travel <= self._tool_reach:
+                    break
+                near = explained + (near - explained) * (0.999 * self._tool_reach / travel)
         if (near == wanted).all():
             return False
         tick.command[self._joints] = self._near(tick, near)
         return True
-
-    def _slow_tool(self, here: Array, there: Array) -> Array:
-        """The part of the way `here` to `there` that the tool may go in a period. Shapes: (k,)."""
-        for _ in range(_ROUNDS):
-            travel = self._travel(here, there)
-            if travel <= self._tool_reach:
-                break
-            there = here + (there - here) * (0.999 * self._tool_reach / travel)
-        return there
 
     def _travel(self, here: Array, there: Array) -> float:
         """Distance that the tool goes [m]; 0 if its kinematics are not known."""

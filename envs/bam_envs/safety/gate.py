@@ -265,15 +265,9 @@ class SafeRobot(metaclass=Sealed):
 
         Commands that were altered on the way to a start pose are not counted.
         """
-        return {
-            guard.name: {
-                "number": guard.number,
-                "limit": guard.limit_value,
-                "unit": guard.unit,
-                **self._counts[guard.name],
-            }
-            for guard in (*self._further, *self._guards)
-        }
+        every = (*self._further, *self._guards)
+        facts = {one.name: {"number": one.number, "limit": one.limit_value, "unit": one.unit} for one in every}
+        return {name: {**fact, **self._counts[name]} for name, fact in facts.items()}
 
     def connect(self) -> None:
         """Connect the robot. Moves nothing."""
@@ -312,6 +306,11 @@ class SafeRobot(metaclass=Sealed):
         measured, period = self._measured(), self.spec.period
         before = np.full_like(measured, np.nan) if self._before is None else self._before
         self._before = measured
+        # The rate of each number: measured, else from tick to tick.
+        velocity: Array = (measured - before) / period
+        if self._state is not None:
+            for place, name, column in self._speeds:
+                velocity[place] = self._state.signals[name][0, column]
         time_passed = min(period, pause or period)
         waiting = getattr(self._live, "waiting", None)
         return Tick(
@@ -321,7 +320,7 @@ class SafeRobot(metaclass=Sealed):
             last_step=self._speed * time_passed,
             measured=measured,
             before=before,
-            velocity=self._velocity(measured, before),
+            velocity=velocity,
             age=self.age(),
             period=time_passed,
             pause=pause,
@@ -329,34 +328,24 @@ class SafeRobot(metaclass=Sealed):
             approach=approach,
         )
 
+    def _in_lockstep(self) -> bool:
+        return bool(getattr(self.info, "lockstep", False))
+
     def _pause(self) -> float:
         """Time since the last command of a motion [s]; 0 for the first one, and in lockstep."""
         if self._live is None or self._sent_at is None or self._in_lockstep():
             return 0.0
         return self._clock() - self._sent_at
 
-    def _in_lockstep(self) -> bool:
-        return bool(getattr(self.info, "lockstep", False))
-
     def _begin_at(self, pause: float) -> Array:
         """The last command if the robot still follows it; else where the robot is, at rest. Shape: (m,)."""
-        goes_on = pause <= LATE * self.spec.period and (
-            self._sent_at is not None or self._live is None or self._in_lockstep()
-        )
-        last = self._last if goes_on else None
-        if last is None:
-            last = self._measured_anew()
-            self._last, self._speed, self._before = last, np.zeros_like(last), None
-            self._restart_guards()
+        goes_on = self._sent_at is not None or self._live is None or self._in_lockstep()
+        if self._last is not None and goes_on and pause <= LATE * self.spec.period:
+            return self._last
+        self._last = last = self._measured_anew()
+        self._speed, self._before = np.zeros_like(last), None
+        self._restart_guards()
         return last
-
-    def _velocity(self, measured: Array, before: Array) -> Array:
-        """Rate of each number of the command [unit/s]: measured, else from tick to tick. Shape: (m,)."""
-        velocity: Array = (measured - before) / self.spec.period
-        if self._state is not None:
-            for place, name, column in self._speeds:
-                velocity[place] = self._state.signals[name][0, column]
-        return velocity
 
     def _measured_anew(self) -> Array:
         """The measured pose as a command; a gripper goes on holding, or is open if it is not measured. Shape: (m,)."""
@@ -391,13 +380,11 @@ class SafeRobot(metaclass=Sealed):
         """
         limit = next(guard.limit_value for guard in self._guards if isinstance(guard, Freshness))
         for _ in range(FRESH_LOOKS):
-            fresh = self.age() <= limit  # asked first: what is measured afterwards can only be newer
+            age = self.age()  # asked first: what is measured afterwards can only be newer
             state: RobotState = self._live.measure()
-            if fresh:
+            if age <= limit:
                 return state
             time.sleep(FRESH_PAUSE)
-        if (age := self.age()) <= limit:
-            return cast(RobotState, self._live.measure())
         raise StaleState(
             f"The newest state is {age:.3f} s old, and a motion begins at a state of at most {limit:g} s. Nothing was "
             "sent; look at the link, at what publishes the state, and at whether this computer is busy.",
@@ -416,12 +403,10 @@ class SafeRobot(metaclass=Sealed):
 
     def _fault(self, tick: Tick) -> tuple[Guard, str] | None:
         for guard in self._guards:
-            reason = guard.fault(tick)
-            if reason is not None:
+            if (reason := guard.fault(tick)) is not None:
                 return guard, reason
         for guard in self._further:
-            reason = guard.fault(_copy(tick))
-            if reason is not None:
+            if (reason := guard.fault(_copy(tick))) is not None:
                 return guard, reason
         return None
 
@@ -470,8 +455,7 @@ class SafeRobot(metaclass=Sealed):
 
     def _require_in_range(self, state: RobotState) -> None:
         for guard in self._guards:
-            reason = guard.trip(state)
-            if reason is not None:
+            if (reason := guard.trip(state)) is not None:
                 self._stop(guard, reason)
 
     def _stop(self, guard: Guard, reason: str) -> NoReturn:
@@ -505,14 +489,14 @@ class SafeRobot(metaclass=Sealed):
             SafetyStop: A guard stopped the robot, now or earlier.
         """
         self._require_free()
-        start = None if self._is_base else _StartPose(self.spec, self.limits, initial)
+        start = None if self._is_base else self._start_pose(initial)
         if self._live is None:
             self._forget()
         else:
             self.halt()
         self._forgive()
         state = self._take(self._robot.reset(env_ids, initial))
-        if start is not None and not start.is_near(self._measured()):
+        if start is not None and (self._joints_off(start) or not self._is_open()):
             self._approach(start)
             state = self._take(self._robot.reset(env_ids, initial))  # put back what the arm may have pushed
             self._forgive()
@@ -527,17 +511,54 @@ class SafeRobot(metaclass=Sealed):
         self._require_in_range(state)
         return state
 
-    def _approach(self, start: _StartPose) -> None:
-        """Open the gripper where the arm is, then go to `start`."""
-        opened = start.opened(self._begin_at(0.0))
-        self._go(opened, GRIPPER_TIME, lambda: start.is_open(self._measured()))
-        self._go(start.command, self.limits.reset_timeout, lambda: self._is_reached(start))
-        if not self._is_reached(start):
-            self.halt()
-            raise start.failure(self._measured(), self.not_ready())
+    def _start_pose(self, initial: Initial) -> Array:
+        """The joints of `initial` as a command, the gripper open. Shape: (m,)."""
+        start: Array = np.array(self.spec.command.high)
+        start[columns_in(self.spec.command, "rad")] = initial.signals["joint_position"][0]
+        low, high = position_range(self.spec, self.limits)
+        inside = (low <= start) & (start <= high)  # NaN is not
+        if not inside.all():
+            column = int(np.argmin(inside))
+            raise InvalidValue(
+                f"The start pose has {self.spec.command.labels[column]} at {start[column]:.3f} rad, outside the "
+                f"{low[column]:.3f} to {high[column]:.3f} rad that the guards allow. Choose another start, or a "
+                "smaller position_margin."
+            )
+        return start
 
-    def _is_reached(self, start: _StartPose) -> bool:
-        return start.is_reached(self._measured(), self._begin_at(0.0))
+    def _joints_off(self, start: Array) -> dict[str, float]:
+        """The joints that are not measured at `start` (m,), with how far they have to go [rad]."""
+        far, near = start - self._measured(), self.limits.reset_tolerance
+        columns = columns_in(self.spec.command, "rad")
+        return {self.spec.command.labels[at]: float(far[at]) for at in columns if not abs(far[at]) <= near}
+
+    def _is_open(self) -> bool:
+        """Whether the gripper is measured open; one that is not measured (NaN) is not waited for."""
+        far = np.array(self.spec.command.high) - self._measured()
+        return not (np.abs(far)[columns_in(self.spec.command, "m")] > GRIPPER_NEAR).any()
+
+    def _approach(self, start: Array) -> None:
+        """Open the gripper where the arm is, then go to `start` (m,)."""
+        joints, grippers = columns_in(self.spec.command, "rad"), columns_in(self.spec.command, "m")
+
+        def is_reached() -> bool:  # all joints are measured there, and were sent there
+            sent = self._begin_at(0.0)
+            return bool((sent == start)[joints].all()) and not self._joints_off(start)
+
+        opened = self._begin_at(0.0).copy()
+        opened[grippers] = start[grippers]
+        self._go(opened, GRIPPER_TIME, self._is_open)
+        self._go(start, self.limits.reset_timeout, is_reached)
+        if not is_reached():
+            self.halt()
+            off, why = self._joints_off(start), self.not_ready()
+            where = ", ".join(f"{name} is {far:+.3f} rad from it" for name, far in off.items()) or "it is on its way"
+            said = "" if why is None else f"Not ready: {why}. "
+            raise StartNotReached(
+                f"{said}The arm did not reach its start pose in {self.limits.reset_timeout:g} s: {where}. "
+                "Look for what holds it, or raise the limit reset_timeout.",
+                off,
+            )
 
     def _go(self, goal: Array, longest: float, done: Callable[[], bool]) -> None:
         """Tick towards `goal` until `done`, at most for `longest` [s]."""
@@ -556,70 +577,6 @@ class SafeRobot(metaclass=Sealed):
         """Halt, then drop the link."""
         self._robot.close()
         self._forget()
-
-
-class _StartPose:
-    """Where an arm's episode starts: as a command, whether the arm is there, and what is missing.
-
-    Args:
-        spec: Of the arm.
-        limits: Tolerance, time and position margin.
-        initial: Its ``joint_position`` is the pose; the gripper is open.
-
-    Raises:
-        InvalidValue: The pose is outside the position limits.
-    """
-
-    def __init__(self, spec: RobotSpec, limits: Limits, initial: Initial) -> None:
-        self._limits = limits
-        self._joints, self._grippers = columns_in(spec.command, "rad"), columns_in(spec.command, "m")
-        self._names = [spec.command.labels[column] for column in self._joints]
-        self.command: Array = np.array(spec.command.high)  # (m,)
-        self.command[self._joints] = np.asarray(initial.signals["joint_position"], dtype=np.float64)[0]
-        self._require_inside(*position_range(spec, limits))
-
-    def _require_inside(self, low: Array, high: Array) -> None:
-        for name, column in zip(self._names, self._joints, strict=True):
-            if not low[column] <= self.command[column] <= high[column]:
-                raise InvalidValue(
-                    f"The start pose has {name} at {self.command[column]:.3f} rad, outside the {low[column]:.3f} to "
-                    f"{high[column]:.3f} rad that the guards allow. Choose another start, or a smaller position_margin."
-                )
-
-    def opened(self, here: Array) -> Array:
-        """The command `here` (m,) with the gripper open."""
-        command: Array = here.copy()
-        command[self._grippers] = self.command[self._grippers]
-        return command
-
-    def is_open(self, measured: Array) -> bool:
-        """Whether the gripper is measured open; one that is not measured (NaN) is not waited for."""
-        return not (np.abs(self.command - measured)[self._grippers] > GRIPPER_NEAR).any()
-
-    def joints_off(self, measured: Array) -> dict[str, float]:
-        """The joints that are not there, with how far they have to go [rad]."""
-        way = (self.command - measured)[self._joints]
-        near = self._limits.reset_tolerance
-        return {name: float(far) for name, far in zip(self._names, way, strict=True) if not abs(far) <= near}
-
-    def is_near(self, measured: Array) -> bool:
-        """Whether joints and gripper are measured there."""
-        return self.is_open(measured) and not self.joints_off(measured)
-
-    def is_reached(self, measured: Array, sent: Array) -> bool:
-        """Whether all joints are measured there, and were sent there."""
-        return bool((sent == self.command)[self._joints].all()) and not self.joints_off(measured)
-
-    def failure(self, measured: Array, why: str | None = None) -> StartNotReached:
-        """The error that names the joints, and `why` the robot cannot move, if it says so."""
-        off = self.joints_off(measured)
-        where = ", ".join(f"{name} is {far:+.3f} rad from it" for name, far in off.items()) or "it is on its way"
-        said = "" if why is None else f"Not ready: {why}. "
-        return StartNotReached(
-            f"{said}The arm did not reach its start pose in {self._limits.reset_timeout:g} s: {where}. "
-            "Look for what holds it, or raise the limit reset_timeout.",
-            off,
-        )
 
 
 def _copied(state: RobotState) -> RobotState:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot import RobotSpec, RobotState, SignalSpec
+from bam_envs.core.validation import check
 
 Array = NDArray[np.float64]
 ToolPosition = Callable[[Array], Array]
@@ -21,9 +24,14 @@ LONGEST_PERIOD = 1.0
 """Longest time between two commands to a live robot [s]: a command may go as far as its limits allow in that time."""
 
 
+_ABOVE_ZERO = Annotated[float, Meta(gt=0, description="a number above 0")]
+_FINITE = Annotated[float, Meta(gt=0, le=sys.float_info.max, description="a finite number above 0")]
+
+
 def _limit(default: float | None, least: float, most: float, unit: str, *, finite: bool = False) -> Any:
     """A limit, with the minimum and maximum that a live robot may have; `finite` if it cannot be switched off."""
-    return field(default=default, metadata={"bounds": (least, most, unit), "finite": finite})
+    kind: Any = _FINITE if finite else _ABOVE_ZERO
+    return field(default=default, metadata={"bounds": (least, most, unit), "type": kind if default else kind | None})
 
 
 @dataclass(frozen=True)
@@ -71,13 +79,7 @@ class Limits:
 
     def __post_init__(self) -> None:
         for one in fields(self):
-            value = getattr(self, one.name)
-            if value is None and one.default is None:
-                continue
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
-                raise InvalidValue(f"The limit {one.name} must be above 0, not {value!r}.")
-            if value == math.inf and one.metadata["finite"]:
-                raise InvalidValue(f"The limit {one.name} must be finite.")
+            check(getattr(self, one.name), one.metadata["type"], f"The limit {one.name}")
 
     @classmethod
     def of(cls, values: Mapping[str, float]) -> Limits:
@@ -87,10 +89,9 @@ class Limits:
             UnknownName: There is no such limit.
             InvalidValue: One is not above 0, or outside `BOUNDS`.
         """
-        names = [one.name for one in fields(cls)]
         for name in values:
-            if name not in names:
-                raise UnknownName("limit", name, names)
+            if name not in BOUNDS:
+                raise UnknownName("limit", name, BOUNDS)
         limits = cls(**values)
         limits.require_bounded()
         return limits

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -255,52 +254,40 @@ def default_guards(
         InvalidValue: The command has numbers that no guard limits, or the tool of an arm would have no speed limit.
     """
     limits = limits or Limits()
-    _require_guarded(spec)
+    units, speeds = set(spec.command.units), {"m/s", "rad/s"}
+    if not (units == speeds if is_base(spec) else "rad" in units and not units & speeds):
+        found = ", ".join(dict.fromkeys(spec.command.units))
+        raise InvalidValue(
+            f"The command of {spec.name} cannot be guarded: a base is told m/s and rad/s and nothing else, an arm rad "
+            f"and no speeds; found {found}."
+        )
     moving = _base_guards(spec, limits) if is_base(spec) else _arm_guards(spec, limits, tool_position)
     first = [Finite(spec, limits), Freshness(spec, limits), Pace(spec, limits), Answers(spec, limits)]
     return [Shape(spec), *first, *moving, MeasuredLimits(spec)]
 
 
-def _require_guarded(spec: RobotSpec) -> None:
-    """Every number of a command is limited by the guards of a base, or by those of an arm."""
-    units, speeds = set(spec.command.units), {"m/s", "rad/s"}
-    if units == speeds if is_base(spec) else "rad" in units and not units & speeds:
-        return
-    found = ", ".join(dict.fromkeys(spec.command.units))
-    raise InvalidValue(
-        f"The command of {spec.name} cannot be guarded: a base is told m/s and rad/s and nothing else, an arm rad and "
-        f"no speeds; found {found}."
-    )
-
-
 def _arm_guards(spec: RobotSpec, limits: Limits, tool_position: ToolPosition | None) -> list[Guard]:
     position = None if math.isinf(limits.tool_speed) else _kinematics(spec, tool_position)
     joints = joint_columns(spec)
-    guards: list[Guard] = [MeasuredJump(spec)]
+    measured: list[Guard] = [MeasuredJump(spec)]
     if math.isfinite(limits.joint_speed):
-        speeds = lambda tick: tick.velocity[joints]  # noqa: E731
-        guards.append(MeasuredSpeed("G8", "joint speed", "rad/s", limits.joint_speed, speeds))
+        measured.append(MeasuredSpeed("G8", "joint speed", "rad/s", limits.joint_speed, lambda t: t.velocity[joints]))
     tool: list[Guard] = []
     if position is not None:
+
+        def tool_speed(tick: Tick) -> Array:
+            here = tick.measured[joints]
+            ends = position(np.stack([here, here + tick.velocity[joints] * _MOMENT]))
+            return np.array([math.dist(*ends) / _MOMENT])
+
+        measured.append(MeasuredSpeed("G10", "tool speed", "m/s", limits.tool_speed, tool_speed))
         tool.append(ToolSpeed(spec, limits, position))
-        guards.append(_measured_tool_speed(limits, joints, position))
-    guards.append(PositionLimits(spec, limits))
-    if "m" in spec.command.units:
-        guards.append(GripperSpeed(spec))
-    guards += [JointSpeed(spec, limits), RampIn(spec, limits), *tool]
-    if math.isfinite(limits.joint_acceleration):
-        guards.append(JointAcceleration(spec, limits))
+    gripper = [GripperSpeed(spec)] if "m" in spec.command.units else []
+    smooth = [JointAcceleration(spec, limits)] if math.isfinite(limits.joint_acceleration) else []
+    speed = [JointSpeed(spec, limits), RampIn(spec, limits), *tool]
     # The tool's speed is limited twice: joints that change their speed one by one can speed the tool up.
-    return [*guards, *tool, JointFollowing(spec, limits, position)]
-
-
-def _measured_tool_speed(limits: Limits, joints: Any, position: ToolPosition) -> MeasuredSpeed:
-    def speed(tick: Tick) -> Array:
-        here, way = tick.measured[joints], tick.velocity[joints] * _MOMENT
-        begin, end = position(np.stack([here, here + way]))
-        return np.array([math.dist(begin, end) / _MOMENT])
-
-    return MeasuredSpeed("G10", "tool speed", "m/s", limits.tool_speed, speed)
+    last = [*smooth, *tool, JointFollowing(spec, limits, position)]
+    return [*measured, PositionLimits(spec, limits), *gripper, *speed, *last]
 
 
 def _kinematics(spec: RobotSpec, tool_position: ToolPosition | None) -> ToolPosition:

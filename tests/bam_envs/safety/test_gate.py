@@ -85,17 +85,6 @@ def test_a_live_robot_has_one_gate():
     SafeRobot(robot)
 
 
-def test_the_limits_of_a_profile_are_those_of_its_gate():
-    report = live_robot(NOBODY, profile="mir100").report()
-    assert report["base speed"]["limit"] == 0.5
-    assert report["turn speed"]["limit"] == 0.7
-    assert report["state age"]["limit"] == 0.5
-    report = live_robot(NOBODY).report()
-    assert report["tool speed"]["limit"] == 0.25
-    assert report["joint speed"]["limit"] == 1.0
-    assert report["state age"]["limit"] == 0.1
-
-
 def test_the_gate_has_neither_copies_nor_other_kinds():
     """A copy made before a stop would not be stopped, and another kind could say that every state is fresh."""
     gate = live_robot(NOBODY)
@@ -121,31 +110,27 @@ def test_the_limits_of_a_live_robot_are_of_no_other_kind_and_their_bounds_are_fi
 
 
 @pytest.mark.parametrize(
-    ("text", "error"),
+    ("base", "text", "error"),
     [
-        ("reach = 100.0", "ur5e may be 0 to 0.5 s behind its commands, not 100.05 s. "),
-        ("reach_periods = 50", "ur5e may be 0 to 0.5 s behind its commands, not 2.55 s. "),
+        ("ur5e_trajectory", "reach = 100.0", "ur5e may be 0 to 0.5 s behind its commands, not 100.05 s. "),
+        ("ur5e_trajectory", "reach_periods = 50", "ur5e may be 0 to 0.5 s behind its commands, not 2.55 s. "),
+        (
+            "ur5e",
+            "period = 100.0",
+            "The period of ur5e must be above 0 and at most 1 s, not 100 s: for so long a command may go as far as "
+            "the limits let it. Command it more often.",
+        ),
     ],
 )
-def test_a_profile_cannot_say_that_a_robot_follows_at_any_time(tmp_path, text, error):
+def test_a_profile_cannot_make_one_command_go_anywhere(tmp_path, base, text, error):
     """How far a command may be from the arm, and for how long it is not missed, would be without bounds."""
-    shipped = Path(bam_envs.__file__).parent / "robots" / "profiles" / "ur5e_trajectory.toml"
-    profile = tmp_path / "late.toml"
-    profile.write_text(shipped.read_text().replace("ur5e_trajectory", "ur5e").replace("reach_periods = 1.5", text))
+    shipped = (Path(bam_envs.__file__).parent / "robots" / "profiles" / f"{base}.toml").read_text()
+    profile = tmp_path / "mine.toml"
+    late = shipped.replace("ur5e_trajectory", "ur5e").replace("reach_periods = 1.5", text)
+    profile.write_text(late if "reach" in text else f'extends = "ur5e"\n{text}\n')
     with pytest.raises(InvalidValue) as caught:
         live_robot(NOBODY, profile=profile)
     assert str(caught.value).startswith(error)
-
-
-def test_a_profile_cannot_make_a_period_so_long_that_one_command_goes_anywhere(tmp_path):
-    profile = tmp_path / "seldom.toml"
-    profile.write_text('extends = "ur5e"\nperiod = 100.0\n')
-    with pytest.raises(InvalidValue) as caught:
-        live_robot(NOBODY, profile=profile)
-    assert str(caught.value) == (
-        "The period of ur5e must be above 0 and at most 1 s, not 100 s: for so long a command may go as far as the "
-        "limits let it. Command it more often."
-    )
 
 
 def test_what_a_caller_writes_into_a_state_the_guards_do_not_believe():

@@ -14,7 +14,7 @@ from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.ur5e import GEOMETRY, JOINTS, arm_spec
 from bam_envs.safety import arm_guards, guards
 from bam_envs.safety.arm_guards import longest_step
-from bam_envs.safety.guard import BOUNDS, Guard, Limits, Tick
+from bam_envs.safety.guard import BOUNDS, Limits, Tick
 from bam_envs.safety.guards import default_guards
 from bam_envs.testing import ARM_HOME
 
@@ -32,13 +32,34 @@ def tick_from(last, step=None, **numbers):
     return Tick(last=last, last_step=np.zeros_like(last) if step is None else np.array(step), **given)
 
 
-def arm_tick(goal, step=None, **numbers):
+def arm_tick(goal, step=(), **numbers):
     """A tick of an arm at home that is told to go `goal` (7,) from there."""
-    return tick_from(HOME, None if step is None else np.array([*step, 0.0]), goal=HOME + goal, **numbers)
+    return tick_from(HOME, joints(*step), goal=HOME + goal, **numbers)
 
 
 def joints(*way):
     return np.array([*way, *[0.0] * (7 - len(way))])
+
+
+def acceleration(limit=10.0):
+    return arm_guards.JointAcceleration(ARM, Limits(joint_acceleration=limit))
+
+
+def test_what_is_not_executed():
+    shape, finite, age = guards.Shape(ARM), guards.Finite(ARM, Limits()), guards.Freshness(ARM, Limits())
+    for bad in ((7,), (1, 6), (2, 7), (1, 7, 1)):
+        with pytest.raises(InvalidValue) as caught:
+            shape.row(np.zeros(bad))
+        assert str(caught.value) == f"The command must have shape (1, 7), not {bad}."
+    with pytest.raises(InvalidValue, match=r"^The command must be numbers: could not convert string"):
+        shape.row(["a"] * 7)
+    assert finite.fault(arm_tick(joints(0.1))) is None
+    text = "the command for shoulder_pan_joint, elbow_joint is not a finite number"
+    assert finite.fault(arm_tick(joints(math.nan, 0, math.inf))) == text
+    assert age.fault(arm_tick(joints(), age=0.1)) is None
+    for seconds in (0.1004, math.inf, math.nan):
+        text = f"the newest state is {seconds:.3f} s old, and at most 0.1 s are allowed"
+        assert age.fault(arm_tick(joints(), age=seconds)) == text
 
 
 def test_the_list_of_an_arm():
@@ -64,12 +85,6 @@ def test_the_list_of_an_arm():
     ]
 
 
-def test_an_arm_that_is_told_its_joints_alone_has_no_guard_of_a_gripper():
-    spec = replace(ARM, command=ARM.command.part(JOINTS))
-    whole, joints_only = ([(one.name, one.limit_value) for one in default_guards(one)] for one in (ARM, spec))
-    assert joints_only == [("shape", 6), *(one for one in whole[1:] if one[0] != "gripper speed")]
-
-
 def test_the_list_of_a_base():
     table = [(one.number, one.name, round(one.limit_value, 9), one.unit) for one in default_guards(BASE)]
     assert table == [
@@ -90,25 +105,27 @@ def test_the_list_of_a_base():
     ]
 
 
-def test_limits_that_are_infinite_are_off():
-    limits = Limits(joint_acceleration=math.inf, tool_speed=math.inf)
-    names = [guard.name for guard in default_guards(ARM, limits)]
-    assert "joint acceleration" not in names
-    assert "tool speed" not in names
+def test_what_is_not_there_or_off_has_no_guard():
+    names = [one.name for one in default_guards(ARM)]
+    off = Limits(joint_acceleration=math.inf, tool_speed=math.inf, joint_speed=math.inf)
+    gone = {name for name in names if "acceleration" in name or "tool speed" in name or name == "measured joint speed"}
+    assert [one.name for one in default_guards(ARM, off)] == [name for name in names if name not in gone]
+    joints_only = replace(ARM, command=ARM.command.part(JOINTS))
+    assert [one.name for one in default_guards(joints_only)] == [name for name in names if name != "gripper speed"]
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, "1", None, True])
-def test_a_limit_is_a_number_above_zero(value):
+@pytest.mark.parametrize(
+    ("name", "value", "text"),
+    [("tool_speed", value, "a number above 0") for value in (0.0, -1.0, math.nan, "1", None, True)]
+    + [
+        (name, math.inf, "a finite number above 0")
+        for name in ("position_margin", "reset_speed", "ramp_time", "reset_tolerance", "reset_timeout")
+    ],
+)
+def test_a_limit_is_a_number_above_zero(name, value, text):
     with pytest.raises(InvalidValue) as caught:
-        Limits(tool_speed=value)
-    assert str(caught.value) == f"The limit tool_speed must be above 0, not {value!r}."
-
-
-@pytest.mark.parametrize("name", ["position_margin", "reset_speed", "ramp_time", "reset_tolerance", "reset_timeout"])
-def test_a_limit_that_cannot_be_switched_off(name):
-    with pytest.raises(InvalidValue) as caught:
-        Limits(**{name: math.inf})
-    assert str(caught.value) == f"The limit {name} must be finite."
+        Limits(**{name: value})
+    assert str(caught.value) == f"The limit {name}: expected {text}, found {value!r}"
 
 
 def test_a_margin_leaves_room():
@@ -174,41 +191,6 @@ def test_a_command_with_numbers_that_no_guard_limits_is_refused(units):
     )
 
 
-def test_a_guard_that_says_nothing_changes_nothing():
-    guard, tick = Guard(), arm_tick(joints(1.0))
-    guard.restart()
-    assert guard.fault(tick) is None
-    assert guard.limit(tick) is False
-    assert guard.trip(RobotState({}, np.zeros(1), HOME[None])) is None
-
-
-@pytest.mark.parametrize("shape", [(7,), (1, 6), (2, 7), (1, 7, 1)])
-def test_shape(shape):
-    with pytest.raises(InvalidValue) as caught:
-        guards.Shape(ARM).row(np.zeros(shape))
-    assert str(caught.value) == f"The command must have shape (1, 7), not {shape}."
-
-
-def test_what_is_no_number():
-    with pytest.raises(InvalidValue, match=r"^The command must be numbers: could not convert string"):
-        guards.Shape(ARM).row(["a"] * 7)
-
-
-def test_finite():
-    guard = guards.Finite(ARM, Limits())
-    assert guard.fault(arm_tick(joints(0.1))) is None
-    tick = arm_tick(joints(math.nan, 0, math.inf))
-    assert guard.fault(tick) == "the command for shoulder_pan_joint, elbow_joint is not a finite number"
-
-
-def test_state_age():
-    guard = guards.Freshness(ARM, Limits())
-    assert guard.fault(arm_tick(joints(), age=0.1)) is None
-    for age in (0.1004, math.inf, math.nan):
-        text = f"the newest state is {age:.3f} s old, and at most 0.1 s are allowed"
-        assert guard.fault(arm_tick(joints(), age=age)) == text
-
-
 @pytest.mark.parametrize(
     ("name", "velocity", "text"),
     [
@@ -247,16 +229,40 @@ def test_a_joint_inside_the_margin_may_stay_and_go_back_and_not_come_nearer():
         assert tick.command[2] == command
 
 
-def test_joint_speed_keeps_the_direction():
-    tick = arm_tick(joints(0.1, -0.05, 0.01))
-    assert arm_guards.JointSpeed(ARM, Limits()).limit(tick)
-    np.testing.assert_allclose(tick.command - HOME, joints(0.05, -0.025, 0.005), atol=1e-15)
+@pytest.mark.parametrize(
+    ("guard", "goal", "sent", "numbers"),
+    [
+        # no joint is faster than the limit, and all keep the direction
+        (arm_guards.JointSpeed(ARM, Limits()), (0.1, -0.05, 0.01), (0.05, -0.025, 0.005), {}),
+        (arm_guards.JointSpeed(ARM, Limits()), (0.05, -0.05, 0, 0, 0, 0, -0.08), None, {}),
+        (arm_guards.ToolSpeed(ARM, Limits(), GEOMETRY.tool_position), (0.02, 0, 0, 0, 0, 0.05), None, {}),
+        # from rest all joints speed up together; a steady motion goes on
+        (acceleration(), (0.05, -0.025), (0.025, -0.0125), {}),
+        (acceleration(), (0.02, -0.01), None, {"step": (0.02, -0.01)}),
+        # where joints cannot go together, each goes as far as it may
+        (acceleration(4.0), (0.03, 0.03), (0.02, -0.02), {"step": (0.03, -0.03)}),
+        (acceleration(4.0), (5e-324, -5e-324), (0.02,), {"step": (0.03,)}),
+        # the gripper is sent no farther than it goes, from the last width where it is not measured
+        (arm_guards.GripperSpeed(ARM), (0, 0, 0, 0, 0, 0, -0.085), (0, 0, 0, 0, 0, 0, -0.0075), {}),
+        (
+            arm_guards.GripperSpeed(ARM),
+            (0, 0, 0, 0, 0, 0, -0.085),
+            (0, 0, 0, 0, 0, 0, -0.0075),
+            {"measured": np.full(7, math.nan)},
+        ),
+    ],
+)
+def test_what_a_guard_lets_through(guard, goal, sent, numbers):
+    tick = arm_tick(joints(*goal), **numbers)
+    assert guard.limit(tick) == (sent is not None)
+    np.testing.assert_allclose(tick.command - HOME, joints(*(goal if sent is None else sent)), atol=1e-9)
 
 
-def test_joint_speed_leaves_the_gripper_and_slow_joints_alone():
-    tick = arm_tick(joints(0.05, -0.05, 0, 0, 0, 0, -0.08))
-    assert not arm_guards.JointSpeed(ARM, Limits()).limit(tick)
-    np.testing.assert_array_equal(tick.command, tick.goal)
+def test_opening_begins_at_the_fingers():
+    last = np.array([*ARM_HOME, 0.0])
+    tick = tick_from(last, goal=HOME, measured=np.array([*ARM_HOME, 0.04]))
+    assert arm_guards.GripperSpeed(ARM).limit(tick)
+    assert tick.command[6] == pytest.approx(0.0475)
 
 
 def test_joint_speed_is_never_above_the_data_sheet():
@@ -275,46 +281,12 @@ def test_tool_speed_shortens_the_step_of_all_joints():
     assert 0.99 * 0.0125 < math.dist(there, here) <= 0.0125
 
 
-def test_tool_speed_leaves_a_slow_tool_alone():
-    tick = arm_tick(joints(0.02, 0, 0, 0, 0, 0.05))
-    assert not arm_guards.ToolSpeed(ARM, Limits(), GEOMETRY.tool_position).limit(tick)
-    np.testing.assert_array_equal(tick.command, tick.goal)
-
-
 def test_tool_speed_holds_where_no_part_of_the_step_is_slow():
     places = iter(range(100))
     guard = arm_guards.ToolSpeed(ARM, Limits(), lambda q: np.full((len(q), 3), float(next(places))))
     tick = arm_tick(joints(0.05))
     assert guard.limit(tick)
     np.testing.assert_array_equal(tick.command, HOME)
-
-
-def acceleration(limit=10.0):
-    return arm_guards.JointAcceleration(ARM, Limits(joint_acceleration=limit))
-
-
-def test_acceleration_from_rest_keeps_the_direction():
-    tick = arm_tick(joints(0.05, -0.025))
-    assert acceleration().limit(tick)
-    np.testing.assert_allclose(tick.command - HOME, joints(0.025, -0.0125), atol=1e-15)
-
-
-def test_acceleration_leaves_a_steady_motion_alone():
-    tick = arm_tick(joints(0.02, -0.01), step=[0.02, -0.01, 0, 0, 0, 0])
-    assert not acceleration().limit(tick)
-    np.testing.assert_array_equal(tick.command, tick.goal)
-
-
-def test_where_joints_cannot_go_together_each_goes_as_far_as_it_may():
-    tick = arm_tick(joints(0.03, 0.03), step=[0.03, -0.03, 0, 0, 0, 0])
-    assert acceleration(4.0).limit(tick)
-    np.testing.assert_allclose(tick.command - HOME, joints(0.02, -0.02), atol=1e-15)
-
-
-def test_a_step_of_next_to_nothing():
-    tick = tick_from(np.zeros(7), [0.03, 0, 0, 0, 0, 0, 0], goal=joints(5e-324, -5e-324))
-    assert acceleration(4.0).limit(tick)
-    np.testing.assert_allclose(tick.command, joints(0.02), atol=1e-9)
 
 
 def ticks_of(guard, goal, count, speed=math.inf):
@@ -353,37 +325,11 @@ def test_the_longest_step_is_followed_by_others_that_stop_at_the_end(distance, c
     assert left >= -1e-9 * max(1.0, distance)
 
 
-def test_the_gripper_is_sent_no_farther_than_it_goes():
-    tick = arm_tick(joints(0, 0, 0, 0, 0, 0, -0.085))
-    assert arm_guards.GripperSpeed(ARM).limit(tick)
-    assert tick.command[6] == pytest.approx(0.0775)
-
-
-def test_opening_begins_at_the_fingers():
-    last = np.array([*ARM_HOME, 0.0])
-    tick = tick_from(last, goal=HOME, measured=np.array([*ARM_HOME, 0.04]))
-    assert arm_guards.GripperSpeed(ARM).limit(tick)
-    assert tick.command[6] == pytest.approx(0.0475)
-
-
-def test_a_gripper_that_is_not_measured_goes_from_the_last_width():
-    tick = arm_tick(joints(0, 0, 0, 0, 0, 0, -0.085), measured=np.full(7, math.nan))
-    assert arm_guards.GripperSpeed(ARM).limit(tick)
-    assert tick.command[6] == pytest.approx(0.0775)
-
-
-def ramp():
-    return arm_guards.RampIn(ARM, Limits())
-
-
-def test_a_near_first_command_is_free_at_once_and_so_is_what_follows():
-    guard = ramp()
-    assert not guard.limit(arm_tick(joints(0.05)))
-    assert not guard.limit(arm_tick(joints(1.0)))
-
-
 def test_a_far_first_command_is_gone_to_slowly_until_it_is_caught_up_with():
-    guard = ramp()
+    guard = arm_guards.RampIn(ARM, Limits())
+    assert not guard.limit(arm_tick(joints(0.05)))  # a near one is free at once, and so is what follows
+    assert not guard.limit(arm_tick(joints(1.0)))
+    guard.restart()
     for _ in range(3):
         tick = arm_tick(joints(0.2, 0.1))
         assert guard.limit(tick)
@@ -391,7 +337,9 @@ def test_a_far_first_command_is_gone_to_slowly_until_it_is_caught_up_with():
     assert not guard.limit(arm_tick(joints(0.05)))
     assert not guard.limit(arm_tick(joints(1.0)))
     guard.restart()
-    assert guard.limit(arm_tick(joints(1.0)))
+    altered = [guard.limit(arm_tick(joints(1.0))) for _ in range(65)]
+    assert altered == [True] * 60 + [False] * 5  # after three seconds it is free
+    assert all(guard.limit(arm_tick(joints(0.03), approach=True)) for _ in range(100))  # on the way to a start pose
 
 
 @pytest.mark.parametrize("data_sheet", [(2.0, 2.0), None])
@@ -401,17 +349,6 @@ def test_a_far_first_command_is_gone_to_slowly_without_a_speed_limit_too(data_sh
     tick = tick_from([0.0, 0.0], goal=np.array([1.0, 0.5]))
     assert guard.limit(tick)
     np.testing.assert_allclose(tick.command, [0.025, 0.0125])
-
-
-def test_after_three_seconds_it_is_free():
-    guard = ramp()
-    altered = [guard.limit(arm_tick(joints(1.0))) for _ in range(65)]
-    assert altered == [True] * 60 + [False] * 5
-
-
-def test_the_way_to_a_start_pose_is_slow_however_long_and_near():
-    guard = ramp()
-    assert all(guard.limit(arm_tick(joints(0.03), approach=True)) for _ in range(100))
 
 
 def base_tick(command, last=(0.0, 0.0)):

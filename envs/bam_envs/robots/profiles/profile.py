@@ -38,7 +38,9 @@ Age = Annotated[float, Meta(gt=0, le=BOUNDS["max_age"][1])]
 """States that are older than this mean nothing any more [s], nor do commands."""
 T = TypeVar("T")
 Topical = TypeVar("Topical", Source, Sink, CameraSource, Readiness)
+Converted = TypeVar("Converted", Source, Sink)
 _SUFFIXES = (".toml", ".yaml", ".yml")
+_SHIPPED = resources.files("bam_envs.robots") / "profiles"
 _AGES = {"arm": 0.1, "base": 0.5}
 _ROBOTS: dict[str, Callable[[], RobotSpec]] = {
     "ur5e": lambda: arm_spec("ur5e", with_object=True),
@@ -110,12 +112,8 @@ def profile_for(spec: RobotSpec) -> RobotProfile:
 
 def shipped_profiles() -> list[str]:
     """Names of the profiles that are shipped, sorted."""
-    names = [entry.name for entry in _folder().iterdir()]
+    names = [entry.name for entry in _SHIPPED.iterdir()]
     return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
-
-
-def _folder() -> Any:
-    return resources.files("bam_envs.robots") / "profiles"
 
 
 def _read_file(name: str) -> tuple[str, Table]:
@@ -125,29 +123,25 @@ def _read_file(name: str) -> tuple[str, Table]:
         if name not in shipped_profiles():
             raise UnknownName("robot profile", name, shipped_profiles())
         path = Path(f"{name}.toml")
-        text = (_folder() / path.name).read_text(encoding="utf-8")
+        text = (_SHIPPED / path.name).read_text(encoding="utf-8")
     else:
-        text = _text_of(path)
-    table: Table = _parsed(str(path), text)
-    base: Table = {}
-    if "extends" in table:
-        extends = check(table["extends"], NonEmpty, f"{path}: extends")
-        if Path(extends).suffix in _SUFFIXES:
+        try:
+            text = path.read_text(encoding="utf-8")
+        except FileNotFoundError as error:
             choices = ", ".join(shipped_profiles())
-            raise InvalidValue(f"{path}: extends must be a shipped profile ({choices}), not {extends!r}.")
-        _, base = _read_file(extends)
-    return str(path), {**base, **table}
-
-
-def _text_of(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise InvalidValue(
-            f"There is no robot profile {path}. Give the path of a file, or one of: {', '.join(shipped_profiles())}."
-        ) from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise InvalidValue(f"The robot profile {path} cannot be read: {error}.") from error
+            raise InvalidValue(
+                f"There is no robot profile {path}. Give the path of a file, or one of: {choices}."
+            ) from error
+        except (OSError, UnicodeDecodeError) as error:
+            raise InvalidValue(f"The robot profile {path} cannot be read: {error}.") from error
+    table = _parsed(str(path), text)
+    if "extends" not in table:
+        return str(path), table
+    extends = check(table["extends"], NonEmpty, f"{path}: extends")
+    if Path(extends).suffix in _SUFFIXES:
+        choices = ", ".join(shipped_profiles())
+        raise InvalidValue(f"{path}: extends must be a shipped profile ({choices}), not {extends!r}.")
+    return str(path), {**_read_file(extends)[1], **table}
 
 
 def _parsed(where: str, text: str) -> Table:
@@ -177,8 +171,14 @@ def _profile(where: str, table: Table) -> RobotProfile:
     commands = {mode: _sinks(where, mode, rows, spec.command) for mode, rows in file.commands.items()}
     if not commands:
         raise InvalidValue(f"{where}: at least one command mode is needed, such as [[commands.position]].")
-    cameras = tuple(_camera(row, at) for row, at in _rows(f"{where}: cameras", file.cameras))
-    readiness = tuple(_readiness(row, at) for row, at in _rows(f"{where}: readiness", file.readiness))
+    cameras, readiness = [], []
+    for row, at in _rows(f"{where}: cameras", file.cameras):
+        cameras.append(_topical(CameraSource, row, at))
+        check(cameras[-1].type, ImageType, f"{at}: type")
+    for row, at in _rows(f"{where}: readiness", file.readiness):
+        readiness.append(entry := _topical(Readiness, row, at))
+        if bool(entry.ready) == (entry.at_least is not None):
+            raise InvalidValue(f"{at}: give either ready (the values with which it can move) or at_least.")
     sinks = [sink for mode in commands.values() for sink in mode]
     entries: list[Source | Sink | CameraSource | Readiness] = [*state, *cameras, *readiness, *sinks]
     _require_known(f"{where}: rename", "topic", file.rename, [entry.topic for entry in entries])
@@ -251,13 +251,12 @@ def _state(where: str, file: _File, spec: RobotSpec) -> list[Source]:
     framed = {source.topic for source in sources.values() if source.frame}
     _require_known(f"{where}: frames", "topic with a frame", file.frames, framed)
     state = [sources[name] for name in sizes if name in sources]
-    state = [replace(source, frame=file.frames.get(source.topic, source.frame)) for source in state]
-    return [_ignoring(source, file.ignore) if source.names else source for source in state]
-
-
-def _ignoring(source: Source, names: tuple[str, ...]) -> Source:
-    others = tuple(name for name in names if name not in (*source.names, *source.ignore))
-    return replace(source, ignore=(*source.ignore, *others))
+    for place, source in enumerate(state):
+        known = (*source.names, *source.ignore)
+        others = tuple(name for name in file.ignore if name not in known) if source.names else ()
+        frame = file.frames.get(source.topic, source.frame)
+        state[place] = replace(source, ignore=(*source.ignore, *others), frame=frame)
+    return state
 
 
 def _checked_source(where: str, source: Source, size: int) -> Source:
@@ -275,7 +274,7 @@ def _checked_source(where: str, source: Source, size: int) -> Source:
         raise InvalidValue(f"{where}: within must be two numbers, the least first, not {list(source.within)}.")
     if source.frame and not has_header(source.type):
         raise InvalidValue(f"{where}: frame needs a type with a header, such as {source.type}Stamped.")
-    return replace(source, **_conversion(where, source, size))
+    return _converted(where, source, size)
 
 
 def _sinks(where: str, mode: str, rows: list[Table], command: SignalSpec) -> tuple[Sink, ...]:
@@ -297,20 +296,7 @@ def _checked_sink(where: str, sink: Sink) -> Sink:
             raise InvalidValue(f"{where}: {key} must have {size} values, not {len(values)}.")
     if not sink.fields and sink.type not in LISTED_TYPES:
         raise InvalidValue(f"{where}: {sink.type} needs fields; only {', '.join(sorted(LISTED_TYPES))} do without.")
-    return replace(sink, names=sink.names or sink.labels, **_conversion(where, sink, size))
-
-
-def _camera(row: Table, where: str) -> CameraSource:
-    camera = _topical(CameraSource, row, where)
-    check(camera.type, ImageType, f"{where}: type")
-    return camera
-
-
-def _readiness(row: Table, where: str) -> Readiness:
-    entry = _topical(Readiness, row, where)
-    if bool(entry.ready) == (entry.at_least is not None):
-        raise InvalidValue(f"{where}: give either ready (the values with which it can move) or at_least.")
-    return entry
+    return _converted(where, replace(sink, names=sink.names or sink.labels), size)
 
 
 def _row(kind: type[T], row: Table, where: str) -> T:
@@ -333,11 +319,12 @@ def _rows(where: str, tables: Iterable[Table]) -> list[tuple[Table, str]]:
     return [(table, f"{where}[{number}]") for number, table in enumerate(tables)]
 
 
-def _conversion(where: str, entry: Source | Sink, size: int) -> dict[str, Any]:
-    """Scale and offset, one for each number."""
+def _converted(where: str, entry: Converted, size: int) -> Converted:
+    """`entry` with a scale and an offset for each number."""
     if 0.0 in entry.scale:
         raise InvalidValue(f"{where}: scale must not be 0.")
-    return {key: _each(where, key, getattr(entry, key), size) for key in ("scale", "offset")}
+    scale, offset = (_each(where, key, getattr(entry, key), size) for key in ("scale", "offset"))
+    return replace(entry, scale=scale, offset=offset)
 
 
 def _each(where: str, key: str, values: tuple[Any, ...], size: int) -> tuple[Any, ...]:
