@@ -1,6 +1,5 @@
 """Live robots behind their guards: served robots, through a server, as any robot."""
 
-
 import numpy as np
 import pytest
 
