@@ -19,7 +19,7 @@ from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.registry import entry_of, resolve_id
 from bam_envs.core.spaces import space_to_json
 from bam_envs.core.wording import did_you_mean
-from bam_envs.robo_gym.options import constructor_options, require_values
+from bam_envs.robo_gym.making import constructor_options, require_values
 from bam_envs.robo_gym.table import ROBO_GYM
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import WHERE

@@ -26,7 +26,7 @@ from gymnasium import spaces
 from bam_envs.core.errors import UnknownName
 from bam_envs.core.registry import are_same, entry_of, resolve_id
 from bam_envs.core.spaces import space_to_json
-from bam_envs.robo_gym.options import PLACES
+from bam_envs.robo_gym.making import PLACES
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, safetensors_file, write_checkpoint
 from bam_train.compat.rllib_directory import Directory, find_policy
 from bam_train.compat.rllib_new_layout import Restored, algorithm_of, restore, states, training_settings

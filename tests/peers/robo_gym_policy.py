@@ -16,8 +16,7 @@ import bam_envs  # noqa: F401 - registers the ids, before robo-gym could
 from bam_envs.core.robot import Initial
 from bam_envs.robots.physics.kinematic_arm import reach_arm
 from bam_envs.robots.physics.kinematic_base import open_floor
-from bam_envs.robots.ur import ur_model
-from bam_envs.tasks.ur_arm import POSITIONS, UrControl, wire_states
+from bam_envs.tasks.ur_arm import POSITIONS, wire_states
 from bam_envs.tasks.ur_reach import UrReachTask
 from bam_train.policy import FrozenPolicy
 from tests.bam_envs.making import make_task
@@ -57,8 +56,7 @@ class ArmServer(services.RobotServerServicer):
     """A robot server of a simulated UR5 and a target."""
 
     def __init__(self):
-        self.robot, self.model = reach_arm(1), ur_model("ur5")
-        self.control = UrControl(self.model, 1, UrReachTask.rate, UrReachTask.velocity_scale)
+        self.robot, self.task = reach_arm(1), UrReachTask(1, ur_model="ur5")
         self.robot.connect()
 
     def SetState(self, request, context):  # noqa: N802
@@ -69,11 +67,11 @@ class ArmServer(services.RobotServerServicer):
 
     def SendActionGetState(self, request, context):  # noqa: N802
         goal = np.array([request.action])[:, [2, 1, 0, 3, 4, 5]]  # the wire has elbow and base exchanged
-        self.state = self.robot.step(self.control.command(goal, self.state))
+        self.state = self.robot.step(self.task.toward(goal, self.state))
         return self.GetState(None, context)
 
     def GetState(self, request, context):  # noqa: N802
-        return messages.State(state_dict=wire_states(self.model, self.state, self.target)[0], success=True)
+        return messages.State(state_dict=wire_states(self.task.model, self.state, self.target)[0], success=True)
 
 
 def same_start(env):

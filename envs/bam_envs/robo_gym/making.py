@@ -1,22 +1,58 @@
-"""robo-gym's environments: what `gymnasium.make` and `gymnasium.make_vec` call for its ids."""
+"""robo-gym's environments: what `gymnasium.make` and `gymnasium.make_vec` call for its ids, with its options.
+
+Where an option means something else here, that is logged, once in a process.
+"""
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Mapping
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
 from bam_envs import make_env as ours
-from bam_envs.core.errors import InvalidValue
-from bam_envs.core.registry import ENVIRONMENTS
+from bam_envs.core.env_options import in_our_words, require_kinds
+from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.registry import ENVIRONMENTS, MAKE_OPTIONS
 from bam_envs.core.robot import Robot
-from bam_envs.core.robot_env import RobotEnv, RobotVectorEnv
+from bam_envs.core.robot_env import RobotEnv, RobotVectorEnv, render_modes
 from bam_envs.core.task import Task
-from bam_envs.robo_gym.options import translate
-from bam_envs.robo_gym.table import ROBO_GYM
+from bam_envs.robo_gym.table import ROBO_GYM, RoboGymId
 
 if TYPE_CHECKING:
     from bam_envs.remote.remote_env import RemoteVectorEnv
+
+_LOG = logging.getLogger(__name__)
+_MANAGER = ("ip", "lower_bound_port", "upper_bound_port", "server_manager_port")
+"""Where robo-gym finds the Server Manager that starts Gazebo."""
+_WINDOWS = ("gui", "gazebo_gui", "rviz_gui")
+_SIMULATED = (*_MANAGER, *_WINDOWS)
+PLACES = frozenset({*_SIMULATED, "rs_address"})
+"""Options that say where an environment of robo-gym's ran, and nothing of what it is."""
+_OTHER_TARGETS = "give the target itself: ee_target_pose=[x, y, z, roll, pitch, yaw], here or to each reset"
+_OF_ENVIRONMENT = frozenset(MAKE_OPTIONS) | {"max_episode_steps"}
+_NOT_HERE = {
+    "max_velocity_scale_factor": "the arm's speed belongs to the environment, which would be another one",
+    "action_rate": "the rate belongs to the environment, which would be another one",
+    "ee_rotation_matters": "bam/isaac-reach-v0 (IsaacReachURSim-v0) has targets with an orientation",
+    "ee_rotation_threshold": "bam/isaac-reach-v0 (IsaacReachURSim-v0) has targets with an orientation",
+    "ee_distance_threshold": "it has no target of the flange",
+    "ee_target_pose": "it has no target of the flange",
+    "ee_target_volume_bounding_box": _OTHER_TARGETS,
+    "ee_rotation_pos_x_range": _OTHER_TARGETS,
+    "ee_rotation_pos_y_range": _OTHER_TARGETS,
+    "ee_rotation_pos_z_range": _OTHER_TARGETS,
+    "ee_rotation_roll_range": _OTHER_TARGETS,
+    "ee_rotation_pitch_range": _OTHER_TARGETS,
+    "ee_rotation_yaw_range": _OTHER_TARGETS,
+    "randomize_start": "give reset the start itself: options={'joint_positions': [...]}",
+    "random_joint_offset": "give reset the start itself: options={'joint_positions': [...]}",
+    "continue_on_success": "give reset the start itself: options={'joint_positions': [...]}",
+    "continue_except_collision": "give reset the start itself: options={'joint_positions': [...]}",
+}
+"""Options of robo-gym's modular environments that are none of ours, and what to do instead."""
 
 
 def make_env(env_id: str, **options: Any) -> gym.Env[Any, Any]:
@@ -34,9 +70,7 @@ def make_env(env_id: str, **options: Any) -> gym.Env[Any, Any]:
     arguments = translate(entry, options)
     if arguments.get("transport") is not None:
         return ours.make_env(env_id, **arguments)
-    made = ours.make_env(entry.env_id, **arguments).unwrapped
-    if not isinstance(made, RobotEnv):
-        raise TypeError(f"{entry.env_id} is a {type(made).__name__}, and a RobotEnv was expected.")
+    made: Any = ours.make_env(entry.env_id, **arguments).unwrapped
     env = RoboGymEnv(made.robot, made.task, made.render_mode, is_live=arguments.get("robot") is not None)
     # robo-gym's ids have no limit at Gymnasium: with parity the task itself terminates at the last step.
     return env if options.get("parity") else gym.wrappers.TimeLimit(env, ENVIRONMENTS[entry.env_id].max_episode_steps)
@@ -82,10 +116,7 @@ class RoboGymEnv(RobotEnv):
         None before the first `reset`.
         """
         task: Any = self.task
-        if self.last_state is None:
-            return None
-        state: dict[str, float] | list[float] = task.rs_state(self.last_state)[0]
-        return state
+        return None if self.last_state is None else task.rs_state(self.last_state)[0]
 
     def kill_sim(self) -> None:
         """End the simulation: its memory is free, and no step is taken until the next `reset`, which begins it anew.
@@ -107,3 +138,115 @@ class RoboGymEnv(RobotEnv):
         """
         self.kill_sim()
         self.robot.connect()
+
+
+def translate(entry: RoboGymId, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of `bam_envs.make_env.make_env` for `entry`; says once in a process what an option means here.
+
+    A ``Sim-v0`` takes ``robot=`` too: a policy that was trained in it is deployed in it.
+
+    Raises:
+        UnknownName: Neither robo-gym nor we have such an option; it carries the closest match.
+        InvalidValue: An option that is there and cannot be had, or is of the wrong kind; a live robot without an
+            address, or a simulated one with one.
+    """
+    taken, refused = constructor_options(entry)
+    known = {*_task_options(entry), *_OF_ENVIRONMENT, *taken} - {"env_id", "task_options"}
+    for name in given:
+        if name in refused and name in _NOT_HERE:
+            raise InvalidValue(f"{name}= of {entry.id}: there is none here; {_NOT_HERE[name]}.")
+        if name not in known | refused:
+            raise UnknownName(f"argument of {entry.id}", name, known, meant=in_our_words(name))
+    require_values(entry, given)
+    options = {name: value for name, value in given.items() if name not in PLACES}
+    robot, address, transport = (given.get(name) for name in ("robot", "rs_address", "transport"))
+    if address is not None and not entry.is_live:
+        raise InvalidValue(f"rs_address={address!r} names a live robot; it belongs to {entry.twin}.")
+    if entry.is_live and transport is None:
+        if robot is not None and address is not None:
+            raise InvalidValue(f"rs_address={address!r} and robot={robot!r} name the same thing; leave one out.")
+        if robot is None and address is None:
+            raise InvalidValue(
+                f"{entry.id} is a live robot, and it has no address: give robot='ws://IP:PORT' of the rosbridge in "
+                f"front of it (rs_address='IP:PORT' is the same), or use {entry.twin} for the simulated one."
+            )
+        options["robot"] = robot = _rosbridge_address(address) if robot is None else robot
+    if robot is not None:
+        without_effect = _SIMULATED
+        why = f"The robot of this {entry.id} is a live one: it has no window here, and no Server Manager."
+    else:
+        without_effect = (*_MANAGER, "rviz_gui")
+        why = (
+            "The robot is simulated in this process; there is no Server Manager and no Gazebo, and nothing to be "
+            "started first."
+        )
+        if transport is None:
+            options |= _window(given)
+    said = ", ".join(f"{name}={given[name]!r}" for name in without_effect if given.get(name))
+    if said:
+        say_once(f"{said}: accepted, and without effect. {why}")
+    if transport is not None:
+        return options
+    if given.get("parity") and "trajectory" in _task_options(entry) and given.get("trajectory") is None:
+        say_once(
+            "parity=True: the trajectory is this package's own, up to 0.67 rad from robo-gym's; "
+            "trajectory='.../robo_gym/envs/ur/robot_trajectories/trajectory_raad_2022.json' of an installed robo-gym "
+            "is that one."
+        )
+    return {**entry.defaults, **options}
+
+
+def constructor_options(entry: RoboGymId) -> tuple[frozenset[str], frozenset[str]]:
+    """What robo-gym's constructors take and ours do not: what is taken here too, and what is refused with a reason.
+
+    Its other options are those of our tasks.
+    """
+    taken = frozenset({*_SIMULATED, "rs_address"} if entry.is_live else _SIMULATED)
+    return taken, frozenset({"rs_address", *_NOT_HERE}) - taken - _task_options(entry).keys()
+
+
+def require_values(entry: RoboGymId, given: Mapping[str, Any]) -> None:
+    """Refuse options of the wrong kind.
+
+    Raises:
+        InvalidValue: A flag is neither True nor False, or a number is none.
+    """
+    said = {name: value for name, value in given.items() if value is not None or name not in _WINDOWS}
+    require_kinds(entry.id, _task_options(entry) | dict.fromkeys(("randomize", *_WINDOWS), False), said)
+
+
+def _task_options(entry: RoboGymId) -> dict[str, Any]:
+    return ENVIRONMENTS[entry.env_id].options()
+
+
+def _rosbridge_address(address: Any) -> str:
+    """``"IP:PORT"`` as the address of a rosbridge server."""
+    text = str(address)
+    if text.startswith(("ws://", "wss://")):
+        return text
+    host, _, port = text.rpartition(":")
+    if not host or set(host) & set(" /") or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise InvalidValue(f"rs_address must be 'IP:PORT', such as '10.0.0.5:9090', not {address!r}.")
+    say_once(
+        f"rs_address={text!r} is read as robot='ws://{text}': the robot is reached through rosbridge (port 9090 unless "
+        "it was given another), and not through a robot server of robo-gym's."
+    )
+    return f"ws://{text}"
+
+
+def _window(given: Mapping[str, Any]) -> dict[str, Any]:
+    """``gui=True`` is a window of the simulated robot's, where there is a display."""
+    names = [name for name in ("gui", "gazebo_gui") if given.get(name)]
+    if not names or given.get("render_mode") is not None:
+        return {}
+    if "human" not in render_modes():
+        say_once(f"{names[0]}=True: no window, for there is no display; render_mode='rgb_array' draws.")
+        return {}
+    say_once(f"{names[0]}=True is render_mode='human': a window with the simulated robot.")
+    return {"render_mode": "human"}
+
+
+@cache
+def say_once(text: str) -> None:
+    """Log `text` as a warning, once in a process."""
+    _LOG.warning("%s", text)

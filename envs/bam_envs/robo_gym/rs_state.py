@@ -6,9 +6,9 @@ knows and a robot does not (a target) is in the wire state too; `read_mir_target
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,28 +51,24 @@ def read_mir(wire: Sequence[float]) -> RobotState:
         InvalidValue: It has not 1030 numbers, or one that is infinite.
     """
     row = _numbers(wire)
-    signals = {name: np.nan_to_num(row[part]) for name, part in (("base_pose", _POSE), ("base_velocity", _TWIST))}
+    signals = {"base_pose": np.nan_to_num(row[_POSE]), "base_velocity": np.nan_to_num(row[_TWIST])}
     return _state({**signals, "f_scan": row[_FRONT], "b_scan": row[_BACK]}, row[_COLLISION], 2)
 
 
 def read_mir_target(wire: Sequence[float]) -> Array:
     """The target's x, y [m] and yaw [rad] of a base's wire state. Shape: (3,)."""
-    target: Array = np.nan_to_num(_numbers(wire)[_TARGET])
-    return target
+    return np.nan_to_num(_numbers(wire)[_TARGET])
 
 
 def _numbers(wire: Sequence[float]) -> Array:
     try:
-        row: Array = np.asarray(wire, dtype=np.float64)
+        row = np.asarray(wire, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InvalidValue(f"The wire state of a MiR100 must be {MIR_LENGTH} numbers: {error}.") from error
     if row.shape != (MIR_LENGTH,):
         raise InvalidValue(f"The wire state of a MiR100 has {MIR_LENGTH} numbers in a row; this has shape {row.shape}.")
-    infinite = np.flatnonzero(np.isinf(row))
-    if infinite.size:
-        raise InvalidValue(
-            f"Number {infinite[0]} of the wire state of a MiR100 must be finite, not {row[infinite[0]]}."
-        )
+    for place in np.flatnonzero(np.isinf(row)):
+        raise InvalidValue(f"Number {place} of the wire state of a MiR100 must be finite, not {row[place]}.")
     return row
 
 
@@ -88,11 +84,17 @@ def read_ur(wire: Mapping[str, float]) -> RobotState:
     Raises:
         InvalidValue: A key is missing or is none of robo-gym's, or its value is not finite; it names the key.
     """
-    require_ur_keys(wire)
+    mode = (
+        "1moving2points" if wire.keys() & set(_FOREARM) else "1object" if wire.keys() & set(_OBJECT) else "only_robot"
+    )
+    keys = UR_KEYS[mode]
+    for key in (*keys, *sorted(wire)):
+        if key not in wire or key not in keys:
+            what = f"lacks {key!r}" if key in keys else f"has {key!r}, which robo-gym's has not"
+            raise InvalidValue(f"The wire state of a UR ({mode}: {len(keys)} keys) {what}; it has {len(wire)} keys.")
     signals = {"joint_position": _take(wire, POSITIONS), "joint_velocity": _take(wire, VELOCITIES)}
-    if _OBJECT[0] in wire:
-        position, quaternion = read_object(wire)
-        signals |= {"object_position": position, "object_quaternion": quaternion}
+    if mode != "only_robot":
+        signals["object_position"], signals["object_quaternion"] = read_object(wire)
     return _state(signals, _take(wire, ("in_collision",))[0], 6)
 
 
@@ -102,37 +104,11 @@ def read_object(wire: Mapping[str, float]) -> tuple[Array, Array]:
     return frame[:3], frame[[6, 3, 4, 5]]
 
 
-def require_ur_keys(wire: Mapping[str, Any]) -> str:
-    """The ``rs_mode`` whose keys `wire` has, exactly.
-
-    Raises:
-        InvalidValue: Names the first key that is missing, or that no mode has.
-    """
-    given = set(wire)
-    for mode, keys in UR_KEYS.items():
-        if given == set(keys):
-            return mode
-    mode = _meant(given)
-    keys = UR_KEYS[mode]
-    missing, more = [key for key in keys if key not in given], sorted(given - set(keys))
-    what = f"lacks {missing[0]!r}" if missing else f"has {more[0]!r}, which robo-gym's has not"
-    raise InvalidValue(f"The wire state of a UR ({mode}: {len(keys)} keys) {what}; it has {len(given)} keys.")
-
-
-def _meant(given: Iterable[str]) -> str:
-    """The mode that keys are of, by the frames that are among them."""
-    names = set(given)
-    if names & set(_FOREARM):
-        return "1moving2points"
-    return "1object" if names & set(_OBJECT) else "only_robot"
-
-
 def _take(wire: Mapping[str, float], keys: Sequence[str]) -> Array:
-    values = np.array([wire[key] for key in keys], dtype=np.float64)
-    for key, value in zip(keys, values, strict=True):
-        if not np.isfinite(value):
-            raise InvalidValue(f"{key} of the wire state of a UR must be finite, not {value}.")
-    return values
+    for key in keys:
+        if not math.isfinite(wire[key]):
+            raise InvalidValue(f"{key} of the wire state of a UR must be finite, not {wire[key]}.")
+    return np.array([wire[key] for key in keys], dtype=np.float64)
 
 
 def _state(signals: Mapping[str, Array], collision: float, commands: int) -> RobotState:

@@ -66,13 +66,13 @@ ROBO_GYM: dict[str, RoboGymId] = {
 """By id, each ``Sim-v0`` followed by its ``Rob-v0``."""
 
 PARITY = {
-    "bam/mir100-navigation-v0": "bam_envs.robo_gym.parity_bases:Mir100NavigationParity",
-    "bam/mir100-avoidance-v0": "bam_envs.robo_gym.parity_bases:Mir100AvoidanceParity",
-    "bam/ur-reach-v0": "bam_envs.robo_gym.parity_arms:UrReachParity",
-    "bam/ur-empty-v0": "bam_envs.robo_gym.parity_arms:UrEmptyParity",
-    "bam/ur-avoidance-v0": "bam_envs.robo_gym.parity_arms:UrAvoidanceParity",
-    "bam/ur-track-v0": "bam_envs.robo_gym.parity_arms:UrTrackParity",
-    "bam/isaac-reach-v0": "bam_envs.robo_gym.parity_arms:IsaacReachParity",
+    "bam/mir100-navigation-v0": "bam_envs.robo_gym.parity:Mir100NavigationParity",
+    "bam/mir100-avoidance-v0": "bam_envs.robo_gym.parity:Mir100AvoidanceParity",
+    "bam/ur-reach-v0": "bam_envs.robo_gym.parity:UrReachParity",
+    "bam/ur-empty-v0": "bam_envs.robo_gym.parity:UrEmptyParity",
+    "bam/ur-avoidance-v0": "bam_envs.robo_gym.parity:UrAvoidanceParity",
+    "bam/ur-track-v0": "bam_envs.robo_gym.parity:UrTrackParity",
+    "bam/isaac-reach-v0": "bam_envs.robo_gym.parity:IsaacReachParity",
 }
 """The task that ``parity=True`` makes of each environment of ours."""
 

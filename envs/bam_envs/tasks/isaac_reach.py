@@ -10,8 +10,9 @@ import numpy as np
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.kinematics import angle_between, from_angles, quaternions
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import Array, Flags, Floats, Label, Score
-from bam_envs.tasks.ur_arm import UrTask, collisions, frame_keys, joint_labels, joint_option, number_option, wire_states
+from bam_envs.core.task import Array, Flags, Floats, Label, Score, finite_numbers
+from bam_envs.core.validation import Positive, check
+from bam_envs.tasks.ur_arm import AboveZero, UrTask, collisions, frame_keys, joint_labels, joint_option, wire_states
 
 DEFAULT = (0.0, -1.712, 1.712, 0.0, 0.0, 0.0)
 """Joint positions [rad] that actions and observations are measured from."""
@@ -75,6 +76,8 @@ class IsaacReachTask(UrTask):
     """Of targets, to either side [rad]."""
     frame: Array = EE_LINK
     """Axes in ``tool0`` of the frame that is brought to the target."""
+    unscaled = False
+    """Whether actions are Isaac Lab's, in units of `isaac_scale`."""
     memory: Mapping[str, str] = {
         "target": "target",
         "quaternion": "quaternion",
@@ -95,18 +98,12 @@ class IsaacReachTask(UrTask):
         ee_rotation_threshold: float = ALIGNED,
         ee_target_pose: Sequence[float] | None = None,
     ) -> None:
-        if not 0 < isaac_scale < np.inf:
-            raise InvalidValue(f"isaac_scale must be a joint angle above 0 rad, not {isaac_scale!r}.")
-        for name, limit, unit in (
-            ("ee_distance_threshold", ee_distance_threshold, "m"),
-            ("ee_rotation_threshold", ee_rotation_threshold, "rad"),
-        ):
-            if not limit > 0:
-                raise InvalidValue(f"{name} must be above 0 {unit}, not {limit!r}.")
-        self._close, self._aligned = ee_distance_threshold, ee_rotation_threshold
-        self._default_target = _target({"ee_target_pose": ee_target_pose})
+        isaac_scale = check(isaac_scale, Positive, "isaac_scale [rad]")
+        self._close = check(ee_distance_threshold, AboveZero, "ee_distance_threshold [m]")
+        self._aligned = check(ee_rotation_threshold, AboveZero, "ee_rotation_threshold [rad]")
+        self._default_target = _target(ee_target_pose)
         self.continue_except_collision = continue_except_collision
-        self.scale = self._action_scale(isaac_scale)
+        self.scale = isaac_scale if self.unscaled else SPAN
         """Joint angle from `DEFAULT` of an action of 1 [rad]."""
         self._default = np.array(DEFAULT)
         super().__init__(num_envs, ur_model=ur_model, fix_wrist_3=False, rs_state_to_info=rs_state_to_info)
@@ -115,10 +112,6 @@ class IsaacReachTask(UrTask):
         self._last_action = np.zeros((num_envs, 6))
         self._ended = np.full((num_envs, 6), np.nan)  # joints where the last episode ended, if the next begins there
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
-
-    def _action_scale(self, isaac_scale: float) -> float:
-        """The joint angle of an action of 1 [rad]; `isaac_scale` is that of Isaac Lab's actions."""
-        return SPAN
 
     def _action_labels(self) -> tuple[Label, ...]:
         return joint_labels("", "joint target from the default pose", "rad", f"/ {self.scale:g}")
@@ -154,27 +147,20 @@ class IsaacReachTask(UrTask):
         yaw = (2 * draws[:, 3] - 1) * self.yaw
         angles = np.stack([np.zeros(len(env_ids)), np.full(len(env_ids), PITCH), yaw], axis=1)
         self.quaternion[env_ids] = from_angles(angles)
-        pose = self._default_target if options.get("ee_target_pose") is None else _target(options)
+        given = _target(options.get("ee_target_pose"))
+        pose = self._default_target if given is None else given
         if pose is not None:
             self.target[env_ids], self.quaternion[env_ids] = pose[:3], pose[3:]
-        joints = self._starts(env_ids, rngs)
-        if options.get("joint_positions") is not None:
-            joints[:] = joint_option(options, "joint_positions", (), self.model)
-        self._last_action[env_ids], self._ended[env_ids] = 0.0, np.nan
-        return self.initial(joints, rngs)
-
-    def _starts(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> Array:
-        """Where the last episodes ended, or the default pose. Shape: (k, 6).
-
-        A generator that the environment did not have before is one that was seeded: what follows depends on the seed
-        alone.
-        """
         joints = self._ended[env_ids]
         for k, (env, rng) in enumerate(zip(env_ids, rngs, strict=True)):
+            # A generator that the environment did not have before was seeded: what follows depends on the seed alone.
             if np.isnan(joints[k, 0]) or self._rngs[env] not in (None, rng):
                 joints[k] = self._default
             self._rngs[env] = rng
-        return joints
+        if options.get("joint_positions") is not None:
+            joints[:] = joint_option(options, DEFAULT, self.model)
+        self._last_action[env_ids], self._ended[env_ids] = 0.0, np.nan
+        return self.initial(joints, rngs)
 
     def _columns(self, state: RobotState) -> list[Array]:
         joints, speeds = state.signals["joint_position"] - self._default, state.signals["joint_velocity"]
@@ -191,9 +177,7 @@ class IsaacReachTask(UrTask):
         """One period on the way to the default pose plus `action`. Shape: (n, 6)."""
         cut = np.clip(action, self.action_space.low, self.action_space.high)
         self._last_action = cut.astype(np.float64)
-        return self.control.command(
-            np.clip(self._default + self.scale * self._last_action, *self.model.joint_limits), state
-        )
+        return self.toward(np.clip(self._default + self.scale * self._last_action, *self.model.joint_limits), state)
 
     def score(self, state: RobotState, action: Floats) -> Score:
         """Nearer and straighter is better."""
@@ -242,17 +226,16 @@ class IsaacReachTask(UrTask):
         self._rngs = [None] * self.num_envs
 
 
-def _target(options: Mapping[str, Any]) -> Array | None:
-    """Position [m] and unit quaternion x, y, z, w that ``ee_target_pose`` gives. Shape: (7,)."""
-    given = options.get("ee_target_pose")
+def _target(given: Any) -> Array | None:
+    """Position [m] and unit quaternion x, y, z, w of ``ee_target_pose``. Shape: (7,)."""
     if given is None:
         return None
     if np.array(given, dtype=object).shape == (7,):
-        pose = number_option(options, "ee_target_pose", (), 7)
+        pose = finite_numbers(given, 7, "ee_target_pose")
         length = float(np.sqrt((pose[3:] ** 2).sum()))
         if abs(length - 1) > 1e-3:
             raise InvalidValue(f"The quaternion of ee_target_pose must have length 1, not {length:.4g}.")
         pose[3:] /= length
         return pose
-    pose = number_option(options, "ee_target_pose", (), 6)
+    pose = finite_numbers(given, 6, "ee_target_pose")
     return np.concatenate([pose[:3], from_angles(pose[None, 3:])[0]])

@@ -71,14 +71,11 @@ class Mir100AvoidanceTask(DriveTask):
 
     def labels(self) -> tuple[Label, ...]:
         """Those of driving, and ranges."""
-        return (*super().labels(), *self.range_labels())
-
-    def range_labels(self) -> tuple[Label, ...]:
-        """What is observed of the scanners."""
         scale = f"1 - range / {SIGHT:g}, clipped"
         meant = "shortest ray of sector {} of the {} scanner, clockwise end first"
         sectors = [(name, sector) for name in ("front", "back") for sector in range(SECTORS)]
-        return tuple(Label(f"{name}_{sector}", meant.format(sector, name), "m", scale, 0.0) for name, sector in sectors)
+        ranges = (Label(f"{name}_{sector}", meant.format(sector, name), "m", scale, 0.0) for name, sector in sectors)
+        return (*super().labels(), *ranges)
 
     def starts(self, draws: Array) -> Array:
         """On either side. Shape: (k, 3)."""
@@ -92,16 +89,15 @@ class Mir100AvoidanceTask(DriveTask):
         x, y = spread(draws[:, 4], -WIDTH, WIDTH), side * spread(draws[:, 5], *SIDE)
         return np.stack([x, y, np.zeros(len(start))], axis=1)
 
-    def make_way(self, start: Array, draws: Array, rngs: Sequence[np.random.Generator]) -> None:
-        """Boxes are drawn until none is where the base starts; a start in a wall is the robot's to refuse."""
+    def scene(
+        self, env_ids: EnvIds, draws: Array, start: Array, rngs: Sequence[np.random.Generator]
+    ) -> dict[str, Array]:
+        """The boxes, drawn until none is where the base is told to start; the robot refuses a start in a wall."""
         for k, rng in enumerate(rngs):
-            for _ in range(_TRIES):
+            for _ in range(0 if np.isnan(start[k, 0]) else _TRIES):
                 if not touches(start[k : k + 1], None, _boxes(draws[k : k + 1]))[0]:
                     break
                 draws[k, _OF_BOXES] = rng.random(9)
-
-    def scene(self, env_ids: EnvIds, draws: Array) -> dict[str, Array]:
-        """The boxes."""
         self.obstacles[env_ids] = _boxes(draws)
         return {"obstacle_pose": self.obstacles[env_ids]}
 
@@ -125,11 +121,6 @@ class Mir100AvoidanceTask(DriveTask):
         touching: Any = state.truth.get("collision", False)
         failed: Flags = (self.sectors(state).min(axis=1) < NEAREST) | touching
         return failed
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go to what `state_dict` returned."""
-        super().load_state_dict(state)
-        self._sectors = None
 
 
 def _boxes(draws: Array) -> Array:

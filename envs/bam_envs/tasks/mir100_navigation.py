@@ -14,7 +14,18 @@ from gymnasium import spaces
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import Array, Flags, Floats, Label, Score, TaskMemory, as_objects, draw_seeds, labelled_box
+from bam_envs.core.task import (
+    Array,
+    Flags,
+    Floats,
+    Label,
+    Score,
+    TaskMemory,
+    as_objects,
+    draw_seeds,
+    finite_numbers,
+    labelled_box,
+)
 from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS, SCAN_RANGE
 
 FASTEST = np.array([0.5, 0.7])
@@ -37,7 +48,6 @@ CANDIDATES = 64
 """Targets that are drawn; the first is taken that is far enough from the start."""
 START_TOLERANCE = 0.2
 """A base that is nearer than this to where it is to start is there [m], [rad]."""
-_MEANT = "x, y [m] and yaw [rad]"
 
 
 class DriveTask(TaskMemory):
@@ -88,11 +98,17 @@ class DriveTask(TaskMemory):
         """Hook: targets for bases that stand at `start` (k, 3). Shapes: (k, draws) -> (k, 3)."""
         raise NotImplementedError
 
-    def make_way(self, start: Array, draws: Array, rngs: Sequence[np.random.Generator]) -> None:
-        """Hook: draw anew, in `draws` (k, draws), what is where bases are to start, at `start` (k, 3)."""
+    def scene(
+        self, env_ids: EnvIds, draws: Array, start: Array, rngs: Sequence[np.random.Generator]
+    ) -> dict[str, Array]:
+        """Hook: start values of other signals than the pose.
 
-    def scene(self, env_ids: EnvIds, draws: Array) -> dict[str, Array]:
-        """Hook: start values of other signals than the pose."""
+        Args:
+            env_ids: Environments that begin. Shape: (k,).
+            draws: Their numbers from [0, 1). Shape: (k, draws).
+            start: Poses that were asked for, NaN where none was; what is there may be drawn anew. Shape: (k, 3).
+            rngs: Their generators.
+        """
         return {}
 
     def seen(self, state: RobotState) -> list[Floats]:
@@ -109,15 +125,14 @@ class DriveTask(TaskMemory):
         """A start pose; the target is chosen when it is known where the base really is."""
         draws = np.stack([rng.random(self.draws) for rng in rngs])
         seeds = draw_seeds(rngs)
-        given = [(name, (options or {}).get(name)) for name in self.reset_options]
-        asked = [np.nan if value is None else floor_pose(name, value, BOUNDARY) for name, value in given]
-        for which, pose in enumerate(asked):
-            self._asked[env_ids, which] = pose
-        start = preferred(self._asked[env_ids, 0], self.starts(draws))
-        if given[0][1] is not None:
-            self.make_way(start, draws, rngs)
+        for which, name in enumerate(self.reset_options):
+            value = (options or {}).get(name)
+            self._asked[env_ids, which] = np.nan if value is None else floor_pose(name, value)
+        asked = self._asked[env_ids, 0]
+        start = np.where(np.isnan(asked), self.starts(draws), asked)
+        scene = self.scene(env_ids, draws, asked, rngs)
         self._draws[env_ids] = draws
-        return Initial({"base_pose": start, **self.scene(env_ids, draws)}, seeds)
+        return Initial({"base_pose": start, **scene}, seeds)
 
     def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
         """Choose the target from where the base is.
@@ -126,8 +141,17 @@ class DriveTask(TaskMemory):
             InvalidValue: A robot that stays where it is was asked to start elsewhere.
         """
         pose = state.signals["base_pose"][env_ids]
-        require_at(self._asked[env_ids, 0], pose)
-        self.target[env_ids] = preferred(self._asked[env_ids, 1], self.targets(self._draws[env_ids], pose))
+        off = self._asked[env_ids, 0] - pose
+        off[:, 2] = np.mod(off[:, 2] + math.pi, 2 * math.pi) - math.pi
+        wrong = np.flatnonzero((np.abs(off) > START_TOLERANCE).any(axis=1))
+        if len(wrong):
+            there, here = self._asked[env_ids[wrong[0]], 0].tolist(), np.round(pose[wrong[0]], 3).tolist()
+            raise InvalidValue(
+                f"start_pose: this robot stays where it is, at {here}, and does not start at {there} (x, y [m], yaw "
+                "[rad]). Drive it there, or leave start_pose out."
+            )
+        asked = self._asked[env_ids, 1]
+        self.target[env_ids] = np.where(np.isnan(asked), self.targets(self._draws[env_ids], pose), asked)
         self.elapsed[env_ids] = 0
         self._previous[env_ids] = self.distance(state)[env_ids]
 
@@ -141,9 +165,8 @@ class DriveTask(TaskMemory):
     def way(self, state: RobotState) -> tuple[Array, Array]:
         """Distance [m] and bearing from -pi to pi [rad] of the target, seen from the base. Shape: (n,) each."""
         pose = state.signals["base_pose"]
-        dx, dy = self.target[:, 0] - pose[:, 0], self.target[:, 1] - pose[:, 1]
-        bearing = np.mod(np.arctan2(dy, dx) - pose[:, 2] + math.pi, 2 * math.pi) - math.pi
-        return np.sqrt(dx * dx + dy * dy), bearing
+        bearing = np.arctan2(self.target[:, 1] - pose[:, 1], self.target[:, 0] - pose[:, 0]) - pose[:, 2]
+        return self.distance(state), np.mod(bearing + math.pi, 2 * math.pi) - math.pi
 
     def _columns(self, state: RobotState) -> list[Array]:
         """The first four numbers of an observation. Shape: (n,) each."""
@@ -174,27 +197,15 @@ class DriveTask(TaskMemory):
         reward = np.where(failed, FAILING, np.where(success, ARRIVING, reward))
         self.elapsed = self.elapsed + 1
         terminated = failed | success
-        return self._scored(
-            state, distance, reward, terminated, success, failed, (self.elapsed >= MAX_STEPS) & ~terminated
-        )
+        status = np.where(self.elapsed >= MAX_STEPS, "max_steps_exceeded", "")
+        status = np.where(success, "success", np.where(failed, self.failure, status))
+        return self._scored(state, distance, reward, terminated, success, status)
 
     def _scored(
-        self,
-        state: RobotState,
-        distance: Array,
-        reward: Array,
-        terminated: Flags,
-        success: Flags,
-        failed: Flags,
-        late: Flags,
+        self, state: RobotState, distance: Array, reward: Array, terminated: Flags, success: Flags, status: Any
     ) -> Score:
         self._previous = distance.copy()  # the info keeps its own
-        status = np.where(success, "success", np.where(failed, self.failure, ""))
-        info: dict[str, Any] = {
-            "distance": distance,
-            "final_status": np.where(late, "max_steps_exceeded", status),
-            "target_coord": self.target.copy(),
-        }
+        info: dict[str, Any] = {"distance": distance, "final_status": status, "target_coord": self.target.copy()}
         if self.rs_state_to_info:
             info["rs_state"] = as_objects(self.rs_state(state))
         return Score(reward, terminated, success, info)
@@ -277,46 +288,14 @@ def spread(draws: Array, low: float, high: float) -> Array:
     return low + draws * (high - low)
 
 
-def floor_pose(name: str, value: Any, boundary: float) -> Array:
-    """The reset option `name` as a pose, with its yaw from -pi to pi. Shape: (3,).
-
-    Args:
-        name: For texts.
-        value: Three numbers.
-        boundary: How far the floor goes from the origin, along x and along y [m].
+def floor_pose(name: str, value: Any) -> Array:
+    """The reset option `name` as a pose, x, y [m] and yaw from -pi to pi [rad]. Shape: (3,).
 
     Raises:
         InvalidValue: It is no pose, or not on the floor.
     """
-    try:
-        pose = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InvalidValue(f"{name} must be three numbers, {_MEANT}, not {value!r}.") from error
-    if pose.shape != (3,) or not np.isfinite(pose).all():
-        raise InvalidValue(f"{name} must be three finite numbers, {_MEANT}, not {pose.tolist()}.")
-    if np.abs(pose[:2]).max() > boundary:
-        raise InvalidValue(f"{name} must be within {boundary:g} m of the origin along x and y, not {pose.tolist()}.")
+    pose = finite_numbers(value, 3, f"{name} (x, y [m], yaw [rad])")
+    if np.abs(pose[:2]).max() > BOUNDARY:
+        raise InvalidValue(f"{name} must be within {BOUNDARY:g} m of the origin along x and y, not {pose.tolist()}.")
     pose[2] = np.mod(pose[2] + math.pi, 2 * math.pi) - math.pi
     return pose
-
-
-def preferred(asked: Array, drawn: Array) -> Array:
-    """What was asked, and where that is nothing (NaN), what was drawn. Shape: (k, 3)."""
-    return np.where(np.isnan(asked), drawn, asked)
-
-
-def require_at(asked: Array, pose: Array) -> None:
-    """Bases at `pose` (k, 3) are where they were `asked` (k, 3) to start; NaN is anywhere.
-
-    Raises:
-        InvalidValue: One is not, since a live base goes nowhere by itself.
-    """
-    off = asked - pose
-    off[:, 2] = np.mod(off[:, 2] + math.pi, 2 * math.pi) - math.pi
-    wrong = np.flatnonzero((np.abs(off) > START_TOLERANCE).any(axis=1))
-    if len(wrong):
-        there, here = asked[wrong[0]].tolist(), np.round(pose[wrong[0]], 3).tolist()
-        raise InvalidValue(
-            f"start_pose: this robot stays where it is, at {here}, and does not start at {there} (x, y [m], yaw "
-            "[rad]). Drive it there, or leave start_pose out."
-        )

@@ -51,11 +51,6 @@ class CubeSense:
         self.offset = self.object - self.tool
         self.distance: Array = np.sqrt(np.einsum("ij,ij->i", self.offset, self.offset))
 
-    def yaw_phase(self) -> Any:
-        """exp(4 i (yaw of the cube - yaw of the gripper)). Shape: (n,) complex."""
-        axis = self.x_axis[:, 0] - 1j * self.x_axis[:, 1]
-        return cube_yaw_phase(self.state.signals["object_quaternion"]) * (axis * axis) ** 2
-
 
 class PickTask(TaskMemory):
     """Grasp the cube, lift it by `LIFT` and hold it for `HOLD_STEPS`.
@@ -128,18 +123,17 @@ class PickTask(TaskMemory):
 
     def observe(self, state: RobotState) -> Floats:
         """See `observation_labels`. Shape: (n, 18) float32."""
-        return np.clip(self.observe_cube(state), self.observation_space.low, self.observation_space.high)
+        observation = np.concatenate(self._columns(state), axis=1).astype(np.float32)
+        return np.clip(observation, self.observation_space.low, self.observation_space.high)
 
-    def observe_cube(self, state: RobotState) -> Floats:
-        """Hand and cube, not clipped. Shape: (n, 18) float32."""
-        sense = self.sense(state)
-        columns = hand_state(state, self.control, sense.tool, sense.x_axis) + self._object_columns(sense)
-        return np.concatenate(columns, axis=1).astype(np.float32)
-
-    def _object_columns(self, sense: CubeSense) -> list[Array]:
-        middle, half = WORKSPACE.mean(axis=0), (WORKSPACE[1] - WORKSPACE[0]) / 2
-        phase = sense.yaw_phase()
+    def _columns(self, state: RobotState) -> list[Array]:
+        """Hand and cube, not clipped. Shape: (n, k) each."""
+        sense, middle, half = self.sense(state), WORKSPACE.mean(axis=0), (WORKSPACE[1] - WORKSPACE[0]) / 2
+        # exp(4 i (yaw of the cube - yaw of the gripper))
+        axis: Any = sense.x_axis[:, 0] - 1j * sense.x_axis[:, 1]
+        phase = cube_yaw_phase(state.signals["object_quaternion"]) * (axis * axis) ** 2
         return [
+            *hand_state(state, self.control, sense.tool, sense.x_axis),
             (sense.object[:, :2] - middle[:2]) / half[:2],
             self.lift(sense)[:, None] / LIFT,
             sense.offset / 0.1,
@@ -184,4 +178,3 @@ class PickTask(TaskMemory):
         """Go to what `state_dict` returned."""
         super().load_state_dict(state)
         self.control.load_state_dict(state["control"])
-        self._sense = None

@@ -78,7 +78,10 @@ class PickPlaceTask(PickTask):
         """As for picking, and a goal at least `GOAL_DISTANCE` from the cube."""
         initial = super().sample_initial(env_ids, rngs)
         for env, rng, cube in zip(env_ids, rngs, initial.signals["object_pose"], strict=True):
-            self.goal[env] = sample_goal(rng, cube[:2])
+            goal = cube[:2]
+            while np.hypot(*(goal - cube[:2])) < GOAL_DISTANCE:
+                goal = CUBE_AREA[0] + rng.random(2) * (CUBE_AREA[1] - CUBE_AREA[0])
+            self.goal[env] = goal
         return initial
 
     def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
@@ -86,14 +89,9 @@ class PickPlaceTask(PickTask):
         super().on_reset(env_ids, state)
         self.picked[env_ids] = False
 
-    def observe(self, state: RobotState) -> Floats:
-        """See `observation_labels`. Shape: (n, 23) float32."""
+    def _columns(self, state: RobotState) -> list[Array]:
         offset = self.goal - self.sense(state).object[:, :2]
-        picked = np.where(self.picked, 1.0, -1.0)[:, None]
-        goal = np.concatenate([offset / 0.2, offset / 0.04, picked], axis=1).astype(np.float32)
-        observation = np.concatenate([self.observe_cube(state), goal], axis=1)
-        clipped: Floats = np.clip(observation, self.observation_space.low, self.observation_space.high)
-        return clipped
+        return [*super()._columns(state), offset / 0.2, offset / 0.04, np.where(self.picked, 1.0, -1.0)[:, None]]
 
     def goal_distance(self, sense: CubeSense) -> Array:
         """Distance of the object from where it would lie at the goal [m]. Shape: (n,)."""
@@ -131,11 +129,3 @@ class PickPlaceTask(PickTask):
     def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
         """The goal."""
         return [(np.array([*self.goal[0], 0.0]), (0.1, 0.7, 0.3, 0.6))]
-
-
-def sample_goal(rng: np.random.Generator, cube: Array) -> Array:
-    """A point of `CUBE_AREA` at least `GOAL_DISTANCE` from `cube` (2,) [m]. Shape: (2,)."""
-    while True:
-        goal: Array = CUBE_AREA[0] + rng.random(2) * (CUBE_AREA[1] - CUBE_AREA[0])
-        if np.hypot(*(goal - cube)) >= GOAL_DISTANCE:
-            return goal

@@ -5,24 +5,18 @@ They keep no memory, so they act on any number of observations in any order, lik
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.registry import ENVIRONMENTS
-from bam_envs.core.task import Label
+from bam_envs.core.task import Array, Flags, Floats, Label
 from bam_envs.robots.ur5e import GEOMETRY, JOINTS
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.pick_place import CARRY, PickPlaceTask
 from bam_envs.tasks.reach import HOME, ReachTask
 from bam_envs.tasks.tool_control import JOINT_STEP, LEASH, TOOL_STEP, YAW_STEP
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
-Flags = NDArray[np.bool_]
 
 HOVER = 0.08
 """How far above the object the tool comes in [m]."""
@@ -32,46 +26,38 @@ PUT_DOWN = 0.004
 """An object lower than this is let go of [m]."""
 
 
-class ScriptedPolicy(Protocol):
-    """The part of a frozen policy that evaluation uses."""
+Take = Callable[..., Array]
+"""Gives the numbers of the observations with these names, side by side. Shape: (n, names)."""
+
+
+class ScriptedPolicy:
+    """The part of a frozen policy that evaluation uses.
+
+    Args:
+        labels: Of the numbers of an observation.
+        act: Makes the actions, shape (n, a), of the observations' numbers by name.
+    """
+
+    def __init__(self, labels: Sequence[Label], act: Callable[[Take], Floats]) -> None:
+        self._columns, self._act = {label.name: column for column, label in enumerate(labels)}, act
 
     def act_batch(self, observations: Floats) -> Floats:
-        """Actions for n observations."""
+        """Actions for n observations. Shapes: (n, k) -> (n, a)."""
+        return self._act(lambda *names: observations[:, [self._columns[name] for name in names]].astype(np.float64))
 
-    def reset(self, rows: Sequence[int] | None = None) -> None:
-        """Forget what was seen of these environments."""
-
-
-class Columns:
-    """Reads an observation (n, k) by the names of its labels."""
-
-    def __init__(self, labels: Sequence[Label]) -> None:
-        self._index = {label.name: column for column, label in enumerate(labels)}
-
-    def take(self, observation: Floats, *names: str) -> Array:
-        """The named numbers, side by side. Shape: (n, len(names))."""
-        columns: Array = observation[:, [self._index[name] for name in names]].astype(np.float64)
-        return columns
-
-
-class ScriptedReach:
-    """Turn the joints along the damped pseudo-inverse of the arm's Jacobian."""
-
-    def __init__(self) -> None:
-        self._columns = Columns(ReachTask.observation_labels)
-
-    def act_batch(self, observations: Floats) -> Floats:
-        """Actions for n observations. Shapes: (n, k) -> (n, 6)."""
-        joints = self._columns.take(observations, *JOINTS) + HOME
-        offset = 0.3 * self._columns.take(observations, "goal_dx", "goal_dy", "goal_dz")
-        jacobian = numeric_jacobian(joints)
-        square = jacobian @ jacobian.transpose(0, 2, 1) + DAMPING**2 * np.eye(3)
-        turn = (jacobian.transpose(0, 2, 1) @ np.linalg.solve(square, offset[:, :, None]))[:, :, 0]
-        actions: Floats = (turn / np.maximum(np.abs(turn).max(axis=1, keepdims=True), JOINT_STEP)).astype(np.float32)
-        return actions
-
-    def reset(self, rows: Sequence[int] | None = None) -> None:
+    def reset(self, env_ids: Sequence[int] | None = None) -> None:
         """Nothing to forget."""
+
+
+def reach(take: Take) -> Floats:
+    """Turn the joints along the damped pseudo-inverse of the arm's Jacobian."""
+    joints = take(*JOINTS) + HOME
+    offset = 0.3 * take("goal_dx", "goal_dy", "goal_dz")
+    jacobian = numeric_jacobian(joints)
+    square = jacobian @ jacobian.transpose(0, 2, 1) + DAMPING**2 * np.eye(3)
+    turn = (jacobian.transpose(0, 2, 1) @ np.linalg.solve(square, offset[:, :, None]))[:, :, 0]
+    actions: Floats = (turn / np.maximum(np.abs(turn).max(axis=1, keepdims=True), JOINT_STEP)).astype(np.float32)
+    return actions
 
 
 def numeric_jacobian(joints: Array) -> Array:
@@ -84,10 +70,7 @@ def numeric_jacobian(joints: Array) -> Array:
 class Sight:
     """What an observation says of hand and object, in SI units, in n environments."""
 
-    def __init__(self, columns: Columns, observations: Floats) -> None:
-        def take(*names: str) -> Array:
-            return columns.take(observations, *names)
-
+    def __init__(self, take: Take) -> None:
         self.offset = 0.1 * take("object_dx", "object_dy", "object_dz")
         """Object from the tool [m]. Shape: (n, 3)."""
         self.lead = LEASH * take("target_dx", "target_dy", "target_dz")
@@ -127,43 +110,24 @@ def tool_actions(travel: Array, turn: Array, grip: Array) -> Floats:
     return clipped
 
 
-class ScriptedPick:
+def pick(take: Take) -> Floats:
     """Grasp the cube and lift it."""
-
-    def __init__(self) -> None:
-        self._columns = Columns(PickTask.observation_labels)
-
-    def act_batch(self, observations: Floats) -> Floats:
-        """Actions for n observations. Shapes: (n, k) -> (n, 5)."""
-        sight = Sight(self._columns, observations)
-        travel, turn, grip = grasp(sight)
-        travel[sight.holding] = (0.0, 0.0, 1.0)
-        return tool_actions(travel, turn, grip)
-
-    def reset(self, rows: Sequence[int] | None = None) -> None:
-        """Nothing to forget."""
+    sight = Sight(take)
+    travel, turn, grip = grasp(sight)
+    travel[sight.holding] = (0.0, 0.0, 1.0)
+    return tool_actions(travel, turn, grip)
 
 
-class ScriptedPickPlace:
+def pick_place(take: Take) -> Floats:
     """Grasp the cube, carry it to the goal, put it down and let go."""
-
-    def __init__(self) -> None:
-        self._columns = Columns(PickPlaceTask.observation_labels)
-
-    def act_batch(self, observations: Floats) -> Floats:
-        """Actions for n observations. Shapes: (n, k) -> (n, 5)."""
-        sight = Sight(self._columns, observations)
-        goal = 0.2 * self._columns.take(observations, "goal_dx", "goal_dy")
-        travel, turn, grip = grasp(sight)
-        over = np.hypot(goal[:, 0], goal[:, 1]) < 0.006
-        travel[sight.holding] = carry(sight, goal, over)[sight.holding]
-        there = (np.hypot(goal[:, 0], goal[:, 1]) < 0.015) & (sight.lift < PUT_DOWN)
-        done = there & (~sight.closed | over)
-        travel[done], turn[done], grip[done] = 0.0, 0.0, -1.0
-        return tool_actions(travel, turn, grip)
-
-    def reset(self, rows: Sequence[int] | None = None) -> None:
-        """Nothing to forget."""
+    sight, goal = Sight(take), 0.2 * take("goal_dx", "goal_dy")
+    travel, turn, grip = grasp(sight)
+    over = np.hypot(goal[:, 0], goal[:, 1]) < 0.006
+    travel[sight.holding] = carry(sight, goal, over)[sight.holding]
+    there = (np.hypot(goal[:, 0], goal[:, 1]) < 0.015) & (sight.lift < PUT_DOWN)
+    done = there & (~sight.closed | over)
+    travel[done], turn[done], grip[done] = 0.0, 0.0, -1.0
+    return tool_actions(travel, turn, grip)
 
 
 def carry(sight: Sight, goal: Array, over: Flags) -> Array:
@@ -175,12 +139,12 @@ def carry(sight: Sight, goal: Array, over: Flags) -> Array:
     return travel
 
 
-SCRIPTED: dict[str, Any] = {
-    "bam/reach-v0": ScriptedReach,
-    "bam/pick-v0": ScriptedPick,
-    "bam/pick-place-v0": ScriptedPickPlace,
+SCRIPTED: dict[str, tuple[type[ReachTask | PickTask], Callable[[Take], Floats]]] = {
+    "bam/reach-v0": (ReachTask, reach),
+    "bam/pick-v0": (PickTask, pick),
+    "bam/pick-place-v0": (PickPlaceTask, pick_place),
 }
-"""The scripted policy of each environment that has one."""
+"""The task, and what makes its actions, of each environment that has a scripted policy."""
 
 
 def scripted_policy(env_id: str) -> ScriptedPolicy:
@@ -194,5 +158,5 @@ def scripted_policy(env_id: str) -> ScriptedPolicy:
         raise InvalidValue(f"{env_id} has no scripted policy. These have one: {', '.join(SCRIPTED)}.")
     if env_id not in SCRIPTED:
         raise UnknownName("scripted policy", env_id, SCRIPTED)
-    policy: ScriptedPolicy = SCRIPTED[env_id]()
-    return policy
+    task, act = SCRIPTED[env_id]
+    return ScriptedPolicy(task.observation_labels, act)

@@ -70,7 +70,6 @@ class ToolControl(TaskMemory):
         self.closed[env_ids] = False
 
     def _go_on(self, env_ids: EnvIds, joints: Array) -> None:
-        """The next targets begin at `joints` (k, 6) [rad] of these environments."""
         position, x_axis = GEOMETRY.tool_pose(joints)
         self.target, self.yaw, self._joints = self.target.copy(), self.yaw.copy(), self._joints.copy()
         self.target[env_ids], self.yaw[env_ids] = position, np.arctan2(x_axis[:, 1], x_axis[:, 0])
@@ -92,20 +91,15 @@ class ToolControl(TaskMemory):
         if len(held):
             self._go_on(held, sent[held])
         moves: Array = np.clip(action, -1.0, 1.0).astype(np.float64)
-        travel = self._travel(moves[:, :3] * TOOL_STEP, tool)
+        target = np.clip(self.target + moves[:, :3] * TOOL_STEP, tool - LEASH, tool + LEASH)
+        travel = np.clip(target, WORKSPACE[0], WORKSPACE[1]) - self.target
+        length = np.sqrt(np.einsum("ij,ij->i", travel, travel))
+        travel = travel * np.minimum(1.0, TOOL_STEP / np.maximum(length, 1e-9))[:, None]
         turn = np.clip(self.yaw + moves[:, 3] * YAW_STEP, -YAW_LIMIT, YAW_LIMIT) - self.yaw
         self._move(travel, turn)
         self.closed = action[:, 4] > 0
         width = np.where(self.closed, 0.0, GRIPPER_OPEN)
         return np.concatenate([self._joints, width[:, None]], axis=1)
-
-    def _travel(self, step: Array, tool: Array) -> Array:
-        """How far the target goes: inside the workspace, near the measured tool, at most TOOL_STEP."""
-        target = np.clip(self.target + step, tool - LEASH, tool + LEASH)
-        travel = np.clip(target, WORKSPACE[0], WORKSPACE[1]) - self.target
-        length = np.sqrt(np.einsum("ij,ij->i", travel, travel))
-        slow: Array = travel * np.minimum(1.0, TOOL_STEP / np.maximum(length, 1e-9))[:, None]
-        return slow
 
     def _move(self, travel: Array, turn: Array) -> None:
         """Move target and joints by as much of `travel` and `turn` as the joint speed allows."""

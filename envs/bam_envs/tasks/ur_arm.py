@@ -10,18 +10,30 @@ follows it a little later. So simulated and live arms get the same set points.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from gymnasium import spaces
+from msgspec import Meta
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.kinematics import LINKS, quaternions
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import Array, Flags, Floats, Label, TaskMemory, as_objects, draw_seeds, labelled_box
+from bam_envs.core.task import (
+    Array,
+    Flags,
+    Floats,
+    Label,
+    TaskMemory,
+    as_objects,
+    draw_seeds,
+    finite_numbers,
+    labelled_box,
+)
 from bam_envs.robots.ur import DEFAULT_MODEL, JOINTS, UrModel
 from bam_envs.robots.ur import ur_model as model_called
 
+AboveZero = Annotated[float, Meta(gt=0)]
 SHORTEST = 0.5
 """Shortest time that a trajectory takes [s]."""
 LEASH = 0.2
@@ -46,6 +58,9 @@ class UrTask(TaskMemory):
         fix_wrist_2: See above.
         fix_wrist_3: See above; it turns the flange about its own axis.
         rs_state_to_info: Put robo-gym's robot server state into info["rs_state"], a dict of floats.
+
+    Raises:
+        InvalidValue: All joints are fixed.
     """
 
     reset_options: tuple[str, ...] = ("joint_positions",)
@@ -55,6 +70,8 @@ class UrTask(TaskMemory):
     """Share of the fastest speed that the joints go at."""
     max_steps: int
     """Steps of an episode."""
+    action_meaning = ("where the joint is to be", "rad", "/ its limit")
+    """Meaning, unit and scale of each number of an action."""
 
     def __init__(
         self,
@@ -70,8 +87,13 @@ class UrTask(TaskMemory):
         rs_state_to_info: bool = False,
     ) -> None:
         fixed = (fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3)
+        if all(fixed):
+            raise InvalidValue(
+                "At least one of the six joints must be free to move: set one of the fix_ options False."
+            )
         self.num_envs, self.model, self.rs_state_to_info = num_envs, model_called(ur_model), rs_state_to_info
-        self.control = UrControl(self.model, num_envs, self.rate, self.velocity_scale, fixed)
+        self.free = np.flatnonzero(~np.array(fixed, dtype=bool))
+        """Places of the joints that are in the action."""
         self.action_labels = self._action_labels()
         self.observation_labels = self._observation_labels()
         self.action_space: spaces.Box = labelled_box(self.action_labels)
@@ -80,7 +102,7 @@ class UrTask(TaskMemory):
         """Steps since each episode began. Shape: (n,)."""
 
     def _action_labels(self) -> tuple[Label, ...]:
-        return self.control.labels("where the joint is to be", "rad", "/ its limit")
+        return tuple(Label(JOINTS[joint], *self.action_meaning) for joint in self.free)
 
     def _observation_labels(self) -> tuple[Label, ...]:
         raise NotImplementedError
@@ -93,6 +115,27 @@ class UrTask(TaskMemory):
         """See `observation_labels`. Shape: (n, k) float32."""
         observation = np.concatenate(self._columns(state), axis=1).astype(np.float32)
         return np.clip(observation, self.observation_space.low, self.observation_space.high)
+
+    def full_action(self, action: Floats, held: Array | float = 0.0) -> Array:
+        """The action of all joints, cut to [-1, 1]: `action` of the free ones (n, a), `held` of the fixed ones.
+
+        Shape: (n, 6).
+        """
+        full = np.empty((self.num_envs, 6))
+        full[:] = held
+        full[:, self.free] = np.clip(action, -1.0, 1.0)
+        return full
+
+    def toward(self, target: Array, state: RobotState) -> Array:
+        """The set points one period on the way from the last ones in `state` to `target`. Shape: (n, 6) [rad] both."""
+        measured, sent = state.signals["joint_position"], state.command
+        joints = np.where(np.abs(sent - measured).max(axis=1, keepdims=True) <= LEASH, sent, measured)
+        way = target - joints
+        speed = self.velocity_scale * self.model.max_velocity
+        duration = np.maximum((np.abs(way) / speed).max(axis=1), SHORTEST)
+        step = way * ((1.0 / self.rate) / duration)[:, None]
+        command: Array = np.clip(joints + step, *self.model.joint_limits)
+        return command
 
     def initial(self, joints: Array, rngs: Sequence[np.random.Generator], **signals: Array) -> Initial:
         """Start at `joints` (k, 6) [rad]; each generator draws the seed of its robot now."""
@@ -118,71 +161,6 @@ class UrTask(TaskMemory):
     def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
         """Nothing to draw beyond the scene."""
         return []
-
-
-class UrControl:
-    """Actions and commands of n arms.
-
-    Args:
-        model: Which arm.
-        num_envs: How many.
-        rate: Commands a second [Hz].
-        velocity_scale: Share of the fastest speed that joints go at.
-        fixed: Which joints are not in the action; six of them.
-
-    Raises:
-        InvalidValue: All joints are fixed.
-    """
-
-    def __init__(
-        self, model: UrModel, num_envs: int, rate: float, velocity_scale: float, fixed: Sequence[bool] = (False,) * 6
-    ) -> None:
-        if all(fixed):
-            raise InvalidValue(
-                "At least one of the six joints must be free to move: set one of the fix_ options False."
-            )
-        self.model, self.num_envs = model, num_envs
-        self.free = np.flatnonzero(~np.array(fixed, dtype=bool))
-        """Places of the joints that are in the action."""
-        self._rate, self._speed = rate, velocity_scale * model.max_velocity
-        self._low, self._high = model.joint_limits
-
-    def labels(self, meaning: str, unit: str, scale: str) -> tuple[Label, ...]:
-        """One label for each free joint."""
-        return tuple(Label(JOINTS[joint], meaning, unit, scale) for joint in self.free)
-
-    def full(self, action: Floats, held: Array | float = 0.0) -> Array:
-        """The action of all joints, cut to [-1, 1].
-
-        Args:
-            action: Of the free joints. Shape: (n, a).
-            held: Of the fixed ones, in the action's units. Shape: (n, 6) or a number.
-
-        Returns:
-            Shape: (n, 6).
-        """
-        full = np.empty((self.num_envs, 6))
-        full[:] = held
-        full[:, self.free] = np.clip(action, -1.0, 1.0)
-        return full
-
-    def command(self, target: Array, state: RobotState) -> Array:
-        """The set points one period on the way to `target`.
-
-        Args:
-            target: Joint positions [rad]. Shape: (n, 6).
-            state: What is measured now, and what was sent last.
-
-        Returns:
-            Joint positions [rad]. Shape: (n, 6).
-        """
-        measured, sent = state.signals["joint_position"], state.command
-        joints = np.where(np.abs(sent - measured).max(axis=1, keepdims=True) <= LEASH, sent, measured)
-        way = target - joints
-        duration = np.maximum((np.abs(way) / self._speed).max(axis=1), SHORTEST)
-        step = way * ((1.0 / self._rate) / duration)[:, None]
-        command: Array = np.clip(joints + step, self._low, self._high)
-        return command
 
 
 def collisions(state: RobotState) -> Flags:
@@ -219,52 +197,20 @@ def joint_labels(prefix: str, meaning: str, unit: str, scale: str, bound: float 
     return tuple(Label(f"{prefix}{joint}", meaning, unit, scale, -bound, bound) for joint in JOINTS)
 
 
-def joint_option(options: Mapping[str, Any], name: str, default: Sequence[float], model: UrModel) -> Array:
-    """Joint positions [rad] that a reset option gives, else `default`. Shape: (6,).
+def joint_option(options: Mapping[str, Any], default: Sequence[float], model: UrModel) -> Array:
+    """Joint positions [rad] that the reset option ``joint_positions`` gives, else `default`. Shape: (6,).
 
     Raises:
         InvalidValue: They are not six finite numbers inside the joint limits.
     """
-    joints = number_option(options, name, default, 6)
-    low, high = model.joint_limits
-    for label, value, least, most in zip(JOINTS, joints, low, high, strict=True):
+    given = options.get("joint_positions")
+    joints = finite_numbers(default if given is None else given, 6, "The reset option joint_positions")
+    for label, value, least, most in zip(JOINTS, joints, *model.joint_limits, strict=True):
         if not least <= value <= most:
             raise InvalidValue(
-                f"The reset option {name} has {label} at {value:g} rad, outside {least:.4g} to {most:.4g} rad."
+                f"The reset option joint_positions has {label} at {value:g} rad, outside {least:.4g} to {most:.4g} rad."
             )
     return joints
-
-
-def number_option(
-    options: Mapping[str, Any], name: str, default: Sequence[float], size: int, kind: str = "reset option"
-) -> Array:
-    """The numbers that an option of `kind` gives, else `default`. Shape: (size,).
-
-    Raises:
-        InvalidValue: They are not `size` finite numbers.
-    """
-    given = options.get(name)
-    if given is None:
-        return np.array(default, dtype=np.float64)
-    try:
-        numbers = np.array(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        numbers = np.array(np.nan)
-    if numbers.shape != (size,) or not np.isfinite(numbers).all():
-        raise InvalidValue(f"The {kind} {name} must be {size} finite numbers, not {given!r}.")
-    return numbers
-
-
-def flag_option(options: Mapping[str, Any], name: str) -> bool:
-    """Whether a reset option is given and True.
-
-    Raises:
-        InvalidValue: It is neither True nor False.
-    """
-    given = options.get(name)
-    if given is None or isinstance(given, (bool, np.bool_)):
-        return bool(given)
-    raise InvalidValue(f"The reset option {name} must be True or False, not {given!r}.")
 
 
 def frame_keys(frame: str) -> tuple[str, ...]:

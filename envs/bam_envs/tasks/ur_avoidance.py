@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import Array, Flags, Floats, Label, Score
+from bam_envs.core.task import Array, Flags, Floats, Label, Score, finite_numbers
 from bam_envs.robots.physics.obstacles import wave_signals
 from bam_envs.tasks.ur_arm import (
     FOREARM,
@@ -22,7 +22,6 @@ from bam_envs.tasks.ur_arm import (
     joint_labels,
     joint_option,
     normalised,
-    number_option,
     spherical,
     wire_states,
 )
@@ -85,6 +84,7 @@ class UrObstacleTask(UrTask):
 
     rate, velocity_scale, max_steps = 20.0, 0.2, 1000
     reset_options = ("joint_positions", "fixed_object_position")
+    action_meaning = ("joint target beside the reference", "rad", "1")
     memory: Mapping[str, str] = {"reference": "reference", "steps": "elapsed", "last_action": "_last_action"}
 
     def __init__(
@@ -97,14 +97,11 @@ class UrObstacleTask(UrTask):
     ) -> None:
         self.include_polar_to_elbow = include_polar_to_elbow
         super().__init__(num_envs, **options)
-        self._place = _place({"fixed_object_position": fixed_object_position}, kind="option")
+        self._place = _place(fixed_object_position)
         self.reference = np.zeros((num_envs, 6))
         """Joint positions to keep to [rad]. Shape: (n, 6)."""
         self._last_action = np.zeros((num_envs, 6))
         self._sense: ObstacleSense | None = None
-
-    def _action_labels(self) -> tuple[Label, ...]:
-        return self.control.labels("joint target beside the reference", "rad", "1")
 
     def _observation_labels(self) -> tuple[Label, ...]:
         return (
@@ -122,8 +119,9 @@ class UrObstacleTask(UrTask):
         Returns:
             Joint positions [rad], shape (k, 6), and where the obstacle stays [m], shape (k, 3), or None if it moves.
         """
-        start = joint_option(options, "joint_positions", joints.tolist(), self.model)
-        place = _place(options, self._place)
+        start = joint_option(options, joints.tolist(), self.model)
+        place = _place(options.get("fixed_object_position"))
+        place = self._place if place is None else place
         self._last_action[env_ids] = 0.0
         stays = None if place is None else np.tile(place, (len(env_ids), 1))
         return np.tile(start, (len(env_ids), 1)), stays
@@ -145,14 +143,14 @@ class UrObstacleTask(UrTask):
 
     def command(self, action: Floats, state: RobotState) -> Array:
         """One period on the way to the reference plus `action` [rad]; fixed joints keep to it. Shape: (n, 6)."""
-        return self.control.command(self.reference + self.control.full(action), state)
+        return self.toward(self.reference + self.full_action(action), state)
 
     def effort(self, action: Floats, weight: float, rapid: float) -> Array:
         """Worth of acting little, and the price of each joint whose action jumps by more than `rapid`. Shape: (n,).
 
         It also notes the action as the last one.
         """
-        full = self.control.full(action)
+        full = self.full_action(action)
         jumps = (np.abs(full - self._last_action) > rapid).sum(axis=1)
         self._last_action = full
         effort: Array = (weight * (1 - np.einsum("ij,ij->i", full, full) / 6) - 0.2 * jumps) / 1000
@@ -184,17 +182,9 @@ class UrObstacleTask(UrTask):
         """The flange at the reference; the robot shows the obstacle."""
         return [(self.model.geometry.flange_pose(self.reference[:1])[0][0], (0.1, 0.7, 0.3, 0.6))]
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go to what `state_dict` returned."""
-        super().load_state_dict(state)
-        self._sense = None
 
-
-def _place(options: Mapping[str, Any], default: Array | None = None, kind: str = "reset option") -> Array | None:
-    """Where the obstacle stays [m], or None where nothing says so. Shape: (3,)."""
-    if options.get("fixed_object_position") is None:
-        return default
-    return number_option(options, "fixed_object_position", (), 3, kind)
+def _place(given: Any) -> Array | None:
+    return None if given is None else finite_numbers(given, 3, "fixed_object_position")
 
 
 class UrAvoidanceTask(UrObstacleTask):
@@ -240,12 +230,13 @@ class UrAvoidanceTask(UrObstacleTask):
 
     def score(self, state: RobotState, action: Floats) -> Score:
         """Staying at the pose, acting little and smoothly, away from the obstacle."""
-        reward = self._staying(state) + self.effort(action, weight=1.0, rapid=RAPID)
+        off, gate = self.spread(state)
+        reward = np.where(gate < SPREAD, (1 - off / SPREAD) / 1000, 0.0)
+        reward = reward + self.effort(action, weight=1.0, rapid=RAPID)
         reward = reward - 0.002 * (self.sense(state).nearest < NEAREST)
         return self.scored(state, reward, self.collision_reward)
 
-    def _staying(self, state: RobotState) -> Array:
-        """Worth of being at the pose. Shape: (n,)."""
+    def spread(self, state: RobotState) -> tuple[Array, Array]:
+        """How far the joints are off the pose, and what must be below `SPREAD` to be worth it. Shape: (n,) each."""
         off = np.abs(self.offset(state)).sum(axis=1)
-        staying: Array = np.where(off < SPREAD, (1 - off / SPREAD) / 1000, 0.0)
-        return staying
+        return off, off

@@ -54,7 +54,7 @@ class UrEmptyTask(UrTask):
         self, env_ids: EnvIds, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] | None = None
     ) -> Initial:
         """The start pose, or what the options say."""
-        joints = joint_option(options or {}, "joint_positions", START, self.model)
+        joints = joint_option(options or {}, START, self.model)
         return self.initial(np.tile(joints, (len(env_ids), 1)), rngs)
 
     def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
@@ -68,7 +68,7 @@ class UrEmptyTask(UrTask):
 
     def command(self, action: Floats, state: RobotState) -> Array:
         """Joint positions [rad] on the way to the action's. Shape: (n, 6)."""
-        return self.control.command(self.control.full(action, self._held) * self.model.joint_limits[1], state)
+        return self.toward(self.full_action(action, self._held) * self.model.joint_limits[1], state)
 
     def score(self, state: RobotState, action: Floats) -> Score:
         """Nothing is better than anything else; a collision ends the episode."""

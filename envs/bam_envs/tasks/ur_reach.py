@@ -9,17 +9,17 @@ import numpy as np
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import Array, Flags, Floats, Label, Score
+from bam_envs.core.task import Array, Flags, Floats, Label, Score, finite_numbers
+from bam_envs.core.validation import check
 from bam_envs.robots.ur import UrModel
 from bam_envs.tasks.ur_arm import (
+    AboveZero,
     UrTask,
     collisions,
-    flag_option,
     in_frame,
     joint_labels,
     joint_option,
     normalised,
-    number_option,
     wire_states,
 )
 
@@ -78,6 +78,10 @@ class UrReachTask(UrTask):
     rate, velocity_scale, max_steps = 10.0, 0.1, 300
     reset_options = ("joint_positions", "ee_target_pose", "randomize_start", "continue_on_success")
     start: tuple[float, ...] = START
+    forgets_success = True
+    """Whether ``continue_on_success`` looks at the last episode only."""
+    must_be_in_reach = True
+    """Whether a target that the arm cannot reach is refused."""
     memory: Mapping[str, str] = {
         "target": "target",
         "elapsed": "elapsed",
@@ -99,11 +103,10 @@ class UrReachTask(UrTask):
         modular: bool = False,
         **options: Any,
     ) -> None:
-        if not ee_distance_threshold > 0:
-            raise InvalidValue(f"ee_distance_threshold must be above 0 m, not {ee_distance_threshold!r}.")
+        self._near = check(ee_distance_threshold, AboveZero, "ee_distance_threshold [m]")
         self.modular = modular
         super().__init__(num_envs, **options)
-        self._near, self._restrict = ee_distance_threshold, restrict_wrist_1 and _WRIST_1 in self.control.free
+        self._restrict = restrict_wrist_1 and _WRIST_1 in self.free
         self.target = np.zeros((num_envs, 3))
         """Where the flange is to be [m]. Shape: (n, 3)."""
         self._held = np.zeros((num_envs, 6))  # normalised start, where fixed joints stay
@@ -130,45 +133,41 @@ class UrReachTask(UrTask):
         )
 
     def _seen_actions(self) -> Any:
-        """The joints whose last action is observed."""
-        return self.control.free if self.modular else range(6)
+        return self.free if self.modular else range(6)
 
     def sample_initial(
         self, env_ids: EnvIds, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] | None = None
     ) -> Initial:
         """The start pose, or what the options say; a target in the workspace."""
         options = self._defaults | {name: value for name, value in (options or {}).items() if value is not None}
-        joints = np.tile(joint_option(options, "joint_positions", self.start, self.model), (len(env_ids), 1))
-        target, randomize = self._given_target(options), flag_option(options, "randomize_start")
+        randomize, goes_on = (
+            check(options[name], bool, f"reset option {name}") for name in ("randomize_start", "continue_on_success")
+        )
+        joints = np.tile(joint_option(options, self.start, self.model), (len(env_ids), 1))
+        target = self._given_target(options)
         for k, (env, rng) in enumerate(zip(env_ids, rngs, strict=True)):
             if randomize:
                 joints[k] = np.clip(joints[k] + rng.uniform(-1.0, 1.0, 6) * START_OFFSET, *self.model.joint_limits)
             self.target[env] = workspace_point(self.model, rng) if target is None else target
-        if flag_option(options, "continue_on_success"):
+        if goes_on:
             joints = np.where(self._continues[env_ids, None], self._last_end[env_ids], joints)
-        self._forget_success(env_ids)
+        if self.forgets_success:
+            self._continues[env_ids] = False
         return self.initial(joints, rngs)
-
-    def _forget_success(self, env_ids: EnvIds) -> None:
-        self._continues[env_ids] = False
 
     def _given_target(self, options: Mapping[str, Any]) -> Array | None:
         """The place that ``ee_target_pose`` gives [m]; None where a place is drawn. Shape: (3,)."""
         if options.get("ee_target_pose") is None:
             return None
-        target = number_option(options, "ee_target_pose", (), 6)[:3]
-        self._require_reach(target)
-        return target
-
-    def _require_reach(self, target: Array) -> None:
+        target = finite_numbers(options["ee_target_pose"], 6, "ee_target_pose")[:3]
         shape = self.model.geometry
         reach = abs(shape.a2) + abs(shape.a3) + float(np.linalg.norm([shape.d4, shape.d5, shape.d6])) + self._near
         far = float(np.linalg.norm(target - [0.0, 0.0, shape.d1]))
-        if far > reach:
+        if far > reach and self.must_be_in_reach:
             raise InvalidValue(
-                f"The reset option ee_target_pose is {far:.3g} m from the shoulder of a {self.model.name}, "
-                f"which reaches {reach:.3g} m."
+                f"ee_target_pose is {far:.3g} m from the shoulder of a {self.model.name}, which reaches {reach:.3g} m."
             )
+        return target
 
     def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
         """Fixed joints stay where they are measured."""
@@ -191,13 +190,13 @@ class UrReachTask(UrTask):
 
     def command(self, action: Floats, state: RobotState) -> Array:
         """Joint positions [rad] on the way to the action's. Shape: (n, 6)."""
-        full = self.control.full(action, self._held)
+        full = self.full_action(action, self._held)
         self._actions = np.stack([full, self._actions[0]])
         goal: Array = full * self.model.joint_limits[1]
         if self._restrict:
             low, high = WRIST_1_RANGE
             goal[:, _WRIST_1] = (full[:, _WRIST_1] + 1.0) * (high - low) / 2.0 + low
-        return self.control.command(goal, state)
+        return self.toward(goal, state)
 
     def score(self, state: RobotState, action: Floats) -> Score:
         """Nearer is better; arriving ends the episode, and so does a collision."""

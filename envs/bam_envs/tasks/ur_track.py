@@ -9,19 +9,18 @@ from __future__ import annotations
 import json
 import stat
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
-from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from msgspec import Meta
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.splines import splines_through
 from bam_envs.core.task import Array, Flags, Floats, Label, Score
+from bam_envs.core.validation import Finite, check
 from bam_envs.robots.physics.obstacles import PATH_POINTS
 from bam_envs.tasks.ur_arm import joint_labels, normalised
 from bam_envs.tasks.ur_avoidance import COLLISION, UrObstacleTask
@@ -30,6 +29,9 @@ RECORDED = "ur_track.json"
 """The trajectory that is shipped; ``scripts/make_ur_track.py`` makes it."""
 _MOST_BYTES = 2**24
 """Size of a file at most: which file it is may come from a stranger's checkpoint."""
+_Waypoint = Annotated[tuple[Finite, Finite, Finite, Finite, Finite, Finite], Meta(description="six joint positions")]
+_Segment = Annotated[list[_Waypoint], Meta(min_length=1, description="a list of waypoints")]
+_Segments = Annotated[list[_Segment], Meta(min_length=1, description="a list of segments")]
 NEAREST = 0.45
 """Distance of the obstacle from flange or elbow that costs [m]."""
 RAPID = 0.4
@@ -135,7 +137,7 @@ class UrTrackTask(UrObstacleTask):
         **options: Any,
     ) -> None:
         super().__init__(num_envs, include_polar_to_elbow=include_polar_to_elbow, **options)
-        self.trajectory = load_trajectory(trajectory, self.model.joint_limits)
+        self._waypoints, self._lengths = load_trajectory(trajectory, self.model.joint_limits)
         self.fixed_paths = fixed_paths
         self.segment, self.step_in_segment = np.zeros(num_envs, dtype=np.int64), np.zeros(num_envs, dtype=np.int64)
         """Which segment is followed, and how many steps of it have been. Shape: (n,)."""
@@ -158,19 +160,18 @@ class UrTrackTask(UrObstacleTask):
         """The first waypoint, and an obstacle on a path or staying."""
         self._episodes[env_ids] += 1
         self.segment[env_ids] = self.step_in_segment[env_ids] = self.targets_reached[env_ids] = 0
-        self.reference[env_ids], self.waits[env_ids] = self.trajectory.waypoints[0, 0], False
-        joints, place = self.begin(env_ids, options or {}, self.trajectory.waypoints[0, 0])
-        obstacle = self._paths(env_ids, rngs) if place is None else {"obstacle_position": place}
-        return self.initial(joints, rngs, **obstacle)
-
-    def _paths(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> dict[str, Array]:
+        self.reference[env_ids], self.waits[env_ids] = self._waypoints[0, 0], False
+        joints, place = self.begin(env_ids, options or {}, self._waypoints[0, 0])
+        if place is not None:
+            return self.initial(joints, rngs, obstacle_position=place)
         if self.fixed_paths:
             paths = [fixed_path(number) for number in self._path_numbers(env_ids, rngs)]
             samples = [FIXED_AROUND] * len(paths)
         else:
             samples = [int(rng.uniform(*AROUND)) for rng in rngs]
             paths = [draw_path(rng, around) for rng, around in zip(rngs, samples, strict=True)]
-        return {"obstacle_path": np.stack(paths), "obstacle_samples": np.array(samples, dtype=np.float64)}
+        around = np.array(samples, dtype=np.float64)
+        return self.initial(joints, rngs, obstacle_path=np.stack(paths), obstacle_samples=around)
 
     def _path_numbers(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> list[int]:
         """Which of the fixed paths the obstacles are on."""
@@ -183,7 +184,9 @@ class UrTrackTask(UrObstacleTask):
     def command(self, action: Floats, state: RobotState) -> Array:
         """One period on the way to the next waypoint plus `action` [rad]. Shape: (n, 6)."""
         self.step_in_segment = self.step_in_segment + 1
-        self.reference, self.waits = self.trajectory.at(self.segment, self.step_in_segment)
+        lengths = self._lengths[self.segment]
+        self.reference = self._waypoints[self.segment, np.minimum(self.step_in_segment, lengths - 1)]
+        self.waits = self.step_in_segment >= lengths
         return super().command(action, state)
 
     def score(self, state: RobotState, action: Floats) -> Score:
@@ -204,96 +207,51 @@ class UrTrackTask(UrObstacleTask):
         joints = state.signals["joint_position"]
         near = np.abs(self.reference - joints) <= ARRIVED + 1e-5 * np.abs(joints)  # as NumPy's isclose has it
         reached: Flags = self.waits & near.all(axis=1)
-        self.segment = np.where(reached, (self.segment + 1) % len(self.trajectory.lengths), self.segment)
+        self.segment = np.where(reached, (self.segment + 1) % len(self._lengths), self.segment)
         self.step_in_segment = np.where(reached, 0, self.step_in_segment)
         self.targets_reached = self.targets_reached + reached
         return reached
 
 
-@dataclass(frozen=True)
-class JointTrajectory:
-    """Segments of waypoints; after the last segment comes the first."""
-
-    waypoints: Array
-    """Joint positions [rad]; short segments are filled up with their last waypoint. Shape: (segments, longest, 6)."""
-    lengths: EnvIds
-    """Waypoints of each segment. Shape: (segments,)."""
-
-    def at(self, segment: EnvIds, step: EnvIds) -> tuple[Array, NDArray[np.bool_]]:
-        """Waypoints, and whether they wait at the end of their segment. Shapes: (n,) each -> (n, 6), (n,)."""
-        end = step >= self.lengths[segment]
-        return self.waypoints[segment, np.minimum(step, self.lengths[segment] - 1)], end
-
-
-def load_trajectory(file: str | Path | None, limits: Array) -> JointTrajectory:
-    """The trajectory in `file`, or the shipped one.
+def load_trajectory(file: str | Path | None, limits: Array) -> tuple[Array, EnvIds]:
+    """The trajectory in `file`, or the shipped one: segments of waypoints; after the last segment comes the first.
 
     Args:
         file: A JSON file of robo-gym's form.
         limits: Lowest and highest joint positions [rad]. Shape: (2, 6).
+
+    Returns:
+        Joint positions [rad], short segments filled up with their last waypoint, shape (segments, longest, 6), and how
+        many waypoints each segment has, shape (segments,).
 
     Raises:
         InvalidValue: There is no such file, or no trajectory of six joints inside their limits in it.
     """
     if not isinstance(file, (str, Path, type(None))):
         raise InvalidValue(f"The trajectory must be the path of a JSON file, not {file!r}.")
-    segments = _shipped() if file is None else _read(Path(file).expanduser())
-    for number, segment in enumerate(segments):
-        outside = (segment < limits[0]) | (segment > limits[1])
-        if outside.any():
-            step, joint = np.argwhere(outside)[0]
-            raise InvalidValue(
-                f"Segment {number} of the trajectory has joint {joint} at {segment[step, joint]:g} rad in waypoint "
-                f"{step}; expected {limits[0, joint]:g} to {limits[1, joint]:g}."
-            )
-    longest = max(len(segment) for segment in segments)
-    filled = [np.pad(one, ((0, longest - len(one)), (0, 0)), mode="edge") for one in segments]
-    return JointTrajectory(np.stack(filled), np.array([len(one) for one in segments], dtype=np.int64))
-
-
-@lru_cache(maxsize=1)
-def _shipped() -> list[Array]:
-    text = (resources.files("bam_envs.tasks") / "data" / RECORDED).read_text(encoding="utf-8")
-    return _segments(json.loads(text), RECORDED)
-
-
-def _read(file: Path) -> list[Array]:
+    path = Path(__file__).parent / "data" / RECORDED if file is None else Path(file).expanduser()
     try:
-        text = _bounded(file)
+        found = path.stat()
+        if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):  # reading a folder fails by itself
+            raise InvalidValue(f"The trajectory {path} is no plain file; expected one in JSON.")
+        if found.st_size > _MOST_BYTES:
+            raise InvalidValue(f"The trajectory {path} has {found.st_size} bytes, expected at most {_MOST_BYTES}.")
+        text = path.read_bytes()
     except OSError as error:
-        raise InvalidValue(f"The trajectory {file} cannot be read: {error.strerror}.") from error
+        raise InvalidValue(f"The trajectory {path} cannot be read: {error.strerror}.") from error
     try:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise InvalidValue(f"The trajectory {file} is not JSON: {error}.") from error
-    return _segments(content, str(file))
-
-
-def _bounded(file: Path) -> bytes:
-    found = file.stat()
-    if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):  # reading a folder fails by itself
-        raise InvalidValue(f"The trajectory {file} is no plain file; expected one in JSON.")
-    if found.st_size > _MOST_BYTES:
-        raise InvalidValue(f"The trajectory {file} has {found.st_size} bytes, expected at most {_MOST_BYTES}.")
-    return file.read_bytes()
-
-
-def _segments(content: Any, name: str) -> list[Array]:
-    segments = content.get("trajectory") if isinstance(content, dict) else None
-    if not isinstance(segments, list) or not segments:
-        raise InvalidValue(f'The trajectory {name} has no list of segments under the key "trajectory".')
-    return [
-        _segment(waypoints, f"Segment {number} of the trajectory {name}") for number, waypoints in enumerate(segments)
-    ]
-
-
-def _segment(waypoints: Any, what: str) -> Array:
-    try:
-        array = np.array(waypoints, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InvalidValue(f"{what} is not a list of waypoints of six numbers each.") from error
-    if array.ndim != 2 or array.shape[1] != 6 or len(array) == 0:
-        raise InvalidValue(f"{what} must have shape (waypoints, 6), not {array.shape}.")
-    if not np.isfinite(array).all():
-        raise InvalidValue(f"{what} must be finite numbers.")
-    return array
+        raise InvalidValue(f"The trajectory {path} is not JSON: {error}.") from error
+    name = f"The trajectory {path}"
+    segments = check(check(content, dict[str, Any], name).get("trajectory"), _Segments, f"{name}: trajectory")
+    longest = max(len(segment) for segment in segments)
+    waypoints = np.array([[*segment, *segment[-1:] * (longest - len(segment))] for segment in segments])
+    outside = np.argwhere((waypoints < limits[0]) | (waypoints > limits[1]))
+    if len(outside):
+        number, step, joint = outside[0]
+        raise InvalidValue(
+            f"Segment {number} of the trajectory has joint {joint} at {waypoints[number, step, joint]:g} rad in "
+            f"waypoint {step}; expected {limits[0, joint]:g} to {limits[1, joint]:g}."
+        )
+    return waypoints, np.array([len(segment) for segment in segments], dtype=np.int64)

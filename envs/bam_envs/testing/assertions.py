@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any
 from unittest import mock
@@ -32,34 +31,14 @@ def raised(kind: type[Exception], act: Callable[[], Any]) -> Exception:
     raise AssertionError(f"{kind.__name__} was not raised")
 
 
-def in_thread(act: Callable[[], None]) -> None:
-    """Run `act` in another thread; it must not raise."""
-    errors: list[BaseException] = []
-
-    def run() -> None:
-        try:
-            act()
-        except Exception as error:
-            errors.append(error)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    thread.join()
-    assert not errors, f"raised in another thread: {errors[0]!r}"
-
-
-def assert_same_state(one: RobotState, two: RobotState) -> None:
-    """All environments are equal, number by number."""
-    assert_same_environments(one, two, list(range(len(one.stamp))))
-
-
-def assert_same_environments(one: RobotState, two: RobotState, env_ids: list[int]) -> None:
-    """These environments are equal, number by number."""
+def assert_same_state(one: RobotState, two: RobotState, env_ids: Sequence[int] | None = None) -> None:
+    """These environments, or all, are equal, number by number."""
+    chosen = np.arange(len(one.stamp)) if env_ids is None else np.array(env_ids)
     assert list(one.signals) == list(two.signals)
     for name, array in one.signals.items():
-        np.testing.assert_array_equal(array[env_ids], two.signals[name][env_ids], err_msg=name)
-    np.testing.assert_array_equal(one.stamp[env_ids], two.stamp[env_ids], err_msg="stamp")
-    np.testing.assert_array_equal(one.command[env_ids], two.command[env_ids], err_msg="command")
+        np.testing.assert_array_equal(array[chosen], two.signals[name][chosen], err_msg=name)
+    np.testing.assert_array_equal(one.stamp[chosen], two.stamp[chosen], err_msg="stamp")
+    np.testing.assert_array_equal(one.command[chosen], two.command[chosen], err_msg="command")
 
 
 def assert_same_tree(one: Any, two: Any, name: str = "state_dict") -> None:

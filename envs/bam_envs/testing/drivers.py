@@ -112,7 +112,7 @@ class DrivenRobot:
         return self.measure()
 
     def _driven(self, command: Array) -> Array:
-        """What the robot is told when the driver is told `command` (1, m)."""
+        """What the robot is told when the driver is told `command`. Shape: (1, m) both."""
         if not self._begins - _ROUNDING <= self.now < self._ends - _ROUNDING:
             return command
         if self._fault == "delay":

@@ -1,13 +1,11 @@
-"""The contract test for robots of one's own.
-
-Longer than other modules because the contract is one list of promises.
-"""
+"""The contract test for robots of one's own: one list of promises."""
 
 from __future__ import annotations
 
 import copy
 import math
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from unittest import SkipTest
 
@@ -15,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue
-from bam_envs.core.robot import EnvIds, Initial, Robot, RobotSpec, RobotState, SignalSpec
-from bam_envs.testing.assertions import assert_same_environments, assert_same_state, in_thread, no_io, raised
+from bam_envs.core.robot import EnvIds, Initial, Robot, RobotSpec, RobotState
+from bam_envs.testing.assertions import assert_same_state, no_io, raised
 
 Array = NDArray[np.float64]
 ARM_HOME = np.array([-0.27, -1.54, 1.89, -1.93, -1.57, -1.84])
@@ -82,7 +80,13 @@ class RobotContract:
         names = [signal.name for signal in spec.signals]
         assert len(set(names)) == len(names), f"signal names repeat: {names}"
         for signal in (*spec.signals, spec.command):
-            _check_signal(signal)
+            size = len(signal.labels)
+            assert size > 0, f"{signal.name} has no labels"
+            assert len(signal.units) == len(signal.low) == len(signal.high) == size, f"lengths of {signal.name} differ"
+            assert len(set(signal.labels)) == size, f"labels of {signal.name} repeat"
+            ordered = all(low < high for low, high in zip(signal.low, signal.high, strict=True))
+            assert ordered, f"limits of {signal.name}"
+            assert signal.max_rate is None or len(signal.max_rate) == size, f"max_rate of {signal.name}"
         assert spec.command.max_rate is not None, "the command needs a max_rate"
 
     def test_step_before_connect_is_refused(self) -> None:
@@ -173,18 +177,19 @@ class RobotContract:
             command = self.stay(state)
             command[1] = self.move(robot, state)[1]
             state, same = robot.step(command), other.step(self.stay(same))
-            assert_same_environments(state, same, [0, 2])
+            assert_same_state(state, same, [0, 2])
             state = robot.reset(np.array([1]), self.initial(robot, np.array([1])))
-            assert_same_environments(state, same, [0, 2])
-            assert_same_environments(robot.step(self.stay(state)), other.step(self.stay(same)), [0, 2])
+            assert_same_state(state, same, [0, 2])
+            assert_same_state(robot.step(self.stay(state)), other.step(self.stay(same)), [0, 2])
 
     def test_halt_never_raises(self) -> None:
         """Before `connect`, twice, from another thread, after `close`."""
         robot = self.make(1)
         robot.halt()
         with self.running() as (running, state):
-            for _ in range(2):
-                in_thread(running.halt)
+            with ThreadPoolExecutor(1) as other:
+                for _ in range(2):
+                    other.submit(running.halt).result()
             running.step(self.stay(state))
             running.halt()
         running.halt()
@@ -199,15 +204,6 @@ class RobotContract:
             raised(BamEnvsError, lambda: running.step(self.stay(state)))
             running.connect()
             running.reset(np.arange(1), self.initial(running, np.arange(1)))
-
-
-def _check_signal(signal: SignalSpec) -> None:
-    size = len(signal.labels)
-    assert size > 0, f"{signal.name} has no labels"
-    assert len(signal.units) == len(signal.low) == len(signal.high) == size, f"lengths of {signal.name} differ"
-    assert len(set(signal.labels)) == size, f"labels of {signal.name} repeat"
-    assert all(low < high for low, high in zip(signal.low, signal.high, strict=True)), f"limits of {signal.name}"
-    assert signal.max_rate is None or len(signal.max_rate) == size, f"max_rate of {signal.name}"
 
 
 def _check_state(robot: Robot, state: RobotState) -> None:

@@ -1,7 +1,4 @@
-"""The contract test for tasks of one's own.
-
-Longer than other modules because the contract is one list of promises.
-"""
+"""The contract test for tasks of one's own: one list of promises."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from bam_envs.core.robot import EnvIds, Robot, RobotState
-from bam_envs.core.task import Score, Task
+from bam_envs.core.task import Task
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.ur5e import GEOMETRY
 from bam_envs.testing.assertions import assert_same_state, assert_same_tree
@@ -56,16 +53,14 @@ class TaskContract:
             robot.close()
 
     def actions(self, task: Task, first: int = 0) -> Iterator[NDArray[np.float32]]:
-        """Actions of the environments from `first` on. Shape: (n, a) each."""
-        parts = [self.actions_of_row(task, first + env) for env in range(task.num_envs)]
-        return map(np.stack, zip(*parts, strict=True))
+        """Random actions, to the limit or inside, each kept for ten steps to get somewhere. Shape: (n, a) each.
 
-    def actions_of_row(self, task: Task, env: int) -> Iterator[NDArray[np.float32]]:
-        """Random actions, to the limit or inside, each kept for ten steps to get somewhere. Shape: (a,) each."""
-        rng = np.random.default_rng(env)
+        Environment k draws from a generator of its own, that of ``first + k``.
+        """
+        rngs = [np.random.default_rng(first + env) for env in range(task.num_envs)]
         for step in range(self.steps):
             if step % 10 == 0:
-                action = rng.uniform(-1, 1, task.action_space.shape).astype(np.float32)
+                action = np.array([rng.uniform(-1, 1, task.action_space.shape) for rng in rngs], np.float32)
                 action = np.sign(action) if step % 20 == 0 else action
             yield action
 
@@ -91,16 +86,23 @@ class TaskContract:
         """Float32, one observation a robot, finite, inside the limits."""
         with self.running(3) as (task, robot, state):
             for action in self.actions(task):
-                _check_observation(task, task.observe(state))
+                observation = task.observe(state)
+                assert observation.dtype == np.float32
+                assert observation.shape == (task.num_envs, *task.observation_space.shape)
+                for env in observation:
+                    assert task.observation_space.contains(env), f"not in the space: {env.tolist()}"
                 state = robot.step(task.command(action, state))
 
     def test_commands_keep_the_robots_limits(self) -> None:
         """Inside the command's limits; no joint and no tool faster than allowed, from the first command on."""
         with self.running(3) as (task, robot, state):
-            last = self.first_command(state)
+            last, spec = self.first_command(state), robot.spec.command
             for action in self.actions(task):
                 command = task.command(action, state)
-                _check_command(robot, command)
+                assert command.shape == (robot.num_robots, len(spec.labels))
+                assert command.dtype == np.float64
+                assert (command >= np.array(spec.low)).all()
+                assert (command <= np.array(spec.high)).all()
                 self.check_pace(last, command)
                 state, last = robot.step(command), command
 
@@ -122,12 +124,20 @@ class TaskContract:
             action = np.ones((1, *task.action_space.shape), np.float32)
             np.testing.assert_array_equal(task.command(100 * action, state), other.command(action, same))
 
-    def test_scores_are_one_a_row(self) -> None:
+    def test_scores_are_one_an_environment(self) -> None:
         """Finite float64 rewards, boolean ends, success ends the episode, infos of shape (n, ...)."""
         with self.running(3) as (task, robot, state):
             for action in self.actions(task):
                 state = robot.step(task.command(action, state))
-                _check_score(task, task.score(state, action))
+                score = task.score(state, action)
+                assert score.reward.shape == score.terminated.shape == score.success.shape == (task.num_envs,)
+                assert score.reward.dtype == np.float64
+                assert np.isfinite(score.reward).all()
+                assert score.terminated.dtype == score.success.dtype == np.bool_
+                assert not (score.success & ~score.terminated).any(), "a success did not end the episode"
+                for name, values in score.info.items():
+                    assert values.shape[:1] == (task.num_envs,), f"info {name} has shape {values.shape}"
+                    assert not name.startswith("_"), f"info {name} looks like a mask"
 
     def test_nothing_given_is_changed(self) -> None:
         """States and actions are the caller's; observing twice is seeing the same."""
@@ -192,29 +202,20 @@ class TaskContract:
                 command = task.command(action, state)
                 np.testing.assert_array_equal(command, other.command(action, state))
                 state = robot.step(command)
-                _assert_same_score(task.score(state, action), other.score(state, action))
-            assert_same_tree(saved, kept)
-
-    def test_saved_memory_is_a_copy(self) -> None:
-        """Beginning another episode right after `state_dict` does not reach into what it returned."""
-        with self.running(2) as (task, robot, state):
-            for action in self.actions(task):
-                state = robot.step(task.command(action, state))
-            saved = task.state_dict()
-            kept = copy.deepcopy(saved)
-            _start(task, robot, np.array([1]), seed=9)
+                assert_same_tree(vars(task.score(state, action)), vars(other.score(state, action)), "score")
             assert_same_tree(saved, kept)
 
     def test_handed_out_is_left_alone(self) -> None:
-        """Beginning another episode does not reach into observations and scores of the one before."""
-        with self.running(2) as (task, robot, state):
-            for action in self.actions(task):
-                state = robot.step(task.command(action, state))
-                score, observation = task.score(state, action), task.observe(state)
-            kept, seen = copy.deepcopy(score), observation.copy()
-            _start(task, robot, np.array([0, 1]), seed=9)
-            _assert_same_score(score, kept)
-            np.testing.assert_array_equal(observation, seen)
+        """Beginning other episodes does not reach into observations, scores and memory that were handed out."""
+        for again in ([1], [0, 1]):
+            with self.running(2) as (task, robot, state):
+                for action in self.actions(task):
+                    state = robot.step(task.command(action, state))
+                    score = task.score(state, action)
+                said = {"score": vars(score), "observation": task.observe(state), "memory": task.state_dict()}
+                kept = copy.deepcopy(said)
+                _start(task, robot, np.array(again), seed=9)
+                assert_same_tree(said, kept)
 
     def test_marks_are_places_and_colours(self) -> None:
         """For pictures."""
@@ -231,36 +232,3 @@ def _start(task: Task, robot: Robot, env_ids: EnvIds, seed: int) -> RobotState:
     )
     task.on_reset(env_ids, state)
     return state
-
-
-def _check_command(robot: Robot, command: Array) -> None:
-    spec = robot.spec.command
-    assert command.shape == (robot.num_robots, len(spec.labels))
-    assert command.dtype == np.float64
-    assert (command >= np.array(spec.low)).all()
-    assert (command <= np.array(spec.high)).all()
-
-
-def _check_observation(task: Task, observation: NDArray[np.float32]) -> None:
-    assert observation.dtype == np.float32
-    assert observation.shape == (task.num_envs, *task.observation_space.shape)
-    for env in observation:
-        assert task.observation_space.contains(env), f"not in the space: {env.tolist()}"
-
-
-def _check_score(task: Task, score: Score) -> None:
-    n = task.num_envs
-    assert score.reward.shape == score.terminated.shape == score.success.shape == (n,)
-    assert score.reward.dtype == np.float64
-    assert np.isfinite(score.reward).all()
-    assert score.terminated.dtype == score.success.dtype == np.bool_
-    assert not (score.success & ~score.terminated).any(), "a success did not end the episode"
-    for name, values in score.info.items():
-        assert values.shape[:1] == (n,), f"info {name} has shape {values.shape}"
-        assert not name.startswith("_"), f"info {name} looks like a mask"
-
-
-def _assert_same_score(one: Score, two: Score) -> None:
-    for name in ("reward", "terminated", "success"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(two, name), err_msg=name)
-    assert_same_tree(one.info, two.info)

@@ -1,4 +1,4 @@
-"""The contract of transports, and the environment that it serves. Longer than most files: one list of promises."""
+"""The contract test for transports of one's own: one list of promises, and the environment that it serves."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import Space, spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, LinkLost, RemoteError
 from bam_envs.core.spaces import space_to_json
@@ -25,7 +24,7 @@ _INT64 = np.iinfo(np.int64)
 
 
 class MirrorEnv(gym.Env[Any, Any]):
-    """Shows each action as the next observation, so that one sees what the way there and back does to it.
+    """Shows each action as the next observation, so that one sees what the link does to it.
 
     Args:
         space: Of actions and observations.
@@ -70,19 +69,12 @@ class MirrorEnv(gym.Env[Any, Any]):
         return action, self.elapsed / 7, self.elapsed >= self.episode_steps, False, info
 
 
-def _box(low: float, high: float, shape: tuple[int, ...], dtype: Any) -> spaces.Box:
-    return spaces.Box(low, high, shape, dtype)
-
-
-def _floats(dtype: Any, *values: float) -> NDArray[Any]:
-    return np.array(values, dtype)
-
-
+_box: Any = spaces.Box
 _TREE = spaces.Dict({"z": spaces.Discrete(3), "a": spaces.Tuple([_box(-1, 1, (2,), np.float32), spaces.Text(4)])})
 ROUND_TRIPS: dict[str, tuple[Space[Any], list[Any]]] = {
-    "float32": (_box(-_INF, _INF, (4,), np.float32), [_floats(np.float32, -0.0, 1e-45, 3.4e38, 0.1)]),
+    "float32": (_box(-_INF, _INF, (4,), np.float32), [np.float32([-0.0, 1e-45, 3.4e38, 0.1])]),
     "float64": (_box(-_INF, _INF, (2, 2), np.float64), [np.array([[-0.0, 5e-324], [1.7e308, 0.1]])]),
-    "float16": (_box(-4, 4, (3,), np.float16), [_floats(np.float16, -0.0, 0.1, 4)]),
+    "float16": (_box(-4, 4, (3,), np.float16), [np.float16([-0.0, 0.1, 4])]),
     "a number": (_box(-1, 1, (), np.float32), [np.float32(0.1).reshape(())]),
     "nothing": (_box(-1, 1, (0,), np.float32), []),
     "int64": (_box(_INT64.min, _INT64.max, (3,), np.int64), [np.array([_INT64.min, _INT64.max, 2**53 + 1])]),
@@ -213,7 +205,7 @@ class TransportContract:
         with self.serving(env) as transport:
             transport.connect()
             transport.reset()
-            env.step = lambda action: ({"x": _floats(np.float32, 0, np.nan)}, 0.0, False, False, {})  # type: ignore[method-assign]
+            env.step = lambda action: ({"x": np.float32([0, np.nan])}, 0.0, False, False, {})  # type: ignore[method-assign]
             error = raised(RemoteError, lambda: transport.step({"x": np.zeros(2, np.float32)}))
             assert "observation['x'][1] is NaN" in str(error)
 
@@ -245,31 +237,23 @@ class TransportContract:
 
     def test_vectors_are_those_of_gymnasium(self) -> None:
         """`RemoteVectorEnv` over a vector environment gives what that gives, automatic resets included."""
-        alone, there = _environments(3), _environments(3)
+        makers = [lambda: MirrorEnv(_box(-1, 1, (2,), np.float32), episode_steps=2)] * 3
+        alone, there = (SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP) for _ in range(2))
         with self.serving(there) as transport:
             envs = RemoteVectorEnv(transport, 3)
             assert_same_value(envs.reset(seed=4)[0], alone.reset(seed=4)[0], "the first observation")
             for value in np.linspace(-1, 1, 30, dtype=np.float32).reshape(5, 3, 2):
                 one: Any = envs.step(value)
                 two: Any = alone.step(value)
-                for name, mine, theirs in zip(("observation", "reward", "end", "cut"), one, two, strict=False):
-                    assert_same_value(mine, theirs, name)
-                _assert_same_final(one[4], two[4])
+                for name, *both in zip(("observation", "reward", "end", "cut"), one, two, strict=False):
+                    assert_same_value(*both, name)
+                mine, theirs = one[4], two[4]
+                assert ("final_obs" in mine) == ("final_obs" in theirs)
+                if "final_obs" in theirs:
+                    np.testing.assert_array_equal(np.stack(mine["final_obs"]), np.stack(theirs["final_obs"]))
+                    np.testing.assert_array_equal(mine["_final_obs"], theirs["_final_obs"])
+                    np.testing.assert_array_equal(mine["final_info"]["elapsed"], theirs["final_info"]["elapsed"])
         alone.close()
-
-
-def _environments(number: int) -> SyncVectorEnv:
-    """Environments whose episodes end after two steps."""
-    makers = [lambda: MirrorEnv(_box(-1, 1, (2,), np.float32), episode_steps=2)] * number
-    return SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
-
-
-def _assert_same_final(mine: dict[str, Any], theirs: dict[str, Any]) -> None:
-    assert ("final_obs" in mine) == ("final_obs" in theirs)
-    if "final_obs" in theirs:
-        np.testing.assert_array_equal(np.stack(mine["final_obs"]), np.stack(theirs["final_obs"]))
-        np.testing.assert_array_equal(mine["_final_obs"], theirs["_final_obs"])
-        np.testing.assert_array_equal(mine["final_info"]["elapsed"], theirs["final_info"]["elapsed"])
 
 
 def assert_same_value(one: Any, two: Any, name: str) -> None:
@@ -286,9 +270,7 @@ def assert_same_value(one: Any, two: Any, name: str) -> None:
     elif isinstance(two, str):
         assert one == two, f"{name}: {one!r} and {two!r}"
     else:
-        _assert_same_array(np.asarray(one), np.asarray(two), name)
-
-
-def _assert_same_array(one: Any, two: Any, name: str) -> None:
-    assert (one.dtype, one.shape) == (two.dtype, two.shape), f"{name}: {one.dtype} {one.shape}, {two.dtype} {two.shape}"
-    assert one.tobytes() == two.tobytes(), f"{name}: {one!r} and {two!r}"
+        one, two = np.asarray(one), np.asarray(two)
+        kinds = (one.dtype, one.shape), (two.dtype, two.shape)
+        assert kinds[0] == kinds[1], f"{name}: {kinds[0]} and {kinds[1]}"
+        assert one.tobytes() == two.tobytes(), f"{name}: {one!r} and {two!r}"

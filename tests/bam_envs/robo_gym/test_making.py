@@ -9,32 +9,23 @@ import pytest
 
 import bam_envs
 from bam_envs.core.errors import InvalidValue, ResetNeeded
-from bam_envs.robo_gym.rs_state import MIR_LENGTH, UR_KEYS, require_ur_keys
+from bam_envs.robo_gym.rs_state import MIR_LENGTH, UR_KEYS
 from bam_envs.robo_gym.table import ROBO_GYM
 
 SIMULATED = [name for name, entry in ROBO_GYM.items() if not entry.is_live]
-MODES = {
-    "EmptyEnvironmentUR": "only_robot",
-    "EmptyEnvironment2UR": "only_robot",
-    "BasicAvoidanceUR": "1moving2points",
-    "AvoidanceRaad2022UR": "1moving2points",
-    "AvoidanceRaad2022TestUR": "1moving2points",
-}
-
-
 SIZES = {
-    "NoObstacleNavigationMir100": (4, 2, 500),
-    "ObstacleAvoidanceMir100": (20, 2, 500),
-    "EmptyEnvironmentUR": (12, 5, 300),
-    "EndEffectorPositioningUR": (27, 5, 300),
-    "BasicAvoidanceUR": (18, 5, 1000),
-    "AvoidanceRaad2022UR": (25, 5, 1000),
-    "AvoidanceRaad2022TestUR": (25, 5, 1000),
-    "EmptyEnvironment2UR": (12, 5, 300),
-    "EndEffectorPositioning2UR": (26, 5, 300),
-    "IsaacReachUR": (25, 6, 600),
+    "NoObstacleNavigationMir100": (4, 2, 500, None),
+    "ObstacleAvoidanceMir100": (20, 2, 500, None),
+    "EmptyEnvironmentUR": (12, 5, 300, "only_robot"),
+    "EndEffectorPositioningUR": (27, 5, 300, "1object"),
+    "BasicAvoidanceUR": (18, 5, 1000, "1moving2points"),
+    "AvoidanceRaad2022UR": (25, 5, 1000, "1moving2points"),
+    "AvoidanceRaad2022TestUR": (25, 5, 1000, "1moving2points"),
+    "EmptyEnvironment2UR": (12, 5, 300, "only_robot"),
+    "EndEffectorPositioning2UR": (26, 5, 300, "1object"),
+    "IsaacReachUR": (25, 6, 600, "1object"),
 }
-"""robo-gym's numbers of observation and action, and its steps."""
+"""robo-gym's numbers of observation and action, its steps, and which keys a wire state of an arm has."""
 
 
 def make(name, **options):
@@ -53,47 +44,33 @@ def played(env, seed=3, steps=5):
 
 
 @pytest.mark.parametrize("name", SIMULATED)
-def test_it_is_the_same_environment(name):
+def test_it_is_the_same_environment_with_robo_gyms_sizes(name):
     entry = ROBO_GYM[name]
-    np.testing.assert_array_equal(played(make(name)), played(make(entry.env_id, **entry.defaults)))
-
-
-@pytest.mark.parametrize("name", SIMULATED)
-@pytest.mark.parametrize("parity", [False, True])
-def test_sizes_are_robo_gyms(name, parity):
-    env = make(name, parity=parity)
-    observation, action, steps = SIZES[ROBO_GYM[name].stem]
-    assert (env.observation_space.shape, env.action_space.shape) == ((observation,), (action,))
-    assert bam_envs.ENVIRONMENTS[ROBO_GYM[name].env_id].max_episode_steps == steps
-
-
-@pytest.mark.parametrize("name", SIMULATED)
-def test_the_time_limit(name):
-    entry = ROBO_GYM[name]
-    env = make(name)
-    assert env.get_wrapper_attr("_max_episode_steps") == bam_envs.ENVIRONMENTS[entry.env_id].max_episode_steps
-    assert "TimeLimit" not in str(make(name, parity=True))
+    env, own, parity = make(name), make(entry.env_id, **entry.defaults), make(name, parity=True)
+    np.testing.assert_array_equal(played(env), played(own))
+    observation, action, steps, _ = SIZES[entry.stem]
+    for one in (env, parity):
+        assert (one.observation_space.shape, one.action_space.shape) == ((observation,), (action,))
+    assert env.get_wrapper_attr("_max_episode_steps") == bam_envs.ENVIRONMENTS[entry.env_id].max_episode_steps == steps
+    assert "TimeLimit" not in str(parity)
 
 
 @pytest.mark.parametrize("name", SIMULATED)
 def test_wire_states(name):
-    env, stem = make(name), ROBO_GYM[name].stem
+    env, keys = make(name), UR_KEYS.get(SIZES[ROBO_GYM[name].stem][3])
     assert env.unwrapped.get_rs_state() is None
     env.reset(seed=0)
-    _, _, _, _, info = env.step(env.action_space.sample())
+    info = env.step(env.action_space.sample())[4]
     wire = env.unwrapped.get_rs_state()
-    if "Mir100" in stem:
-        assert [type(wire), len(wire), type(wire[0])] == [list, MIR_LENGTH, float]
+    if keys is None:
+        assert [type(wire), len(wire), {type(number) for number in wire}] == [list, MIR_LENGTH, {float}]
     else:
-        mode = require_ur_keys(wire)
-        assert mode == MODES.get(stem, "1object")
-        assert set(wire) == set(UR_KEYS[mode])
+        assert set(wire) == set(keys)
         assert {type(value) for value in wire.values()} == {float}
     assert ("rs_state" in info) == ROBO_GYM[name].defaults.get("rs_state_to_info", False)
     assert info.get("rs_state", wire) == wire
     for same in (pickle.loads(pickle.dumps(info)), copy.deepcopy(info)):
-        assert same.keys() == info.keys()
-        assert same.get("rs_state") == info.get("rs_state")
+        assert (same.keys(), same.get("rs_state")) == (info.keys(), info.get("rs_state"))
 
 
 def test_the_wire_state_after_the_end():
@@ -141,7 +118,7 @@ def test_a_live_robot_has_no_simulation(name, options):
 
 
 @pytest.mark.parametrize("name", SIMULATED)
-def test_rows(name):
+def test_vector_environments(name):
     env = gym.make_vec(name, num_envs=3)
     observations, _ = env.reset(seed=3)
     assert observations.shape == (3, *make(name).observation_space.shape)
@@ -150,21 +127,17 @@ def test_rows(name):
     env.close()
 
 
-def test_rows_with_wire_states():
-    env = gym.make_vec("EmptyEnvironmentURSim-v0", num_envs=2, rs_state_to_info=True)
+def test_options_of_vector_environments():
+    env = gym.make_vec("EmptyEnvironmentURSim-v0", num_envs=2, rs_state_to_info=True, max_episode_steps=7)
     env.reset(seed=0)
     infos = env.step(env.action_space.sample())[4]
     assert [len(wire) for wire in infos["rs_state"]] == [20, 20]
-
-
-def test_rows_have_a_limit_of_their_own():
-    env = gym.make_vec("EmptyEnvironmentURSim-v0", num_envs=2, max_episode_steps=7)
     assert env.max_episode_steps == 7
     assert gym.make_vec("EmptyEnvironmentURSim-v0", num_envs=2).max_episode_steps == 300
     assert gym.make_vec("EmptyEnvironmentURSim-v0", num_envs=2, parity=True).max_episode_steps is None
 
 
-def test_a_live_robot_is_no_rows():
+def test_a_live_robot_is_no_vector_environment():
     with pytest.raises(InvalidValue) as caught:
         gym.make_vec("EmptyEnvironmentURRob-v0", num_envs=2, robot="ws://127.0.0.1:1")
     assert str(caught.value) == (

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue, UnknownName
-from bam_envs.robo_gym import options
+from bam_envs.robo_gym import making
+from bam_envs.robo_gym.making import constructor_options, say_once, translate
 from bam_envs.robo_gym.table import ROBO_GYM
 
 SIM, ROB = ROBO_GYM["EndEffectorPositioningURSim-v0"], ROBO_GYM["EndEffectorPositioningURRob-v0"]
@@ -16,16 +17,16 @@ DEFAULTS = {"ur_model": "ur5", "rs_state_to_info": True}
 @pytest.fixture(autouse=True)
 def told(caplog):
     """What is said, from a process that has said nothing."""
-    options.forget()
+    say_once.cache_clear()
     caplog.set_level(logging.WARNING)
     yield lambda: [record.getMessage() for record in caplog.records]
-    options.forget()
+    say_once.cache_clear()
 
 
 def test_defaults_are_robo_gyms_and_say_nothing(told):
-    assert options.translate(SIM, {}) == DEFAULTS
-    assert options.translate(SIM, {"ip": None, "gui": False, "lower_bound_port": None}) == DEFAULTS
-    assert options.translate(ROBO_GYM["NoObstacleNavigationMir100Sim-v0"], {}) == {}
+    assert translate(SIM, {}) == DEFAULTS
+    assert translate(SIM, {"ip": None, "gui": False, "lower_bound_port": None}) == DEFAULTS
+    assert translate(ROBO_GYM["NoObstacleNavigationMir100Sim-v0"], {}) == {}
     assert told() == []
 
 
@@ -37,8 +38,8 @@ def test_options_of_the_task_go_through(told):
         "rs_state_to_info": False,
         "parity": True,
     }
-    assert options.translate(SIM, given) == given
-    assert options.translate(ROBO_GYM["AvoidanceRaad2022TestURSim-v0"], {"include_polar_to_elbow": False}) == {
+    assert translate(SIM, given) == given
+    assert translate(ROBO_GYM["AvoidanceRaad2022TestURSim-v0"], {"include_polar_to_elbow": False}) == {
         **DEFAULTS,
         "fixed_paths": True,
         "include_polar_to_elbow": False,
@@ -48,38 +49,23 @@ def test_options_of_the_task_go_through(told):
 
 def test_a_server_manager_is_said_once_not_to_be_there(told):
     for _ in range(3):
-        assert options.translate(SIM, {"ip": "127.0.0.1", "lower_bound_port": 50100, "rviz_gui": True}) == DEFAULTS
+        assert translate(SIM, {"ip": "127.0.0.1", "lower_bound_port": 50100, "rviz_gui": True}) == DEFAULTS
     assert told() == [
         "ip='127.0.0.1', lower_bound_port=50100, rviz_gui=True: accepted, and without effect. The robot is simulated "
         "in this process; there is no Server Manager and no Gazebo, and nothing to be started first."
     ]
 
 
-def test_an_option_is_said_once_whatever_else_is_given(told):
-    """Of the second call only what is new is said; with a robot it means another thing, which is said too."""
-    options.translate(SIM, {"ip": "127.0.0.1"})
-    options.translate(ROBO_GYM["IsaacReachURSim-v0"], {"ip": "127.0.0.1", "server_manager_port": 50100})
-    options.translate(SIM, {"ip": "127.0.0.2", "server_manager_port": 50100})
-    options.translate(ROB, {"robot": "ws://a:1", "ip": "127.0.0.1"})
-    options.translate(ROB, {"robot": "ws://a:1", "ip": "127.0.0.1", "gui": True})
-    assert [text.partition(": accepted")[0] for text in told()] == [
-        "ip='127.0.0.1'",
-        "server_manager_port=50100",
-        "ip='127.0.0.1'",
-        "gui=True",
-    ]
-
-
 def test_parity_without_robo_gyms_trajectory(told):
     raad, test = (ROBO_GYM[f"AvoidanceRaad2022{kind}Sim-v0"] for kind in ("UR", "TestUR"))
-    options.translate(SIM, {"parity": True})
-    options.translate(raad, {"parity": False})
-    options.translate(raad, {"parity": True, "trajectory": "theirs.json"})
+    translate(SIM, {"parity": True})
+    translate(raad, {"parity": False})
+    translate(raad, {"parity": True, "trajectory": "theirs.json"})
     assert told() == []
     for entry in (raad, test):
-        options.translate(entry, {"parity": True})
+        translate(entry, {"parity": True})
     assert told() == [
-        "parity=True of AvoidanceRaad2022URSim-v0: the trajectory is this package's own, up to 0.67 rad from "
+        "parity=True: the trajectory is this package's own, up to 0.67 rad from "
         "robo-gym's; trajectory='.../robo_gym/envs/ur/robot_trajectories/trajectory_raad_2022.json' of an installed "
         "robo-gym is that one."
     ]
@@ -87,30 +73,30 @@ def test_parity_without_robo_gyms_trajectory(told):
 
 @pytest.mark.parametrize("name", ["gui", "gazebo_gui"])
 def test_gui_is_a_window(name, told, monkeypatch):
-    monkeypatch.setattr(options, "render_modes", lambda: ["rgb_array", "human"])
+    monkeypatch.setattr(making, "render_modes", lambda: ["rgb_array", "human"])
     for _ in range(2):
-        assert options.translate(SIM, {name: True}) == {**DEFAULTS, "render_mode": "human"}
+        assert translate(SIM, {name: True}) == {**DEFAULTS, "render_mode": "human"}
     assert told() == [f"{name}=True is render_mode='human': a window with the simulated robot."]
-    assert options.translate(SIM, {name: True, "render_mode": "rgb_array"})["render_mode"] == "rgb_array"
+    assert translate(SIM, {name: True, "render_mode": "rgb_array"})["render_mode"] == "rgb_array"
 
 
 def test_gui_without_a_display(told, monkeypatch):
-    monkeypatch.setattr(options, "render_modes", lambda: ["rgb_array"])
-    assert options.translate(SIM, {"gui": True}) == DEFAULTS
+    monkeypatch.setattr(making, "render_modes", lambda: ["rgb_array"])
+    assert translate(SIM, {"gui": True}) == DEFAULTS
     assert told() == ["gui=True: no window, for there is no display; render_mode='rgb_array' draws."]
 
 
 def test_the_address_of_a_robot(told):
     for _ in range(2):
-        found = options.translate(ROB, {"rs_address": "10.0.0.5:9090", "ip": None})
+        found = translate(ROB, {"rs_address": "10.0.0.5:9090", "ip": None})
         assert found == {**DEFAULTS, "robot": "ws://10.0.0.5:9090"}
     assert told() == [
         "rs_address='10.0.0.5:9090' is read as robot='ws://10.0.0.5:9090': the robot is reached through rosbridge "
         "(port 9090 unless it was given another), and not through a robot server of robo-gym's."
     ]
     for given in ({"robot": "wss://10.0.0.5:9090/arm"}, {"rs_address": "wss://10.0.0.5:9090/arm"}):
-        assert options.translate(ROB, given)["robot"] == "wss://10.0.0.5:9090/arm"
-    assert options.translate(SIM, {"robot": "ws://10.0.0.5:9090"})["robot"] == "ws://10.0.0.5:9090"
+        assert translate(ROB, given)["robot"] == "wss://10.0.0.5:9090/arm"
+    assert translate(SIM, {"robot": "ws://10.0.0.5:9090"})["robot"] == "ws://10.0.0.5:9090"
 
 
 @pytest.mark.parametrize(
@@ -178,7 +164,7 @@ def test_the_address_of_a_robot(told):
 )
 def test_what_cannot_be_had(entry, given, text):
     with pytest.raises(InvalidValue) as caught:
-        options.translate(entry, given)
+        translate(entry, given)
     assert str(caught.value) == text
 
 
@@ -195,7 +181,7 @@ def test_what_cannot_be_had(entry, given, text):
 )
 def test_a_typo_is_not_swallowed(name, closest):
     with pytest.raises(UnknownName) as caught:
-        options.translate(SIM, {name: 1})
+        translate(SIM, {name: 1})
     assert str(caught.value) == (
         f"Unknown argument of EndEffectorPositioningURSim-v0 {name!r}. Did you mean {closest!r}?"
     )
@@ -203,8 +189,8 @@ def test_a_typo_is_not_swallowed(name, closest):
 
 def test_a_live_robot_takes_what_a_simulated_one_does(told):
     given = {"robot": "ws://10.0.0.5:9090", "ip": "127.0.0.1", "gui": True, "gazebo_gui": None}
-    for entry in (ROB, ROB, SIM):
-        assert options.translate(entry, given) == {**DEFAULTS, "robot": "ws://10.0.0.5:9090"}
+    for entry in (ROB, ROB):
+        assert translate(entry, given) == {**DEFAULTS, "robot": "ws://10.0.0.5:9090"}
     assert told() == [
         "ip='127.0.0.1', gui=True: accepted, and without effect. The robot of this EndEffectorPositioningURRob-v0 is a "
         "live one: it has no window here, and no Server Manager."
@@ -213,8 +199,8 @@ def test_a_live_robot_takes_what_a_simulated_one_does(told):
 
 @pytest.mark.parametrize("entry", [SIM, ROB])
 def test_what_robo_gym_takes_and_we_do_not(entry):
-    assert options.translate(entry, {"robot": "ws://a:1", "parity": np.True_})["parity"]
-    taken, refused = options.constructor_options(entry)
+    assert translate(entry, {"robot": "ws://a:1", "parity": np.True_})["parity"]
+    taken, refused = constructor_options(entry)
     assert {"ip", "gui"} <= taken
     assert "rs_address" in (taken if entry.is_live else refused)
     assert "action_rate" in refused
@@ -225,4 +211,4 @@ def test_options_of_arms_are_none_of_bases():
     with pytest.raises(
         UnknownName, match=r"Unknown argument of NoObstacleNavigationMir100Sim-v0 'ur_model'\. Choose from: ca_file, "
     ):
-        options.translate(ROBO_GYM["NoObstacleNavigationMir100Sim-v0"], {"ur_model": "ur5"})
+        translate(ROBO_GYM["NoObstacleNavigationMir100Sim-v0"], {"ur_model": "ur5"})

@@ -13,6 +13,8 @@ import pytest
 
 import bam_envs  # noqa: F401 - registers robo-gym's ids, before robo-gym could
 from bam_envs.robo_gym.rs_state import read_mir
+from bam_envs.robots.ur import ur_model
+from bam_envs.tasks.ur_track import load_trajectory
 
 if importlib.util.find_spec("robo_gym") is None:
     pytest.skip("robo-gym is not installed; tests/peers/test_robo_gym.py has it", allow_module_level=True)
@@ -324,10 +326,10 @@ def test_ends_that_come_together(stem, collided, arrived, last):
 
 def test_our_trajectory_is_another():
     """As many segments of as many waypoints, which is why `trajectory` has to name robo-gym's for parity."""
-    task = gym.make("AvoidanceRaad2022URSim-v0", parity=True, disable_env_checker=True).unwrapped.task
+    waypoints, lengths = load_trajectory(None, ur_model("ur5").joint_limits)
     theirs = make_theirs("AvoidanceRaad2022UR").trajectory
-    assert task.trajectory.lengths.tolist() == [len(segment) for segment in theirs]
-    apart = [np.abs(task.trajectory.waypoints[i, : len(one)] - one).max() for i, one in enumerate(theirs)]
+    assert lengths.tolist() == [len(segment) for segment in theirs]
+    apart = [np.abs(waypoints[i, : len(one)] - one).max() for i, one in enumerate(theirs)]
     assert 0.6 < max(apart) < 0.7
 
 

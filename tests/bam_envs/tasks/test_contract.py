@@ -1,135 +1,117 @@
 """Every task keeps the same promises, on a robot without physics and on the simulated one."""
 
-from typing import Any, ClassVar
-
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
 from bam_envs.core.registry import ENVIRONMENTS
-from bam_envs.core.robot import Robot, RobotState
-from bam_envs.core.task import Array, Task
 from bam_envs.robots.ur import UR_MODELS
+from bam_envs.tasks.isaac_reach import DEFAULT
 from bam_envs.tasks.pick import PickTask
-from bam_envs.tasks.pick_place import PickPlaceTask
-from bam_envs.tasks.reach import ReachTask
 from bam_envs.testing import TaskContract
+from tests.bam_envs.making import make_task
 
-PARITY: dict[str, Any] = {"parity": True, "rs_state_to_info": True}
+PARITY = {"parity": True, "rs_state_to_info": True}
+SPEEDS = {
+    "bam/ur-reach-v0": (0.1, 10),
+    "bam/ur-empty-v0": (0.2, 20),
+    "bam/ur-avoidance-v0": (0.2, 20),
+    "bam/ur-track-v0": (0.2, 20),
+    "bam/isaac-reach-v0": (0.2, 30),
+}
+"""Share of its fastest speed that a joint may go at, and commands a second [Hz]."""
 
 
-class TestReach(TaskContract):
-    def make(self, num_envs: int) -> Task:
-        return ReachTask(num_envs)
-
-
-class TestPick(TaskContract):
-    def make(self, num_envs: int) -> Task:
-        return PickTask(num_envs)
-
-
-class TestPickPlace(TaskContract):
-    def make(self, num_envs: int) -> Task:
-        return PickPlaceTask(num_envs)
+@pytest.mark.parametrize("env_id", ["bam/reach-v0", "bam/pick-v0", "bam/pick-place-v0"])
+class TestWithoutPhysics(TaskContract):
+    @pytest.fixture(autouse=True)
+    def chosen(self, env_id):
+        self.make = lambda num_envs: make_task(env_id, num_envs)
 
 
 class Simulated(TaskContract):
-    id: str
-    options: ClassVar[dict[str, Any]] = {}
+    id = "bam/isaac-reach-v0"
+    options = PARITY
     randomize = False
 
-    def make(self, num_envs: int) -> Task:
-        return ENVIRONMENTS[self.id].make_task(num_envs, self.options)
+    def make(self, num_envs):
+        return make_task(self.id, num_envs, **self.options)
 
-    def make_robot(self, num_robots: int) -> Robot:
+    def make_robot(self, num_robots):
         return ENVIRONMENTS[self.id].make_robot(num_robots, self.randomize, self.options)
 
+    def first_command(self, state):
+        return state.command if "mir100" in self.id else super().first_command(state)
 
-class TestReachSimulated(Simulated):
-    id = "bam/reach-v0"
-
-
-class TestPickSimulated(Simulated):
-    id = "bam/pick-v0"
-
-
-class TestPickPlaceSimulated(Simulated):
-    id = "bam/pick-place-v0"
-
-
-class TestPickRandomized(Simulated):
-    id = "bam/pick-v0"
-    randomize = True
+    def check_pace(self, last, command):
+        if self.id in SPEEDS:
+            share, rate = SPEEDS[self.id]
+            model = UR_MODELS[self.options.get("ur_model", "ur10" if "isaac" in self.id else "ur5")]
+            assert (np.abs(command - last) <= share * model.max_velocity / rate * (1 + 1e-9)).all()
+        elif "mir100" in self.id:
+            assert (np.abs(command) <= [0.5, 0.7]).all()
+        else:
+            super().check_pace(last, command)
 
 
-class Ur(Simulated):
-    joint_step = 0.1 * np.pi * 0.1 * (1 + 1e-12)
-    tool_step = 0.06
-
-    def tool_position(self, joints: Array) -> Array:
-        return UR_MODELS[self.options.get("ur_model", "ur5")].geometry.tool_position(joints)
-
-
-class TestUrReach(Ur):
-    id = "bam/ur-reach-v0"
-
-
-class TestUrReachParity(TestUrReach):
-    options = PARITY
-
-
-class TestUrReachSmall(TestUrReach):
-    options: ClassVar[dict[str, Any]] = {"ur_model": "ur3"}
-    joint_step = 0.2 * np.pi * 0.1 * (1 + 1e-12)
-
-
-class TestUrReachOnArmsThatDiffer(TestUrReach):
-    randomize = True
-
-
-class TestUrEmpty(Ur):
-    id = "bam/ur-empty-v0"
-
-
-class TestUrEmptyParity(TestUrEmpty):
-    options: ClassVar[dict[str, Any]] = {**PARITY, "ur_model": "ur16e"}
+@pytest.mark.parametrize(
+    ("env_id", "options", "randomize"),
+    [
+        ("bam/reach-v0", {}, False),
+        ("bam/pick-v0", {}, False),
+        ("bam/pick-place-v0", {}, False),
+        ("bam/pick-v0", {}, True),
+        ("bam/ur-reach-v0", {}, False),
+        ("bam/ur-reach-v0", PARITY, False),
+        ("bam/ur-reach-v0", {"ur_model": "ur3"}, True),
+        ("bam/ur-empty-v0", {**PARITY, "ur_model": "ur16e"}, False),
+        ("bam/ur-avoidance-v0", PARITY, False),
+        ("bam/ur-avoidance-v0", {"ur_model": "ur10e", "include_polar_to_elbow": True, "fix_base": True}, False),
+        ("bam/ur-avoidance-v0", {"fixed_object_position": (0.12, 0.34, 0.5)}, False),
+        ("bam/ur-track-v0", {}, False),
+        ("bam/ur-track-v0", {**PARITY, "fixed_paths": True}, False),
+        ("bam/ur-track-v0", {"fixed_paths": True, "include_polar_to_elbow": False, "fix_wrist_3": False}, False),
+        ("bam/isaac-reach-v0", {}, False),
+        ("bam/mir100-navigation-v0", {}, False),
+        ("bam/mir100-navigation-v0", PARITY, False),
+        ("bam/mir100-avoidance-v0", {}, False),
+        ("bam/mir100-avoidance-v0", PARITY, False),
+    ],
+)
+class TestSimulated(Simulated):
+    @pytest.fixture(autouse=True)
+    def chosen(self, env_id, options, randomize):
+        self.id, self.options, self.randomize = env_id, options, randomize
 
 
-class Drive(Simulated):
-    def first_command(self, state: RobotState) -> Array:
-        return state.command
+class TestIsaacReachInParity(Simulated):
+    """An action is in units of half a radian from the default pose, to the limits of the joints."""
 
-    def check_pace(self, last: Array, command: Array) -> None:
-        assert (np.abs(command) <= [0.5, 0.7]).all()
+    def test_spaces_have_a_label_for_each_number(self):
+        task, (low, high) = self.make(1), UR_MODELS["ur10"].joint_limits
+        np.testing.assert_array_equal(task.action_space.high, ((high - DEFAULT) / 0.5).astype(np.float32))
+        np.testing.assert_array_equal(task.action_space.low, ((low - DEFAULT) / 0.5).astype(np.float32))
+        bound = [*(1.2 * high - DEFAULT), *[np.inf] * 9, *[1.0] * 4, *task.action_space.high]
+        np.testing.assert_array_equal(task.observation_space.high, np.array(bound, np.float32))
+        bound = [*(1.2 * low - DEFAULT), *[-np.inf] * 9, *[-1.0] * 4, *task.action_space.low]
+        np.testing.assert_array_equal(task.observation_space.low, np.array(bound, np.float32))
+        assert len({label.name for label in task.observation_labels}) == 25
 
-
-class TestNavigation(Drive):
-    id = "bam/mir100-navigation-v0"
-
-
-class TestNavigationInParity(TestNavigation):
-    options = PARITY
-
-
-class TestAvoidance(Drive):
-    id = "bam/mir100-avoidance-v0"
-
-
-class TestAvoidanceInParity(TestAvoidance):
-    options = PARITY
+    def test_actions_beyond_the_space_are_cut(self):
+        with self.running() as (task, _, where), self.running() as (other, _, same):
+            high = task.action_space.high[None]
+            np.testing.assert_array_equal(task.command(100 * high, where), other.command(high, same))
 
 
 class Broken(PickTask):
-    """Breaks one promise after another."""
-
-    def observe(self, state):  # type: ignore[no-untyped-def]
+    def observe(self, state):
         state.signals["joint_position"] += 0.001
         return super().observe(state)
 
 
-def test_the_contract_finds_a_task_that_changes_a_state() -> None:
+def test_the_contract_finds_a_task_that_changes_a_state():
     contract = TaskContract()
-    contract.make = Broken  # type: ignore[method-assign]
+    contract.make = Broken
     with pytest.raises(AssertionError):
         contract.test_nothing_given_is_changed()
 
@@ -142,5 +124,5 @@ SIZES = [("bam/ur-reach-v0", {"ur_model": model}) for model in UR_MODELS]
 @pytest.mark.filterwarnings("ignore:.*A Box observation space m(ini|axi)mum value is -?infinity")  # robo-gym's bounds
 @pytest.mark.filterwarnings("ignore:.*we recommend using a symmetric and normalized space")  # Isaac Lab's actions
 @pytest.mark.filterwarnings("ignore:.*maximum and minimum values are equal")  # an elbow that sees nothing
-def test_gymnasium_finds_nothing_wrong(make, env_id, options):  # type: ignore[no-untyped-def]
+def test_gymnasium_finds_nothing_wrong(make, env_id, options):
     check_env(make(env_id, **options).unwrapped, skip_render_check=True)

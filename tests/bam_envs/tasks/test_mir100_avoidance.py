@@ -10,7 +10,7 @@ import pytest
 import bam_envs  # noqa: F401 - registers the environments
 from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.core.robot import RobotState
-from bam_envs.robo_gym.parity_bases import BEAMS
+from bam_envs.robo_gym.parity import BEAMS
 from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS
 from bam_envs.tasks.mir100_avoidance import BOXES
 from tests.bam_envs.making import make_task

@@ -1,28 +1,17 @@
 """How targets become set points of UR arms, what reset options may be, and robo-gym's names for the state."""
 
-import copy
-import pickle
-
 import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import RobotState
-from bam_envs.core.task import as_objects
 from bam_envs.robots.ur import UR_MODELS
-from bam_envs.tasks.ur_arm import (
-    UrControl,
-    collisions,
-    flag_option,
-    in_frame,
-    joint_option,
-    normalised,
-    number_option,
-    spherical,
-    wire_states,
-)
+from bam_envs.tasks.ur_arm import in_frame, joint_option, normalised, spherical, wire_states
+from bam_envs.tasks.ur_empty import UrEmptyTask
+from bam_envs.tasks.ur_reach import UrReachTask
 
-UR5, UR10 = UR_MODELS["ur5"], UR_MODELS["ur10"]
+JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
+UR5 = UR_MODELS["ur5"]
 HERE = np.array([[0.0, -2.5, 1.5, 0.0, -1.4, 0.0]])
 
 
@@ -32,35 +21,24 @@ def at(joints, sent=None, **truth):
     return RobotState({"joint_position": joints}, np.zeros(len(joints)), sent, truth)
 
 
-def test_far_targets_are_gone_to_at_a_share_of_the_speed():
-    control = UrControl(UR5, 1, 10.0, 0.1)
-    command = control.command(HERE + np.array([[1.0, -0.5, 0.0, 0.25, 0.0, -1.0]]), at(HERE))
-    step = 0.1 * np.pi / 10
-    np.testing.assert_allclose(command - HERE, [[step, -step / 2, 0, step / 4, 0, -step]], atol=1e-15)
-
-
-def test_near_targets_are_gone_to_in_half_a_second():
-    control = UrControl(UR5, 1, 10.0, 0.1)
-    command = control.command(HERE + np.array([[0.15, 0, 0, 0, 0, 0.01]]), at(HERE))
-    np.testing.assert_allclose(command - HERE, [[0.03, 0, 0, 0, 0, 0.002]], atol=1e-15)
-    quick = UrControl(UR5, 1, 20.0, 0.2)
-    command = quick.command(HERE + np.array([[0.3, 0, 0, 0, 0, 0.01]]), at(HERE))
-    np.testing.assert_allclose(command - HERE, [[0.03, 0, 0, 0, 0, 0.001]], atol=1e-15)
-
-
-def test_the_slowest_joint_sets_the_pace():
-    """A UR10's base does 120 degrees/s, its wrists 180."""
-    control = UrControl(UR10, 1, 10.0, 0.1)
-    command = control.command(HERE + np.array([[1.0, 0, 0, 1.2, 0, 0]]), at(HERE))
-    step = 0.1 * (2 * np.pi / 3) / 10
-    np.testing.assert_allclose(command - HERE, [[step, 0, 0, 1.2 * step, 0, 0]], atol=1e-15)
+@pytest.mark.parametrize(
+    ("task", "way", "step"),
+    [
+        (UrReachTask(), [1.0, -0.5, 0.0, 0.25, 0.0, -1.0], 0.1 * np.pi / 10 * np.array([1, -0.5, 0, 0.25, 0, -1])),
+        (UrReachTask(), [0.15, 0, 0, 0, 0, 0.01], [0.03, 0, 0, 0, 0, 0.002]),  # within half a second
+        (UrEmptyTask(), [0.3, 0, 0, 0, 0, 0.01], [0.03, 0, 0, 0, 0, 0.001]),
+        # The slowest joint sets the pace: a UR10's base does 120 degrees/s, its wrists 180.
+        (UrReachTask(ur_model="ur10"), [1.0, 0, 0, 1.2, 0, 0], 0.02 * np.pi / 3 * np.array([1, 0, 0, 1.2, 0, 0])),
+    ],
+)
+def test_one_period_on_the_way_to_a_target(task, way, step):
+    np.testing.assert_allclose(task.toward(HERE + np.array([way]), at(HERE)) - HERE, [step], atol=1e-15)
 
 
 def test_set_points_go_on_from_the_last_one_unless_the_arm_is_elsewhere():
-    control = UrControl(UR5, 2, 10.0, 0.1)
     here = np.tile(HERE, (2, 1))
     sent = here + np.array([[0.1, 0, 0, 0, 0, 0], [0.1, 0, 0, 0, 0.21, 0]])
-    command = control.command(here + 1.0, at(here, sent))
+    command = UrReachTask(2).toward(here + 1.0, at(here, sent))
     begin = np.stack([sent[0], here[1]])
     way = here + 1.0 - begin
     duration = np.abs(way).max(axis=1, keepdims=True) / (0.1 * np.pi)
@@ -68,26 +46,24 @@ def test_set_points_go_on_from_the_last_one_unless_the_arm_is_elsewhere():
 
 
 def test_commands_stay_inside_the_limits():
-    control = UrControl(UR5, 1, 10.0, 0.1)
     end = np.array([[0.0, 0.0, np.pi - 0.01, 0.0, 0.0, 0.0]])
-    command = control.command(end + 2.0, at(end))
-    assert command[0, 2] == np.pi
+    assert UrReachTask().toward(end + 2.0, at(end))[0, 2] == np.pi
 
 
 def test_fixed_joints_are_not_in_the_action():
-    control = UrControl(UR5, 2, 10.0, 0.1, (True, False, False, False, False, True))
-    assert control.free.tolist() == [1, 2, 3, 4]
+    task = UrReachTask(2, fix_base=True)
+    assert task.free.tolist() == [1, 2, 3, 4]
     action = np.array([[0.1, 0.2, -0.3, 7.0], [0, 0, 0, -7.0]], np.float32)
     held = np.full((2, 6), 0.5)
     expected = np.array([[0.5, 0.1, 0.2, -0.3, 1.0, 0.5], [0.5, 0, 0, 0, -1.0, 0.5]])
-    np.testing.assert_allclose(control.full(action, held), expected, atol=1e-7)
-    assert control.full(action)[:, [0, 5]].tolist() == [[0, 0], [0, 0]]
-    assert control.full(action).dtype == np.float64
+    np.testing.assert_allclose(task.full_action(action, held), expected, atol=1e-7)
+    assert task.full_action(action)[:, [0, 5]].tolist() == [[0, 0], [0, 0]]
+    assert task.full_action(action).dtype == np.float64
 
 
 def test_not_all_joints_can_be_fixed():
     with pytest.raises(InvalidValue) as caught:
-        UrControl(UR5, 1, 10.0, 0.1, (True,) * 6)
+        UrReachTask(**{f"fix_{name}": True for name in JOINTS})
     assert str(caught.value) == (
         "At least one of the six joints must be free to move: set one of the fix_ options False."
     )
@@ -113,22 +89,10 @@ def test_a_point_as_a_frame_sees_it():
     np.testing.assert_allclose(in_frame(point, position, rotation), local, atol=1e-12)
 
 
-def test_collisions_are_what_a_simulation_knows():
-    assert collisions(at(HERE)).tolist() == [False]
-    assert collisions(at(HERE, collision=np.array([True]))).tolist() == [True]
-
-
-def test_options_that_are_not_given_are_the_defaults():
-    for options in ({}, {"joint_positions": None, "randomize_start": None}):
-        np.testing.assert_array_equal(joint_option(options, "joint_positions", HERE[0], UR5), HERE[0])
-        assert flag_option(options, "randomize_start") is False
-
-
-def test_options_that_are_given():
-    given = [0, -1, 1, 0, 0.5, 6]
-    for value in (given, tuple(given), np.array(given)):
-        np.testing.assert_array_equal(joint_option({"joint_positions": value}, "joint_positions", HERE[0], UR5), given)
-    assert flag_option({"randomize_start": np.bool_(True)}, "randomize_start") is True
+@pytest.mark.parametrize("given", [None, [0, -1, 1, 0, 0.5, 6], (0, -1, 1, 0, 0.5, 6), np.array([0, -1, 1, 0, 0.5, 6])])
+def test_joint_options(given):
+    expected = HERE[0] if given is None else given
+    np.testing.assert_array_equal(joint_option({"joint_positions": given}, HERE[0], UR5), expected)
 
 
 @pytest.mark.parametrize(
@@ -149,20 +113,8 @@ def test_options_that_are_given():
 )
 def test_joint_options_that_do_not_fit(value, text):
     with pytest.raises(InvalidValue) as caught:
-        joint_option({"joint_positions": value}, "joint_positions", HERE[0], UR5)
+        joint_option({"joint_positions": value}, HERE[0], UR5)
     assert str(caught.value) == text
-
-
-def test_other_options_that_do_not_fit():
-    with pytest.raises(InvalidValue) as caught:
-        flag_option({"randomize_start": 1}, "randomize_start")
-    assert str(caught.value) == "The reset option randomize_start must be True or False, not 1."
-    with pytest.raises(InvalidValue) as caught:
-        number_option({"place": [1, 2]}, "place", (), 3)
-    assert str(caught.value) == "The reset option place must be 3 finite numbers, not [1, 2]."
-
-
-JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
 
 
 def a_state(**truth):
@@ -200,10 +152,3 @@ def test_more_with_an_object_and_the_forearm():
     forearm = UR5.geometry.link_poses(state.signals["joint_position"])[0][:, 2]
     assert [two[0][f"forearm_to_ref_translation_{axis}"] for axis in "xyz"] == forearm[0].tolist()
     assert one[0]["in_collision"] == 0.0
-
-
-def test_it_can_be_pickled_and_copied():
-    objects = as_objects(list(wire_states(UR5, a_state())))
-    assert objects.shape == (2,)
-    assert all(type(value) is float for value in objects[0].values())
-    assert pickle.loads(pickle.dumps(objects))[1] == objects[1] == copy.deepcopy(objects[1])

@@ -90,13 +90,13 @@ class ArmContacts:
         """Whether two links that share no joint overlap. Shape: (n,)."""
         one, other = self._one, self._other
         distance = segment_distance2(arms.start[:, one], arms.end[:, one], arms.start[:, other], arms.end[:, other])
-        return _any(distance < self._near)
+        return np.logical_or.reduce(distance < self._near, axis=1)
 
     def touching_table(self, arms: Capsules) -> Flags:
         """Whether a link is lower than the ground or overlaps the table. Shape: (n,)."""
         start, end, radius = arms.start[:, _LOW_LINKS], arms.end[:, _LOW_LINKS], arms.radius[_LOW_LINKS]
         lowest = np.minimum(start[:, :, 2], end[:, :, 2]) - radius
-        touching = _any(lowest < GROUND)
+        touching = np.logical_or.reduce(lowest < GROUND, axis=1)
         row, link = np.nonzero(lowest < TABLE[1, 2])
         if len(row):  # the others are above the table
             overlaps = box_distance2(start[row, link], end[row, link]) < radius[link] ** 2
@@ -109,7 +109,7 @@ class ArmContacts:
         offset = middle[:, None] - start
         share = np.clip(_dot(offset, way) / np.maximum(_dot(way, way), 1e-12), 0.0, 1.0)
         offset -= share[:, :, None] * way
-        return _any(_dot(offset, offset) < (arms.radius[1:] + BALL_RADIUS) ** 2)
+        return np.logical_or.reduce(_dot(offset, offset) < (arms.radius[1:] + BALL_RADIUS) ** 2, axis=1)
 
 
 def segment_distance2(start: Array, end: Array, other_start: Array, other_end: Array) -> Array:
@@ -145,12 +145,6 @@ def _outside(point: Array) -> Array:
     """How far points (n, 3) are outside the table, along each axis."""
     outside: Array = np.maximum(point - TABLE[1], 0.0) + np.minimum(point - TABLE[0], 0.0)
     return outside
-
-
-def _any(flags: Flags) -> Flags:
-    """Whether one of each row is set. Shape: (n, k) -> (n,)."""
-    result: Flags = np.logical_or.reduce(flags, axis=1)
-    return result
 
 
 def _dot(one: Array, other: Array) -> Array:

@@ -79,12 +79,8 @@ class Imperfection:
         model.actuator_gainprm[:, 0] = nominal.actuator_gainprm[:, 0] * gain
         model.actuator_biasprm[:, 1:3] = nominal.actuator_biasprm[:, 1:3] * gain[:, None]
         mass, friction, size = (rng.uniform(*span) for span in (ranges.mass, ranges.friction, ranges.size))
-        if self._has_object:
-            self._vary_object(model, nominal, mass, friction, size)
-            self._physics.recompute(env)
-
-    @staticmethod
-    def _vary_object(model: Any, nominal: Any, mass: float, friction: float, size: float) -> None:
+        if not self._has_object:
+            return
         body, geom = model.body("object").id, model.geom("object").id
         model.body_mass[body] = nominal.body_mass[body] * mass
         model.body_inertia[body] = nominal.body_inertia[body] * mass * size**2
@@ -94,6 +90,7 @@ class Imperfection:
         for name in ("object", "left_pad", "right_pad"):
             index = model.geom(name).id
             model.geom_friction[index, 0] = nominal.geom_friction[index, 0] * friction
+        self._physics.recompute(env)
 
     def delayed(self, command: Array) -> Array:
         """What reaches the robot now when `command` (n, m) is sent."""

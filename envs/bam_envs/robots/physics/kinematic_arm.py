@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, ResetNeeded
 from bam_envs.core.robot import EnvIds, Initial, RobotState, checked_command
-from bam_envs.robots.physics.contacts import GROUND, TABLE, ArmContacts, Capsules
+from bam_envs.robots.physics.contacts import GROUND, TABLE, ArmContacts
 from bam_envs.robots.physics.obstacles import RADIUS, Obstacles
 from bam_envs.robots.physics.shapes import BLUE, GREY, RED, WOOD, Drawn, Shape, View
 from bam_envs.robots.ur import DEFAULT_MODEL, START, UrModel, ur_spec
@@ -77,9 +77,8 @@ class KinematicArm(Drawn):
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
         """Set these environments to the initial joint positions, at rest, and begin the way of their obstacles."""
         self._require_link()
-        self._position, self._velocity = self._position.copy(), self._velocity.copy()  # states of before keep theirs
-        self._stamp, self._command = self._stamp.copy(), self._command.copy()
-        self._collided = self._collided.copy()
+        for name in _ARRAYS:  # states of before keep theirs
+            setattr(self, "_" + name, getattr(self, "_" + name).copy())
         self._position[env_ids] = initial.signals["joint_position"]
         self._velocity[env_ids], self._stamp[env_ids] = 0.0, 0.0
         self._command[env_ids] = self._position[env_ids]
@@ -149,11 +148,17 @@ class KinematicArm(Drawn):
         self._connected = False
 
     def picture(self) -> tuple[list[Shape], View]:
-        """The arm of environment 0, its table and its ball."""
-        shapes = [table_shape(), *arm_shapes(self._contacts.capsules(self._position[:1]))]
+        """The arm of environment 0, its table and its ball, from so far away that the arm fits."""
+        x, y, z = (TABLE[1] - TABLE[0]).tolist()
+        shapes = [Shape("box", TABLE.mean(axis=0), (x, y, z), WOOD)]
+        arms = self._contacts.capsules(self._position[:1])
+        for link, (start, end, radius) in enumerate(zip(arms.start[0], arms.end[0], arms.radius, strict=True)):
+            colour = GREY if link in (2, 3) else BLUE  # tubes around joints are blue
+            shapes.append(Shape("capsule", start, (float(radius),), colour, to=end))
         if self._obstacles is not None:
-            shapes.append(ball_shape(self._obstacles.position(self._stamp)[0]))
-        return shapes, view_of(self.model.workspace_radius)
+            shapes.append(Shape("sphere", self._obstacles.position(self._stamp)[0], (RADIUS,), RED))
+        reach = self.model.workspace_radius
+        return shapes, View((0.0, 0.1 * reach, 0.35 * reach), max(1.6, 2.6 * reach), 140.0, -25.0)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the future of the simulated robots depends on."""
@@ -193,28 +198,3 @@ def obstacle_arm(num_robots: int = 1, *, randomize: bool = False, ur_model: str 
 def isaac_arm(num_robots: int = 1, *, randomize: bool = False, ur_model: str = "ur10") -> KinematicArm:
     """The arm at 30 Hz."""
     return KinematicArm(num_robots, model_called(ur_model), 1 / 30, randomize=randomize)
-
-
-def view_of(reach: float) -> View:
-    """From the front, so far away that an arm of `reach` [m] fits."""
-    return View((0.0, 0.1 * reach, 0.35 * reach), max(1.6, 2.6 * reach), 140.0, -25.0)
-
-
-def table_shape() -> Shape:
-    """The table that the arm stands on."""
-    x, y, z = (TABLE[1] - TABLE[0]).tolist()
-    return Shape("box", TABLE.mean(axis=0), (x, y, z), WOOD)
-
-
-def arm_shapes(arms: Capsules) -> list[Shape]:
-    """The tubes of the first arm; those around joints are blue."""
-    shapes = []
-    for link, (start, end, radius) in enumerate(zip(arms.start[0], arms.end[0], arms.radius, strict=True)):
-        colour = GREY if link in (2, 3) else BLUE
-        shapes.append(Shape("capsule", start, (float(radius),), colour, to=end))
-    return shapes
-
-
-def ball_shape(position: Array) -> Shape:
-    """The obstacle at `position` (3,) [m]."""
-    return Shape("sphere", position, (RADIUS,), RED)

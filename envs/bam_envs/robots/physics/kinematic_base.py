@@ -30,7 +30,11 @@ from bam_envs.robots.physics.shapes import BLUE, DARK, GREY, RED, WOOD, Colour, 
 Array = NDArray[np.float64]
 HEIGHT = 0.352
 """Of a MiR100 [m]."""
-_FLOOR_TO_BODY = 0.05
+_BODY: tuple[tuple[float, tuple[float, float, float], float, Colour], ...] = (
+    (FOOTPRINT_AHEAD, (*FOOTPRINT, HEIGHT - 0.05), HEIGHT, BLUE),
+    (FOOTPRINT_AHEAD + FOOTPRINT[0] / 2 - 0.1, (0.08, FOOTPRINT[1] - 0.1, 0.02), HEIGHT + 0.02, DARK),
+)
+"""Boxes that the base looks like: how far ahead [m], edges [m], height of the top [m], colour."""
 _WALL = (0.15, 0.5)  # thickness and height [m]
 _LASER_HEIGHT = 0.1914
 _EVERY = 6
@@ -106,31 +110,26 @@ class SimulatedBase(Drawn):
         self._require_link()
         pose = initial.signals.get("base_pose", np.zeros((len(env_ids), 3)))
         boxes = initial.signals.get("obstacle_pose", np.tile(np.array(NOWHERE), (len(env_ids), self.boxes.shape[1], 1)))
-        self._require_free(pose, boxes)
-        self._own()
+        touching = np.flatnonzero(touches(pose, self.room, boxes))
+        if len(touching):
+            where, walls = np.round(pose[touching[0]], 3).tolist(), ""
+            if self.room is not None:
+                (left, bottom), (right, top) = self.room.low, self.room.high
+                walls = f" The walls are at x {left:g} and {right:g} m, y {bottom:g} and {top:g} m."
+            raise InvalidValue(
+                f"The base cannot start at {where} (x, y [m], yaw [rad]): it touches a wall or a box there.{walls}"
+            )
+        for attribute in ("_seen", *_MEMORY.values()):  # states that were handed out keep theirs
+            setattr(self, attribute, getattr(self, attribute).copy())
         self.pose[env_ids], self.boxes[env_ids] = pose, boxes
         self._velocity[env_ids], self._stamp[env_ids], self._command[env_ids] = 0.0, 0.0, 0.0
         self._collision[env_ids], self._scans[env_ids] = False, 0
         self._seeds[env_ids] = mixed(initial.seeds.astype(np.uint64))
         if self.randomize:
-            self._gain[env_ids] = 1.0 + GAIN_SPREAD * _uniform(self._seeds[env_ids], 2)
+            columns = [mixed(self._seeds[env_ids] ^ np.uint64(1 + column)) for column in range(2)]
+            self._gain[env_ids] = 1.0 + GAIN_SPREAD * (np.stack(columns, axis=1) / 2.0**63 - 1.0)  # from -1 to 1
         self._scan(env_ids)
         return self._state()
-
-    def _own(self) -> None:
-        """States that were handed out keep their arrays; go on with copies."""
-        self.pose, self.boxes, self._velocity = self.pose.copy(), self.boxes.copy(), self._velocity.copy()
-        self._stamp, self._command, self._seen = self._stamp.copy(), self._command.copy(), self._seen.copy()
-        self._collision = self._collision.copy()
-
-    def _require_free(self, pose: Array, boxes: Array) -> None:
-        touching = np.flatnonzero(touches(pose, self.room, boxes))
-        if len(touching):
-            where = np.round(pose[touching[0]], 3).tolist()
-            raise InvalidValue(
-                f"The base cannot start at {where} (x, y [m], yaw [rad]): it touches a wall or a box there."
-                f"{_inside(self.room)}"
-            )
 
     def step(self, command: Array) -> RobotState:
         """Drive with `command` (n, 2), forward [m/s] and turning anticlockwise [rad/s]; one period later, measure."""
@@ -200,11 +199,22 @@ class SimulatedBase(Drawn):
         self._connected = False
 
     def picture(self) -> tuple[list[Shape], View]:
-        """The base of environment 0, its room and boxes, and what its lasers see."""
-        pose, seen = self.pose[0], self._seen[0]
-        scans = scan_shapes(pose, seen[:FRONT_RAYS], seen[FRONT_RAYS:]) if len(seen) else []
-        shapes = [*base_shapes(pose), *wall_shapes(self.room), *box_shapes(self.boxes[0]), *scans]
-        return shapes, view_of(pose, self.room)
+        """The base of environment 0, its room and boxes, and what its lasers see.
+
+        From above: the whole room; without one, the camera goes along once the base has gone far.
+        """
+        pose, seen, rotation = self.pose[0], self._seen[0], turned(float(self.pose[0, 2]))
+        shapes = []
+        for ahead, edges, top, colour in _BODY:  # a dark bar says which end is the front
+            middle = np.array([pose[0], pose[1], top - edges[2] / 2]) + rotation @ [ahead, 0.0, 0.0]
+            shapes.append(Shape("box", middle, edges, colour, rotation))
+        shapes += [] if self.room is None else wall_shapes(self.room)
+        for x, y, yaw in self.boxes[0]:
+            shapes.append(Shape("box", np.array([x, y, BOX_EDGE / 2]), (BOX_EDGE,) * 3, WOOD, turned(yaw)))
+        if len(seen):
+            shapes += scan_shapes(pose, seen[:FRONT_RAYS], seen[FRONT_RAYS:])
+        x, y = pose[:2] - np.clip(pose[:2], -_STAYS, _STAYS) if self.room is None else (0.0, 0.0)
+        return shapes, View((round(float(x), 3), round(float(y), 3), 0.0), 11.0, 90.0, -65.0)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the future of the bases depends on."""
@@ -234,50 +244,8 @@ _MEMORY = {
 """Name in a saved state -> attribute."""
 
 
-def _inside(room: Room | None) -> str:
-    """What to say of the walls."""
-    if room is None:
-        return ""
-    (left, bottom), (right, top) = room.low, room.high
-    return f" The walls are at x {left:g} and {right:g} m, y {bottom:g} and {top:g} m."
-
-
-def _uniform(seeds: NDArray[np.uint64], count: int) -> Array:
-    """`count` numbers from -1 to 1 for each seed. Shape: (n,) -> (n, count)."""
-    columns = [mixed(seeds ^ np.uint64(column + 1)) for column in range(count)]
-    return np.stack(columns, axis=1) / 2.0**63 - 1.0
-
-
-def view_of(pose: Array, room: Room | None) -> View:
-    """From above: the whole room; without one, the camera goes along once the base has gone far. `pose`: (3,)."""
-    x, y = pose[:2] - np.clip(pose[:2], -_STAYS, _STAYS) if room is None else (0.0, 0.0)
-    return View((round(float(x), 3), round(float(y), 3), 0.0), 11.0, 90.0, -65.0)
-
-
-def base_shapes(pose: Array) -> list[Shape]:
-    """The base at `pose` (3,): x, y [m], yaw [rad]; a dark bar says which end is the front."""
-    return [
-        _body(pose, FOOTPRINT_AHEAD, (*FOOTPRINT, HEIGHT - _FLOOR_TO_BODY), HEIGHT, BLUE),
-        _body(pose, FOOTPRINT_AHEAD + FOOTPRINT[0] / 2 - 0.1, (0.08, FOOTPRINT[1] - 0.1, 0.02), HEIGHT + 0.02, DARK),
-    ]
-
-
-def _body(pose: Array, ahead: float, edges: tuple[float, float, float], top: float, colour: Colour) -> Shape:
-    rotation = turned(float(pose[2]))
-    position = np.array([pose[0], pose[1], top - edges[2] / 2]) + rotation @ [ahead, 0.0, 0.0]
-    return Shape("box", position, edges, colour, rotation)
-
-
-def box_shapes(boxes: Array) -> list[Shape]:
-    """The boxes at `boxes` (b, 3): x, y [m], yaw [rad]."""
-    edges = (BOX_EDGE, BOX_EDGE, BOX_EDGE)
-    return [Shape("box", np.array([x, y, BOX_EDGE / 2]), edges, WOOD, turned(yaw)) for x, y, yaw in boxes]
-
-
-def wall_shapes(room: Room | None) -> list[Shape]:
+def wall_shapes(room: Room) -> list[Shape]:
     """The four walls around `room`."""
-    if room is None:
-        return []
     low, high, (thick, height) = np.array(room.low), np.array(room.high), _WALL
     middle, edges = (low + high) / 2, high - low + 2 * thick
     walls = []
@@ -292,17 +260,10 @@ def scan_shapes(pose: Array, front: Array, back: Array) -> list[Shape]:
     """Dots where some of the rays end, of the base at `pose` (3,) whose scanners measure `front` and `back` [m]."""
     dots = []
     for mount, masked, ranges in ((FRONT_MOUNT, FRONT_MASKED, front), (BACK_MOUNT, BACK_MASKED, back)):
-        bearing = np.linspace(*SCAN_SPAN, SCAN_RAYS)[masked[0] : SCAN_RAYS - masked[1]]
-        for x, y in _ends(pose, mount, bearing[::_EVERY], ranges[::_EVERY]):
+        bearing = np.linspace(*SCAN_SPAN, SCAN_RAYS)[masked[0] : SCAN_RAYS - masked[1]][::_EVERY]
+        ends = ranges[::_EVERY] < SCAN_RANGE[1]  # the others meet nothing
+        eye = pose[:2] + turned(float(pose[2]))[:2, :2] @ np.array(mount[:2])
+        heading, far = float(pose[2]) + mount[2] + bearing[ends], ranges[::_EVERY][ends, None]
+        for x, y in eye + far * np.stack([np.cos(heading), np.sin(heading)], axis=1):
             dots.append(Shape("sphere", np.array([x, y, _LASER_HEIGHT]), (0.03,), RED))
     return dots
-
-
-def _ends(pose: Array, mount: tuple[float, float, float], bearing: Array, ranges: Array) -> Array:
-    """Where rays end that end at all [m]. Shape: (k, 2)."""
-    met = ranges < SCAN_RANGE[1]
-    rotation = turned(float(pose[2]))[:2, :2]
-    heading = float(pose[2]) + mount[2] + bearing[met]
-    ways = ranges[met, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
-    ends: Array = pose[:2] + rotation @ np.array(mount[:2]) + ways
-    return ends

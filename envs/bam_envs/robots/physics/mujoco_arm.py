@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, PhysicsDiverged, ResetNeeded
 from bam_envs.core.robot import EnvIds, Initial, RobotState, checked_command
+from bam_envs.robots.physics.shapes import marked
 from bam_envs.robots.ur5e import COMMAND, GRIPPER_OPEN, GRIPPER_SPEED, arm_spec
 
 if TYPE_CHECKING:
@@ -159,7 +160,10 @@ class SimulatedArm:
         self._command = np.clip(within, LOWEST, HIGHEST)
         arriving = self._command if self._imperfection is None else self._imperfection.delayed(self._command)
         travel = arriving - self._setpoint
-        travel[:, 6] = self._gripper_travel(arriving[:, 6])
+        # The gripper's set point goes at its own speed, and stays near the fingers.
+        fingers, limit = self.physics.qpos[:, 6] + self.physics.qpos[:, 7], GRIPPER_SPEED * self.spec.period
+        width = self._setpoint[:, 6] + np.clip(travel[:, 6], -limit, limit)
+        travel[:, 6] = np.clip(width, fingers - GRIPPER_LEASH, fingers + GRIPPER_LEASH) - self._setpoint[:, 6]
         return travel
 
     def _slices(self, travel: Array, parts: int) -> Iterator[RobotState]:
@@ -171,13 +175,6 @@ class SimulatedArm:
             self._setpoint = here = start + travel * ramp[:, -1]
             last = ramp[0, -1, 0] == 1.0
             yield self._measure(self._all if last else self._all[:0])
-
-    def _gripper_travel(self, width: Array) -> Array:
-        """How far the gripper's set point goes towards `width` (n,) [m]: at its speed, and near the fingers."""
-        measured, limit = self.physics.qpos[:, 6] + self.physics.qpos[:, 7], GRIPPER_SPEED * self.spec.period
-        setpoint = self._setpoint[:, 6] + np.clip(width - self._setpoint[:, 6], -limit, limit)
-        travel: Array = np.clip(setpoint, measured - GRIPPER_LEASH, measured + GRIPPER_LEASH) - self._setpoint[:, 6]
-        return travel
 
     def _measure(self, fresh: EnvIds) -> RobotState:
         """The state of all environments; a noisy tracker looks again at the `fresh` ones only."""
@@ -232,7 +229,7 @@ class SimulatedArm:
 
         if self._renderer is None:
             self._renderer = SceneRenderer(self.physics, mode)
-        return self._renderer.render(marks)
+        return self._renderer.render(marked(marks))
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the future of the simulated robots depends on."""

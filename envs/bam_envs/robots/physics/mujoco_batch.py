@@ -16,9 +16,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.robots.physics.engine import load_mujoco
+from bam_envs.core.errors import InvalidValue, MissingExtra
 
-mujoco = load_mujoco("A simulated robot")
+try:
+    mujoco: Any = importlib.import_module("mujoco")
+except ImportError as missing:
+    raise MissingExtra("mujoco", "sim", "A simulated robot or its picture") from missing
+except RuntimeError as refused:
+    raise InvalidValue(
+        f"MuJoCo cannot be imported: {refused}. Unset MUJOCO_GL, or set it to egl or osmesa."
+    ) from refused
 rollout: Any = importlib.import_module("mujoco.rollout")
 Array = NDArray[np.float64]
 FULL = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
@@ -38,14 +45,14 @@ class Physics:
         self.model: Any = mujoco.MjModel.from_xml_path(str(MODELS / scene))
         self.num_envs = num_envs
         self._models = [copy.copy(self.model) if varied else self.model for _ in range(num_envs)]
-        threads = min(
-            len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, num_envs
-        )
-        self._threads = threads
-        self._chunk = max(1, num_envs // (4 * threads))
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        self._threads = min(cores, num_envs)
+        self._chunk = max(1, num_envs // (4 * self._threads))
         self._start()
         self._buffers: dict[int, tuple[Array, Array]] = {}
-        self.state: Array = np.tile(self._default_state(), (num_envs, 1))
+        state = np.empty(mujoco.mj_stateSize(self.model, FULL))
+        mujoco.mj_getState(self.model, self._scratch, state, FULL)
+        self.state: Array = np.tile(state, (num_envs, 1))
         """Time, joint positions, joint velocities. Shape: (n, 1 + nq + nv)."""
 
     def _start(self) -> None:
@@ -53,11 +60,6 @@ class Physics:
         self._data = [mujoco.MjData(self.model) for _ in range(self._threads)]
         self._scratch = mujoco.MjData(self.model)
         self._rollout: Any = rollout.Rollout(nthread=self._threads if self._threads > 1 else 0)
-
-    def _default_state(self) -> Array:
-        state = np.empty(mujoco.mj_stateSize(self.model, FULL))
-        mujoco.mj_getState(self.model, self._scratch, state, FULL)
-        return state
 
     @property
     def time(self) -> Array:
@@ -88,34 +90,27 @@ class Physics:
         Args:
             control: Actuator set points for each physics step. Shape: (n, steps, nu).
         """
-        states, sensors = self._output(control.shape[1])
+        steps = control.shape[1]
+        if steps not in self._buffers:
+            states = np.empty((self.num_envs, steps, self.state.shape[1]))
+            self._buffers[steps] = states, np.empty((self.num_envs, steps, self.model.nsensordata))
+        states, sensors = self._buffers[steps]
         self._rollout.rollout(
             self._models,
             self._data,
             self.state,
             control,
-            nstep=control.shape[1],
+            nstep=steps,
             state=states,
             sensordata=sensors,
             skip_checks=True,
             chunk_size=self._chunk,
         )
         after = states[:, -1].copy()
-        self._mark_diverged(after, self.time + control.shape[1] * self.model.opt.timestep)
+        # MuJoCo puts a diverged state back to its default, so its time is not what it should be, or NaN.
+        diverged = ~(np.abs(after[:, 0] - (self.time + steps * self.model.opt.timestep)) < 1e-6)
+        after[diverged] = np.nan
         self.state = after
-
-    @staticmethod
-    def _mark_diverged(state: Array, time: Array) -> None:
-        """Fill what did not get to `time` (n,) [s] with NaN: MuJoCo puts a diverged state back to its default."""
-        late = ~(np.abs(state[:, 0] - time) < 1e-6)  # also where time is NaN
-        if late.any():
-            state[late] = np.nan
-
-    def _output(self, steps: int) -> tuple[Array, Array]:
-        if steps not in self._buffers:
-            states = np.empty((self.num_envs, steps, self.state.shape[1]))
-            self._buffers[steps] = states, np.empty((self.num_envs, steps, self.model.nsensordata))
-        return self._buffers[steps]
 
     def data_of(self, env: int) -> Any:
         """An `MjData` with the state of `env` and all that follows from it; overwritten by the next call."""

@@ -102,14 +102,10 @@ class Obstacles:
         place[:, 2] += self._wave[:, 0] * _triangle(sample, self._wave[:, 1])
         follows = self._samples > 0
         if follows.any():
-            place[follows] = self._on_path(follows, sample[follows])
+            path = Splines(self._knots[follows], self._coefficients[follows])
+            count = self._samples[follows]
+            place[follows] = path.at((sample[follows] % count / (count - 1))[:, None])[:, 0]
         return place
-
-    def _on_path(self, env_ids: NDArray[np.bool_], sample: Array) -> Array:
-        count = self._samples[env_ids]
-        path = Splines(self._knots[env_ids], self._coefficients[env_ids])
-        places: Array = path.at((sample % count / (count - 1))[:, None])[:, 0]
-        return places
 
     def state_dict(self) -> dict[str, Any]:
         """How each obstacle moves, as plain arrays."""

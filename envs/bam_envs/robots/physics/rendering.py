@@ -14,30 +14,23 @@ import subprocess
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import BamEnvsError
-from bam_envs.robots.physics.engine import load_mujoco
+from bam_envs.robots.physics.mujoco_batch import mujoco
 
 if TYPE_CHECKING:
     from bam_envs.robots.physics.mujoco_batch import Physics
-    from bam_envs.robots.physics.shapes import Colour, Shape, View
+    from bam_envs.robots.physics.shapes import Shape, View
 
-mujoco = load_mujoco("A picture of a robot")
-
-Array = NDArray[np.float64]
-Mark: TypeAlias = "tuple[Array, Colour]"
-Draw = Callable[[Any], None]
-"""Appends bodies that are in no model to an ``MjvScene``."""
 WIDTH, HEIGHT = 640, 480
 CAMERA = "front"
-MARK_RADIUS = 0.02
 MOST_GEOMS = 1000
 BACKENDS = ("egl", "osmesa")
 _PROBE = "import sys, importlib; importlib.import_module('mujoco.' + sys.argv[1]).GLContext(16, 16).make_current()"
@@ -52,13 +45,13 @@ class SceneRenderer:
 
     def __init__(self, physics: Physics, mode: str) -> None:
         model = physics.model_of(0)
-        self._physics, self._view = physics, open_view(model, mode)
+        self._physics, self._view = physics, _open_view(model, mode)
         self._view.camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._view.camera.fixedcamid = model.camera(CAMERA).id
 
-    def render(self, marks: list[Mark]) -> NDArray[np.uint8] | None:
-        """An image (480, 640, 3), or None from a window."""
-        return self._view.show(self._physics.data_of(0), lambda scene: add_marks(scene, marks))
+    def render(self, shapes: Sequence[Shape]) -> NDArray[np.uint8] | None:
+        """An image (480, 640, 3), or None from a window; with `shapes` besides."""
+        return self._view.show(self._physics.data_of(0), shapes)
 
     def close(self) -> None:
         """Free the OpenGL context or close the window."""
@@ -66,41 +59,29 @@ class SceneRenderer:
 
 
 class ShapeRenderer:
-    """Draws shapes off screen or in a window; OpenGL is started by the first picture.
+    """Draws shapes on a floor, off screen or in a window; OpenGL is started by the first picture.
 
     Args:
         mode: ``"rgb_array"`` or ``"human"``.
         floor: Height of the floor [m].
-        mark_radius: Radius of the marks [m].
     """
 
-    def __init__(self, mode: str, *, floor: float = 0.0, mark_radius: float = 0.02) -> None:
+    def __init__(self, mode: str, floor: float = 0.0) -> None:
         scene = mujoco.MjSpec.from_file(str(Path(__file__).parent / "models" / "floor.xml"))
         scene.geom("floor").pos = [0.0, 0.0, floor]
         model = scene.compile()
         self._data = mujoco.MjData(model)
         mujoco.mj_forward(model, self._data)
-        self._view, self._mark_radius = open_view(model, mode), mark_radius
+        self._view = _open_view(model, mode)
         self._seen: View | None = None
 
-    def render(self, shapes: Sequence[Shape], marks: Sequence[Mark], view: View) -> NDArray[np.uint8] | None:
+    def render(self, shapes: Sequence[Shape], view: View) -> NDArray[np.uint8] | None:
         """An image (480, 640, 3), or None from a window.
 
         Args:
             shapes: What there is; what is beyond MuJoCo's most bodies is left out.
-            marks: Spheres: position (3,) [m] and colour.
             view: From where. In a window, the mouse turns it; only a new target is followed.
         """
-        self._look(view)
-
-        def draw(scene: object) -> None:
-            add_marks(scene, marks, self._mark_radius)
-            for shape in shapes:
-                add_shape(scene, shape)
-
-        return self._view.show(self._data, draw)
-
-    def _look(self, view: View) -> None:
         camera = self._view.camera
         if self._seen is None:
             camera.type = mujoco.mjtCamera.mjCAMERA_FREE
@@ -108,25 +89,14 @@ class ShapeRenderer:
         if self._seen is None or self._seen.target != view.target:
             camera.lookat[:] = view.target
         self._seen = view
+        return self._view.show(self._data, shapes)
 
     def close(self) -> None:
         """Free the OpenGL context or close the window; idempotent."""
         self._view.close()
 
 
-def add_shape(scene: object, shape: Shape) -> None:
-    """Append one body to an ``MjvScene``."""
-    edges = np.resize(np.asarray(shape.size, np.float64), 3)
-    size = edges / 2 if shape.kind == "box" else edges
-    rotation = np.eye(3) if shape.rotation is None else shape.rotation
-    geom = add_geom(scene, shape.kind, shape.position, size.tolist(), shape.colour, rotation.ravel())
-    if shape.to is not None and geom is not None:
-        ends = (np.asarray(end, np.float64) for end in (shape.position, shape.to))
-        mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, shape.size[0], *ends)
-
-
-def open_view(model: Any, mode: str) -> OffScreen | Window:
-    """Where `model` is drawn: in memory for ``rgb_array``, else in a window."""
+def _open_view(model: Any, mode: str) -> OffScreen | Window:
     return OffScreen(model) if mode == "rgb_array" else Window(model)
 
 
@@ -135,7 +105,13 @@ class OffScreen:
 
     def __init__(self, model: Any) -> None:
         self._model = model
-        self._gl: Any = gl_context(find_backend())
+        backend = find_backend()
+        try:
+            self._gl: Any = importlib.import_module(f"mujoco.{backend}").GLContext(WIDTH, HEIGHT)
+        except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
+            raise RenderingUnavailable(
+                f"MUJOCO_GL={backend} does not work here: {error}. Unset it, or try egl."
+            ) from error
         self._gl.make_current()
         self._scene = mujoco.MjvScene(model, maxgeom=MOST_GEOMS)
         self._option = mujoco.MjvOption()
@@ -145,12 +121,12 @@ class OffScreen:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         atexit.register(self.close)  # while OpenGL is still there
 
-    def show(self, data: Any, draw: Draw) -> NDArray[np.uint8]:
-        """Draw the model as `data` says and what `draw` adds; read back an image (480, 640, 3)."""
+    def show(self, data: Any, shapes: Sequence[Shape]) -> NDArray[np.uint8]:
+        """Draw the model as `data` says and `shapes`; read back an image (480, 640, 3)."""
         self._gl.make_current()
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(self._model, data, self._option, None, self.camera, everything, self._scene)
-        draw(self._scene)
+        _add_shapes(self._scene, shapes)
         view, image = mujoco.MjrRect(0, 0, WIDTH, HEIGHT), np.empty((HEIGHT, WIDTH, 3), dtype=np.uint8)
         mujoco.mjr_render(view, self._scene, self._context)
         mujoco.mjr_readPixels(image, None, view, self._context)
@@ -180,13 +156,13 @@ class Window:
         self.camera: Any = self._viewer.cam
         """From where it is seen; the mouse moves it too."""
 
-    def show(self, data: Any, draw: Draw) -> None:
+    def show(self, data: Any, shapes: Sequence[Shape]) -> None:
         """Bring the window up to date."""
         with self._viewer.lock():
             self._data.qpos[:], self._data.qvel[:], self._data.time = data.qpos, data.qvel, data.time
             mujoco.mj_forward(self._model, self._data)
             self._viewer.user_scn.ngeom = 0
-            draw(self._viewer.user_scn)
+            _add_shapes(self._viewer.user_scn, shapes)
         self._viewer.sync()
 
     def close(self) -> None:
@@ -212,57 +188,23 @@ def require_display() -> None:
     glfw.terminate()
 
 
-def add_marks(scene: Any, marks: Sequence[Mark], radius: float = MARK_RADIUS) -> None:
-    """Append a sphere of `radius` [m] for each mark to `scene`."""
-    for position, colour in marks:
-        add_geom(scene, "sphere", position, (radius, 0.0, 0.0), colour)
-
-
-_UPRIGHT = np.eye(3).ravel()
-
-
-def add_geom(
-    scene: Any,
-    kind: str,
-    position: Array,
-    size: Sequence[float],
-    colour: Colour,
-    rotation: Array = _UPRIGHT,
-) -> Any:
-    """Append a body to `scene`; it is left out where there is no room for more.
-
-    Args:
-        scene: An ``MjvScene``.
-        kind: "box" or "sphere" or another of MuJoCo's ``mjtGeom``.
-        position: Its middle [m]. Shape: (3,).
-        size: MuJoCo's sizes of the kind [m]: half edges of a box, radius of a sphere. Length 3.
-        colour: Its colour.
-        rotation: From its frame to the world's, row by row. Shape: (9,).
-
-    Returns:
-        The ``MjvGeom``, or None without room.
-    """
-    if scene.ngeom >= scene.maxgeom:
-        return None
-    geom, type_ = scene.geoms[scene.ngeom], getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
-    mujoco.mjv_initGeom(
-        geom,
-        type_,
-        np.asarray(size, np.float64),
-        np.asarray(position, np.float64),
-        rotation,
-        np.array(colour, np.float32),
-    )
-    scene.ngeom += 1
-    return geom
-
-
-def gl_context(backend: str) -> Any:
-    """An OpenGL context of `backend`, for images of `WIDTH` x `HEIGHT`."""
-    try:
-        return importlib.import_module(f"mujoco.{backend}").GLContext(WIDTH, HEIGHT)
-    except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
-        raise RenderingUnavailable(f"MUJOCO_GL={backend} does not work here: {error}. Unset it, or try egl.") from error
+def _add_shapes(scene: Any, shapes: Sequence[Shape]) -> None:
+    """Append bodies that are in no model to an ``MjvScene``, as far as it has room."""
+    for shape in shapes[: scene.maxgeom - scene.ngeom]:
+        edges = np.resize(np.asarray(shape.size, np.float64), 3)
+        geom = scene.geoms[scene.ngeom]
+        mujoco.mjv_initGeom(
+            geom,
+            getattr(mujoco.mjtGeom, f"mjGEOM_{shape.kind.upper()}"),
+            edges / 2 if shape.kind == "box" else edges,
+            np.asarray(shape.position, np.float64),
+            (np.eye(3) if shape.rotation is None else shape.rotation).ravel(),
+            np.array(shape.colour, np.float32),
+        )
+        if shape.to is not None:
+            ends = (np.asarray(end, np.float64) for end in (shape.position, shape.to))
+            mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, shape.size[0], *ends)
+        scene.ngeom += 1
 
 
 @cache

@@ -60,16 +60,13 @@ def touches(pose: Array, room: Room | None, boxes: Array) -> Flags:
     x, y = pose[:, 0] + FOOTPRINT_AHEAD * cos, pose[:, 1] + FOOTPRINT_AHEAD * sin
     hit = np.zeros(len(pose), dtype=bool)
     if room is not None:
-        hit |= _beyond(x, _HALF[0] * np.abs(cos) + _HALF[1] * np.abs(sin), room.low[0], room.high[0])
-        hit |= _beyond(y, _HALF[0] * np.abs(sin) + _HALF[1] * np.abs(cos), room.low[1], room.high[1])
+        reach_x = _HALF[0] * np.abs(cos) + _HALF[1] * np.abs(sin)
+        reach_y = _HALF[0] * np.abs(sin) + _HALF[1] * np.abs(cos)
+        hit |= (x - reach_x < room.low[0]) | (x + reach_x > room.high[0])
+        hit |= (y - reach_y < room.low[1]) | (y + reach_y > room.high[1])
     for box in range(boxes.shape[1]):
         hit |= _overlaps(x, y, cos, sin, *np.ascontiguousarray(boxes[:, box].T))
     return hit
-
-
-def _beyond(middle: Array, reach: Array, low: float, high: float) -> Flags:
-    beyond: Flags = (middle - reach < low) | (middle + reach > high)
-    return beyond
 
 
 def _overlaps(x: Array, y: Array, cos: Array, sin: Array, box_x: Array, box_y: Array, box_yaw: Array) -> Flags:
@@ -99,7 +96,7 @@ class LaserScanner:
         bearing = np.linspace(*SCAN_SPAN, SCAN_RAYS)[masked[0] : SCAN_RAYS - masked[1]]
         self.rays = len(bearing)
         """How many rays there are."""
-        self._directions: tuple[Floats, Floats] = (_float32(np.cos(bearing)), _float32(np.sin(bearing)))
+        self._directions = (np.cos(bearing).astype(np.float32), np.sin(bearing).astype(np.float32))
         self._scratch = np.empty((6, _CHUNK, self.rays), np.float32)
         self._hits = np.empty((_CHUNK, self.rays), bool)
 
@@ -114,7 +111,9 @@ class LaserScanner:
         Returns:
             Shape: (n, rays).
         """
-        eye, heading = self._eyes(pose)
+        x, y, yaw = np.ascontiguousarray(pose.T)
+        (ahead, left, turned), cos, sin = self._mount, np.cos(yaw), np.sin(yaw)
+        eye, heading = np.stack([x + ahead * cos - left * sin, y + ahead * sin + left * cos], axis=1), yaw + turned
         ranges = np.empty((len(pose), self.rays), np.float32)
         with np.errstate(divide="ignore", invalid="ignore"):  # rays along an axis
             for start in range(0, len(pose), _CHUNK):
@@ -124,12 +123,6 @@ class LaserScanner:
                 for box in range(boxes.shape[1]):
                     self._to_box(eye[chunk], heading[chunk], boxes[chunk, box], out)
         return ranges
-
-    def _eyes(self, pose: Array) -> tuple[Array, Array]:
-        """Where the scanners are [m] and look to [rad]. Shapes: (n, 2), (n,)."""
-        x, y, yaw = np.ascontiguousarray(pose.T)
-        (ahead, left, turned), cos, sin = self._mount, np.cos(yaw), np.sin(yaw)
-        return np.stack([x + ahead * cos - left * sin, y + ahead * sin + left * cos], axis=1), yaw + turned
 
     def _slopes(self, turn: Array, scratch: Floats) -> tuple[Floats, Floats]:
         """1 / x and 1 / y of each ray's direction, after a turn (k,) [rad]. Shape: (k, rays) each."""
@@ -183,10 +176,6 @@ class LaserScanner:
         np.minimum(out, near, out=out, where=hits)
 
 
-def _float32(values: Array) -> Floats:
-    return values.astype(np.float32)
-
-
 def _column(values: Array) -> Floats:
     """As a column of float32. Shape: (k,) -> (k, 1)."""
     return values.astype(np.float32)[:, None]
@@ -204,7 +193,7 @@ def noise(seeds: Seeds, count: Seeds, rays: int) -> Floats:
     """Normal deviates of mean 0 and standard deviation `NOISE` [m].
 
     Each scan is a stretch of one long tape that begins where the seed and the number of the scan say: so no
-    row has a generator of its own to keep, and a scan costs a copy.
+    environment has a generator of its own to keep, and a scan costs a copy.
 
     Args:
         seeds: Of the bases. Shape: (n,).

@@ -1,4 +1,4 @@
-"""What robots without a MuJoCo model look like: boxes, capsules and spheres. The first picture imports MuJoCo."""
+"""Bodies of a picture that are in no MuJoCo model: boxes, capsules and spheres. The first picture imports MuJoCo."""
 
 from __future__ import annotations
 
@@ -52,6 +52,11 @@ class View:
     """-90 looks straight down [deg]."""
 
 
+def marked(marks: Sequence[tuple[Array, Colour]], radius: float = 0.02) -> list[Shape]:
+    """The spheres of a task's `marks`, of `radius` [m]."""
+    return [Shape("sphere", position, (radius,), colour) for position, colour in marks]
+
+
 class Drawn:
     """A simulated robot that says what it looks like, and so has pictures; a subclass defines `picture`."""
 
@@ -62,11 +67,11 @@ class Drawn:
     _renderer: ShapeRenderer | None = None
 
     def picture(self) -> tuple[list[Shape], View]:
-        """What row 0 looks like, and from where."""
+        """What environment 0 looks like, and from where."""
         raise NotImplementedError
 
     def render(self, mode: str, marks: Sequence[tuple[Array, Colour]]) -> NDArray[np.uint8] | None:
-        """Show row 0: an image (480, 640, 3) for ``rgb_array``, a window for ``human``.
+        """Show environment 0: an image (480, 640, 3) for ``rgb_array``, a window for ``human``.
 
         Args:
             mode: ``"rgb_array"`` or ``"human"``.
@@ -75,9 +80,9 @@ class Drawn:
         from bam_envs.robots.physics.rendering import ShapeRenderer
 
         if self._renderer is None:
-            self._renderer = ShapeRenderer(mode, floor=self.floor, mark_radius=self.mark_radius)
+            self._renderer = ShapeRenderer(mode, self.floor)
         shapes, view = self.picture()
-        return self._renderer.render(shapes, marks, view)
+        return self._renderer.render([*marked(marks, self.mark_radius), *shapes], view)
 
     def close_picture(self) -> None:
         """Close the window, or free what pictures needed."""

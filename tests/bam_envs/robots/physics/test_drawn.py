@@ -5,12 +5,11 @@ import pytest
 
 from bam_envs.core.robot import Initial
 from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS
-from bam_envs.robots.physics import kinematic_base
-from bam_envs.robots.physics.kinematic_arm import obstacle_arm, reach_arm
-from bam_envs.robots.physics.kinematic_base import lab, open_floor
+from bam_envs.robots.physics.kinematic_arm import obstacle_arm
+from bam_envs.robots.physics.kinematic_base import SimulatedBase, lab, open_floor
 from bam_envs.robots.physics.rendering import RenderingUnavailable
 from bam_envs.robots.physics.room import LAB
-from bam_envs.robots.physics.shapes import BLUE, RED, Drawn
+from bam_envs.robots.physics.shapes import BLUE, RED
 
 GREEN = (0.0, 1.0, 0.0, 1.0)
 READY = {"joint_position": np.array([[0.0, -2.5, 1.5, 0.0, -1.4, 0.0]])}
@@ -67,10 +66,13 @@ def test_the_target_is_marked(connected):
     assert rows.mean() < 230
 
 
-def test_the_camera_goes_along_once_the_base_is_far():
-    assert kinematic_base.view_of(np.array([2.0, -2.0, 1.0]), None).target == (0.0, 0.0, 0.0)
-    assert kinematic_base.view_of(np.array([7.0, -4.0, 1.0]), None).target == (4.5, -1.5, 0.0)
-    assert kinematic_base.view_of(np.array([2.0, -3.0, 1.0]), LAB).target == (0.0, 0.0, 0.0)
+def test_the_camera_goes_along_once_the_base_is_far(connected):
+    for robot, pose, target in (
+        (open_floor(), [2.0, -2.0, 1.0], (0.0, 0.0, 0.0)),
+        (open_floor(), [7.0, -4.0, 1.0], (4.5, -1.5, 0.0)),
+        (lab(), [2.0, -2.7, 1.0], (0.0, 0.0, 0.0)),
+    ):
+        assert connected(robot, base_pose=np.array([pose])).picture()[1].target == target
 
 
 def test_walls_boxes_and_scans_are_seen(connected):
@@ -87,19 +89,19 @@ def test_walls_boxes_and_scans_are_seen(connected):
     assert ((image[:, :, 0] > 120) & (image[:, :, 1] < 90)).sum() > 20
 
 
-def test_walls_enclose_what_is_free():
-    walls = kinematic_base.wall_shapes(LAB)
+def test_walls_enclose_what_is_free_and_an_open_floor_has_none(connected):
+    walls = connected(lab()).picture()[0][2:6]
     insides = [
         shape.position[axis] + side * shape.size[axis] / 2
         for shape, axis, side in zip(walls, (0, 1, 0, 1), (1, 1, -1, -1), strict=True)
     ]
     np.testing.assert_allclose(insides, [*LAB.low, *LAB.high])
-    assert kinematic_base.wall_shapes(None) == []
+    assert len(connected(open_floor()).picture()[0]) == 2  # the base and its front
 
 
-def test_rays_that_meet_nothing_are_not_drawn():
-    far = np.full(FRONT_RAYS, 29.0), np.full(BACK_RAYS, 29.0)
-    assert kinematic_base.scan_shapes(np.zeros(3), *far) == []
+def test_rays_that_meet_nothing_are_not_drawn(connected):
+    far = SimulatedBase(room=None)
+    assert [shape.kind for shape in connected(far).picture()[0]] == ["box"] * 2
 
 
 @pytest.mark.parametrize("model", ["ur3", "ur5", "ur10"])
@@ -114,18 +116,9 @@ def test_an_arm_moves_and_its_ball_is_seen(connected, model):
     assert (picture(robot) != before).any(axis=2).sum() > 1000
 
 
-def test_an_arm_without_a_ball(connected):
-    assert [shape.kind for shape in connected(reach_arm(), **READY).picture()[0]] == ["box", *["capsule"] * 8]
-
-
 def test_row_0_is_drawn_after_close_too(connected):
     robot = connected(open_floor(3))
     first = picture(robot)
     robot.close()
     robot.connect()
     np.testing.assert_array_equal(picture(robot), first)
-
-
-def test_a_robot_says_what_it_looks_like():
-    with pytest.raises(NotImplementedError):
-        Drawn().picture()

@@ -12,6 +12,12 @@ from bam_envs.robots.physics.mujoco_batch import Physics
 from bam_envs.testing import ARM_HOME
 
 SCENE = "ur5e_cube.xml"
+MAKE = """
+import gymnasium, bam_envs
+env = gymnasium.make('bam/pick-v0', disable_env_checker=True)
+try: env.reset()
+except Exception as error: print(f"{type(error).__name__}: {error}")
+"""
 
 
 def control(rows, steps=10):
@@ -51,17 +57,6 @@ def test_rows_do_not_know_of_each_other():
         physics.close()
 
 
-def test_a_saved_state_goes_on_exactly():
-    physics, other = started(3), started(3)
-    for _ in range(5):
-        physics.step(control(3))
-    other.state = physics.state.copy()
-    for _ in range(5):
-        physics.step(control(3))
-        other.step(control(3))
-    np.testing.assert_array_equal(physics.state, other.state)
-
-
 @pytest.mark.parametrize("bad", [np.nan, 1e11])
 def test_a_row_that_diverges_is_noticed(bad, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its log there
@@ -88,33 +83,16 @@ def test_without_affinity_every_core_is_used(monkeypatch):
     physics.close()
 
 
-def test_varied_rows_have_models_of_their_own():
-    physics = started(2, varied=True)
-    model = physics.model_of(1)
-    model.actuator_gainprm[:, 0] *= 0.5
-    assert physics.model_of(0).actuator_gainprm[0, 0] == physics.model.actuator_gainprm[0, 0]
-    physics.close()
-
-
-def test_the_cube_rests_where_it_is_put():
-    physics = started(4)
-    physics.qpos[:, 10] = 0.02
-    before = physics.qpos[:, 8:11].copy()
-    for _ in range(40):
-        physics.step(control(4))
-    assert np.abs(physics.qpos[:, 8:11] - before).max() < 1e-3
-    physics.close()
-
-
 def test_without_mujoco_the_extra_is_named(python):
-    result = python(
-        "import sys; sys.modules['mujoco'] = None\n"
-        "import gymnasium, bam_envs\n"
-        "from bam_envs.core.errors import MissingExtra\n"
-        "env = gymnasium.make('bam/pick-v0', disable_env_checker=True)\n"
-        "try: env.reset()\n"
-        "except MissingExtra as error: print(error)\n"
+    code = "import sys; sys.modules['mujoco'] = None" + MAKE
+    expected = (
+        'A simulated robot or its picture needs mujoco, which is not installed. Run: pip install "bam-train[sim]"'
     )
-    expected = 'A simulated robot needs mujoco, which is not installed. Run: pip install "bam-train[sim]"'
-    assert result == expected
+    assert python(code) == f"MissingExtra: {expected}"
     assert issubclass(MissingExtra, ImportError)
+
+
+def test_a_backend_that_mujoco_does_not_know(python):
+    said = python(MAKE, MUJOCO_GL="dx")
+    assert said.startswith("InvalidValue: MuJoCo cannot be imported: ")
+    assert said.endswith(" Unset MUJOCO_GL, or set it to egl or osmesa.")

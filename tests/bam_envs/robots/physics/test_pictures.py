@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bam_envs.robots.physics.rendering import MOST_GEOMS, RenderingUnavailable, ShapeRenderer
-from bam_envs.robots.physics.shapes import BLUE, RED, Shape, View, turned
+from bam_envs.robots.physics.shapes import BLUE, RED, Shape, View, marked, turned
 
 ABOVE = View((0.0, 0.0, 0.0), 4.0, 90.0, -90.0)
 """Straight from above, x to the right and y up: 45 degrees high, so about 3.3 m over 480 lines at the floor."""
@@ -15,7 +15,7 @@ PIXELS = 480 / (2 * 4.0 * np.tan(np.pi / 8))
 @pytest.fixture
 def renderer():
     try:
-        made = ShapeRenderer("rgb_array", mark_radius=0.1)
+        made = ShapeRenderer("rgb_array")
     except RenderingUnavailable as error:
         pytest.skip(str(error))
     yield made
@@ -23,10 +23,10 @@ def renderer():
     made.close()
 
 
-def changed(renderer, *shapes, marks=()):
+def changed(renderer, *shapes):
     """Where the picture with these differs from that without (480, 640); shadows are faint, and left out."""
-    empty = renderer.render([], [], ABOVE).astype(int)
-    image = renderer.render(shapes, marks, ABOVE)
+    empty = renderer.render([], ABOVE).astype(int)
+    image = renderer.render(shapes, ABOVE)
     assert image.shape == (480, 640, 3)
     assert image.dtype == np.uint8
     return np.ptp(image.astype(int), axis=2) > np.ptp(empty, axis=2) + 40
@@ -65,7 +65,7 @@ def test_a_capsule_goes_from_end_to_end(renderer):
 def test_spheres_and_marks(renderer):
     seen = changed(renderer, Shape("sphere", np.array([0.6, 0.6, 0.0]), (0.2,), RED))
     np.testing.assert_allclose(extent(seen), (0.4, 0.4), atol=0.05)
-    seen = changed(renderer, marks=[(np.array([-0.6, 0.6, 0.0]), (0.0, 1.0, 0.0, 1.0))])
+    seen = changed(renderer, *marked([(np.array([-0.6, 0.6, 0.0]), (0.0, 1.0, 0.0, 1.0))], 0.1))
     np.testing.assert_allclose(middle(seen), (-0.6, 0.6), atol=0.03)
     np.testing.assert_allclose(extent(seen), (0.2, 0.2), atol=0.05)
 
@@ -73,18 +73,18 @@ def test_spheres_and_marks(renderer):
 def test_the_camera_follows_its_target(renderer):
     box = Shape("box", np.array([5.0, 3.0, 0.01]), (0.4, 0.4, 0.02), BLUE)
     assert not changed(renderer, box).any()
-    image = renderer.render([box], [], View((5.0, 3.0, 0.0), 4.0, 90.0, -90.0)).astype(int)
+    image = renderer.render([box], View((5.0, 3.0, 0.0), 4.0, 90.0, -90.0)).astype(int)
     np.testing.assert_allclose(middle(np.ptp(image, axis=2) > 80), (0.0, 0.0), atol=0.02)
 
 
 def test_what_is_too_much_is_left_out(renderer):
     many = [Shape("sphere", np.array([0.0, 0.0, 0.0]), (0.01,), RED)] * (2 * MOST_GEOMS)
-    assert renderer.render(many, [], ABOVE).shape == (480, 640, 3)
+    assert renderer.render(many, ABOVE).shape == (480, 640, 3)
 
 
 def test_the_floor_may_lie_lower(renderer):
     lower = ShapeRenderer("rgb_array", floor=-0.5)
     try:
-        assert (lower.render([], [], ABOVE) != renderer.render([], [], ABOVE)).any()
+        assert (lower.render([], ABOVE) != renderer.render([], ABOVE)).any()
     finally:
         lower.close()

@@ -1,4 +1,4 @@
-"""robo-gym's arithmetic of the UR arms' tasks, to the last constant, oddities included: nothing is scaled."""
+"""robo-gym's arithmetic (2.1.0), to the last constant, oddities included: what ``parity=True`` makes of our tasks."""
 
 from __future__ import annotations
 
@@ -11,16 +11,26 @@ from gymnasium import spaces
 from bam_envs.core.errors import ProtocolError
 from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.task import Array, Flags, Floats, Label, Score
+from bam_envs.robots.mir100 import BACK_RAYS, FOOTPRINT, FRONT_RAYS
 from bam_envs.robots.ur import JOINTS, START
 from bam_envs.tasks.isaac_reach import TOOL1, IsaacReachTask
+from bam_envs.tasks.mir100_avoidance import NEAREST, Mir100AvoidanceTask
+from bam_envs.tasks.mir100_navigation import ARRIVED, BOUNDARY, MAX_STEPS, DriveTask, Mir100NavigationTask
 from bam_envs.tasks.ur_arm import UrTask, in_frame, joint_labels, normalised, spherical
-from bam_envs.tasks.ur_avoidance import COLLISION, SPREAD, UrAvoidanceTask, UrObstacleTask, obstacle_labels
+from bam_envs.tasks.ur_avoidance import COLLISION, UrAvoidanceTask, UrObstacleTask, obstacle_labels
 from bam_envs.tasks.ur_empty import UrEmptyTask
 from bam_envs.tasks.ur_reach import UrReachTask
 from bam_envs.tasks.ur_track import FIXED_PATHS, UrTrackTask
 
 _INF = np.inf
 _UNSCALED = ("1", "1", "1")
+NEARER, FAILING, POWER = 50.0, -200.0, (0.30, 0.03)
+"""Rewards of a metre nearer and of failure; cost of full speed, forward and turning."""
+SAFETY_RADIUS = 0.40
+"""A corner of the base nearer than this to the middle of a box is a collision [m]."""
+BEAMS = np.round(np.linspace(0, FRONT_RAYS + BACK_RAYS - 1, 16)).astype(np.int64)
+"""The rays that are observed, out of those of the front and the back scanner."""
+_CORNERS = np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]]) * np.array(FOOTPRINT) / 2
 
 
 class UrParity(UrTask):
@@ -67,11 +77,14 @@ class UrReachParity(UrParity, UrReachTask):
     last one; and after 300 steps an episode is terminated as "max_steps_exceeded".
     """
 
+    must_be_in_reach = False
+
     def __init__(
         self, num_envs: int = 1, *, restrict_wrist_1: bool = True, modular: bool = False, **options: Any
     ) -> None:
         super().__init__(num_envs, restrict_wrist_1=restrict_wrist_1, modular=modular, **options)
         self._restrict = restrict_wrist_1 and not modular  # robo-gym maps a fixed wrist 1 too, and so moves it
+        self.forgets_success = modular  # else a success of any earlier episode counts
         if modular:
             self.start = START
 
@@ -100,13 +113,6 @@ class UrReachParity(UrParity, UrReachTask):
         target = super()._given_target(options)
         return np.zeros(3) if target is None and self.modular else target  # robo-gym's sampler forgets the place
 
-    def _require_reach(self, target: Array) -> None:
-        """Any target will do."""
-
-    def _forget_success(self, env_ids: EnvIds) -> None:
-        if self.modular:  # else a success of any earlier episode counts
-            super()._forget_success(env_ids)
-
 
 class IsaacReachParity(UrParity, IsaacReachTask):
     """robo-gym's IsaacReachUR.
@@ -116,10 +122,7 @@ class IsaacReachParity(UrParity, IsaacReachTask):
     turned by 90 degrees about x. Observations and actions are then those of Isaac Lab's policies.
     """
 
-    yaw, frame = 3.14, TOOL1
-
-    def _action_scale(self, isaac_scale: float) -> float:
-        return isaac_scale
+    yaw, frame, unscaled = 3.14, TOOL1, True
 
     def _action_labels(self) -> tuple[Label, ...]:
         low, high = (self.model.joint_limits - self._default) / self.scale
@@ -178,12 +181,10 @@ class UrAvoidanceParity(UrObstacleParity, UrAvoidanceTask):
 
     pose, collision_reward = START, None
 
-    def _staying(self, state: RobotState) -> Array:
-        """Its gate is a wrong slice: the last three offsets and the obstacle seen from the elbow. Shape: (n,)."""
+    def spread(self, state: RobotState) -> tuple[Array, Array]:
+        """The second is a wrong slice: the last three offsets and the obstacle seen from the elbow."""
         seen = np.abs(self.observe(state).astype(np.float64))
-        off, gate = seen[:, 9:15].sum(axis=1), seen[:, 12:18].sum(axis=1)
-        staying: Array = np.where(gate < SPREAD, (1 - off / SPREAD) / 1000, 0.0)
-        return staying
+        return seen[:, 9:15].sum(axis=1), seen[:, 12:18].sum(axis=1)
 
 
 class UrTrackParity(UrObstacleParity, UrTrackTask):
@@ -218,6 +219,113 @@ class UrTrackParity(UrObstacleParity, UrTrackTask):
         reward, counted = self._following(state, offset, action), self.targets_reached
         self._advance(state)
         return self.scored(state, reward, COLLISION, targets_reached=counted.copy())
+
+
+class DriveParity(DriveTask):
+    """Metres and radians; the way, but none for the first step; 500 steps terminate."""
+
+    success_reward: float
+
+    def labels(self) -> tuple[Label, ...]:
+        """Nothing is scaled."""
+        return (
+            Label("target_distance", "target from the base", "m", low=-_INF, high=_INF),
+            Label("target_bearing", "where the target is, seen from the base", "rad", low=-np.pi, high=np.pi),
+            Label("linear_velocity", "speed forward", "m/s", low=-1.1, high=1.1),
+            Label("angular_velocity", "speed of turning anticlockwise", "rad/s", low=-1.6, high=1.6),
+        )
+
+    def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
+        """There is no distance of before."""
+        super().on_reset(env_ids, state)
+        self._previous[env_ids] = np.nan
+
+    def _columns(self, state: RobotState) -> list[Array]:
+        return [*self.way(state), *state.signals["base_velocity"].T]
+
+    def _bounded(self, observation: Floats) -> Floats:
+        return require_inside(observation, self.observation_space, self.observation_labels)
+
+    def score(self, state: RobotState, action: Floats) -> Score:
+        """Arriving wins over failing, and the last step over both."""
+        distance, failed = self.distance(state), self.failed(state)
+        success = distance < ARRIVED
+        # The first step has no shaping but its power, which is float32 as the action.
+        forward, turn = np.abs(action * np.array(POWER, np.float32)).T
+        nearer = -NEARER * distance - -NEARER * self._previous
+        first = np.isnan(self._previous)
+        reward = np.where(first, (-forward - turn).astype(np.float64), nearer - forward - turn)
+        reward = np.where(failed, FAILING, reward)
+        reward = np.where(success, self.success_reward, reward)
+        self.elapsed = self.elapsed + 1
+        late = self.elapsed >= MAX_STEPS
+        status = np.where(success, "success", np.where(failed, self.failure, ""))
+        status = np.where(late, "max_steps_exceeded", status)
+        return self._scored(state, distance, reward, failed | success | late, success, status)
+
+    def _wire_obstacles(self, state: RobotState) -> Array:
+        return np.zeros((self.num_envs, 9))
+
+
+class Mir100NavigationParity(DriveParity, Mir100NavigationTask):
+    """robo-gym's NoObstacleNavigationMir100.
+
+    With ``parity=True`` observation, reward and end are those of robo-gym's `NoObstacleNavigationMir100`: metres and
+    radians, the way at a hundred times this reward but none for that of the first step, 200 at success, -200 outside,
+    y below -10 m is not noticed, and the episode is terminated after 500 steps as "max_steps_exceeded".
+    """
+
+    success_reward = 200.0
+
+    def failed(self, state: RobotState) -> Flags:
+        """Whether the base left the floor; a misplaced parenthesis lets it go where y is low. Shape: (n,)."""
+        x, y = state.signals["base_pose"][:, 0], state.signals["base_pose"][:, 1]
+        outside: Flags = (np.abs(x) > BOUNDARY) | (y > BOUNDARY)
+        return outside
+
+
+class Mir100AvoidanceParity(DriveParity, Mir100AvoidanceTask):
+    """robo-gym's ObstacleAvoidanceMir100.
+
+    With ``parity=True`` observation, reward and end are those of robo-gym's `ObstacleAvoidanceMir100`: metres and
+    radians, 16 single rays, the way at a hundred times this reward but none for that of the first step, 100 at
+    success, -200 at a collision; it collides also when a corner comes near the middle of a box, never on a live robot
+    and never by a ray that is not a number, and the episode is terminated after 500 steps as "max_steps_exceeded".
+    """
+
+    success_reward = 100.0
+
+    def labels(self) -> tuple[Label, ...]:
+        """Those of driving, and single rays."""
+        rays = (Label(f"range_{ray}", f"ray {ray} of both scanners", "m", low=0.0, high=29.0) for ray in BEAMS)
+        return (*DriveParity.labels(self), *rays)
+
+    def seen(self, state: RobotState) -> list[Floats]:
+        """Single rays. Shape: (n, 16) in two parts."""
+        front, back = BEAMS[BEAMS < FRONT_RAYS], BEAMS[BEAMS >= FRONT_RAYS] - FRONT_RAYS
+        rays = (state.signals["f_scan"][:, front], state.signals["b_scan"][:, back])
+        return [np.nan_to_num(one).astype(np.float32) for one in rays]
+
+    def failed(self, state: RobotState) -> Flags:
+        """Whether the base touches something, or nearly does, in simulation. Shape: (n,)."""
+        if not state.truth:
+            return np.zeros(self.num_envs, dtype=bool)
+        front, back = state.signals["f_scan"], state.signals["b_scan"]
+        near: Flags = np.fmin(np.fmin.reduce(front, axis=1), np.fmin.reduce(back, axis=1)) < NEAREST
+        near &= ~np.isnan(front[:, 0])  # Python's min() never leaves a first number that is none
+        near |= self._corner_near_box(state.signals["base_pose"])
+        touching: Any = state.truth.get("collision", False)
+        failed: Flags = near | touching
+        return failed
+
+    def _corner_near_box(self, pose: Array) -> Flags:
+        """Whether a corner is within `SAFETY_RADIUS` of the middle of a box; as if the base's frame were its middle."""
+        cos, sin = np.cos(pose[:, 2].copy())[:, None], np.sin(pose[:, 2].copy())[:, None]
+        x = pose[:, :1] + _CORNERS[:, 0] * cos - _CORNERS[:, 1] * sin
+        y = pose[:, 1:2] + _CORNERS[:, 0] * sin + _CORNERS[:, 1] * cos
+        dx, dy = x[:, :, None] - self.obstacles[:, None, :, 0], y[:, :, None] - self.obstacles[:, None, :, 1]
+        near: Flags = (dx * dx + dy * dy <= SAFETY_RADIUS**2).any(axis=(1, 2))
+        return near
 
 
 def require_inside(observation: Floats, space: spaces.Box, labels: Sequence[Label]) -> Floats:
