@@ -171,8 +171,8 @@ def translate(entry: RoboGymId, given: Mapping[str, Any]) -> dict[str, Any]:
                 f"front of it (rs_address='IP:PORT' is the same), or use {entry.twin} for the simulated one."
             )
         options["robot"] = robot = _rosbridge_address(address) if robot is None else robot
+    without_effect: tuple[str, ...] = _SIMULATED
     if robot is not None:
-        without_effect = _SIMULATED
         why = f"The robot of this {entry.id} is a live one: it has no window here, and no Server Manager."
     else:
         without_effect = (*_MANAGER, "rviz_gui")

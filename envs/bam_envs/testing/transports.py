@@ -72,9 +72,9 @@ class MirrorEnv(gym.Env[Any, Any]):
 _box: Any = spaces.Box
 _TREE = spaces.Dict({"z": spaces.Discrete(3), "a": spaces.Tuple([_box(-1, 1, (2,), np.float32), spaces.Text(4)])})
 ROUND_TRIPS: dict[str, tuple[Space[Any], list[Any]]] = {
-    "float32": (_box(-_INF, _INF, (4,), np.float32), [np.float32([-0.0, 1e-45, 3.4e38, 0.1])]),
+    "float32": (_box(-_INF, _INF, (4,), np.float32), [np.array([-0.0, 1e-45, 3.4e38, 0.1], np.float32)]),
     "float64": (_box(-_INF, _INF, (2, 2), np.float64), [np.array([[-0.0, 5e-324], [1.7e308, 0.1]])]),
-    "float16": (_box(-4, 4, (3,), np.float16), [np.float16([-0.0, 0.1, 4])]),
+    "float16": (_box(-4, 4, (3,), np.float16), [np.array([-0.0, 0.1, 4], np.float16)]),
     "a number": (_box(-1, 1, (), np.float32), [np.float32(0.1).reshape(())]),
     "nothing": (_box(-1, 1, (0,), np.float32), []),
     "int64": (_box(_INT64.min, _INT64.max, (3,), np.int64), [np.array([_INT64.min, _INT64.max, 2**53 + 1])]),
@@ -205,7 +205,7 @@ class TransportContract:
         with self.serving(env) as transport:
             transport.connect()
             transport.reset()
-            env.step = lambda action: ({"x": np.float32([0, np.nan])}, 0.0, False, False, {})  # type: ignore[method-assign]
+            env.step = lambda action: ({"x": np.array([0, np.nan], np.float32)}, 0.0, False, False, {})  # type: ignore[method-assign]
             error = raised(RemoteError, lambda: transport.step({"x": np.zeros(2, np.float32)}))
             assert "observation['x'][1] is NaN" in str(error)
 
@@ -245,8 +245,8 @@ class TransportContract:
             for value in np.linspace(-1, 1, 30, dtype=np.float32).reshape(5, 3, 2):
                 one: Any = envs.step(value)
                 two: Any = alone.step(value)
-                for name, *both in zip(("observation", "reward", "end", "cut"), one, two, strict=False):
-                    assert_same_value(*both, name)
+                for name, mine, theirs in zip(("observation", "reward", "end", "cut"), one, two, strict=False):
+                    assert_same_value(mine, theirs, name)
                 mine, theirs = one[4], two[4]
                 assert ("final_obs" in mine) == ("final_obs" in theirs)
                 if "final_obs" in theirs:

@@ -90,13 +90,14 @@ class ArmContacts:
         """Whether two links that share no joint overlap. Shape: (n,)."""
         one, other = self._one, self._other
         distance = segment_distance2(arms.start[:, one], arms.end[:, one], arms.start[:, other], arms.end[:, other])
-        return np.logical_or.reduce(distance < self._near, axis=1)
+        touching: Flags = np.logical_or.reduce(distance < self._near, axis=1)
+        return touching
 
     def touching_table(self, arms: Capsules) -> Flags:
         """Whether a link is lower than the ground or overlaps the table. Shape: (n,)."""
         start, end, radius = arms.start[:, _LOW_LINKS], arms.end[:, _LOW_LINKS], arms.radius[_LOW_LINKS]
         lowest = np.minimum(start[:, :, 2], end[:, :, 2]) - radius
-        touching = np.logical_or.reduce(lowest < GROUND, axis=1)
+        touching: Flags = np.logical_or.reduce(lowest < GROUND, axis=1)
         row, link = np.nonzero(lowest < TABLE[1, 2])
         if len(row):  # the others are above the table
             overlaps = box_distance2(start[row, link], end[row, link]) < radius[link] ** 2
@@ -109,7 +110,8 @@ class ArmContacts:
         offset = middle[:, None] - start
         share = np.clip(_dot(offset, way) / np.maximum(_dot(way, way), 1e-12), 0.0, 1.0)
         offset -= share[:, :, None] * way
-        return np.logical_or.reduce(_dot(offset, offset) < (arms.radius[1:] + BALL_RADIUS) ** 2, axis=1)
+        touching: Flags = np.logical_or.reduce(_dot(offset, offset) < (arms.radius[1:] + BALL_RADIUS) ** 2, axis=1)
+        return touching
 
 
 def segment_distance2(start: Array, end: Array, other_start: Array, other_end: Array) -> Array:
