@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from bam_train.loop.gym.parallel_gym_agent import ParallelGymAgent as ParallelGymAgent
     from bam_train.loop.gym.parallel_gym_agent import make_env as make_env
     from bam_train.loop.gym.vec_gym_agent import VecGymAgent as VecGymAgent
-    from bam_train.loop.policy_agent import PolicyAgent as PolicyAgent
+    from bam_train.loop.robot_agent import PolicyAgent as PolicyAgent
     from bam_train.loop.robot_agent import RobotAgent as RobotAgent
     from bam_train.loop.tensors.replay_buffer import ReplayBuffer as ReplayBuffer
     from bam_train.loop.tensors.returns import gae as gae
@@ -38,8 +38,7 @@ _ON_USE = {
     "loop.gym.gym_agent": ("GymAgent",),
     "loop.gym.parallel_gym_agent": ("ParallelGymAgent", "make_env"),
     "loop.gym.vec_gym_agent": ("VecGymAgent",),
-    "loop.policy_agent": ("PolicyAgent",),
-    "loop.robot_agent": ("RobotAgent",),
+    "loop.robot_agent": ("PolicyAgent", "RobotAgent"),
     "loop.tensors.replay_buffer": ("ReplayBuffer",),
     "loop.tensors.returns": ("cumulated_reward", "doubleqlearning_temporal_difference", "gae", "temporal_difference"),
     "loop.video_agent": ("record_video",),

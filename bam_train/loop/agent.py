@@ -4,13 +4,9 @@ It is BBRL's `Agent`. An agent that is made after torch was imported is an `nn.M
 to one: its class is a subclass of its own class and of `nn.Module`. Without torch it is a plain object, and agents that
 work on NumPy arrays need nothing more.
 
-Differences from BBRL:
-
-- After an exception the agent has let go of its workspace, and can be used again.
-- Two threads in one agent are an error; BBRL mixes their workspaces.
-- `reads`, `reads_previous` and `writes` can be declared, and are then checked before anything runs.
-- `close` is called when an exception leaves the loop.
-- `load_model` works.
+Differences from BBRL: after an exception the agent can be used again; two threads in one agent are an error; `reads`,
+`reads_previous` and `writes` can be declared, and are then checked before anything runs; `close` is called when an
+exception leaves the loop; `load_model` works.
 """
 
 from __future__ import annotations
@@ -38,11 +34,10 @@ class Agent(_Base):  # type: ignore[misc]
 
     Args:
         name: What `get_by_name` finds.
-        verbose: Kept as an attribute.
+        verbose: An attribute that BBRL's agents have, as `prefix`; nothing here uses it.
 
     Attributes:
         workspace: The workspace during a call, else None.
-        prefix: An attribute that BBRL's agents have; nothing here uses it.
         reads: Names it reads at t, which agents before it must write; None if it does not say.
         reads_previous: Names it reads at t - 1, which any agent may write.
         writes: Names it writes at t; None if it does not say.
@@ -56,7 +51,7 @@ class Agent(_Base):  # type: ignore[misc]
     workspace: Any = None
     prefix: str = ""
     verbose: bool = False
-    _name: str | None = None
+    name: str | None = None
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """A plain object; once torch is imported, an `nn.Module` too, as a `pathlib.Path` is a `PosixPath`."""
@@ -67,9 +62,7 @@ class Agent(_Base):  # type: ignore[misc]
     def __init__(self, name: str | None = None, verbose: bool = False) -> None:
         if is_module(self):
             sys.modules["torch"].nn.Module.__init__(self)
-        self._name = name
-        self.verbose = verbose
-        self.workspace = None
+        self.name, self.verbose, self.workspace = name, verbose, None
 
     # -- running ---------------------------------------------------------------------------------------------------
 
@@ -161,28 +154,19 @@ class Agent(_Base):  # type: ignore[misc]
 
     # -- name, seed, copies ----------------------------------------------------------------------------------------
 
-    @property
-    def name(self) -> str | None:
-        """What `get_by_name` finds."""
-        return self._name
-
-    @name.setter
-    def name(self, name: str | None) -> None:
-        self._name = name
-
     def get_name(self) -> str | None:
         """The name."""
-        return self._name
+        return self.name
 
     def set_name(self, n: str | None) -> Self:
         """Set the name; the agent itself is returned."""
-        self._name = n
+        self.name = n
         return self
 
     def get_by_name(self, n: str) -> list[Agent]:
         """The agents of that name in the tree: those in it first, then itself."""
         found = [one for agent in self._inner() for one in agent.get_by_name(n)]
-        return [*found, self] if n == self._name else found
+        return [*found, self] if n == self.name else found
 
     def with_prefix(self, prefix: str) -> Self:
         """Set `prefix`; the agent itself is returned."""
@@ -242,7 +226,7 @@ def import_torch(purpose: str) -> Any:
 
 def agent_name(agent: Agent) -> str:
     """Its class, and its name if it has one, for error messages."""
-    return type(agent).__name__ + (f" {agent._name!r}" if agent._name else "")
+    return type(agent).__name__ + (f" {agent.name!r}" if agent.name else "")
 
 
 def is_live(agent: Agent) -> bool:

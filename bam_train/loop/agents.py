@@ -21,7 +21,6 @@ class Agents(Agent):
 
     Args:
         agents: The members.
-        name: What `get_by_name` finds.
 
     Raises:
         LoopError: One of them is no agent.
@@ -101,7 +100,6 @@ class CopyTAgent(Agent):
         input_name: From.
         output_name: To.
         detach: Cut the copy off the graph.
-        name: What `get_by_name` finds.
     """
 
     def __init__(self, input_name: str, output_name: str, detach: bool = False, name: str | None = None) -> None:
@@ -122,7 +120,6 @@ class PrintAgent(Agent):
 
     Args:
         names: Which; all that there are by default.
-        name: What `get_by_name` finds.
     """
 
     def __init__(self, *names: str, name: str | None = None) -> None:

@@ -24,7 +24,6 @@ class TemporalAgent(Agent):
 
     Args:
         agent: What to run; often an `Agents` whose first member is the environment.
-        name: What `get_by_name` finds.
         progress: True for a progress display on standard error, or a ``rich.progress.Progress`` to add a task to.
 
     Raises:

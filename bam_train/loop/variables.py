@@ -31,9 +31,7 @@ class Variable:
         make_room: Called with a time that does not fit; it must call `drop`.
 
     Attributes:
-        shape: The shape of one time; None before the first write.
-        dtype: The dtype of the values; None before the first write.
-        library: Has `stack` and `concatenate` for its values.
+        shape: The shape of one time; None before the first write, as `dtype`.
     """
 
     ARRAY: type = np.ndarray
@@ -43,6 +41,7 @@ class Variable:
     COPIES = True
     """Whether values are copied in; else the objects themselves are kept."""
     library: Any = np
+    """Has `stack` and `concatenate` for them."""
 
     def __init__(
         self, name: str, first: int = 0, limit: int = UNLIMITED, make_room: Callable[[int], None] | None = None

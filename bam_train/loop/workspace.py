@@ -181,19 +181,11 @@ class Workspace:
     # -- sizes -----------------------------------------------------------------------------------------------------
 
     def time_size(self) -> int | None:
-        """One after the last time written; None when empty.
-
-        Raises:
-            WorkspaceError: The variables differ.
-        """
+        """One after the last time written; None when empty, `WorkspaceError` where the variables differ."""
         return _common("time", {name: one.time_size() for name, one in self.variables.items()})
 
     def batch_size(self) -> int | None:
-        """B; None when empty.
-
-        Raises:
-            WorkspaceError: The variables differ.
-        """
+        """B; None when empty, `WorkspaceError` where the variables differ."""
         return _common("batch", {name: one.batch_size() for name, one in self.variables.items()})
 
     def __str__(self) -> str:
@@ -224,10 +216,9 @@ class Workspace:
         self.copy_time(size - n, 0, n, var_names)
 
     def subtime(self, from_t: int, to_t: int) -> Workspace:
-        """A new workspace of times [from_t, to_t) of all variables, by Python's slice rules.
+        """A new workspace of times [from_t, to_t) of all variables, which have one length, by Python's slice rules.
 
         Raises:
-            WorkspaceError: The variables have different lengths.
             TimeNotWritten: It begins with a time that has left the window.
         """
         begin, end, _ = slice(from_t, to_t).indices(self.time_size() or 0)
@@ -242,21 +233,13 @@ class Workspace:
     # -- batch -----------------------------------------------------------------------------------------------------
 
     def select_batch(self, batch_indexes: Any) -> Workspace:
-        """A new workspace of these batch columns: integers (order and repeats kept) or a mask of booleans.
-
-        Raises:
-            WorkspaceError: The variables have different batch sizes.
-        """
+        """A new workspace of these batch columns: integers (order and repeats kept) or a mask of booleans."""
         self.batch_size()
         views = {name: (one, one.view()) for name, one in self.variables.items()}
         return _of({name: array[:, one.index(batch_indexes, array)] for name, (one, array) in views.items()})
 
     def select_batch_n(self, n: int) -> Workspace:
-        """A new workspace of n batch columns, drawn uniformly with replacement.
-
-        Raises:
-            WorkspaceError: There are none.
-        """
+        """A new workspace of n batch columns, drawn uniformly with replacement."""
         size = self.batch_size()
         if not size:
             raise WorkspaceError(f"select_batch_n: {n} columns are wanted, and there are none.")
@@ -264,11 +247,7 @@ class Workspace:
         return self.select_batch(torch.randint(size, (n,)) if torch else np.random.randint(size, size=n))
 
     def select_subtime(self, t: Any, window_size: int) -> Workspace:
-        """A new workspace where column b has times t[b] to t[b] + window_size - 1.
-
-        Args:
-            t: One time for each column. Shape: (B,), int.
-            window_size: The number of times of the result.
+        """A new workspace where column b has times t[b] to t[b] + window_size - 1; `t` is (B,), int.
 
         Raises:
             TimeNotWritten: A window goes beyond the times of a variable.
@@ -287,12 +266,10 @@ class Workspace:
         return _of(result)
 
     def sample_subworkspace(self, n_times: int, n_batch_elements: int, n_timesteps: int) -> Workspace:
-        """A new workspace of `n_times` random windows, one after the other over the batch.
+        """A new workspace of `n_times` random windows, side by side over the batch.
 
-        Args:
-            n_times: The number of windows.
-            n_batch_elements: The columns of each, drawn without replacement; all if there are not more.
-            n_timesteps: The times of each.
+        Each has `n_timesteps` times and `n_batch_elements` columns, drawn without replacement (all if there are not
+        more).
 
         Raises:
             WorkspaceError: A window is longer than what there is.
@@ -317,24 +294,19 @@ class Workspace:
 
     @staticmethod
     def cat_batch(workspaces: Sequence[Workspace]) -> Workspace:
-        """A new workspace: these, side by side over the batch.
-
-        Raises:
-            WorkspaceError: There are none, or they have different lengths.
-        """
+        """A new workspace: these, which have one length, side by side over the batch."""
         if not workspaces:
             raise WorkspaceError("cat_batch: expected one workspace or more, found none.")
-        first = workspaces[0]
+        times = workspaces[0].time_size()
         for other in workspaces[1:]:
-            if other.time_size() != first.time_size():
+            if other.time_size() != times:
                 raise WorkspaceError(
-                    f"cat_batch: expected workspaces of {first.time_size()} times, found one of {other.time_size()}."
+                    f"cat_batch: expected workspaces of {times} times, found one of {other.time_size()}."
                 )
-        arrays = {
-            name: one.library.concatenate([workspace.get_full(name) for workspace in workspaces], 1)
-            for name, one in first.variables.items()
-        }
-        return _of(arrays)
+        variables = workspaces[0].variables.items()
+        return _of(
+            {name: one.library.concatenate([ws.get_full(name) for ws in workspaces], 1) for name, one in variables}
+        )
 
     # -- transitions -----------------------------------------------------------------------------------------------
 
@@ -342,11 +314,7 @@ class Workspace:
         """A new workspace of pairs of neighbouring times, 2 x N x ..., time-major, then over the batch.
 
         A pair whose first step has `filter_key` true joins the last state of an episode to the first of the next one;
-        such pairs are left out.
-
-        Args:
-            no_final_state: Leave none out; `filter_key` is not needed.
-            filter_key: The variable that says where episodes end.
+        such pairs are left out, unless `no_final_state`, which needs no `filter_key`.
 
         Raises:
             WorkspaceError: A variable is not as long as `filter_key`.
@@ -471,11 +439,11 @@ def _of(arrays: Mapping[str, Any]) -> Workspace:
 def _pairs(one: Variable, inside: Any) -> Any:
     """Neighbouring times of a variable, 2 x N x ...; those where `inside` (T - 1, B) is true, or all."""
     array = one.view()
-    if inside is None:
-        shape = (-1, *array.shape[2:]) if array.shape[0] > 1 else (0, *array.shape[2:])
-        return one.library.stack((array[:-1].reshape(shape), array[1:].reshape(shape)))
-    chosen = one.index(inside, array)
-    return one.library.stack((array[:-1][chosen], array[1:][chosen]))
+    if inside is not None:
+        chosen = one.index(inside, array)
+        return one.library.stack((array[:-1][chosen], array[1:][chosen]))
+    shape = (-1 if len(array) > 1 else 0, *array.shape[2:])
+    return one.library.stack((array[:-1].reshape(shape), array[1:].reshape(shape)))
 
 
 def _common(what: str, sizes: Mapping[str, int]) -> int | None:

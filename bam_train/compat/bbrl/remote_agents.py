@@ -36,8 +36,6 @@ class _ProcessAgent(Agent):
 
     Args:
         agent: What to run there; its weights move into shared memory.
-        name: What `get_by_name` finds.
-        verbose: Kept as an attribute.
         start_method: "spawn", "forkserver" or "fork".
     """
 
@@ -51,7 +49,7 @@ class _ProcessAgent(Agent):
         self._worker: Worker | None = None
 
     def get_by_name(self, n: str) -> list[Agent]:
-        """The agents of that name: this one, then those in the agent it runs, whose weights are shared."""
+        """This agent and those in the agent it runs, whose weights are shared, if they have the name."""
         return super().get_by_name(n) + self.agent.get_by_name(n)
 
     def seed(self, seed: int) -> Self:
@@ -120,7 +118,6 @@ class RemoteAgent(_ProcessAgent):
         Raises:
             WorkspaceError: The workspace is not shared.
             RemoteAgentError: The agent failed, or its process ended.
-            LoopError: It is running already.
         """
         self.start(workspace, **kwargs)
         if self._worker is not None:
@@ -209,8 +206,7 @@ class NRemoteAgent(Agent):
 
         Raises:
             WorkspaceError: The workspace is not shared, or not as wide as all copies together.
-            RemoteAgentError: A copy failed, or its process ended. All are closed then.
-            LoopError: It is running already.
+            RemoteAgentError: A copy failed, or its process ended; all are closed.
         """
         self.start(workspace, **kwargs)
         try:
@@ -294,12 +290,7 @@ class AsynchronousAgent(_ProcessAgent):
         self._expected = False
 
     def __call__(self, **kwargs: Any) -> None:  # type: ignore[override]  # it has its own workspace
-        """Start the agent on a new workspace with these keywords; does not wait.
-
-        Raises:
-            LoopError: The last call has not ended.
-            RemoteAgentError: The keywords or the agent cannot be sent to the process, or the last call failed.
-        """
+        """Start the agent on a new workspace with these keywords, without waiting; refused while one is running."""
         if self.is_running():
             raise _still_running(self)
         self._running_worker().send("run_alone", kwargs)

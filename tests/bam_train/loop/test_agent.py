@@ -57,16 +57,6 @@ def test_the_workspace_itself_may_be_used(ws, kind):
     kind.check(ws["y"], [[0.0, 0.0], [10.0, 12.0]])
 
 
-def test_keywords_reach_forward():
-    class Noting(Agent):
-        def forward(self, t, stochastic, **kwargs):
-            self.seen = (t, stochastic, kwargs)
-
-    agent = Noting()
-    agent(Workspace(), t=3, stochastic=True, epsilon=0.1)
-    assert agent.seen == (3, True, {"epsilon": 0.1})
-
-
 def test_what_forward_does_not_take_is_an_error():
     class Narrow(Agent):
         def forward(self, t):
@@ -129,12 +119,6 @@ def test_attributes_of_every_agent():
     assert agent.seed(3) is None
 
 
-def test_what_agents_declare_by_default():
-    agent = Agent()
-    assert (agent.reads, agent.reads_previous, agent.writes) == (None, (), None)
-    assert agent.close() is None
-
-
 def test_an_agent_that_calls_itself(kind):
     class Nested(Agent):
         def forward(self, t, **kwargs):
@@ -194,15 +178,6 @@ def test_a_copy_made_during_a_call_is_free(kind):
     thread.start()
     thread.join(30)
     kind.check(ws["y"], [[1.0]])
-
-
-def test_an_agent_in_two_workspaces_one_after_the_other(ws, kind):
-    agent, other = Times(factor=3), Workspace()
-    other.set("x", 0, kind([1.0]))
-    agent(ws, t=0)
-    agent(other, t=0)
-    kind.check(ws["y"], [[0.0, 3.0]])
-    kind.check(other["y"], [[3.0]])
 
 
 def test_a_hand_made_loop_without_a_temporal_agent(kind):

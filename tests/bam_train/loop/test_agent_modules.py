@@ -122,16 +122,6 @@ def test_learning_through_a_workspace():
     assert policy.model.weight.tolist() == [[-0.25, -0.25]]
 
 
-def test_a_second_pass_of_a_critic_over_transitions():
-    agent, ws = loop(), Workspace()
-    with torch.no_grad():
-        agent(ws, n_steps=3)
-    pairs = ws.get_transitions(no_final_state=True)
-    TemporalAgent(agent.agent.agents[1])(pairs, t=0, n_steps=2)
-    assert pairs["action"].requires_grad
-    assert pairs["action"].detach().flatten(1).tolist() == [[1.0, 2.0], [2.0, 3.0]]
-
-
 @pytest.mark.parametrize("again", [lambda a: a.clone(), copy.deepcopy, lambda a: pickle.loads(pickle.dumps(a))])
 def test_copies(again):
     agent = loop()
@@ -205,35 +195,6 @@ def test_an_agent_that_names_nn_module_itself():
     assert ws["x"].tolist() == [[1.0]]
     assert pickle.loads(pickle.dumps(agent)).name == "both"
     assert list(TemporalAgent(agent).state_dict()) == []
-
-
-def test_a_module_before_super_init_is_refused_as_torch_does():
-    class Early(Agent):
-        def __init__(self):
-            self.model = nn.Linear(1, 1)
-            super().__init__()
-
-    with pytest.raises(AttributeError) as error:
-        Early()
-    assert "super().__init__()" in str(error.value) or "Module.__init__()" in str(error.value)
-
-
-def test_one_agent_in_two_loops_shares_its_parameters():
-    policy = Policy()
-    train, evaluate = TemporalAgent(Agents(Observing(), policy)), TemporalAgent(Agents(Observing(), policy))
-    with torch.no_grad():
-        policy.scale.fill_(4.0)
-    for agent in (train, evaluate):
-        ws = Workspace()
-        agent(ws, n_steps=1)
-        assert ws["action"].tolist() == [[[2.0]]]
-
-
-def test_hooks_of_modules_are_not_called():
-    agent, calls = Observing(), []
-    agent.register_forward_hook(lambda *args: calls.append(args))
-    agent(Workspace(), t=0)
-    assert calls == []
 
 
 BEFORE_TORCH = """

@@ -37,17 +37,6 @@ def test_members_run_in_order_with_the_same_keywords(ws, kind):
     kind.check(ws["x"], [[12288.0]])
 
 
-def test_one_agent_twice(ws, kind):
-    add = Add(1)
-    Agents(add, add)(ws, t=0)
-    kind.check(ws["x"], [[11.0]])
-
-
-def test_no_members(ws, kind):
-    Agents()(ws, t=0)
-    kind.check(ws["x"], [[0.0]])
-
-
 def test_members_can_be_reached():
     one, two = Add(1, name="add"), Add(2, name="add")
     agents = Agents(one, two, name="all")
@@ -93,20 +82,6 @@ def test_every_member_is_closed_even_if_one_fails():
     assert (stuck.closed, add.closed) == (1, 1)
 
 
-def test_the_later_of_two_writers_wins(kind):
-    class Constant(Agent):
-        def __init__(self, value):
-            super().__init__()
-            self.value = value
-
-        def forward(self, t, **kwargs):
-            self.set(("action", t), kind([self.value]))
-
-    ws = Workspace()
-    TemporalAgent(Agents(Constant(1.0), Constant(2.0)))(ws, n_steps=2)
-    kind.check(ws["action"], [[2.0], [2.0]])
-
-
 def test_keywords_of_a_wrapper(ws, kind):
     wrapper = KWAgentWrapper(Add(3), sign=-1)
     wrapper(ws, t=0)
@@ -141,13 +116,6 @@ def test_copying_and_detaching(keywords):
     assert ws["kept"].requires_grad
     assert not ws["cut"].requires_grad
     assert ws["cut"].tolist() == [[1.0]]
-
-
-def test_copying_and_detaching_arrays(kind):
-    ws = Workspace()
-    ws.set("x", 0, kind([2.0]))
-    CopyTAgent("x", "y", detach=True)(ws, t=0)
-    kind.check(ws["y"], [[2.0]])
 
 
 def test_printing(kind, capsys):

@@ -98,13 +98,6 @@ def test_too_many_lines_are_capped_and_it_says_so(kind):
     assert chosen.get_title() == ""
 
 
-def test_one_time_is_a_point(kind):
-    ws = Workspace()
-    ws.set("x", 0, kind([3.0]))
-    (axes,) = plot(ws).axes
-    assert axes.get_lines()[0].get_marker() == "."
-
-
 def test_time_is_the_workspaces(kind):
     ws = Workspace(window=2)
     for t in range(100):
@@ -208,14 +201,6 @@ def test_shorter_variables_leave_holes(ws, kind):
     assert table["flag"].tolist() == [True, False] + [pandas.NA] * 4
     assert table["one"].isna().tolist() == [False] + [True] * 5
     assert [str(table[name].dtype) for name in ("value", "count", "flag")] == ["float32", "Int64", "boolean"]
-
-
-def test_a_table_is_a_copy(ws, kind):
-    table = to_dataframe(ws, "reward")
-    table["reward"] = 9.0
-    kind.check(ws.get("reward", 0), [0.0, 0.0])
-    ws.set("reward", 0, kind([5.0, 5.0]))
-    assert table["reward"].tolist() == [9.0] * 6
 
 
 @pytest.mark.parametrize(

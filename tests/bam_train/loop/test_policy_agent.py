@@ -47,14 +47,6 @@ def test_rows_whose_episode_begins_are_forgotten():
     assert workspace["action"].tolist() == [[0, 1, 2]] * 5
 
 
-def test_it_acts_at_ended_rows_too():
-    """An environment with auto-reset reads the action of the row at which all have ended."""
-    policy, workspace = Recorded(), Workspace()
-    at(workspace, 0, [4, 5, 6], done=True)
-    PolicyAgent(policy)(workspace, t=0)
-    assert workspace["action"].tolist() == [[0, 1, 2]]
-
-
 @pytest.mark.parametrize("make", [make_parallel, make_vector])
 def test_environments_with_auto_reset(make):
     """Always to the left: every episode of CartPole is over within some ten steps."""
@@ -113,9 +105,3 @@ def test_an_action_that_is_not_finite(seed, whose):
         f"action[1, 0] is inf at step 0 of {whose}; expected finite numbers: the policy is broken"
     )
     assert "action" not in workspace
-
-
-def test_what_it_reads_and_writes():
-    agent = PolicyAgent(None, ["cam/env_obs"], input_prefix="cam/", output_string="wish")
-    assert agent.reads == ("cam/env_obs", "cam/timestep", "cam/done")
-    assert agent.writes == ("wish",)

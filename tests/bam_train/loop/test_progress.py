@@ -175,15 +175,6 @@ def test_a_temporal_agent_shows_its_steps(name):
     assert (task.description, task.completed, task.finished) == (f"{name or 'steps'} from t=3", 5, True)
 
 
-def test_a_temporal_agent_that_fails_stops_its_task():
-    display = undrawn()
-    with pytest.raises(ValueError, match="broken"):
-        TemporalAgent(Nothing(), progress=display)(Workspace(), n_steps=5, at=2)
-    (task,) = display.tasks
-    assert (task.completed, task.finished) == (2, False)
-    assert task.stop_time is not None
-
-
 def test_a_copy_of_a_temporal_agent_can_be_made():
     copy = TemporalAgent(Nothing(), progress=undrawn()).clone()
     copy(Workspace(), n_steps=2)

@@ -37,13 +37,6 @@ def refused(*agents, ws=None, **kwargs):
     return str(error.value)
 
 
-def test_what_fits_runs():
-    ws, env, policy = Workspace(), Env(), Step(("obs",), ("action",))
-    TemporalAgent(Agents(env, policy))(ws, n_steps=2)
-    assert (env.calls, policy.calls) == (2, 2)
-    assert ws["action"].tolist() == [[0.0], [1.0]]
-
-
 def test_a_misspelt_variable():
     assert refused(Env(), Step(("osb",), ("action",), name="policy")) == (
         "Step 'policy' reads 'osb', which nobody writes, did you mean 'obs'? Written are 'done', 'obs'."

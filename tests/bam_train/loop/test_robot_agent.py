@@ -106,32 +106,6 @@ def test_wiring_is_checked_before_the_robot_is_connected():
         robot.step(np.zeros((1, 7)))
 
 
-def test_nobody_acts():
-    with pytest.raises(WiringError, match=r"^RobotAgent reads 'action', which nobody writes"):
-        TemporalAgent(RobotAgent(robot_env()))
-
-
-def test_an_agent_before_the_robot_cannot_read_what_it_writes():
-    with pytest.raises(WiringError) as caught:
-        TemporalAgent(Agents(PolicyAgent(None, single=True), RobotAgent(robot_env())))
-    assert str(caught.value) == (
-        "PolicyAgent reads 'env/env_obs', which only an agent after it writes; put it behind that one."
-    )
-
-
-def test_in_a_chain_with_a_robot_every_agent_says_what_it_does():
-    class Silent(Agent):
-        def forward(self, t, **kwargs):
-            pass
-
-    with pytest.raises(WiringError) as caught:
-        TemporalAgent(Agents(RobotAgent(robot_env()), Choose([0, 0, 0, 0, 0]), Silent()))
-    assert str(caught.value) == (
-        "Silent is in a chain with a robot and does not say what it reads and writes; "
-        'give its class reads = ("name", ...) and writes = ("name", ...).'
-    )
-
-
 def test_an_exception_halts_the_robot_and_earlier_times_stay():
     class Fails(Agent):
         reads = ("env/env_obs",)

@@ -40,24 +40,12 @@ def test_another_flag_of_any_number(ws, kind, dtype, ends):
     kind.check(pairs["x"], [[0, 10, 11, 20, 21], [10, 20, 21, 30, 31]], "int64")
 
 
-def test_full_variables_give_the_same(ws, kind):
-    whole = ws.contiguous()
-    kind.check(whole.get_transitions()["x"], [[0, 1, 10, 20, 21], [10, 11, 20, 30, 31]], "int64")
-    kind.check(whole.get_transitions(no_final_state=True)["x"][0], [0, 1, 10, 11, 20, 21], "int64")
-
-
 @pytest.mark.parametrize("no_final_state", [False, True])
 def test_one_time_gives_no_transition(ws, kind, no_final_state):
     pairs = ws.subtime(0, 1).get_transitions(no_final_state=no_final_state)
     assert tuple(pairs["x"].shape) == (2, 0)
     assert tuple(pairs["v"].shape) == (2, 0, 2)
     assert (pairs.time_size(), pairs.batch_size()) == (2, 0)
-
-
-def test_the_original_is_not_shared(ws, kind):
-    pairs = ws.get_transitions()
-    pairs["x"][:] = 7
-    kind.check(ws["x"], [[0, 1], [10, 11], [20, 21], [30, 31]], "int64")
 
 
 def test_agents_run_on_transitions(ws, kind):

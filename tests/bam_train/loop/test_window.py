@@ -72,14 +72,6 @@ def test_pieces_are_few_and_own_their_memory(kind):
     assert flat[:500] == list(range(500))
 
 
-def test_without_a_sink_old_times_are_forgotten(kind):
-    ws = Workspace(window=2)
-    for t in range(300):
-        ws.set("x", t, kind([t], "int64"))
-    assert ws.get("x", -1).tolist() == [299]
-    assert ws["x"].flatten().tolist() == list(range(ws.first_time, 300))
-
-
 def test_reading_and_writing_what_has_left_the_window(kind):
     ws = Workspace(window=2)
     for t in range(200):
@@ -186,31 +178,3 @@ def test_a_window_holds_the_last_time_and_the_one_before(window):
     with pytest.raises(WorkspaceError) as error:
         Workspace(window=window)
     assert str(error.value) == f"window: expected at least 2 times (the last and the one before), found {window}."
-
-
-def test_the_first_time_without_a_window(kind):
-    ws = Workspace()
-    assert ws.first_time == 0
-    for t in range(1000):
-        ws.set("x", t, kind([t], "int64"))
-    assert ws.first_time == 0
-    assert len(ws["x"]) == 1000
-
-
-def test_a_value_that_an_agent_keeps_does_not_change_as_time_goes_on(kind):
-    """Such as a hidden state or the observation before, kept as an attribute."""
-    ws, kept = Workspace(window=2), []
-    for t in range(200):
-        ws.set("x", t, kind([t], "int64"))
-        kept.append(ws.get("x", t))
-    assert [value.item() for value in kept] == list(range(200))
-
-
-def test_gradients_in_a_window():
-    torch = pytest.importorskip("torch")
-    weight = torch.tensor([1.0], requires_grad=True)
-    ws = Workspace(window=2)
-    for t in range(100):
-        ws.set("x", t, weight * t)
-    ws["x"].sum().backward()
-    assert weight.grad.item() == sum(range(ws.first_time, 100))

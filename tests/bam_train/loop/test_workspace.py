@@ -4,7 +4,6 @@ import copy
 import gc
 import pickle
 import weakref
-from collections import OrderedDict
 
 import pytest
 
@@ -18,14 +17,6 @@ def counted(kind, *names, times=3):
         for t in range(times):
             ws.set(name, t, kind([100.0 * k + 10 * t, 100.0 * k + 10 * t + 1]))
     return ws
-
-
-def test_set_and_get_one_time(kind):
-    ws = Workspace()
-    assert ws.set("x", 0, kind([1.0, 2.0])) is None
-    ws.set("x", 1, kind([3.0, 4.0]))
-    kind.check(ws.get("x", 0), [1.0, 2.0])
-    kind.check(ws.get("x", 1), [3.0, 4.0])
 
 
 def test_all_times(kind):
@@ -76,21 +67,6 @@ def test_missing_earlier_times_are_zeros(kind, dtype, zero, one):
     kind.check(ws["x"][2:], [[[one, one]], [[zero, zero]], [[one, zero]]], dtype)
 
 
-def test_any_order_and_overwriting(kind):
-    ws = Workspace()
-    for t in (3, 1, 2, 0):
-        ws.set("x", t, kind([float(t)]))
-    ws.set("x", 1, kind([9.0]))
-    kind.check(ws["x"], [[0.0], [9.0], [2.0], [3.0]])
-
-
-def test_reading_again_after_every_write(kind):
-    ws = Workspace()
-    for t in range(40):
-        ws.set("x", t, kind([t], "int64"))
-        kind.check(ws["x"], [[k] for k in range(t + 1)], "int64")
-
-
 @pytest.mark.parametrize("dtype", ["float16", "float64", "int32", "uint8", "bool"])
 def test_the_first_write_fixes_the_dtype(kind, dtype):
     ws = Workspace()
@@ -99,35 +75,12 @@ def test_the_first_write_fixes_the_dtype(kind, dtype):
     kind.check(ws["x"], [[[1, 0]], [[0, 1]]], dtype)
 
 
-def test_images(kind):
-    ws = Workspace()
-    ws.set("x", 0, kind.zeros(2, 4, 5, 3, dtype="uint8"))
-    ws.set("x", 1, kind.zeros(2, 4, 5, 3, dtype="uint8"))
-    assert tuple(ws["x"].shape) == (2, 2, 4, 5, 3)
-    assert (ws.time_size(), ws.batch_size()) == (2, 2)
-
-
-def test_a_batch_of_nobody(kind):
-    ws = Workspace()
-    ws.set("x", 0, kind.zeros(0, 3))
-    assert tuple(ws["x"].shape) == (1, 0, 3)
-    assert (ws.time_size(), ws.batch_size()) == (1, 0)
-
-
 def test_set_full(kind):
     ws = Workspace()
     ws.set_full("x", kind.column(1.0, 2.0, 3.0))
     kind.check(ws["x"], [[1.0], [2.0], [3.0]])
     kind.check(ws.get("x", 1), [2.0])
     kind.check(ws.get("x", -1), [3.0])
-
-
-def test_set_full_replaces_a_full_variable(kind):
-    ws = Workspace()
-    ws.set_full("x", kind.column(1.0, 2.0, 3.0))
-    ws.set_full("x", kind.column(4.0, 5.0))
-    kind.check(ws["x"], [[4.0], [5.0]])
-    assert ws.time_size() == 2
 
 
 def test_set_full_over_single_times_leaves_a_longer_tail(kind):
@@ -144,16 +97,6 @@ def test_set_after_set_full(kind):
     ws.set("x", 0, kind([5.0]))
     ws.set("x", 3, kind([6.0]))
     kind.check(ws["x"], [[5.0], [2.0], [0.0], [6.0]])
-
-
-def test_names_keep_the_order_of_their_first_write(kind):
-    ws = counted(kind, "b", "a", "c")
-    ws.set("a", 0, kind([0.0, 0.0]))
-    assert list(ws.keys()) == ["b", "a", "c"]
-    assert list(ws.variables) == ["b", "a", "c"]
-    assert "a" in ws.variables
-    assert "d" not in ws.variables
-    assert {name: variable.time_size() for name, variable in ws.variables.items()} == OrderedDict(b=3, a=3, c=3)
 
 
 def test_sizes(kind):
@@ -194,18 +137,6 @@ def test_a_copy_shares_nothing(kind):
     kind.check(ws["x"], [[5.0, 5.0], [10.0, 11.0]])
 
 
-def test_contiguous(kind):
-    ws = counted(kind, "x", "y", times=2)
-    ws.set_full("y", kind([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]))
-    whole = ws.contiguous()
-    assert whole is not ws
-    assert list(whole.keys()) == ["x", "y"]
-    kind.check(whole["x"], [[0.0, 1.0], [10.0, 11.0]])
-    kind.check(whole["y"], [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
-    whole.set_full("x", kind.column(1.0))
-    kind.check(ws["x"], [[0.0, 1.0], [10.0, 11.0]])
-
-
 def test_as_text(kind):
     ws = counted(kind, "env/obs", "action")
     text = "Workspace:\n\tenv/obs: time_size = 3, batch_size = 2\n\taction: time_size = 3, batch_size = 2"
@@ -232,18 +163,6 @@ def test_pickled_and_copied(kind, again):
     kind.check(other["x"][2], [5.0, 5.0])
     kind.check(other["y"], [[1.0, 2.0], [3.0, 4.0]])
     assert ws.time_size() == 2
-
-
-def test_values_one_number_each(kind):
-    """T numbers without a batch can be written whole, such as the advantages of a flat batch."""
-    ws = Workspace()
-    ws.set_full("x", kind([1.0, 2.0, 3.0]))
-    kind.check(ws["x"], [1.0, 2.0, 3.0])
-    assert ws.time_size() == 3
-
-
-def test_is_not_shared(kind):
-    assert counted(kind, "x").is_shared is False
 
 
 @pytest.mark.parametrize("window", [None, 3])

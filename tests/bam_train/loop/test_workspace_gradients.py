@@ -64,15 +64,6 @@ def test_values_with_and_without_gradient_in_one_variable(weight):
     assert gradient(weight, ws["x"].sum()) == [4.0, 4.0]
 
 
-def test_set_full_and_its_views(weight):
-    ws = Workspace()
-    ws.set_full("x", torch.stack([weight, 2 * weight]))
-    assert gradient(weight, ws.get("x", 1).sum()) == [2.0, 2.0]
-    ws.set_full("x", torch.stack([weight, 3 * weight]))
-    ws.set("x", 2, 5 * weight)
-    assert gradient(weight, ws["x"].sum()) == [9.0, 9.0]
-
-
 def test_a_stored_value_may_be_changed_in_place(weight):
     ws = Workspace()
     ws.set_full("x", torch.ones(3, 2))
@@ -138,10 +129,3 @@ def test_epochs_with_zero_grad_between(weight):
     agent(ws, t=1, n_steps=1)
     assert ws["q"].tolist() == [[4.0, 9.0], [8.0, 27.0]]
     assert gradient(weight, ws["q"].sum()) == [4.0, 9.0]
-
-
-def test_a_copy_is_cloned_with_its_graph_or_without_but_shares_nothing(ws):
-    copy = Workspace(ws)
-    with torch.no_grad():
-        copy.get("x", 1).zero_()
-    assert ws.get("x", 1).tolist() == [2.0, 3.0]

@@ -29,24 +29,11 @@ def test_copy_time_of_some_variables(ws, kind):
     kind.check(ws.get("y", 0), [-30.0, -31.0, -32.0])
 
 
-def test_copy_time_beyond_the_end_of_single_times(kind):
-    ws = Workspace()
-    for t in range(2):
-        ws.set("x", t, kind([float(t)]))
-    ws.copy_time(0, 2, 2)
-    kind.check(ws["x"], [[0.0], [1.0], [0.0], [1.0]])
-
-
 def test_copy_n_last_steps_keeps_the_length(ws, kind):
     assert ws.copy_n_last_steps(1) is None
     kind.check(ws["x"], [[30.0, 31.0, 32.0], [10.0, 11.0, 12.0], [20.0, 21.0, 22.0], [30.0, 31.0, 32.0]])
     kind.check(ws.get("y", 0), [-30.0, -31.0, -32.0])
     assert ws.time_size() == 4
-
-
-def test_copy_two_last_steps(ws, kind):
-    ws.copy_n_last_steps(2)
-    kind.check(ws["x"], [[20.0, 21.0, 22.0], [30.0, 31.0, 32.0], [20.0, 21.0, 22.0], [30.0, 31.0, 32.0]])
 
 
 def test_copy_n_last_steps_of_some_variables_copies_these_only(ws, kind):
@@ -57,30 +44,10 @@ def test_copy_n_last_steps_of_some_variables_copies_these_only(ws, kind):
     kind.check(ws.get("other", 0), [5.0, 5.0, 5.0])
 
 
-def test_copying_no_steps_does_nothing(ws, kind):
-    ws.copy_n_last_steps(0)
-    ws.copy_time(0, 1, 0)
-    kind.check(ws.get("x", 0), [0.0, 1.0, 2.0])
-    kind.check(ws.get("y", 0), [0.0, -1.0, -2.0])
-
-
-def test_subtime(ws, kind):
-    piece = ws.subtime(1, 3)
-    kind.check(piece["x"], [[10.0, 11.0, 12.0], [20.0, 21.0, 22.0]])
-    kind.check(piece["y"], [[-10.0, -11.0, -12.0], [-20.0, -21.0, -22.0]])
-    assert (piece.time_size(), piece.batch_size()) == (2, 3)
-
-
 @pytest.mark.parametrize(("begin", "end", "times"), [(2, 99, [2, 3]), (-2, 4, [2, 3]), (0, -1, [0, 1, 2])])
 def test_subtime_follows_the_rules_of_slices(ws, begin, end, times):
     for name, sign in (("x", 1), ("y", -1)):
         assert ws.subtime(begin, end)[name][:, 1].tolist() == [sign * (10.0 * t + 1) for t in times]
-
-
-def test_changing_a_subtime_of_single_times_leaves_the_original(ws, kind):
-    piece = ws.subtime(0, 2)
-    piece.set("x", 0, kind([7.0, 7.0, 7.0]))
-    kind.check(ws.get("x", 0), [0.0, 1.0, 2.0])
 
 
 def test_get_time_truncated(ws, kind):
@@ -134,13 +101,6 @@ def test_select_subtime(ws, kind):
     kind.check(piece["y"], [[0.0, -21.0, -12.0], [-10.0, -31.0, -22.0]])
 
 
-def test_select_subtime_of_vectors(kind):
-    ws = Workspace()
-    ws.set_full("x", kind([[[t, column] for column in range(2)] for t in range(3)], "int64"))
-    piece = ws.select_subtime(kind([1, 0], "int64"), 2)
-    kind.check(piece["x"], [[[1, 0], [0, 1]], [[2, 0], [1, 1]]], "int64")
-
-
 @pytest.mark.parametrize("n_times", [1, 3])
 def test_sample_subworkspace(ws, n_times):
     piece = ws.sample_subworkspace(n_times, 2, 3)
@@ -154,24 +114,12 @@ def test_sample_subworkspace(ws, n_times):
         assert {value // 10 for value in columns} <= {0.0, 1.0}
 
 
-def test_sample_subworkspace_of_everything(ws):
-    piece = ws.sample_subworkspace(1, 3, 4)
-    assert (piece.time_size(), piece.batch_size()) == (4, 3)
-    assert sorted(piece["x"][0].tolist()) == [0.0, 1.0, 2.0]
-
-
 @pytest.mark.parametrize("through", [Workspace, Workspace()])
 def test_cat_batch(ws, kind, through):
     both = through.cat_batch([ws, ws.select_batch(kind([1], "int64"))])
     kind.check(both.get("x", 1), [10.0, 11.0, 12.0, 11.0])
     kind.check(both.get("y", 3), [-30.0, -31.0, -32.0, -31.0])
     assert (both.time_size(), both.batch_size()) == (4, 4)
-
-
-def test_zero_grad_changes_no_value(ws, kind):
-    ws.zero_grad()
-    kind.check(ws.get("x", 3), [30.0, 31.0, 32.0])
-    kind.check(ws.get("y", 3), [-30.0, -31.0, -32.0])
 
 
 def test_to_a_device(ws, kind):

@@ -1,5 +1,3 @@
-import copy
-import pickle
 
 import pytest
 import torch
@@ -91,18 +89,6 @@ def test_unseeded_it_draws_from_torchs_global_generator():
     assert drawn(agent) == first
 
 
-def test_copies_go_on_alike():
-    agent = ShuffledDatasetAgent(DATA, 8).seed(1)
-    run(agent)
-    copies = [copy.deepcopy(agent), pickle.loads(pickle.dumps(agent))]
-    expected = drawn(agent)
-    assert [drawn(one) for one in copies] == [expected, expected]
-
-
-def test_items_of_numbers():
-    assert run(ShuffledDatasetAgent([(1.5, 2)], 2))["x"].tolist() == [[1.5, 1.5]]
-
-
 def test_an_empty_dataset():
     with pytest.raises(WorkspaceError, match=r"^The dataset is empty: there is nothing to draw from"):
         run(ShuffledDatasetAgent([], 2))
@@ -112,10 +98,3 @@ def test_an_empty_dataset():
 def test_seeds_are_natural_numbers(seed):
     with pytest.raises(WorkspaceError, match=r"^seed: expected a whole number of at least 0.*, found"):
         ShuffledDatasetAgent(DATA, 2).seed(seed)
-
-
-def test_making_one_draws_nothing():
-    torch.manual_seed(0)
-    before = torch.get_rng_state()
-    ShuffledDatasetAgent(DATA, 2), DataLoaderAgent([1])
-    assert torch.equal(torch.get_rng_state(), before)

@@ -136,17 +136,6 @@ def test_unseeded_processes_differ(created):
     assert workspace["x"][0, 0, 4] != workspace["x"][0, 2, 4]
 
 
-def test_an_unseeded_remote_agent_follows_torchs_seed(started):
-    noise = []
-    for _ in range(2):
-        remote, workspace = started()
-        torch.manual_seed(4)
-        remote(workspace, **STEPS)
-        noise.append(workspace["x"][:, :, 4].clone())
-        assert workspace["x"][0, 0, 0] == -1
-    assert torch.equal(*noise)
-
-
 def test_seeds_after_the_start(created):
     agent = loop(Walker())
     remote, workspace = created(agent)
@@ -190,13 +179,6 @@ def test_one_call_at_a_time(started):
     assert not remote.is_running()
 
 
-def test_in_a_loop_of_this_process(created):
-    remote, workspace = created(Walker(), t=0, time_size=3)
-    TemporalAgent(Agents(remote))(workspace, t=0, n_steps=3, scale=4.0)
-    assert workspace["x"][:, 2, 1].tolist() == [1, 2, 3]
-    assert workspace["x"][:, 2, 3].tolist() == [4, 4, 4]
-
-
 def test_numpy_variables(created):
     class Numbers(Agent):
         def forward(self, t, **kwargs):
@@ -207,15 +189,6 @@ def test_numpy_variables(created):
     assert isinstance(workspace["x"], np.ndarray)
     assert workspace["x"][:, [0, 2]].tolist() == [[0, 0], [1, 1], [2, 2]]
     assert len({os.getpid(), *workspace["x"][0, [1, 3]].tolist()}) == 3
-
-
-def test_several_without_waiting(created):
-    remote, workspace = created(loop(Walker()))
-    assert not remote.is_running()
-    remote.start(workspace, **STEPS)
-    while remote.is_running():
-        pass
-    assert workspace["x"][:, 3, 1].tolist() == [1, 2, 3]
 
 
 # -- create ------------------------------------------------------------------------------------------------------------
@@ -230,13 +203,6 @@ def test_without_processes_it_is_a_copy(created):
     made(workspace, t=3)
     assert workspace["x"][:, 0, 1].tolist() == [0, 0, 0, 1]
     assert multiprocessing.active_children() == []
-
-
-def test_a_workspace_of_another_length(created):
-    remote, workspace = created(loop(Walker()), time_size=5, n_steps=1)
-    assert (workspace.time_size(), workspace.batch_size()) == (5, 4)
-    remote(workspace, t=0, n_steps=5)
-    assert workspace["x"][:, 0, 1].tolist() == [1, 2, 3, 4, 5]
 
 
 def test_an_agent_that_is_seeded_already():

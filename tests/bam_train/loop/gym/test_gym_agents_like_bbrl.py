@@ -69,13 +69,6 @@ def test_cartpole(n, autoreset, include_last_state, reward_at_t):
     assert autoreset != bool(ours["env/done"][-1].all())
 
 
-def test_bbrls_environments():
-    theirs = bbrl_gymnasium.ParallelGymAgent(partial(bbrl_gymnasium.make_env, "CartPole-v1", autoreset=True), 2)
-    ours = ParallelGymAgent(partial(make_env, "CartPole-v1", autoreset=True), 2)
-    act = discrete(2, 2)
-    assert_same(play(ours, Workspace(), act), play(theirs, bbrl_workspace.Workspace(), act))
-
-
 @pytest.mark.parametrize("env", ["FrozenLake-v1", "Taxi-v3", "CliffWalking-v1", "Acrobot-v1", "MountainCar-v0"])
 def test_discrete_actions(env):
     make = partial(make_env, env, autoreset=True, max_episode_steps=30)
@@ -146,30 +139,6 @@ def test_nested_dicts_images_and_kinds_of_rewards(reward, wrap):
     compare(lambda: wrap(Nested(reward)), 3, act)
 
 
-@pytest.mark.parametrize(
-    "observation",
-    [
-        np.array([1.5, 2.5]),
-        np.array([1, 2], np.uint8),
-        np.array([True, False]),
-        3,
-        0.5,
-        True,
-        [1.0, 2.0],
-        [1, 2],
-        torch.tensor([1.0, 2.0]),
-        {"a": {"b": np.zeros(2)}, "c": 1},
-    ],
-)
-def test_format_frame(observation):
-    theirs = bbrl_gymnasium.ParallelGymAgent._format_frame(observation)
-    ours = ParallelGymAgent._format_frame(observation)
-    assert list(ours) == list(theirs)
-    for name, one in theirs.items():
-        assert ours[name].dtype == one.dtype
-        assert torch.equal(ours[name], one)
-
-
 def test_going_on_in_one_workspace():
     make = partial(make_env, "CartPole-v1", autoreset=True)
     act = discrete(2, 2)
@@ -195,14 +164,3 @@ def test_vector_environments():
     theirs = play(bbrl_gymnasium.ParallelGymAgent(make, 3), bbrl_workspace.Workspace(), act)
     vector = partial(gym.make_vec, "CartPole-v1", num_envs=3, vectorization_mode="sync", max_episode_steps=20)
     assert_same(play(VecGymAgent(vector), Workspace(), act), theirs)
-
-
-@pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1"])
-def test_members(env):
-    theirs = bbrl_gymnasium.ParallelGymAgent(partial(make_env, env), 2)
-    ours = ParallelGymAgent(partial(make_env, env), 2)
-    for name in ("continuous_state", "discrete_state", "continuous_action", "discrete_action"):
-        assert getattr(ours, f"is_{name}")() == getattr(theirs, f"is_{name}")()
-    assert ours.get_obs_and_actions_sizes() == theirs.get_obs_and_actions_sizes()
-    assert ours.get_observation_space() == theirs.get_observation_space()
-    assert [name for name, _ in ours.named_parameters()] == [name for name, _ in theirs.named_parameters()]

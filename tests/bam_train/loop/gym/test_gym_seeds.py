@@ -2,7 +2,6 @@
 
 from functools import partial
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -42,12 +41,6 @@ def test_42_by_default_and_never_after_that(make):
         agent.seed(7)
 
 
-def test_a_seed_in_the_constructor(make):
-    agent = make(1, seed=3)
-    agent(Workspace(), t=0)
-    assert seeds(agent) == [[7]]
-
-
 def test_a_seed_in_the_call(make):
     agent = make(2)
     agent(Workspace(), t=0, seed=10)
@@ -77,18 +70,3 @@ def test_auto_resets_pass_no_seed(toys):
     agent = ParallelGymAgent(lambda: Autoreset(toys.Counting(length=1)), 1).seed(1)
     toys.run(agent, 5, seed=20)
     assert seeds(agent) == [[20, None, None]]
-
-
-def test_the_same_seed_gives_the_same_run():
-    import torch
-
-    def play():
-        agent = ParallelGymAgent(lambda: Autoreset(gym.make("CartPole-v1")), 2).seed(3)
-        ws = Workspace()
-        for t in range(60):
-            agent(ws, t=t)
-            ws.set("action", t, torch.tensor([t % 2, t % 3 % 2]))
-        return ws
-
-    first, second = play(), play()
-    assert all(torch.equal(first[name], second[name]) for name in first.variables)

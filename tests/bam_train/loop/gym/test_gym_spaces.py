@@ -172,13 +172,6 @@ def test_an_action_in_one_piece_where_the_space_is_a_dict(toys):
         step_with(toys, spaces.Dict(go=spaces.Discrete(2)), torch.tensor([0, 1]))
 
 
-def test_a_missing_part_of_the_action(toys):
-    with pytest.raises(UnknownVariable, match=r"^'action/stop' is not in the workspace"):
-        step_with(
-            toys, spaces.Dict(go=spaces.Discrete(2), stop=spaces.Discrete(2)), {"action/go": torch.tensor([0, 1])}
-        )
-
-
 @pytest.mark.parametrize(
     ("space", "action", "text"),
     [

@@ -120,23 +120,6 @@ assert "torch" not in sys.modules
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_extension_from_the_end_of_a_workspace(toys):
-    ws = Workspace()
-    agent = ParallelGymAgent(toys.Counting, 1, {"length": 9})
-    toys.run(agent, 3, ws)
-    toys.run(agent, 2, ws, first=ws.time_size())
-    assert toys.column(ws, "env/timestep") == [0, 1, 2, 3, 4]
-
-
-def test_epochs_joined_by_the_last_step(toys):
-    ws = Workspace()
-    agent = ParallelGymAgent(lambda: Autoreset(toys.Counting(9)), 1)
-    toys.run(agent, 3, ws)
-    ws.copy_n_last_steps(1)
-    toys.run(agent, 2, ws, first=1)
-    assert toys.column(ws, "env/timestep") == [2, 3, 4]
-
-
 def test_an_exception_in_one_environment_writes_nothing_of_that_time(toys):
     class Failing(toys.Counting):
         def step(self, action):

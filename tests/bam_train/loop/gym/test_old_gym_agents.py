@@ -112,10 +112,3 @@ def test_rendering(toys, kind):
     assert ws["env/rendering"][:, 1, 0, 0, 0].tolist() == [0, 1, 2]
     ws = toys.run(agent, 2, render=True)
     assert "env/rendering" not in ws.variables
-
-
-@BOTH
-def test_numpy(toys, kind):
-    ws = toys.run(kind(toys.Counting, {}, 1, 0, arrays="numpy"), 3)
-    assert isinstance(ws["env/reward"], np.ndarray)
-    assert toys.column(ws, "env/reward") == [0, 11, 12]

@@ -1,7 +1,6 @@
 """What the rows of `ParallelGymAgent` hold: with and without auto-reset, last states, rewards at t."""
 
 import gymnasium as gym
-import numpy as np
 import pytest
 import torch
 from gymnasium.wrappers import Autoreset
@@ -70,25 +69,6 @@ def test_auto_reset_with_the_last_state(toys):
     assert ws["env/cumulated_reward"][ws["env/done"]].tolist() == [23, 43]
 
 
-def test_the_pair_over_an_episode_end_is_no_transition(toys):
-    ws = toys.run(ParallelGymAgent(lambda: Autoreset(toys.Counting(length=2)), 1), 5)
-    steps = ws.get_transitions()
-    assert steps["env/env_obs"][:, :, 1].tolist() == [[0, 1, 0], [1, 2, 1]]
-    assert steps["action"][0].tolist() == [1, 2, 4]
-    assert steps["env/reward"][1].tolist() == [11, 12, 21]
-
-
-def test_auto_reset_without_the_last_state(toys):
-    agent = ParallelGymAgent(lambda: Autoreset(toys.Counting(length=2)), 1, include_last_state=False)
-    ws = toys.run(agent, 6)
-    assert toys.column(ws, "env/env_obs") == [[1, 0], [1, 1], [2, 0], [2, 1], [3, 0], [3, 1]]
-    assert toys.column(ws, "env/reward") == [0, 11, 12, 21, 22, 31]
-    assert toys.column(ws, "env/cumulated_reward") == [0, 11, 23, 21, 43, 31]
-    assert toys.column(ws, "env/done") == [False, False, True, False, True, False]
-    assert toys.column(ws, "env/timestep") == [0, 1, 2, 0, 1, 0]  # one short from the second episode on, as BBRL's
-    assert agent.envs[0].unwrapped.actions == [1, 2, 3, 4, 5]
-
-
 @pytest.mark.parametrize("wrap", [lambda env: env, gym.wrappers.RecordEpisodeStatistics])
 def test_time_limits(toys, wrap):
     """The same whether `Autoreset`, `TimeLimit` and `OrderEnforcing` are outermost or not."""
@@ -101,22 +81,6 @@ def test_time_limits(toys, wrap):
         assert toys.column(ws, "env/truncated", row) == [False, False, True, False, False, True, False, False]
         assert toys.column(ws, "env/timestep", row) == [0, 1, 2, 0, 1, 2, 0, 1]
     assert not ws["env/terminated"].any()
-
-
-def test_a_time_limit_of_its_own_for_each_environment(toys):
-    limits = iter([4, 2])
-    agent = ParallelGymAgent(lambda: gym.wrappers.TimeLimit(toys.Counting(length=3), next(limits)), 2)
-    ws = toys.run(agent, 5)
-    assert toys.column(ws, "env/truncated", 0) == [False] * 5
-    assert toys.column(ws, "env/terminated", 0) == [False, False, False, True, True]
-    assert toys.column(ws, "env/truncated", 1) == [False, False, True, True, True]
-
-
-def test_ends_at_the_time_limit_too(toys):
-    make = lambda: Autoreset(gym.wrappers.TimeLimit(toys.Counting(length=2), 2))  # noqa: E731
-    ws = toys.run(ParallelGymAgent(make, 1, include_last_state=False), 6)
-    assert toys.column(ws, "env/truncated") == [False, False, True, False, True, False]
-    assert toys.column(ws, "env/terminated") == [False, False, True, False, True, False]
 
 
 def test_reward_at_t(toys):
@@ -208,19 +172,6 @@ def test_refused_arguments(toys):
         ParallelGymAgent(toys.Counting, 1, arrays="jax")
     with pytest.raises(SettingsError, match=r"^info_keys: expected several names, found 'odd'; write \('odd',\)\.$"):
         ParallelGymAgent(toys.Counting, 1, info_keys="odd")
-
-
-def test_float32_rewards_are_summed_as_bbrl_sums_them(toys):
-    class Tenths(toys.Counting):
-        def step(self, action):
-            observation, _, *rest = super().step(action)
-            return observation, np.float32(0.1), *rest
-
-    ws = toys.run(ParallelGymAgent(Tenths, 1, {"length": 99}), 60)
-    expected = 0.0
-    for _ in range(59):
-        expected = expected + np.float32(0.1)
-    assert ws["env/cumulated_reward"][-1].item() == float(np.float32(expected))
 
 
 @pytest.mark.parametrize(

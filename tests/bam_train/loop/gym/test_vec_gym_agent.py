@@ -99,17 +99,6 @@ def test_without_auto_reset_the_last_state_is_always_there(toys):
     assert toys.column(toys.run(agent, 4), "env/env_obs") == [[1, 0], [1, 1], [1, 2], [1, 2]]
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_exact_rows(toys, mode):
-    ws = toys.run(VecGymAgent(vector_of(toys, mode, (2,))), 8)
-    assert [step for _, step in toys.column(ws, "env/env_obs")] == [0, 1, 2, 0, 1, 2, 0, 1]
-    assert toys.column(ws, "env/timestep") == [0, 1, 2, 0, 1, 2, 0, 1]
-    assert toys.column(ws, "env/done") == [False, False, True, False, False, True, False, False]
-    rewards = toys.column(ws, "env/reward")
-    assert [one % 10 for one in rewards] == [0, 1, 2, 0, 1, 2, 0, 1]
-    assert toys.column(ws, "env/cumulated_reward")[:6] == [0, 11, 23, 0, rewards[4], rewards[4] + rewards[5]]
-
-
 def test_what_is_given_away_may_be_changed(toys):
     agent = VecGymAgent(vector_of(toys, AutoresetMode.DISABLED, (2, 4)), auto_reset=False)
     ws = toys.run(agent, 4)
@@ -125,28 +114,6 @@ def test_nothing_is_stepped_when_all_is_over(toys):
     agent = VecGymAgent(vector_of(toys, AutoresetMode.NEXT_STEP, (2,)), auto_reset=False)
     toys.run(agent, 9)
     assert agent.envs.envs[0].actions == [1, 2]
-
-
-def test_numpy_arrays(toys):
-    ws = toys.run(VecGymAgent(vector_of(toys, AutoresetMode.SAME_STEP), arrays="numpy", info_keys=("odd",)), 4)
-    assert {name: one.dtype.name for name, one in ws.variables.items()} == {
-        "env/env_obs": "float64",
-        "env/terminated": "bool",
-        "env/truncated": "bool",
-        "env/done": "bool",
-        "env/reward": "float64",
-        "env/cumulated_reward": "float64",
-        "env/timestep": "int64",
-        "env/info/odd": "int64",
-        "env/info/_odd": "bool",
-        "action": "int64",
-    }
-
-
-def test_reward_at_t(toys):
-    ws = toys.run(VecGymAgent(vector_of(toys, AutoresetMode.NEXT_STEP, (5,)), reward_at_t=True), 4)
-    assert toys.column(ws, "env/reward") == [11, 12, 13, 0]
-    assert toys.column(ws, "env/cumulated_reward") == [11, 23, 36, 36]
 
 
 # -- Gymnasium's and our environments --

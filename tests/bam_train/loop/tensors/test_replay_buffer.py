@@ -35,21 +35,6 @@ def test_rows_are_kept_row_first():
     assert (buffer.size(), buffer.position, buffer.is_full) == (3, 3, False)
 
 
-def test_the_oldest_rows_make_room():
-    buffer = ReplayBuffer(5)
-    states = []
-    for first, count in [(0, 2), (2, 2), (4, 1), (5, 3), (8, 5)]:
-        buffer.put(rows(first, count))
-        states.append((column(buffer), buffer.position, buffer.is_full, buffer.size()))
-    assert states == [
-        ([0, 1, 0, 0, 0], 2, False, 2),
-        ([0, 1, 2, 3, 0], 4, False, 4),
-        ([0, 1, 2, 3, 4], 0, True, 5),
-        ([5, 6, 7, 3, 4], 3, True, 5),
-        ([10, 11, 12, 8, 9], 3, True, 5),
-    ]
-
-
 @pytest.mark.parametrize("count", [5, 6, 7, 10, 11, 23])
 def test_of_too_many_rows_the_newest_are_kept(count):
     buffer, one_by_one = ReplayBuffer(5), ReplayBuffer(5)
@@ -61,24 +46,6 @@ def test_of_too_many_rows_the_newest_are_kept(count):
     assert column(buffer) == column(one_by_one)
     assert buffer.position == one_by_one.position
     assert buffer.is_full
-
-
-def test_no_rows_fix_the_shapes_only():
-    buffer = ReplayBuffer(5)
-    buffer.put(rows(0, 0))
-    assert (buffer.size(), buffer.is_full, buffer.variables["x"].shape) == (0, False, (5, 2))
-
-
-def test_a_batch_is_drawn_from_torchs_global_generator():
-    buffer = ReplayBuffer(8)
-    buffer.put(rows(0, 6))
-    torch.manual_seed(3)
-    expected = torch.randint(6, (4,))
-    torch.manual_seed(3)
-    drawn = buffer.get_shuffled(4)
-    assert drawn["x"].tolist() == [expected.tolist(), (expected + 100).tolist()]
-    assert drawn["done"].tolist() == [(expected > 1).tolist(), (expected > 0).tolist()]
-    assert (drawn.time_size(), drawn.batch_size()) == (2, 4)
 
 
 def test_a_batch_is_a_copy():
@@ -98,28 +65,12 @@ def test_values_are_copied_and_detached():
     assert not buffer.variables["x"].requires_grad
 
 
-def test_variables_written_time_by_time_and_whole_rollouts():
-    workspace = Workspace()
-    for t in range(4):
-        workspace.set("obs", t, torch.full((3, 2), float(t)))
-    buffer = ReplayBuffer(3)
-    buffer.put(workspace)
-    assert buffer.variables["obs"].shape == (3, 4, 2)
-    assert buffer.variables["obs"][1, :, 0].tolist() == [0, 1, 2, 3]
-
-
 def test_numpy_workspaces():
     import numpy as np
 
     buffer = ReplayBuffer(3)
     buffer.put(full(x=np.array([[1.0, 2.0], [3.0, 4.0]])))
     assert buffer.variables["x"].tolist() == [[1, 3], [2, 4], [0, 0]]
-
-
-def test_variables_of_different_times():
-    buffer = ReplayBuffer(3)
-    buffer.put(full(obs=torch.zeros(2, 2), advantage=torch.ones(1, 2)))
-    assert buffer.variables["advantage"].shape == (3, 1)
 
 
 def test_to_moves_rows_and_later_puts():
