@@ -258,20 +258,13 @@ def test_without_physics_too(actions_of):
     assert_same_steps(one, two, actions[30:])
 
 
-def steps_to_find_nan(env_id, randomize):
-    """100,000, many of them to the limit, of pick; a quarter of that where MuJoCo computes too, and less elsewhere."""
-    if env_id not in SCRIPTED:
-        return 10_000
-    return 100_000 if env_id == "bam/pick-v0" and not randomize else 25_000
-
-
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 @pytest.mark.parametrize("randomize", [False, True])
 def test_no_number_is_ever_nan(make_rows, env_id, randomize):
     envs = make_rows(env_id, 64, randomize=randomize)
     envs.reset(seed=0)
     space, rng = envs.single_observation_space, np.random.default_rng(0)
-    for step in range(steps_to_find_nan(env_id, randomize) // 64 + 1):
+    for step in range(400 if env_id == "bam/pick-v0" else 110):
         if step % 4 == 0:
             actions = rng.uniform(-2, 2, envs.action_space.shape).clip(-1, 1).astype(np.float32)
         observation, reward, *_ = envs.step(actions)
