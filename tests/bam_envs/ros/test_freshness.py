@@ -5,6 +5,13 @@ import pytest
 from bam_envs.core.errors import RemoteError
 from bam_envs.ros.freshness import ClockOffset, FreshnessCheck, Tag, Tagger, read_echo, read_tag
 
+OTHER = [
+    "bam1 s=a e=1 q=2",
+    "bam1 s=a e=x q=2 t=0 d=0",
+    "bam1 s=a e=1 q=2 t=nan d=0",
+    f"bam1 s={'a' * 256} e=1 q=2 t=0 d=0",
+]
+
 
 class Clock:
     def __init__(self, now=100.0):
@@ -21,20 +28,7 @@ def test_a_tag_travels_as_text():
     assert read_tag(tag.to_text() + " seed=0") == tag
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "base_link",
-        None,
-        3,
-        "bam1",
-        "bam1 s=a e=1 q=2",
-        "bam1 s=a e=x q=2 t=0 d=0",
-        "bam1 s=a e=1 q=2 t=nan d=0",
-        f"bam1 s={'a' * 256} e=1 q=2 t=0 d=0",
-    ],
-)
+@pytest.mark.parametrize("text", ["", "base_link", None, 3, "bam1", *OTHER])
 def test_other_text_is_no_tag(text):
     assert read_tag(text) is None
 

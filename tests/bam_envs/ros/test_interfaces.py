@@ -37,17 +37,12 @@ def test_each_type_has_defaults_that_fit_it(kind):
 def test_names_of_both_ros_mean_the_same():
     assert normal_name("std_msgs/msg/String") == "std_msgs/String"
     assert normal_name("std_srvs/srv/Trigger") == "std_srvs/Trigger"
-    assert normal_name("std_msgs/String") == "std_msgs/String"
+    assert [normal_name(name) for name in ("std_msgs/String", "a/msg")] == ["std_msgs/String", "a/msg"]
     assert request_type("std_srvs/srv/SetBool") == "std_srvs/SetBoolRequest"
 
 
-@pytest.mark.parametrize(
-    "name", ["String", "a/b/c", "", "a/", "/b", "a b/c", "a/msg", None, 3, "é/b", "a" * 300 + "/b"]
-)
+@pytest.mark.parametrize("name", ["String", "a/b/c", "", "a/", "/b", "a b/c", None, 3, "é/b", "a" * 300 + "/b"])
 def test_other_names_are_refused(name):
-    if name == "a/msg":
-        assert normal_name(name) == "a/msg"
-        return
     with pytest.raises(InvalidValue, match=r"^Type: expected a name such as 'std_msgs/String', found "):
         normal_name(name)
 
@@ -109,52 +104,35 @@ def test_fields_that_a_type_does_not_have_can_be_ignored():
     assert str(caught.value) == "bam_msgs/GymAPIRequest.seed: expected an integer (int64), found '3'."
 
 
-def test_bytes_as_a_list_of_integers():
-    assert complete("std_msgs/UInt8MultiArray", {"data": [0, 255]})["data"] == b"\x00\xff"
-
-
-ARRAY, TWIST = "std_msgs/Float64MultiArray", "geometry_msgs/Twist"
+ARRAY, TWIST, THING = "std_msgs/Float64MultiArray", "geometry_msgs/Twist", "my_msgs/Thing"
 BASE64 = ".data: expected bytes as base64 or a list of integers in [0, 255], found "
+FLOAT32, UINT8 = "std_msgs/Float32MultiArray", "std_msgs/UInt8MultiArray"
+BITS = "expected a finite number of 32 bits, found"
 EXPECTED = [
     (ARRAY, {"data": [1, math.nan]}, ".data[1]: expected a finite number, found nan."),
-    (ARRAY, {"data": [1.0, math.nan]}, ".data[1]: expected a finite number, found nan."),
     (ARRAY, {"data": [1.0, math.inf]}, ".data[1]: expected a finite number, found inf."),
-    (ARRAY, {"data": [math.inf, -math.inf]}, ".data[0]: expected a finite number, found inf."),
+    (ARRAY, {"data": [math.inf, 1, -math.inf]}, ".data[0]: expected a finite number, found inf."),
     (ARRAY, {"data": [None]}, ".data[0]: expected a number, found None."),
-    (ARRAY, {"data": [True]}, ".data[0]: expected a number, found True."),
+    (ARRAY, {"data": [1, 2.5, True]}, ".data[2]: expected a number, found True."),
     (ARRAY, {"data": ["1"]}, ".data[0]: expected a number, found '1'."),
     (ARRAY, {"data": "1"}, ".data: expected a list, found '1'."),
     (ARRAY, {"data": None}, ".data: expected a list, found None."),
     (ARRAY, {"data": np.zeros(2)}, ".data: expected a list, found array([0., 0.])."),
     (ARRAY, {"data": [np.int64(1)]}, ".data[0]: expected a number, found np.int64(1)."),
     (ARRAY, {"data": [10**400]}, ".data[0]: expected a finite number, found "),
-    (ARRAY, {"data": [0.5, 10**400]}, ".data[1]: expected a finite number, found "),
     (ARRAY, {"data": [1, -(10**400), 10**400]}, ".data[1]: expected a finite number, found "),
-    (ARRAY, {"data": [1, 2.5, True]}, ".data[2]: expected a number, found True."),
-    (ARRAY, {"data": [math.inf, 1, -math.inf]}, ".data[0]: expected a finite number, found inf."),
-    (
-        "std_msgs/Float32MultiArray",
-        {"data": [0, 2**128]},
-        ".data[1]: expected a finite number of 32 bits, found ",
-    ),
-    ("std_msgs/UInt8MultiArray", {"data": [True]}, BASE64 + "[True]."),
-    ("std_msgs/UInt8MultiArray", {"data": [256]}, BASE64 + "[256]."),
     (ARRAY, {"datas": []}, ": expected only the fields layout, data, found 'datas'."),
     (ARRAY, [], ": expected an object, found []."),
     (ARRAY, None, ": expected an object, found None."),
-    (
-        ARRAY,
-        {"layout": {"dim": [{"size": -1}]}},
-        ".layout.dim[0].size: expected an integer in [0, 4294967295], found -1.",
-    ),
+    (ARRAY, {"layout": {"dim": [{"size": -1}]}}, ".layout.dim[0].size: expected an integer in [0, 4294967295], found "),
+    (FLOAT32, {"data": [0, 2**128]}, f".data[1]: {BITS} "),
+    (FLOAT32, {"data": [0.0, -1e39]}, f".data[1]: {BITS} -1e+39."),
+    (UINT8, {"data": [True]}, BASE64 + "[True]."),
+    (UINT8, {"data": [256]}, BASE64 + "[256]."),
+    (UINT8, {"data": "#"}, BASE64 + "'#'."),
     (TWIST, {"linear": {"x": "1"}}, ".linear.x: expected a number, found '1'."),
     (TWIST, {"linear": None}, ".linear: expected an object, found None."),
-    ("std_msgs/Float32", {"data": 1e39}, ".data: expected a finite number of 32 bits, found 1e+39."),
-    (
-        "std_msgs/Float32MultiArray",
-        {"data": [0.0, -1e39]},
-        ".data[1]: expected a finite number of 32 bits, found -1e+39.",
-    ),
+    ("std_msgs/Float32", {"data": 1e39}, f".data: {BITS} 1e+39."),
     ("std_msgs/UInt8", {"data": 256}, ".data: expected an integer in [0, 255], found 256."),
     ("std_msgs/Int32", {"data": 1.0}, ".data: expected an integer (int32), found 1.0."),
     ("std_msgs/Int32", {"data": True}, ".data: expected an integer (int32), found True."),
@@ -163,23 +141,16 @@ EXPECTED = [
     ("std_msgs/String", {"data": 1}, ".data: expected a text, found 1."),
     ("std_msgs/String", {"data": "\ud800"}, ".data: expected a text of whole characters, found '\\ud800'."),
     ("std_msgs/Empty", {"data": 1}, ": expected no fields, found 'data'."),
-    (
-        "std_msgs/UInt8MultiArray",
-        {"data": "#"},
-        ".data: expected bytes as base64 or a list of integers in [0, 255], found '#'.",
-    ),
-    (
-        "geometry_msgs/PoseWithCovariance",
-        {"covariance": [0.0]},
-        ".covariance: expected a list of 36, found a list of 1.",
-    ),
-    ("my_msgs/Thing", {"a": [{"b": None}]}, ".a[0].b: expected a plain value, found None."),
-    ("my_msgs/Thing", {"a": math.nan}, ".a: expected a finite number, found nan."),
-    ("my_msgs/Thing", {"a": 2**64}, ".a: expected a number of 64 bits, found 18446744073709551616."),
-    ("my_msgs/Thing", {"a": [1, 2**64]}, ".a[1]: expected a number of 64 bits, found 18446744073709551616."),
-    ("my_msgs/Thing", {"a": [-(2**63) - 1]}, ".a[0]: expected a number of 64 bits, found -9223372036854775809."),
-    ("my_msgs/Thing", {"a": object()}, ".a: expected a plain value, found <object"),
-    ("my_msgs/Thing", {1: 2}, ": expected texts as names, found 1."),
+    ("sensor_msgs/CameraInfo", {"k": [0.0]}, ".k: expected a list of 9, found a list of 1."),
+    ("sensor_msgs/JointState", {"name": ["a", 1]}, ".name[1]: expected a text, found 1."),
+    ("sensor_msgs/JointState", {"name": ["\ud800"]}, ".name[0]: expected a text of whole characters"),
+    (THING, {"a": [{"b": None}]}, ".a[0].b: expected a plain value, found None."),
+    (THING, {"a": math.nan}, ".a: expected a finite number, found nan."),
+    (THING, {"a": 2**64}, ".a: expected a number of 64 bits, found 18446744073709551616."),
+    (THING, {"a": [1, 2**64]}, ".a[1]: expected a number of 64 bits, found 18446744073709551616."),
+    (THING, {"a": [-(2**63) - 1]}, ".a[0]: expected a number of 64 bits, found -9223372036854775809."),
+    (THING, {"a": object()}, ".a: expected a plain value, found <object"),
+    (THING, {1: 2}, ": expected texts as names, found 1."),
 ]
 
 
@@ -209,18 +180,6 @@ def test_null_is_plain_outside_of_messages():
         require_plain({"id": math.nan}, "Message")
 
 
-def test_fields_can_be_looked_up():
-    (fields,) = variants("sensor_msgs/JointState")
-    assert [one.name for one in fields] == ["header", "name", "position", "velocity", "effort"]
-    assert fields[2].type == "float64"
-    assert fields[2].array == ""
-    assert variants("my_msgs/Thing") == ()
-
-
 def test_texts_in_a_list():
-    assert complete("sensor_msgs/JointState", {"name": ["a", "\u00e9"]})["name"] == ["a", "\u00e9"]
-    assert complete("sensor_msgs/JointState", {"name": ("a", "b")})["name"] == ["a", "b"]
-    for names, found in ((["a", 1], "[1]: expected a text, found 1."), (["\ud800"], "[0]: expected a text of whole")):
-        with pytest.raises(InvalidValue) as raised:
-            complete("sensor_msgs/JointState", {"name": names})
-        assert str(raised.value).startswith(f"sensor_msgs/JointState.name{found}")
+    for names in (["a", "\u00e9"], ("a", "b")):
+        assert complete("sensor_msgs/JointState", {"name": names})["name"] == list(names)

@@ -129,10 +129,8 @@ class ScriptedServer:
         with self._changed:
             self.frames.append(frame)
             self._changed.notify_all()
-        if frame["op"] == "call_service":
-            await self._answer(connection, frame)
-
-    async def _answer(self, connection, frame):
+        if frame["op"] != "call_service":
+            return
         respond = self.responses.get(frame["service"], lambda args: f"Service {frame['service']} does not exist")
         values = respond(frame["args"])
         if values is not None:
@@ -169,21 +167,13 @@ class Heard:
 
 
 @pytest.fixture
-def heard():
-    return Heard()
-
-
-@pytest.fixture
 def new_heard():
     return Heard
 
 
 @pytest.fixture
-def scripted():
-    """A running `ScriptedServer`."""
-    server = ScriptedServer().start()
-    yield server
-    server.stop()
+def heard():
+    return Heard()
 
 
 @pytest.fixture
@@ -198,6 +188,12 @@ def new_scripted():
     yield make
     for server in made:
         server.stop()
+
+
+@pytest.fixture
+def scripted(new_scripted):
+    """A running `ScriptedServer`."""
+    return new_scripted()
 
 
 @pytest.fixture

@@ -6,12 +6,16 @@ import random
 import struct
 
 import cbor2
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.rosbridge.encoding import (
     Fragments,
+    decode_cbor,
     decode_frame,
     dump_json,
     encode_cbor,
@@ -66,11 +70,8 @@ def test_everything_else_is_refused(frame, text):
     assert refusal(frame) == text
 
 
-def test_numbers_without_end_are_refused():
+def test_numbers_without_end_are_refused_and_those_that_are_not_finite_are_for_others_to_refuse():
     assert refusal('{"a":' + "9" * 5000 + "}").startswith("Message: expected JSON: Exceeds the limit (4300")
-
-
-def test_numbers_that_are_not_finite_are_for_others_to_refuse():
     assert decode_frame('{"a": [-Infinity, 1e400]}') == {"a": [-math.inf, math.inf]}
 
 
@@ -87,11 +88,7 @@ def test_a_png_holds_the_text(length):
     assert image.tobytes().rstrip(b"\n") == b"x" * length
 
 
-def test_cbor_has_typed_arrays_of_little_endian_numbers():
-    message = {"op": "publish", "topic": "/a", "msg": {"data": [1.5, -2.0]}}
-    decoded = cbor2.loads(encode_cbor(message, "std_msgs/Float64MultiArray"))
-    assert decoded["msg"]["data"] == cbor2.CBORTag(86, struct.pack("<2d", 1.5, -2.0))
-    assert decoded["topic"] == "/a"
+# CBOR and its typed arrays.
 
 
 @pytest.mark.parametrize(
@@ -99,22 +96,50 @@ def test_cbor_has_typed_arrays_of_little_endian_numbers():
     [("Int8", 72, "b"), ("Int16", 77, "h"), ("Int32", 78, "i"), ("Int64", 79, "q"), ("UInt16", 69, "H"),
      ("UInt32", 70, "I"), ("UInt64", 71, "Q"), ("Float32", 85, "f"), ("Float64", 86, "d")],
 )  # fmt: skip
-def test_each_type_has_its_tag(kind, tag, code):
-    packed = encode_cbor({"msg": {"data": [1, 2]}}, f"std_msgs/{kind}MultiArray")
-    found = cbor2.loads(packed)["msg"]["data"]
-    assert found == cbor2.CBORTag(tag, struct.pack(f"<2{code}", 1, 2))
+def test_lists_of_numbers_become_typed_arrays_of_their_type(kind, tag, code):
+    packed = encode_cbor({"op": "publish", "msg": {"data": [1, 2]}}, f"std_msgs/{kind}MultiArray")
+    data = cbor2.CBORTag(tag, struct.pack(f"<2{code}", 1, 2))
+    assert cbor2.loads(packed) == {"op": "publish", "msg": {"data": data}}
 
 
 def test_cbor_leaves_the_rest_as_it_is():
     inside = {"points": [{"positions": [1.0]}], "joint_names": ["a"]}
-    decoded = cbor2.loads(
-        encode_cbor({"msg": inside}, "trajectory_msgs/msg/JointTrajectory"),
-    )
-    assert decoded["msg"]["points"][0]["positions"].tag == 86
-    assert decoded["msg"]["joint_names"] == ["a"]
-    assert cbor2.loads(encode_cbor({"msg": {"a": [1.0], "b": b"\x00"}}, "my_msgs/Thing")) == {
-        "msg": {"a": [1.0], "b": b"\x00"}
-    }
+    decoded = cbor2.loads(encode_cbor({"msg": inside}, "trajectory_msgs/msg/JointTrajectory"))["msg"]
+    assert (decoded["points"][0]["positions"].tag, decoded["joint_names"]) == (86, ["a"])
+    unknown = {"msg": {"a": [1.0], "b": b"\x00"}}
+    assert cbor2.loads(encode_cbor(unknown, "my_msgs/Thing")) == unknown
+
+
+@pytest.mark.parametrize(
+    ("frame", "text"),
+    [
+        (cbor2.dumps([1]), "expected an object in CBOR, found a list"),
+        (cbor2.dumps({"a": cbor2.CBORTag(83, b"")}), "CBOR tag 83 on a bytes: expected a typed array, 64 to 86"),
+        (cbor2.dumps({"a": cbor2.CBORTag(85, b"abc")}), "CBOR tag 85: expected a multiple of 4 bytes, found 3"),
+        (b"\xff\xff", "expected CBOR, found b'\\xff\\xff': "),
+    ],
+)
+def test_cbor_that_cannot_be_read(frame, text):
+    with pytest.raises(ProtocolError) as raised:
+        decode_cbor(frame)
+    assert str(raised.value).startswith(text)
+
+
+TAGS = {64: "u1", 65: ">u2", 66: ">u4", 67: ">u8", 68: "u1", 69: "<u2", 70: "<u4", 71: "<u8", 72: "i1", 73: ">i2"}
+TAGS |= {74: ">i4", 75: ">i8", 77: "<i2", 78: "<i4", 79: "<i8", 80: ">f2", 81: ">f4", 82: ">f8", 84: "<f2"}
+TAGS |= {85: "<f4", 86: "<f8"}
+
+
+@given(st.sampled_from(sorted(TAGS)), st.binary(max_size=64))
+def test_every_typed_array_is_what_was_sent(tag, data):
+    dtype = np.dtype(TAGS[tag])
+    data = data[: len(data) // dtype.itemsize * dtype.itemsize]
+    found = decode_cbor(cbor2.dumps({"a": {"b": [cbor2.CBORTag(tag, data)]}}))["a"]["b"][0]
+    assert found.dtype == dtype.newbyteorder("=")
+    assert found.astype(dtype).tobytes() == data
+
+
+# Fragments.
 
 
 def test_a_text_is_split_where_it_is_too_long():
@@ -131,12 +156,6 @@ def test_fragments_come_in_any_order_and_twice():
     fragments = Fragments(1000)
     assert [fragments.add(part, 0.0) for part in [parts[0], *parts]][-1] == "The quick brown fox"
     assert fragments.deadline is None
-
-
-def test_the_total_may_have_a_fraction():
-    fragments = Fragments(1000)
-    assert fragments.add({"id": 1, "data": "a", "num": 0, "total": 2.52}, 0.0) is None
-    assert fragments.add({"id": 1, "data": "b", "num": 1, "total": 2.52}, 0.0) == "ab"
 
 
 def test_unfinished_messages_are_given_up():

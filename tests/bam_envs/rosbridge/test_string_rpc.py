@@ -101,27 +101,28 @@ def test_lost_first_messages_are_said_again_and_executed_once(pair):
     assert asked == [{"n": 1}]
 
 
-@pytest.mark.parametrize("kind", [RemoteError, NotInCommand])
-def test_an_error_over_there_is_one_here(pair, kind):
-    def fail(payload):
-        raise kind("no cube there")
+def fail(payload):
+    raise payload["error"]("no cube there")
 
-    rpc, _, _ = pair(fail)
-    with pytest.raises(kind, match=r"^no cube there$"):
+
+@pytest.mark.parametrize(
+    ("handler", "kind", "text"),
+    [
+        (lambda payload: fail({"error": RemoteError}), RemoteError, "no cube there"),
+        (lambda payload: fail({"error": NotInCommand}), NotInCommand, "no cube there"),
+        (lambda payload: 1 / 0, RemoteError, "ZeroDivisionError: division by zero"),
+        (
+            lambda payload: {"x": float("nan")},
+            RemoteError,
+            "The reply of /bam/scene.payload.x: expected a finite number, found nan.",
+        ),
+    ],
+)
+def test_an_error_over_there_is_one_here(pair, caplog, handler, kind, text):
+    rpc, _, _ = pair(handler)
+    with pytest.raises(kind) as caught:
         rpc.call({}, 5)
-
-
-def test_a_handler_that_breaks_answers_too(pair, caplog):
-    rpc, _, _ = pair(lambda payload: 1 / 0)
-    with pytest.raises(RemoteError, match=r"^ZeroDivisionError: division by zero$"):
-        rpc.call({}, 5)
-    assert "the handler failed" in caplog.text
-
-
-def test_a_reply_that_is_no_json_is_an_error_over_there(pair):
-    rpc, _, _ = pair(lambda payload: {"x": float("nan")})
-    with pytest.raises(RemoteError, match=r"The reply of /bam/scene\.payload\.x: expected a finite number, found nan"):
-        rpc.call({}, 5)
+    assert (type(caught.value), str(caught.value)) == (kind, text)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), {1, 2}])
@@ -132,15 +133,11 @@ def test_only_plain_finite_values_are_sent(pair, value):
     assert bus.sent == []
 
 
-def test_nobody_answers():
-    rpc = StringRpc(LocalBus(), "/bam/scene")
+def test_nobody_answers(pair):
+    rpc, bus, asked = pair(lambda payload: {}, lose=["/bam/scene/request"] * 9)
     text = r"^/bam/scene did not answer in 0.05 s; whether it did what was asked is unknown\.$"
     with pytest.raises(LinkLost, match=text):
         rpc.call({}, 0.05)
-
-
-def test_a_link_that_is_down_is_told_at_once(pair):
-    rpc, bus, asked = pair(lambda payload: {})
     bus.is_up = False
     with pytest.raises(LinkLost, match="the link is down"):
         rpc.call({}, 60)
@@ -164,17 +161,12 @@ def test_a_call_under_way_fails_when_the_link_drops(pair):
 
 def test_old_requests_are_refused(pair, replies):
     _, bus, asked = pair(lambda payload: {"done": payload["n"]})
-    assert replies(bus, tagged(5)) == {"id": "abc-5", "payload": {"done": 5}}
+    for _ in range(2):  # what comes twice is executed once
+        assert replies(bus, tagged(5)) == {"id": "abc-5", "payload": {"done": 5}}
     assert replies(bus, tagged(4))["error"] == "old message: number 4 after number 5"
     assert replies(bus, tagged(6, epoch=2)) == {"id": "abc-6", "payload": {"done": 6}}
     assert replies(bus, tagged(7, epoch=1))["error"] == "old connection: epoch 1, and epoch 2 is there"
     assert asked == [{"n": 5}, {"n": 6}]
-
-
-def test_the_same_request_gets_the_same_answer_and_is_not_executed_again(pair, replies):
-    _, bus, asked = pair(lambda payload: {"done": payload["n"]})
-    assert replies(bus, tagged(5)) == replies(bus, tagged(5))
-    assert asked == [{"n": 5}]
 
 
 def test_a_request_of_somebody_elses_client_has_no_tag(pair, replies):
@@ -184,20 +176,22 @@ def test_a_request_of_somebody_elses_client_has_no_tag(pair, replies):
     assert wrong["error"] == "/bam/scene/request: payload must be an object, not list."
 
 
-def test_a_request_without_an_id_is_refused_at_the_topic(pair):
+@pytest.mark.parametrize(
+    ("data", "text"),
+    [
+        ("{}", ": id must be a string, not NoneType."),
+        ("[" + "{}," * 500_000 + "{}]", " must be a JSON object: expected at most 100000 values, found more."),
+        (
+            "[" * 1000 + "]" * 1000,
+            " must be a JSON object: expected at most 32 lists and objects in one another, found",
+        ),
+    ],
+)
+def test_a_request_that_is_refused_at_the_topic(pair, data, text):
     _, bus, _ = pair(lambda payload: {})
-    with pytest.raises(ProtocolError, match=r"^/bam/scene/request: id must be a string, not NoneType\.$"):
-        bus.publish("/bam/scene/request", {"data": "{}"})
-
-
-def test_a_request_with_too_much_in_it_is_refused_before_it_is_read(pair):
-    _, bus, _ = pair(lambda payload: {})
-    for data, text in (
-        ("[" + "{}," * 500_000 + "{}]", "expected at most 100000 values, found more"),
-        ("[" * 1000 + "]" * 1000, "expected at most 32 lists and objects in one another, found more"),
-    ):
-        with pytest.raises(ProtocolError, match=f"^/bam/scene/request must be a JSON object: {text}"):
-            bus.publish("/bam/scene/request", {"data": data})
+    with pytest.raises(ProtocolError) as caught:
+        bus.publish("/bam/scene/request", {"data": data})
+    assert str(caught.value).startswith(f"/bam/scene/request{text}")
 
 
 def test_closing_is_possible_twice(pair):

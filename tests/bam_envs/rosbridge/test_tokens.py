@@ -6,12 +6,6 @@ from bam_envs.core.errors import InvalidValue
 from bam_envs.rosbridge.tokens import Guesses, Tokens, read_token
 
 
-def test_a_secret_is_read_without_the_white_space_around_it(tmp_path):
-    path = tmp_path / "token"
-    path.write_text(" se cret \n")
-    assert read_token(path) == "se cret"
-
-
 @pytest.mark.parametrize(
     ("content", "text"),
     [
@@ -95,9 +89,3 @@ def test_few_guesses_a_second_from_all_and_no_address_is_kept_out_by_others():
         assert guesses.may_try("10.1.0.1")
     now[0] += 100.0
     assert guesses.may_try("10.0.0.1")
-
-
-def test_addresses_are_forgotten_in_the_end():
-    guesses = Guesses()
-    tries(guesses, [f"10.{k // 250}.{k % 250}.1" for k in range(6000)])
-    assert len(guesses._wrong) == 4096

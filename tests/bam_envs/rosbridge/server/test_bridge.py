@@ -72,6 +72,12 @@ class Peers:
             self.bridge.services.finish(invoke, self.bridge.services.packed_answer(invoke))
             self.work()
 
+    def call(self, session, **more):
+        """Call a service of this process, let the handlers answer; what the client got."""
+        got = self.say(session, op="call_service", service="/s", **more)
+        self.run()
+        return got + self.take(session)
+
     def wait(self, seconds):
         self.now += seconds
         self.bridge.tick(self.now)
@@ -101,157 +107,76 @@ def text(value):
 # Everything is answered, and the connection is usable afterwards: the inputs of which real servers were measured.
 
 
+SERVED = "Actions are not supported by this server; use a service, or a pair of topics."
+LET_IN = "The op auth is for the first message of a web page; this client has been let in already."
+NUMBER = "std_msgs/Float64MultiArray.data[0]: expected a"
+
+
 @pytest.mark.parametrize(
-    ("frame", "told"),
+    ("title", "fields", "told"),
     [
-        ("{", "Message: expected JSON: Expecting property name enclosed in double quotes: line 1 column 2 (char 1)."),
-        ("{}", "message: op: expected a text, found None."),
-        ('{"op": 3}', "message: op: expected a text, found 3."),
-        ('{"op": "dance", "id": 4}', None),
-        ("[]", "Message: expected an object, found []."),
-        (b"\xa1\x00\x01", "Message: expected text in UTF-8: invalid start byte at byte 0."),
-        (
-            '{"op": "set_level", "level": "loud"}',
-            "set_level: level: expected one of none, error, warning, info, found 'loud'.",
-        ),
-        ('{"op": "subscribe", "topic": "/new"}', "subscribe: Topic /new does not exist yet; its type is needed."),
-        (
-            '{"op": "subscribe", "topic": "/t", "type": "std_msgs/Bool"}',
-            "subscribe: Topic /t is of type std_msgs/String, found 'std_msgs/Bool'.",
-        ),
-        (
-            '{"op": "subscribe", "topic": "/t", "throttle_rate": "300"}',
-            "subscribe /t: throttle_rate: expected a number >= 0, found '300'.",
-        ),
-        (
-            '{"op": "subscribe", "topic": "/t", "queue_length": -1}',
-            "subscribe /t: queue_length: expected a number >= 0, found -1.",
-        ),
-        (
-            '{"op": "subscribe", "topic": "/t", "compression": "cbor-raw"}',
-            "subscribe /t: compression: expected one of none, png, cbor, found 'cbor-raw'.",
-        ),
-        (
-            '{"op": "subscribe", "topic": "/t", "fragment_size": 0}',
-            "subscribe /t: fragment_size: expected an integer >= 1, found 0.",
-        ),
-        (
-            '{"op": "subscribe", "topic": "/a b", "type": "std_msgs/Bool"}',
-            "subscribe /a b: Name: expected one such as '/joint_states', found '/a b'.",
-        ),
-        (
-            '{"op": "subscribe", "topic": "/t", "id": {}}',
-            "subscribe /t: id: expected a text or an integer, found {}.",
-        ),
-        (
-            '{"op": "subscribe", "topic": "/t", "id": 1e400}',
-            "subscribe /t: id: expected a text or an integer, found inf.",
-        ),
-        (
-            '{"op": "subscribe", "topic": "/t", "id": 9999999999999999999}',
-            "subscribe /t: id: expected an integer of 53 bits, found 9999999999999999999.",
-        ),
-        (
-            '{"op": "subscribe", "topic": "/t", "throttle_rate": 1e400}',
-            "subscribe /t: throttle_rate: expected a number >= 0, found inf.",
-        ),
-        ('{"op": "unsubscribe", "topic": "/t"}', "unsubscribe: Topic /t was not subscribed so by this client."),
-        (
-            '{"op": "advertise", "topic": "/t", "type": "std_msgs/Bool"}',
-            "advertise: Topic /t is of type std_msgs/String, found 'std_msgs/Bool'.",
-        ),
-        ('{"op": "advertise", "topic": "/u"}', "advertise /u: type: expected a text, found None."),
-        (
-            '{"op": "advertise", "topic": "/u", "type": "Bool"}',
-            "advertise /u: Type: expected a name such as 'std_msgs/String', found 'Bool'.",
-        ),
-        ('{"op": "unadvertise", "topic": "/u"}', "unadvertise: Topic /u was not advertised so by this client."),
-        (
-            '{"op": "publish", "topic": "/u", "msg": {}}',
-            "publish: Topic /u does not exist; advertise it with its type first.",
-        ),
-        (
-            '{"op": "publish", "topic": "/t", "msg": {"datum": ""}}',
-            "publish /t: std_msgs/String: expected only the fields data, found 'datum'.",
-        ),
-        (
-            '{"op": "publish", "topic": "/t", "msg": {"data": 1}}',
-            "publish /t: std_msgs/String.data: expected a text, found 1.",
-        ),
-        (
-            '{"op": "publish", "topic": "/f", "msg": {"data": [NaN]}}',
-            "publish /f: std_msgs/Float64MultiArray.data[0]: expected a finite number, found nan.",
-        ),
-        (
-            '{"op": "publish", "topic": "/f", "msg": {"data": [Infinity]}}',
-            "publish /f: std_msgs/Float64MultiArray.data[0]: expected a finite number, found inf.",
-        ),
-        (
-            '{"op": "publish", "topic": "/f", "msg": {"data": [1e400]}}',
-            "publish /f: std_msgs/Float64MultiArray.data[0]: expected a finite number, found inf.",
-        ),
-        (
-            '{"op": "publish", "topic": "/f", "msg": {"data": [null]}}',
-            "publish /f: std_msgs/Float64MultiArray.data[0]: expected a number, found None.",
-        ),
-        (
-            '{"op": "publish", "topic": "/f", "msg": {"data": [true]}}',
-            "publish /f: std_msgs/Float64MultiArray.data[0]: expected a number, found True.",
-        ),
-        (
-            '{"op": "unadvertise_service", "service": "/s"}',
-            "unadvertise_service: Service /s is not offered by this client.",
-        ),
-        (
-            '{"op": "advertise_service", "service": "/s", "type": "std_srvs/Empty"}',
-            "advertise_service: Service /s is offered by this server already.",
-        ),
-        (
-            '{"op": "service_response", "id": "7", "service": "/s"}',
-            "service_response /s: Nobody waits for a response with the id '7'.",
-        ),
-        (
-            '{"op": "auth", "mac": ""}',
-            "auth: The op auth is for the first message of a web page; this client has been let in already.",
-        ),
-        (
-            '{"op": "advertise_action", "action": "/a"}',
-            "advertise_action: Actions are not supported by this server; use a service, or a pair of topics.",
-        ),
+        ("", "x", "Message: expected JSON: Expecting value: line 1 column 1 (char 0)."),
+        ("", "[]", "Message: expected an object, found []."),
+        ("", b"\xa1\x00\x01", "Message: expected text in UTF-8: invalid start byte at byte 0."),
+        ("", '{"op": "a"}{"op": "a"}', "Message: expected one in a frame, found more behind it."),
+        ("", "{}", "message: op: expected a text, found None."),
+        ("", '{"op": 3}', "message: op: expected a text, found 3."),
+        ("set_level", '"level": "loud"', "level: expected one of none, error, warning, info, found 'loud'."),
+        ("subscribe", '"topic": "/new"', "Topic /new does not exist yet; its type is needed."),
+        ("subscribe", '"topic": "/t", "type": "a/B"', "Topic /t is of type std_msgs/String, found 'a/B'."),
+        ("subscribe /t", '"throttle_rate": "300"', "throttle_rate: expected a number >= 0, found '300'."),
+        ("subscribe /t", '"throttle_rate": 1e400', "throttle_rate: expected a number >= 0, found inf."),
+        ("subscribe /t", '"queue_length": -1', "queue_length: expected a number >= 0, found -1."),
+        ("subscribe /t", '"compression": "raw"', "compression: expected one of none, png, cbor, found 'raw'."),
+        ("subscribe /t", '"fragment_size": 0', "fragment_size: expected an integer >= 1, found 0."),
+        ("subscribe /a b", '"type": "a/B"', "Name: expected one such as '/joint_states', found '/a b'."),
+        ("subscribe /t", '"id": {}', "id: expected a text or an integer, found {}."),
+        ("subscribe /t", '"id": 1e400', "id: expected a text or an integer, found inf."),
+        ("subscribe /t", f'"id": {10**19}', f"id: expected an integer of 53 bits, found {10**19}."),
+        ("unsubscribe", '"topic": "/t"', "Topic /t was not subscribed so by this client."),
+        ("advertise", '"topic": "/t", "type": "a/B"', "Topic /t is of type std_msgs/String, found 'a/B'."),
+        ("advertise /u", '"a": 0', "type: expected a text, found None."),
+        ("advertise /u", '"type": "Bool"', "Type: expected a name such as 'std_msgs/String', found 'Bool'."),
+        ("unadvertise", '"topic": "/u"', "Topic /u was not advertised so by this client."),
+        ("publish", '"topic": "/u", "msg": {}', "Topic /u does not exist; advertise it with its type first."),
+        ("publish /t", '"msg": {"b": ""}', "std_msgs/String: expected only the fields data, found 'b'."),
+        ("publish /t", '"msg": {"data": 1}', "std_msgs/String.data: expected a text, found 1."),
+        ("publish /f", '"msg": {"data": [NaN]}', f"{NUMBER} finite number, found nan."),
+        ("publish /f", '"msg": {"data": [Infinity]}', f"{NUMBER} finite number, found inf."),
+        ("publish /f", '"msg": {"data": [1e400]}', f"{NUMBER} finite number, found inf."),
+        ("publish /f", '"msg": {"data": [null]}', f"{NUMBER} number, found None."),
+        ("publish /f", '"msg": {"data": [true]}', f"{NUMBER} number, found True."),
+        ("unadvertise_service", '"service": "/s"', "Service /s is not offered by this client."),
+        ("advertise_service", '"service": "/s", "type": "a/B"', "Service /s is offered by this server already."),
+        ("service_response", '"id": "7"', "Nobody waits for a response with the id '7'."),
+        ("auth", '"mac": ""', LET_IN),
+        ("advertise_action", '"action": "/a"', SERVED),
     ],
 )
-def test_what_does_not_work_is_said_at_once(peers, frame, told):
+def test_what_does_not_work_is_said_at_once(peers, title, fields, told):
     peers.bridge.subscribe("/t", TEXT, lambda message, caller: None)
     peers.bridge.subscribe("/f", FLOATS, lambda message, caller: pytest.fail("it must not get through"))
     peers.bridge.serve("/s", TRIGGER, lambda request, caller: {})
-    client = peers.client()
+    client, (op, _, topic) = peers.client(), title.partition(" ")
+    named = f'"topic": "{topic}", ' if topic else ""
+    frame = f'{{"op": "{op}", {named}{fields}}}' if op else fields
     (answer,) = peers.say(client, frame)
     assert (answer["op"], answer["level"]) == ("status", "error")
-    if told is None:
-        assert answer["msg"].startswith("dance: Unknown op 'dance'; expected one of advertise, ")
-        assert answer["id"] == 4
-    else:
-        assert answer["msg"] == told
+    assert answer["msg"] == (f"{title}: {told}" if op else told)
     peers.say(client, op="call_service", service="/s", id=1)
     peers.run()
     assert peers.take(client) == response({"success": False, "message": ""}, True, id=1)
 
 
+def test_an_operation_that_nobody_knows(peers):
+    (answer,) = peers.say(peers.client(), op="dance", id=4)
+    assert answer["msg"].startswith("dance: Unknown op 'dance'; expected one of advertise, ")
+    assert answer["id"] == 4
+
+
 def test_a_goal_of_an_action_is_answered_as_one(peers):
-    answer = {
-        "op": "action_result",
-        "action": "/a",
-        "id": "g",
-        "values": "Actions are not supported by this server; use a service, or a pair of topics.",
-        "status": 6,
-        "result": False,
-    }
+    answer = {"op": "action_result", "action": "/a", "id": "g", "values": SERVED, "status": 6, "result": False}
     assert peers.say(peers.client(), op="send_action_goal", action="/a", action_type="x/Y", id="g") == [answer]
-
-
-def test_two_messages_in_one_frame_are_refused(peers):
-    frame = json.dumps({"op": "call_service", "service": "/no"})
-    assert peers.say(peers.client(), frame + frame) == status("Message: expected one in a frame, found more behind it.")
 
 
 def test_json_in_a_binary_frame_is_done(peers):
@@ -265,11 +190,8 @@ def test_a_wrong_type_harms_nobody_else(peers):
     peers.say(second, op="subscribe", topic="/t", type="std_msgs/Int32")
     assert peers.say(third, op="subscribe", topic="/t", type="std_msgs/msg/String") == []
     peers.say(second, op="publish", topic="/t", msg=text("x"))
-    assert [peers.take(one) for one in (first, second, third)] == [
-        [published("/t", text("x"))],
-        [],
-        [published("/t", text("x"))],
-    ]
+    told = [published("/t", text("x"))]
+    assert [peers.take(one) for one in (first, second, third)] == [told, [], told]
 
 
 def test_levels_of_status(peers):
@@ -344,23 +266,14 @@ def test_a_topic_of_the_rate_that_is_asked_for_loses_nothing(peers):
     assert count == 100
 
 
-def test_the_queue_length_goes_with_what_is_sent(peers):
-    client = peers.client()
-    peers.say(client, op="subscribe", topic="/t", type=TEXT, queue_length=3)
+def test_packing_is_done_once_for_all_and_the_queue_length_goes_with_it(peers):
+    for number in range(3):
+        peers.say(peers.client(str(number)), op="subscribe", topic="/t", type=TEXT, queue_length=3)
     peers.bridge.advertise("/t", TEXT)
     peers.bridge.publish(peers.bridge.publication("/t", text("x")), 0.0)
-    (event,) = peers.bridge.events()
-    assert event.keep == 3
-    assert event.packet.stream == "/t"
-
-
-def test_packing_is_done_once_for_all(peers):
-    clients = [peers.client(str(number)) for number in range(3)]
-    for client in clients:
-        peers.say(client, op="subscribe", topic="/t", type=TEXT)
-    peers.bridge.advertise("/t", TEXT)
-    peers.bridge.publish(peers.bridge.publication("/t", text("x")), 0.0)
-    assert len({id(event.packet) for event in peers.bridge.events()}) == 1
+    events = peers.bridge.events()
+    assert len({id(event.packet) for event in events}) == 1
+    assert [(event.keep, event.packet.stream) for event in events] == [(3, "/t")] * 3
 
 
 def test_compressions(peers):
@@ -446,24 +359,24 @@ def test_a_listener_that_breaks_silences_nobody(peers, caplog):
     assert "A listener of /cmd failed." in caplog.text
 
 
-def test_mistakes_of_this_process_are_values(peers):
-    peers.bridge.advertise("/t", TEXT)
-    for mistake, told in [
+@pytest.mark.parametrize(
+    ("mistake", "told"),
+    [
+        (lambda bridge: bridge.advertise("/t", "a/B"), "Topic /t is of type std_msgs/String, found 'a/B'."),
+        (lambda bridge: bridge.publication("/u", {}), "Topic /u does not exist; advertise it with its type first."),
+        (lambda bridge: bridge.publication("/t", {"data": 1}), "std_msgs/String.data: expected a text, found 1."),
+        (lambda bridge: bridge.publication("a b", {}), "Name: expected one such as '/joint_states', found 'a b'."),
         (
-            lambda: peers.bridge.advertise("/t", FLOATS),
-            "Topic /t is of type std_msgs/String, found 'std_msgs/Float64MultiArray'.",
-        ),
-        (lambda: peers.bridge.publication("/u", {}), "Topic /u does not exist; advertise it with its type first."),
-        (lambda: peers.bridge.publication("/t", {"data": 1}), "std_msgs/String.data: expected a text, found 1."),
-        (lambda: peers.bridge.publication("a b", {}), "Name: expected one such as '/joint_states', found 'a b'."),
-        (
-            lambda: peers.bridge.serve("/rosapi/topics", TRIGGER, print),
+            lambda bridge: bridge.serve("/rosapi/topics", TRIGGER, print),
             "Service /rosapi/topics is offered by this server already.",
         ),
-    ]:
-        with pytest.raises(InvalidValue) as caught:
-            mistake()
-        assert str(caught.value) == told
+    ],
+)
+def test_mistakes_of_this_process_are_values(peers, mistake, told):
+    peers.bridge.advertise("/t", TEXT)
+    with pytest.raises(InvalidValue) as caught:
+        mistake(peers.bridge)
+    assert str(caught.value) == told
 
 
 def test_who_left_is_told(peers, caplog):
@@ -489,12 +402,8 @@ def test_a_handler_answers(peers):
 def test_arguments_may_have_no_names(peers):
     peers.bridge.serve("/s", SET_BOOL, lambda request, caller: {"success": request["data"]})
     client = peers.client()
-    peers.say(client, op="call_service", service="/s", args=[True])
-    peers.run()
-    assert peers.take(client) == response({"success": True, "message": ""}, True)
-    assert peers.say(client, op="call_service", service="/s", args=[True, 1]) == response(
-        "args: expected an object, found [True, 1].", False
-    )
+    assert peers.call(client, args=[True]) == response({"success": True, "message": ""}, True)
+    assert peers.call(client, args=[True, 1]) == response("args: expected an object, found [True, 1].", False)
 
 
 @pytest.mark.parametrize(
@@ -515,51 +424,33 @@ def test_a_wrong_call_is_answered_by_a_response(peers, call, told):
     assert peers.say(peers.client(), message) == response(told, False, message["service"], id=1)
 
 
-@pytest.mark.parametrize(
-    ("error", "told"),
-    [(RemoteError("no"), "no"), (ValueError("boom"), "Service /s failed: ValueError: boom")],
-)
-def test_a_handler_that_fails_answers(peers, caplog, error, told):
-    def fail(request, caller):
-        raise error
+def boom(request, caller):
+    raise ValueError("boom")
 
-    peers.bridge.serve("/s", TRIGGER, fail)
-    client = peers.client()
-    peers.say(client, op="call_service", service="/s")
-    peers.run()
-    assert peers.take(client) == response(told, False)
+
+def refuse(request, caller):
+    raise RemoteError("no")
 
 
 @pytest.mark.parametrize(
-    ("values", "told"),
+    ("handler", "told"),
     [
-        ({"success": 1}, "std_srvs/TriggerResponse.success: expected true or false, found 1."),
-        (3, "std_srvs/TriggerResponse: expected an object, found 3."),
+        (refuse, "no"),
+        (boom, "Service /s failed: ValueError: boom"),
+        (lambda *_: {"success": 1}, "std_srvs/TriggerResponse.success: expected true or false, found 1."),
+        (lambda *_: 3, "std_srvs/TriggerResponse: expected an object, found 3."),
+        (lambda *_: {"message": "x" * 1000}, "The response of /s has 1094 bytes, and 1000 is the most."),
     ],
 )
-def test_a_handler_that_answers_wrongly(peers, values, told):
-    peers.bridge.serve("/s", TRIGGER, lambda request, caller: values)
-    client = peers.client()
-    peers.say(client, op="call_service", service="/s")
-    peers.run()
-    assert peers.take(client) == response(told, False)
-
-
-def test_a_response_that_is_too_large():
+def test_a_handler_that_fails_or_answers_wrongly_is_an_answer(caplog, handler, told):
     peers = Peers(ServerOptions(max_message=1000))
-    peers.bridge.serve("/s", TRIGGER, lambda request, caller: {"message": "x" * 1000})
-    client = peers.client()
-    peers.say(client, op="call_service", service="/s")
-    peers.run()
-    assert peers.take(client) == response("The response of /s has 1094 bytes, and 1000 is the most.", False)
+    peers.bridge.serve("/s", TRIGGER, handler)
+    assert peers.call(peers.client()) == response(told, False)
 
 
 def test_a_response_in_fragments(peers):
     peers.bridge.serve("/s", TRIGGER, lambda request, caller: {"message": "x" * 100})
-    client = peers.client()
-    peers.say(client, op="call_service", service="/s", fragment_size=60)
-    peers.run()
-    answer = json.loads("".join(part["data"] for part in peers.take(client)))
+    answer = json.loads("".join(part["data"] for part in peers.call(peers.client(), fragment_size=60)))
     assert [answer] == response({"success": False, "message": "x" * 100}, True)
 
 
@@ -707,10 +598,6 @@ def test_a_message_in_fragments_is_done_once_it_is_whole(peers):
     parts = split(json.dumps({"op": "call_service", "service": "/no", "id": 3}), 10, "f")
     assert peers.say(client, *reversed(parts)) == response("Service /no does not exist", False, "/no", id=3)
     assert peers.bridge.next_deadline is None
-
-
-def test_fragments_that_do_not_come_are_told_of(peers):
-    client = peers.client()
     assert peers.say(client, op="fragment", id="f", data="x", num=0, total=2) == []
     assert peers.bridge.next_deadline == 110.0
     peers.wait(10.0)

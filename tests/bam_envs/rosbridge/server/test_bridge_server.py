@@ -108,9 +108,16 @@ def test_it_ends_with_a_goodbye_and_leaves_no_thread(threads):
     assert threads() == set()
 
 
-def test_it_starts_once(server):
+def test_it_starts_once_and_alone_on_its_port(server):
     with pytest.raises(InvalidValue, match=r"^A server starts once; make a new one\.$"):
         server.start()
+    with pytest.raises(InvalidValue) as caught:
+        BridgeServer(port=server.port).start()
+    remedy = "Stop the program there, or choose another port (0 takes a free one)."
+    assert str(caught.value) == f"Port {server.port} on 127.0.0.1 is in use. {remedy}"
+    text = r"^Listening on '192\.0\.2\.1', port 0: expected an address of this computer"
+    with pytest.raises(InvalidValue, match=text):
+        BridgeServer("192.0.2.1", 0).start()
 
 
 def test_a_constructor_opens_nothing_and_close_may_come_first(threads):
@@ -120,32 +127,17 @@ def test_a_constructor_opens_nothing_and_close_may_come_first(threads):
     assert threads() == set()
 
 
-def test_a_port_in_use(server):
-    with pytest.raises(InvalidValue) as caught:
-        BridgeServer(port=server.port).start()
-    remedy = "Stop the program there, or choose another port (0 takes a free one)."
-    assert str(caught.value) == f"Port {server.port} on 127.0.0.1 is in use. {remedy}"
-
-
 @pytest.mark.parametrize(
     ("options", "text"),
     [
         ({"port": 70000}, "Port: expected an integer in [0, 65535], found 70000."),
         ({"port": 0, "key": "k.pem"}, "A key needs its certificate; name the file of that too."),
-        ({"port": 0, "token": ""}, "Token: expected a text, found an empty one."),
     ],
 )
 def test_wrong_options_are_refused_at_once(options, text):
     with pytest.raises(InvalidValue) as caught:
         BridgeServer(**options)
     assert str(caught.value) == text
-
-
-def test_an_address_of_another_computer():
-    with pytest.raises(
-        InvalidValue, match=r"^Listening on '192\.0\.2\.1', port 0: expected an address of this computer"
-    ):
-        BridgeServer("192.0.2.1", 0).start()
 
 
 # The bus.
@@ -187,14 +179,6 @@ def test_topics_both_ways(server, new_client, heard):
     stop()
     assert clients[0].ask(op="publish", topic="/to", msg={"data": "3"})["op"] == "status"
     assert len(heard.messages) == 1
-
-
-def test_values_are_checked_where_they_are_published(server):
-    server.advertise("/t", TEXT)
-    with pytest.raises(InvalidValue, match=r"^std_msgs/String\.data: expected a text, found 1\.$"):
-        server.publish("/t", {"data": 1})
-    with pytest.raises(InvalidValue, match=r"^Topic /t is of type std_msgs/String, found 'std_msgs/Bool'\.$"):
-        server.subscribe("/t", "std_msgs/Bool", print)
 
 
 def test_a_listener_may_use_the_bus_and_refuse(server, client):
@@ -327,26 +311,25 @@ def test_an_operator_is_known_by_another_token(new_server, new_client):
     assert all(0.0 <= caller.silence() < DEADLINE for caller in callers)
 
 
-def guess(url, source=None):
-    """The HTTP status of a wrong token from the address `source`."""
-    options = {"sock": socket.create_connection(url, source_address=(source, 0) if source else None)}
+def guess(place):
+    """The HTTP status of a wrong token."""
+    options = {"sock": socket.create_connection(place), "additional_headers": {"Authorization": "Bearer guess"}}
     with pytest.raises(InvalidStatus) as caught:
-        connect("ws://127.0.0.1/", additional_headers={"Authorization": "Bearer guess"}, **options)
+        connect("ws://127.0.0.1/", **options)
     return caught.value.response.status_code
 
 
 def test_guessing_tokens_is_slow_and_keeps_no_other_address_out(new_server, new_client):
     server = new_server(token="secret")
     place = ("127.0.0.1", server.port)
-    server._admission._guesses._clock = lambda: 100.0
-    assert [guess(place) for _ in range(6)] == [401] * 4 + [429] * 2
+    statuses = [guess(place) for _ in range(20)]
+    assert statuses[:4] == [401] * 4
+    assert 429 in statuses
     try:
         elsewhere = socket.create_connection(place, source_address=("127.0.0.2", 0))
     except OSError:
         pytest.skip("this system has one loopback address")
     new_client(server.url, sock=elsewhere, additional_headers={"Authorization": "Bearer secret"}).sync()
-    server._admission._guesses._clock = lambda: 101.0
-    new_client(server.url, additional_headers={"Authorization": "Bearer secret"}).sync()
 
 
 @pytest.mark.parametrize("headers", [{"Authorization": "Bearer first"}, {}])
@@ -398,12 +381,11 @@ def test_there_is_room_for_so_many(new_server, new_client):
 # Bad company.
 
 
-@pytest.mark.parametrize("size", [16 * 2**20 + 1, 100_000_000])
-def test_a_message_that_is_too_large_ends_only_its_connection(server, new_client, size):
+def test_a_message_that_is_too_large_ends_only_its_connection(server, new_client):
     big, other = new_client(), new_client()
     # The server closes while the message is still on its way.
     with contextlib.suppress(ConnectionClosed):
-        big.socket.send(b" " * size)
+        big.socket.send(b" " * (16 * 2**20 + 1))
     with pytest.raises(ConnectionClosed) as end:
         big.receive()
     assert end.value.rcvd is None or end.value.rcvd.code == 1009
@@ -416,14 +398,11 @@ def test_a_message_of_a_usual_size_is_done(server, client):
     assert answer["values"].startswith("Name: expected one such as '/joint_states', found '/txxx")
 
 
-def test_an_answer_may_be_larger_than_what_a_client_may_send(new_server, new_client):
+def test_what_comes_is_bounded_otherwise_than_answers(new_server, new_client):
     server = new_server(options=ServerOptions(max_incoming=1000))
     server.serve("/big", TRIGGER, lambda request, caller: {"message": "x" * 5000})
-    assert new_client(server.url).call("/big")["values"]["message"] == "x" * 5000
-
-
-def test_fragments_may_not_be_larger_together_than_one_message(new_server, new_client):
-    client = new_client(new_server(options=ServerOptions(max_incoming=1000)).url)
+    client = new_client(server.url)
+    assert client.call("/big")["values"]["message"] == "x" * 5000
     client.send(op="fragment", id="a", num=0, total=3, data="x" * 700)
     answer = client.ask(op="fragment", id="a", num=1, total=3, data="x" * 700)
     assert answer["msg"] == "fragment: Fragments: expected at most 1000 bytes, found 1600."
@@ -546,15 +525,10 @@ def test_a_client_that_does_not_take_its_answers_is_closed(new_server, new_clien
         for _ in range(200):
             sleeper.send(op="call_service", service="/big")
     with pytest.raises(ConnectionClosed) as end:
-        read_all(sleeper)
+        list(iter(sleeper.receive, None))
     assert end.value.rcvd.code == 1013
     assert end.value.rcvd.reason.endswith(" bytes wait, and the client does not read")
     other.sync()
-
-
-def read_all(client):
-    while True:
-        client.receive()
 
 
 def test_pings_that_are_never_read_do_not_pile_up(new_server, new_client, until):
@@ -566,12 +540,7 @@ def test_pings_that_are_never_read_do_not_pile_up(new_server, new_client, until)
     )
     ping = b"\x89\xfd\x00\x00\x00\x00" + b"x" * 125
     with pytest.raises(OSError, match=r"reset|Broken pipe"):
-        flood(sleeper, ping * 500)
+        list(iter(lambda: sleeper.sendall(ping * 500), 1))
     sleeper.close()
     until(lambda: server.clients == 1)
     other.sync()
-
-
-def flood(sender, data):
-    for _ in range(10_000):
-        sender.sendall(data)
