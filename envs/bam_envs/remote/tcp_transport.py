@@ -137,9 +137,11 @@ class TcpTransport:
             spec = self._open()
             if self._spec is not None and spec_to_json(self._spec) != spec_to_json(spec):
                 raise ProtocolError(f"{self.url}: it serves another environment than before: {spec.env_id}.")
-            self._require_open()  # another thread may have closed it meanwhile, when there was no link to drop
-        except BaseException:
+            self._require_open()  # another thread may have closed it meanwhile
+        except BaseException as error:
             self._drop()
+            if isinstance(error, LinkLost):
+                self._require_open()
             raise
         self._spec = spec
         return spec

@@ -4,7 +4,6 @@ import os
 import signal
 import threading
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -12,12 +11,12 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from bam_envs.core.errors import InvalidValue, LinkLost, ResetNeeded
 from bam_envs.core.registry import ENVIRONMENTS
-from bam_envs.remote.remote_env import RemoteVectorEnv
-from bam_envs.remote.serve.env_server import EnvServer
+from bam_envs.remote.remote_vector_env import RemoteVectorEnv, join_final, join_infos
+from bam_envs.remote.serve.env_server import EnvServer, split_infos
 from bam_envs.remote.serve.local_transport import FakeEnv, FakeTransport, LocalTransport
 from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.remote.tcp_transport import TcpTransport
-from bam_envs.testing.transports import MirrorEnv, assert_same_value
+from bam_envs.testing.transports import assert_same_value
 
 PATIENCE = 10.0
 
@@ -223,29 +222,6 @@ def test_actions_of_another_shape_are_refused(shape):
     envs.close()
 
 
-SPACE = spaces.Dict({"x": spaces.Box(-1, 1, (2,)), "n": spaces.Discrete(3, start=1), "t": spaces.Text(3)})
-
-
-def test_rows_of_any_space():
-    makers = [lambda: MirrorEnv(SPACE, episode_steps=2)] * 2
-    alone = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
-    envs = RemoteVectorEnv([LocalTransport(makers[0]()), LocalTransport(SyncVectorEnv(makers[:1], **SAME_STEP))])
-    assert_same_value(envs.reset(seed=3)[0], alone.reset(seed=3)[0], "the first observation")
-    envs.action_space.seed(1)
-    for _ in range(4):
-        action = envs.action_space.sample()
-        ours, theirs = envs.step(action), alone.step(action)
-        assert_same_value(ours[0], theirs[0], "observation")
-    last = [ours[4]["final_obs"], theirs[4]["final_obs"]]
-    for one, two in zip(*last, strict=True):
-        assert_same_value(one, two, "final_obs")
-    envs.close()
-    alone.close()
-
-
-SAME_STEP = {"autoreset_mode": AutoresetMode.SAME_STEP}
-
-
 def test_discrete_actions():
     transports = [FakeTransport(FakeEnv(action_space=spaces.Discrete(3))) for _ in range(2)]
     envs = RemoteVectorEnv(transports)
@@ -255,15 +231,6 @@ def test_discrete_actions():
     with pytest.raises(InvalidValue) as caught:
         envs.step(np.array([2, 0, 1]))
     assert str(caught.value) == "There must be one action for each of 2 environments, not 3."
-    envs.close()
-
-
-def test_gymnasiums_wrappers_work():
-    envs = gym.wrappers.vector.RecordEpisodeStatistics(RemoteVectorEnv([FakeTransport(), FakeTransport()]))
-    envs.reset(seed=0)
-    for _ in range(10):
-        infos = envs.step(envs.action_space.sample())[4]
-    assert infos["episode"]["l"].tolist() == [10, 10]
     envs.close()
 
 
@@ -295,3 +262,51 @@ def test_a_forked_child_has_threads_of_its_own():
     os.waitpid(child, 0)
     os.close(reads)
     envs.close()
+
+
+ROWS = [
+    {"x": 0.5, "n": 1, "ok": True, "in": {"a": 2}, "arr": np.int8([1, 2])},
+    {"x": 1.5, "in": {}, "text": "b"},
+    {"x": np.float64(2.5), "n": 3, "ok": False, "in": {"a": 4}, "arr": np.int8([3, 4])},
+]
+
+
+def test_joining_makes_columns_with_masks():
+    infos = join_infos(ROWS)
+    assert infos["x"].tolist() == [0.5, 1.5, 2.5]
+    assert infos["_x"].tolist() == [True, True, True]
+    assert (infos["n"].dtype, infos["n"].tolist()) == (np.int64, [1, 0, 3])
+    assert infos["_n"].tolist() == [True, False, True]
+    assert (infos["ok"].dtype, infos["ok"].tolist()) == (np.bool_, [True, False, False])
+    assert infos["in"]["a"].tolist() == [2, 0, 4]
+    assert infos["in"]["_a"].tolist() == [True, False, True]
+    assert (infos["arr"].dtype, infos["arr"].tolist()) == (np.int8, [[1, 2], [0, 0], [3, 4]])
+    assert (infos["text"].dtype, infos["text"].tolist()) == (object, [None, "b", None])
+    assert infos["_text"].tolist() == [False, True, False]
+
+
+def test_splitting_gives_the_rows_back():
+    back = split_infos(join_infos(ROWS), 3)
+    for row, given in zip(back, ROWS, strict=True):
+        assert row.keys() == given.keys()
+        assert all(np.array_equal(row[key], given[key]) for key in given)
+
+
+def test_values_of_several_kinds_keep_them():
+    column = join_infos([{"x": 1}, {"x": 0.5}, {"x": [1]}])["x"]
+    assert column.tolist() == [1, 0.5, [1]]
+    assert column.dtype == object
+
+
+def test_what_has_no_mask_or_no_rows_is_for_every_row():
+    assert split_infos({"x": np.arange(2), "name": "rack", "sizes": [1, 2, 3], "_hidden": 1}, 2) == [
+        {"x": 0, "name": "rack", "sizes": [1, 2, 3], "_hidden": 1},
+        {"x": 1, "name": "rack", "sizes": [1, 2, 3], "_hidden": 1},
+    ]
+
+
+def test_last_observations():
+    infos = [{}, {"final_obs": np.float32([9])}]
+    box = join_final(spaces.Box(-9, 9, (1,)), [np.float32([1]), np.float32([2])], infos)
+    assert box.tolist() == [[1], [9]]
+    assert join_final(spaces.Text(3), ["a", "b"], [{}, {"final_obs": "z"}]).tolist() == [None, "z"]

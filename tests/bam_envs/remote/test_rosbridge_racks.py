@@ -93,17 +93,6 @@ def test_a_real_rack(rack, open_to, images):
     assert [one["header"]["request_type"] for one in there.requests] == [2, 1, 3]
 
 
-def test_two_arms_of_a_rack_are_one_request(rack, open_to):
-    there = rack(arms=2)
-    transport = open_to(**PICKING, num_envs=2)
-    assert transport.connect().vector
-    assert len(transport.reset()[0]) == 2
-    observation, reward, *_ = transport.step([ACTION, ACTION])
-    assert [row["state"][0] for row in observation] == [0.25, 0.25]
-    assert reward == [1.0, 1.0]
-    assert [len(one["action"]) for one in there.requests] == [0, 2]
-
-
 def heights(*numbers):
     """The actions of as many arms."""
     rows = [{**UPRIGHT, "position": np.float32([0.5, 0, z]), "gripper_width": np.float32(0)} for z in numbers]
@@ -195,10 +184,3 @@ def test_a_rack_whose_spaces_are_not_given(rack, open_to):
         "/bam_001/gym_env/gym_api_request: Unsupported request type; give observation_space and action_space, or an "
         "env_id that is registered here. Start one: bam-serve --env Pick --namespace bam_001"
     )
-
-
-def test_a_rack_that_runs_what_is_registered_here(rack, open_to):
-    rack()
-    spec = open_to(env_id="CartPole-v1").connect()
-    assert (spec.env_id, spec.action_space) == ("CartPole-v1", spaces.Discrete(2))
-    assert spec.observation_space.shape == (4,)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from bam_envs.core.errors import InvalidValue, NoServer
+from bam_envs.core.errors import InvalidValue
 from bam_envs.remote.remote_env import RemoteEnv, RemoteVectorEnv
 from bam_envs.remote.rosbridge_transport import RosbridgeTransport
 from bam_envs.rosbridge.server import BridgeServer
@@ -133,11 +133,6 @@ def test_spaces_that_are_given():
     assert (spec.env_id, spec.observation_space, spec.action_space) == ("Pick", *SPACES.values())
     assert (spec.num_envs, spec.vector, spec.autoreset, spec.period) == (2, True, False, 0.5)
     assert Transport(Rack(JUNE_22), env_id="").connect().env_id == "rack"
-
-
-def test_spaces_that_nobody_knows():
-    with pytest.raises(NoServer, match="Unsupported request type; give observation_space and action_space"):
-        Transport(Rack(JUNE_22), env_id="Pikc", observation_space=None).connect()
 
 
 def test_a_version_that_there_is_not():

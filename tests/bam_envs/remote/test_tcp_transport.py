@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from bam_envs.core.errors import LinkLost, NoServer, ProtocolError, RemoteError
+from bam_envs.core.errors import LinkLost, NoServer, ProtocolError
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.local_transport import FakeEnv
 from bam_envs.remote.serve.tcp_server import TcpServer
@@ -27,6 +27,19 @@ ACTION = np.zeros(2, np.float32)
 @pytest.fixture
 def env():
     return MirrorEnv(spaces.Box(-1, 1, (2,)))
+
+
+class Slow(MirrorEnv):
+    """A step lasts until it may end."""
+
+    def __init__(self):
+        super().__init__(spaces.Box(-1, 1, (2,)))
+        self.begun, self.may_end = threading.Event(), threading.Event()
+
+    def step(self, action):
+        self.begun.set()
+        assert self.may_end.wait(PATIENCE)
+        return super().step(action)
 
 
 @pytest.fixture
@@ -134,10 +147,6 @@ def test_a_description_that_is_none(content):
         assert refused(url).startswith("not a bam-serve TCP server: Expected the description of an environment, found ")
 
 
-def test_the_constructor_does_no_io():
-    TcpTransport("tcp://nobody.invalid:1").close()
-
-
 def test_requests_carry_session_epoch_sequence_and_deadline():
     with answering(welcome, telling("ok", [np.zeros(3, np.float32), {}])) as (url, asked):
         transport = TcpTransport(url, timeout=7.0)
@@ -151,35 +160,26 @@ def test_requests_carry_session_epoch_sequence_and_deadline():
 
 
 def test_a_lost_link_stays_down_until_a_reset_and_nothing_is_sent_again(env):
-    server = TcpServer(EnvServer(env))
-    server.start()
-    transport = TcpTransport(server.url)
-    transport.connect()
-    transport.reset()
-    server.close()
-    with pytest.raises(LinkLost) as caught:
-        transport.step(ACTION)
-    assert str(caught.value) == f"{server.url}: the other end closed the connection."
-    again = TcpServer(EnvServer(env), port=server.port)
-    again.start()
-    with pytest.raises(LinkLost) as caught:
-        transport.step(ACTION)
-    assert str(caught.value) == (
-        f"{server.url}: the link is down, and nothing was sent. Call reset() to connect again."
-    )
+    with TcpServer(EnvServer(env)) as server:
+        transport = TcpTransport(server.url)
+        transport.reset()
+    for reason in (
+        "the other end closed the connection.",
+        "the link is down, and nothing was sent. Call reset() to connect again.",
+    ):
+        with TcpServer(EnvServer(env), port=server.port), pytest.raises(LinkLost) as caught:
+            transport.step(ACTION)
+        assert str(caught.value) == f"{server.url}: {reason}"
     assert env.seen == []
-    transport.reset()
-    transport.step(ACTION)
+    with TcpServer(EnvServer(env), port=server.port):
+        transport.reset()
+        transport.step(ACTION)
+        transport.close()
     assert len(env.seen) == 1
-    transport.close()
-    again.close()
 
 
-def test_no_answer_in_time_is_a_lost_link_and_the_server_does_not_act_later(env):
-    server = TcpServer(EnvServer(env))
-    server.start()
+def test_no_answer_in_time_is_a_lost_link_and_the_server_does_not_act_later(server, env):
     transport = TcpTransport(server.url)
-    transport.connect()
     transport.reset()
     transport.timeout = 0.1
     with server.server.lock, pytest.raises(LinkLost) as caught:
@@ -190,23 +190,19 @@ def test_no_answer_in_time_is_a_lost_link_and_the_server_does_not_act_later(env)
     assert env.seen == []
 
 
-def test_a_server_that_answers_something_else():
-    with answering(welcome, telling("ok", [np.zeros(4, np.float32), {}])) as (url, _):
+@pytest.mark.parametrize(
+    ("answer", "text"),
+    [
+        (np.zeros(4, np.float32), "observation must have shape (3,), not (4,)."),
+        (np.float32([0, np.nan, 0]), "observation[1] is NaN; only numbers are sent."),
+    ],
+)
+def test_a_server_that_answers_something_else(answer, text):
+    with answering(welcome, telling("ok", [answer, {}])) as (url, _):
         transport = TcpTransport(url)
-        transport.connect()
         with pytest.raises(ProtocolError) as caught:
             transport.reset()
-        assert str(caught.value) == (f"{url}: observation must have shape (3,), not (4,).")
-        transport.close()
-
-
-def test_a_server_that_sends_nan():
-    with answering(welcome, telling("ok", [np.float32([0, np.nan, 0]), {}])) as (url, _):
-        transport = TcpTransport(url)
-        transport.connect()
-        with pytest.raises(ProtocolError) as caught:
-            transport.reset()
-        assert str(caught.value) == f"{url}: observation[1] is NaN; only numbers are sent."
+        assert str(caught.value) == f"{url}: {text}"
         transport.close()
 
 
@@ -214,86 +210,58 @@ def test_an_answer_to_another_request_drops_the_link():
     wrong = lambda sock, frames, tree: frames.send(encode([99, "ok", None]), time.monotonic() + PATIENCE)  # noqa: E731
     with answering(welcome, wrong) as (url, _):
         transport = TcpTransport(url)
-        transport.connect()
         with pytest.raises(ProtocolError) as caught:
             transport.reset()
         assert str(caught.value) == "Expected the answer to request 1, found [99, 'ok', None]."
         with pytest.raises(LinkLost):
-            transport.step(np.zeros(2, np.float32))
+            transport.step(ACTION)
         transport.close()
 
 
 def test_another_environment_after_a_reconnect_is_refused(env):
-    server = TcpServer(EnvServer(env))
-    server.start()
-    transport = TcpTransport(server.url)
-    transport.connect()
-    server.close()
-    other = TcpServer(EnvServer(FakeEnv()), port=server.port)
-    other.start()
-    with pytest.raises(LinkLost):
-        transport.reset()
-    with pytest.raises(ProtocolError) as caught:
-        transport.reset()
-    assert str(caught.value) == f"{server.url}: it serves another environment than before: FakeEnv."
-    transport.close()
-    other.close()
+    with TcpServer(EnvServer(env)) as server:
+        transport = TcpTransport(server.url)
+        transport.connect()
+    with TcpServer(EnvServer(FakeEnv()), port=server.port):
+        with pytest.raises(LinkLost):
+            transport.reset()
+        with pytest.raises(ProtocolError) as caught:
+            transport.reset()
+        assert str(caught.value) == f"{server.url}: it serves another environment than before: FakeEnv."
+        transport.close()
 
 
-def test_an_error_of_the_environment_leaves_the_link_up(server, env):
-    transport = TcpTransport(server.url)
-    transport.connect()
-    transport.reset()
-    env.fault = ZeroDivisionError("by nought")
-    with pytest.raises(RemoteError) as caught:
-        transport.step(ACTION)
-    assert str(caught.value) == "ZeroDivisionError: by nought"
-    transport.reset()
-    transport.step(ACTION)
-    transport.close()
-
-
-def test_closing_ends_a_request_that_is_under_way(server):
-    transport = TcpTransport(server.url)
-    transport.connect()
-    transport.reset()
-    told, waiting = [], threading.Event()
+def test_closing_ends_a_request_that_is_under_way():
+    env, told = Slow(), []
 
     def step():
-        waiting.set()
         with pytest.raises(LinkLost) as caught:
             transport.step(ACTION)
         told.append(str(caught.value))
 
-    with server.server.lock:
+    with TcpServer(EnvServer(env)) as server:
+        transport = TcpTransport(server.url)
+        transport.reset()
         thread = threading.Thread(target=step)
         thread.start()
-        waiting.wait(PATIENCE)
-        deadline = time.monotonic() + PATIENCE
-        while not transport._lock.locked() and time.monotonic() < deadline:
-            pass
+        assert env.begun.wait(PATIENCE)
         transport.close()
         thread.join(PATIENCE)
-    assert len(told) == 1
-    assert "closed" in told[0]
+        env.may_end.set()
+    assert told == [f"{server.url}: this transport was closed meanwhile."]
 
 
-def test_closing_while_it_connects_leaves_no_link(server, monkeypatch):
-    transport = TcpTransport(server.url)
-    open_link = transport._open
-
-    def slow():
-        spec = open_link()
-        frames, transport._frames = transport._frames, None  # as if close() came before there was a link
+def test_closing_while_it_connects_leaves_no_link():
+    def close_first(sock, frames, tree):
         transport.close()
-        transport._frames = frames
-        return spec
+        welcome(sock, frames, tree)
 
-    monkeypatch.setattr(transport, "_open", slow)
-    with pytest.raises(LinkLost) as caught:
-        transport.connect()
-    assert str(caught.value) == f"{server.url}: this transport is closed; make a new one."
-    assert transport._frames is None
+    with answering(close_first) as (url, _):
+        transport = TcpTransport(url)
+        for _ in range(2):
+            with pytest.raises(LinkLost) as caught:
+                transport.connect()
+            assert str(caught.value) == f"{url}: this transport is closed; make a new one."
 
 
 def test_options_reach_the_environment(server, env):

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from bam_envs.core.errors import ProtocolError
-from bam_envs.remote.gymapi.leaves import NUMBERS, Leaf, Lists, is_depth, joined, leaves_of
+from bam_envs.remote.gymapi.leaves import is_depth, leaves_of
 
 POSE = {"position": spaces.Box(-1, 1, (3,)), "orientation": spaces.Box(-1, 1, (4,))}
 WIDTH = spaces.Box(0, 1, ())
@@ -57,44 +56,10 @@ def test_an_action_may_be_a_pose_with_a_gripper_width():
     assert kinds(spaces.Dict({**POSE, "gripper_width": WIDTH}), gripper=True) == [("pose", "it")]
 
 
-def test_labels():
-    space = spaces.Dict(OrderedDict(m=spaces.Box(-1, 1, (2, 2)), x=WIDTH))
-    assert [leaf.labels for leaf in leaves_of(space, "it")] == [("m[0, 0]", "m[0, 1]", "m[1, 0]", "m[1, 1]"), ("x",)]
-
-
 @pytest.mark.parametrize("other", [spaces.Text(3), spaces.Box(0, 1, (0,)), spaces.Discrete(3)])
 def test_where_two_parts_have_one_name_all_is_one_exact_leaf(other):
     space = spaces.Dict(OrderedDict({"0": spaces.Tuple([spaces.MultiBinary(1)]), "0/0": other}))
     assert kinds(space) == [("exact", "it")]
-
-
-def test_taken_apart_and_put_together():
-    space = spaces.Dict(OrderedDict(b=spaces.Tuple([WIDTH, spaces.Discrete(2)]), a=spaces.Text(3)))
-    value = {"b": (np.float32(1), 1), "a": "x"}
-    parts = {leaf.path: leaf.of(value) for leaf in leaves_of(space, "it")}
-    assert parts == {("b", 0): 1, ("b", 1): 1, ("a",): "x"}
-    assert joined(space, parts) == value
-    assert list(joined(space, parts)) == ["b", "a"]
-
-
-LEAF = Leaf(NUMBERS, "a", ("a",), WIDTH, ("a",))
-
-
-@pytest.mark.parametrize(
-    ("value", "numbers"),
-    [([2**53, -(2**53)], [2**53, -(2**53)]), ([2**53 + 1], None), ([np.inf], None), ([True, False], [1, 0])],
-)
-def test_numbers_that_a_list_of_float64_holds_exactly(value, numbers):
-    fields = {}
-    assert Lists("names", "values", (LEAF,)).write(LEAF, np.array(value), fields) == (numbers is not None)
-    assert fields.get("values") == numbers
-
-
-def test_more_names_than_expected_only_where_that_is_meant():
-    message = {"names": ["z", "a"], "values": [1, 2]}
-    assert Lists("names", "values", (LEAF,), extra=True).read(message) == [(LEAF, [2])]
-    with pytest.raises(ProtocolError, match="The names of values must be a, one for each value, not z, a for 2"):
-        Lists("names", "values", (LEAF,)).read(message)
 
 
 def test_depth():

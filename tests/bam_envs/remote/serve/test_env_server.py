@@ -9,8 +9,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from bam_envs.core.errors import InvalidValue, NotInCommand, RemoteError, ResetNeeded, SafetyStop, UnknownName
-from bam_envs.core.registry import ENVIRONMENTS
+from bam_envs.core.errors import InvalidValue, NotInCommand, RemoteError, ResetNeeded, UnknownName
 from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.env_server import EnvServer, describe_env, same_name
 from bam_envs.remote.serve.local_transport import FakeEnv
@@ -31,30 +30,6 @@ def raised(kind, act):
     return str(caught.value)
 
 
-def test_it_is_the_environment(make, actions_of):
-    alone, server = make("bam/reach-v0"), EnvServer(make("bam/reach-v0"))
-    first, info = server.reset("ann", 3)
-    np.testing.assert_array_equal(first, alone.reset(seed=3)[0])
-    assert info == {"is_success": False}
-    for action in actions_of(0, 20, 6):
-        mine, theirs = server.step("ann", action), alone.step(action)
-        np.testing.assert_array_equal(mine[0], theirs[0])
-        assert mine[1:] == theirs[1:]
-
-
-def test_rows_are_lists(make_rows):
-    alone, server = make_rows("bam/reach-v0", 2), EnvServer(make_rows("bam/reach-v0", 2))
-    first, infos = server.reset("ann", [3, 9])
-    np.testing.assert_array_equal(first, alone.reset(seed=[3, 9])[0])
-    assert infos == [{"is_success": False}] * 2
-    action = np.zeros((2, 6), np.float32)
-    observations, rewards, terminated, truncated, infos = server.step("ann", list(action))
-    theirs = alone.step(action)
-    np.testing.assert_array_equal(observations, theirs[0])
-    assert (rewards, terminated, truncated) == (theirs[1].tolist(), [False, False], [False, False])
-    assert [info["distance"] for info in infos] == theirs[4]["distance"].tolist()
-
-
 def test_rows_that_end_say_so_in_their_own_info():
     envs = SyncVectorEnv([lambda n=n: FakeEnv(episode_steps=n) for n in (1, 3)], autoreset_mode=AutoresetMode.SAME_STEP)
     server = EnvServer(envs)
@@ -69,13 +44,6 @@ def test_rows_that_end_say_so_in_their_own_info():
     server.close()
 
 
-def test_some_rows_can_be_reset(make_rows):
-    server = EnvServer(make_rows("bam/reach-v0", 3))
-    first, _ = server.reset("ann", 1)
-    again, _ = server.reset("ann", None, {"reset_mask": [False, True, False]})
-    assert [np.array_equal(*pair) for pair in zip(first, again, strict=True)] == [True, False, True]
-
-
 def test_the_wrong_number_of_actions_is_refused(make_rows):
     server = EnvServer(make_rows("bam/reach-v0", 3))
     server.reset("ann", 1)
@@ -85,15 +53,6 @@ def test_the_wrong_number_of_actions_is_refused(make_rows):
     assert raised(InvalidValue, lambda: server.step("ann", [np.zeros(6)] * 2 + [np.full(6, np.nan)])) == (
         "action of environment 2[0] is NaN; only numbers are sent."
     )
-
-
-def test_an_episode_must_run():
-    _, server = mirror(episode_steps=1)
-    action = np.zeros(2)
-    assert raised(ResetNeeded, lambda: server.step("ann", action)) == NO_EPISODE
-    server.reset("ann")
-    assert server.step("ann", action)[2] is True
-    assert raised(ResetNeeded, lambda: server.step("ann", action)) == NO_EPISODE
 
 
 def test_the_others_are_told_who_is_in_command():
@@ -128,34 +87,6 @@ def test_a_lease_can_be_shared():
     assert "a robot's client is in command, not ann" in raised(NotInCommand, lambda: server.step("ann", np.zeros(2)))
     lease.release("a robot's client")
     assert raised(ResetNeeded, lambda: server.step("ann", np.zeros(2))) == NO_EPISODE
-
-
-def test_silence_passes_command_on():
-    now = [0.0]
-    server = EnvServer(FakeEnv(), lease=2.0, clock=lambda: now[0])
-    server.reset("ann")
-    now[0] = 2.1
-    server.step("ann", np.zeros(2))
-    now[0] = 4.3
-    server.reset("bob")
-
-
-@pytest.mark.parametrize(
-    ("fault", "text"),
-    [
-        (ValueError("over\n  there"), "ValueError: over there"),
-        (SafetyStop("G2", "too far"), "SafetyStop: too far"),
-        (KeyError("x"), "KeyError: 'x'"),
-    ],
-)
-def test_errors_of_the_environment_are_told_and_a_reset_goes_on(fault, text):
-    env, server = mirror()
-    server.reset("ann")
-    env.fault = fault
-    assert raised(RemoteError, lambda: server.step("ann", np.zeros(2))) == text
-    assert raised(ResetNeeded, lambda: server.step("ann", np.zeros(2))) == NO_EPISODE
-    server.reset("ann")
-    server.step("ann", np.zeros(2))
 
 
 class Odd(FakeEnv):
@@ -251,15 +182,6 @@ def test_a_client_that_lost_command_while_it_waited_does_nothing():
     assert env.seen == []
 
 
-def test_names_it_answers_to():
-    server = EnvServer(FakeEnv(), env_id="bam/pick-v0")
-    for name in ("", "Pick", "bam/pick"):
-        server.require_name(name)
-    assert raised(RemoteError, lambda: server.require_name("Place")) == (
-        "There is no environment 'Place' here; bam/pick-v0 is served."
-    )
-
-
 class Halting(FakeEnv):
     """Has a robot, and a period."""
 
@@ -348,29 +270,22 @@ def test_wrapped_environments_are_served():
     assert raised(ResetNeeded, lambda: server.step("ann", np.zeros(2))) == NO_EPISODE
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
-def test_one_of_ours_says_everything(make, env_id):
-    env, entry = make(env_id), ENVIRONMENTS[env_id]
-    spec = describe_env(env)
-    assert (spec.env_id, spec.num_envs, spec.vector) == (env_id, 1, False)
-    assert (spec.period, spec.max_episode_steps) == (entry.period, entry.max_episode_steps)
-    assert (spec.observation_space, spec.action_space) == (env.observation_space, env.action_space)
-    assert spec.signals == env.unwrapped.describe()
-
-
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
-def test_rows_of_ours(make_rows, env_id):
-    envs, entry = make_rows(env_id, 3), ENVIRONMENTS[env_id]
-    spec = describe_env(envs)
-    assert (spec.env_id, spec.num_envs, spec.vector) == (env_id, 3, True)
-    assert (spec.period, spec.max_episode_steps) == (entry.period, entry.max_episode_steps)
-    assert spec.observation_space == envs.single_observation_space
-    assert describe_env(make_rows(env_id, 2, max_episode_steps=7)).max_episode_steps == 7
-
-
-def test_episodes_that_end_by_themselves_have_no_limit(make, make_rows):
-    for env in (make("bam/ur-reach-v0", parity=True), make_rows("bam/ur-reach-v0", 2, parity=True)):
-        assert describe_env(env).max_episode_steps is None
+@pytest.mark.parametrize(
+    ("name", "other", "same"),
+    [
+        *((name, "bam/pick-place-v0", True) for name in ("pick-place", "PickPlace", "pick_place", "bam/pick-place")),
+        *((name, "bam/pick-place-v0", False) for name in ("pick", "bam/pick-v0", "place", "bam", "-v0")),
+        ("ale_py:ALE/Pong-v5", "Pong", True),
+        ("NoObstacleNavigationMir100Sim-v0", "bam/mir100-navigation-v0", True),
+        ("mir100-navigation", "NoObstacleNavigationMir100Rob", True),
+        ("NoObstacleNavigationMir100Rob", "ObstacleAvoidanceMir100Sim-v0", False),
+        ("AvoidanceRaad2022TestURSim-v0", "bam/ur-track-v0", False),
+        ("AvoidanceRaad2022TestURSim-v0", "AvoidanceRaad2022TestURRob", True),
+        ("EndEffectorPositioning2URSim-v0", "EndEffectorPositioningURSim-v0", False),
+    ],
+)
+def test_names_of_one_environment(name, other, same):
+    assert same_name(name, other) is same
 
 
 def test_another_one_says_less():
@@ -398,32 +313,3 @@ def test_spaces_that_cannot_be_sent_are_refused_at_once():
     with pytest.raises(UnknownName) as caught:
         describe_env(FakeEnv(spaces.Graph(spaces.Box(0, 1, (2,)), None)))
     assert caught.value.name == "Graph"
-
-
-@pytest.mark.parametrize("name", ["pick-place", "PickPlace", "pick_place", "bam/pick-place", "bam/pick-place-v0"])
-def test_names_that_are_one(name):
-    assert same_name(name, "bam/pick-place-v0")
-
-
-@pytest.mark.parametrize("name", ["pick", "bam/pick-v0", "place", "bam", "-v0"])
-def test_names_that_are_not(name):
-    assert not same_name(name, "bam/pick-place-v0")
-
-
-def test_gymnasium_ids_with_a_module():
-    assert same_name("ale_py:ALE/Pong-v5", "Pong")
-
-
-@pytest.mark.parametrize(
-    "name", ["NoObstacleNavigationMir100Sim-v0", "NoObstacleNavigationMir100Rob", "mir100-navigation"]
-)
-def test_robo_gyms_names_of_ours(name):
-    assert same_name(name, "bam/mir100-navigation-v0")
-    assert same_name(name, "NoObstacleNavigationMir100Sim-v0")
-    assert not same_name(name, "ObstacleAvoidanceMir100Sim-v0")
-
-
-def test_robo_gyms_variants_of_ours():
-    assert not same_name("AvoidanceRaad2022TestURSim-v0", "bam/ur-track-v0")
-    assert same_name("AvoidanceRaad2022TestURSim-v0", "AvoidanceRaad2022TestURRob")
-    assert not same_name("EndEffectorPositioning2URSim-v0", "EndEffectorPositioningURSim-v0")

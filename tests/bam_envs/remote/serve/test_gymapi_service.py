@@ -129,11 +129,6 @@ def test_asked_for_nothing_it_says_what_is_there(serve):
     assert env.given == []
 
 
-@pytest.mark.parametrize("name", ["", "Pick", "pick", "bam/pick", "bam/pick-v0", "pick-v0"])
-def test_names_that_are_served(serve, name):
-    assert code_of(serve(MirrorEnv(spaces.Discrete(3)))(RESET, env_name=name)) == 1
-
-
 @pytest.mark.parametrize("request_type", [NONE, STEP, RESET])
 @pytest.mark.parametrize("name", ["PickAndLift", "CartPole", "bam/pick-place"])
 def test_names_that_are_not(serve, name, request_type):
@@ -160,15 +155,6 @@ def test_actions_that_do_not_fit_move_nothing(serve, action, text):
     assert text in refusal(ask(STEP, action=action))
     assert env.seen == []
     assert code_of(ask(STEP, action=[{"continuous_action": [1, 1]}])) == 1
-
-
-def test_an_environment_that_breaks_is_a_failure_and_no_end(serve):
-    env = MirrorEnv(spaces.Discrete(3))
-    ask = serve(env)
-    ask(RESET)
-    env.fault = ZeroDivisionError("seven by nought")
-    assert refusal(ask(STEP, action=[{"discrete_action": [1]}])) == "ZeroDivisionError: seven by nought"
-    assert code_of(ask(RESET)) == 1
 
 
 def test_one_client_is_in_command(serve):
@@ -205,16 +191,6 @@ def test_a_long_name_is_cut(serve):
     assert refusal(ask(RESET, OTHER)).startswith(
         f"{'a' * 100} (127.0.0.1:1) is in command, not somebody (127.0.0.1:2);"
     )
-
-
-def test_who_hangs_up_is_no_longer_in_command(serve, bus):
-    ask = serve(MirrorEnv(spaces.Discrete(3)))
-    ask(RESET, client_id="ann")
-    gone = threading.Event()
-    ask.server.lease.on_change(lambda before, after: gone.set())
-    bus.leave("c1")
-    assert gone.wait(10)
-    assert code_of(ask(RESET, OTHER, client_id="bob")) == 1
 
 
 def test_who_is_back_on_another_connection_stays_in_command(serve, bus):

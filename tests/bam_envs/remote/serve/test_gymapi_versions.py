@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import re
 from contextlib import closing, contextmanager
 
 import numpy as np
@@ -99,6 +100,16 @@ def test_on_the_wire(serve, version, given):
         with on_websocket(server.url) as call:
             play(Client(version, call), service.env.env.pictures)
         assert service.env.env.given == [(3, None), (None, None)]
+
+
+def test_two_clients_with_one_name_and_without_what_they_need_not_say(serve):
+    with BridgeServer(port=0) as server:
+        serve(server)
+        with on_websocket(server.url) as one, on_websocket(server.url) as two:
+            reset = {"header": {"client_id": "plain", "request_type": RESET, "newer": [None]}, "newer": {"a": 1}}
+            assert one(reset)["header"]["error_code"]["value"] == 1
+            text = two(reset)["header"]["error_msg"]
+    assert re.match(r"plain \(127\.0\.0\.1:\d+\) is in command, not plain \(127\.0\.0\.1:\d+\);", text)
 
 
 class CompiledBus(MemoryBus):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from bam_envs.core.errors import InvalidValue, LinkLost, NotInCommand, RemoteError
+from bam_envs.core.errors import LinkLost, NotInCommand
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.local_transport import FakeEnv, FakeTransport, LocalTransport
 
@@ -40,16 +40,6 @@ def test_a_shared_server_goes_on():
     assert str(lost.value) == "This transport is closed; make a new one."
     with pytest.raises(LinkLost):
         one.connect()
-
-
-def test_errors_are_those_of_every_transport():
-    transport = LocalTransport(FakeEnv())
-    with pytest.raises(RemoteError) as caught:
-        transport.step(np.zeros(2))
-    assert str(caught.value) == "No episode is running: it ended, or never began. Call reset() first."
-    transport.reset()
-    with pytest.raises(InvalidValue):
-        transport.step(np.zeros(3))
 
 
 def test_it_notes_calls_and_raises_faults_once():

@@ -13,7 +13,7 @@ from bam_envs.remote.serve.served_robot import ServedRobot
 from bam_envs.remote.tcp_transport import TcpTransport
 from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.robots.ur5e import arm_spec
-from bam_envs.ros.codec import encode_command, read_info
+from bam_envs.ros.codec import encode_command
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.server import BridgeServer
@@ -111,12 +111,6 @@ def test_an_environment_without_a_robot_has_no_topics(serve, transport):
     np.testing.assert_array_equal(observation, gym.make("CartPole-v1").reset(seed=3)[0])
 
 
-def test_several_rows_have_no_topics(serve, transport):
-    served = serve(num_envs=3)
-    assert served.endpoints == [f"bam/pick-v0 on {served.bus.url}, fast: /gym_env/gym_api_request"]
-    assert transport(RosbridgeTransport, served.bus.url).connect().num_envs == 3
-
-
 @pytest.mark.parametrize("kind", [RosbridgeTransport, TcpTransport])
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_the_environment_is_the_one_in_process_bit_for_bit(serve, transport, make, actions_of, env_id, kind):
@@ -170,11 +164,6 @@ def test_it_ends_at_once_while_a_client_steps(serve, transport):
     ending.join()
 
 
-def test_real_time_needs_a_period(serve):
-    with pytest.raises(InvalidValue, match=r"does not say its period, so it has no real time; serve it with --fast\."):
-        serve("Taxi-v3", env=Timeless(), realtime=True)
-
-
 class Timeless(gym.Env):
     observation_space = action_space = gym.spaces.Discrete(2)
     metadata = {}  # noqa: RUF012 - Gymnasium's attribute
@@ -211,13 +200,6 @@ def test_topics_and_environment_are_one_robot_with_one_client_in_command(serve, 
     wait_for(lambda: said, other)
     assert "is in command, not" in said[0]
     assert [line.rpartition(" is ")[2] for line in served.lines] == ["in command", "no longer in command", "in command"]
-
-
-def test_it_says_what_the_robot_is(serve, link):
-    served = serve(fast=True, namespace="cell")
-    answer = link(served.bus.url).call("/cell/bam/robot", "std_srvs/Trigger", {}, 5.0)
-    info = read_info(answer["message"], "/cell/bam/robot")
-    assert (info.name, info.simulated, info.lockstep, info.period) == ("ur5e", True, True, 0.05)
 
 
 def test_through_somebody_elses_server(serve, link, transport):
