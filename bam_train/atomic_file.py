@@ -36,30 +36,21 @@ def replacing(target: Path, suffix: str = ".tmp") -> Iterator[Path]:
         yield path
         if fcntl is not None:
             os.fsync(descriptor)
-        path.chmod(0o666 & ~_umask())
+        mask = os.umask(0o022)
+        os.umask(mask)
+        path.chmod(0o666 & ~mask)
         os.replace(path, target)
     finally:
         with contextlib.suppress(OSError):
             path.unlink()
         if fcntl is not None:
             os.close(descriptor)
-    _sync_folder(target.parent)
-
-
-def _umask() -> int:
-    mask = os.umask(0o022)
-    os.umask(mask)
-    return mask
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make the rename itself durable, where the system can."""
-    with contextlib.suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
+    with contextlib.suppress(OSError):  # make the rename itself durable, where the system can
+        folder = os.open(target.parent, os.O_RDONLY)
         try:
-            os.fsync(descriptor)
+            os.fsync(folder)
         finally:
-            os.close(descriptor)
+            os.close(folder)
 
 
 def _locked(target: Path, suffix: str) -> tuple[int, Path]:
@@ -79,14 +70,8 @@ def remove_orphans(target: Path) -> None:
     """Remove temporary files of `target`, and of name-2, name-3, … beside it, whose writers are dead; never fails."""
     ours = re.compile(rf"\.{re.escape(target.stem)}(-\d+)?{re.escape(target.suffix)}\.\w{{8}}\.tmp")
     with contextlib.suppress(OSError):
-        for path in target.parent.iterdir():
+        for path in target.parent.iterdir() if fcntl is not None else ():
             if ours.fullmatch(path.name):
-                _remove_if_unlocked(path)
-
-
-def _remove_if_unlocked(path: Path) -> None:
-    if fcntl is None:
-        return
-    with contextlib.suppress(OSError), path.open("rb+") as file:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # BlockingIOError: somebody writes it
-        path.unlink()
+                with contextlib.suppress(OSError), path.open("rb+") as file:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # BlockingIOError: somebody writes it
+                    path.unlink()

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from bam_envs.core.registry import entry_of
+from bam_envs.core.validation import Positive, check
 from bam_train.errors import SettingsError
-
-_OF_SIMULATIONS = frozenset({"randomize"})
-"""Arguments that say how a robot is simulated."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +45,6 @@ class Place:
                 raise SettingsError(
                     f"{flag} is for a link, and the robot is simulated here; give --robot or --transport"
                 )
-        self._require_sane_addresses()
-        self._require_sane_timeout()
-
-    def _require_sane_addresses(self) -> None:
         plain = [url.rstrip("/") for url in self.transport]
         for url in plain:
             if plain.count(url) > 1:
@@ -59,14 +52,9 @@ class Place:
         without = [url for url in (self.robot, *self.transport) if url is not None and not url.startswith("wss://")]
         if self.ca_file is not None and without:
             raise SettingsError(f"--ca-file says whom wss:// trusts, and {without[0]} is without TLS; leave it out")
-
-    def _require_sane_timeout(self) -> None:
-        if self.timeout is None:
-            return
-        if not self.transport:
+        if self.timeout is not None and not self.transport:
             raise SettingsError("--timeout is how long an answer of --transport is waited for; leave it out")
-        if not 0 < self.timeout < math.inf:
-            raise SettingsError(f"timeout: expected more than 0 s, found {self.timeout:g}")
+        check(self.timeout, Positive | None, "--timeout", SettingsError)
 
     @property
     def is_remote(self) -> bool:
@@ -81,11 +69,7 @@ class Place:
     @property
     def link_options(self) -> dict[str, Any]:
         """What opening a transport takes beside the address."""
-        return {**self._files, "timeout": self.timeout}
-
-    @property
-    def _files(self) -> dict[str, Any]:
-        return {"ca_file": self.ca_file, "token_file": self.token_file}
+        return {"ca_file": self.ca_file, "token_file": self.token_file, "timeout": self.timeout}
 
     def robot_kwargs(self, env_id: str, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
         """Arguments with which `env_id` is made with the live robot.
@@ -98,8 +82,9 @@ class Place:
                 f"{env_id} has no robot that --robot could exchange; serve it next to the robot with "
                 f"bam-serve --env {env_id}, and give --transport"
             )
-        own = {name: value for name, value in env_kwargs.items() if name not in _OF_SIMULATIONS}
-        return {**own, "robot": self.robot, "profile": self.profile, **self._files}
+        own = {name: value for name, value in env_kwargs.items() if name != "randomize"}  # of simulations alone
+        link = {"ca_file": self.ca_file, "token_file": self.token_file}
+        return {**own, "robot": self.robot, "profile": self.profile, **link}
 
 
 HERE = Place()

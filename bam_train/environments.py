@@ -97,7 +97,8 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
             f"found {limit}; use {entry.id} for longer ones"
         )
     taken, refused = constructor_options(theirs) if theirs else (frozenset(), frozenset())
-    own = set(registry.MAKE_OPTIONS) - _NO_SETTINGS
+    # Not what a setting cannot be, nor what says where it runs, which has settings of its own.
+    own = set(registry.MAKE_OPTIONS) - {"render_mode", "timeout"} - WHERE
     known = own | taken | options.keys() | {"max_episode_steps"}
     for name in given:
         if name not in known | refused:  # making it says why it is refused
@@ -108,10 +109,6 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
         require_values(theirs, given) if theirs else require_kinds(env, options | {"randomize": False}, given)
     except InvalidValue as error:
         raise SettingsError(f"env_kwargs: {error}") from error
-
-
-_NO_SETTINGS = frozenset({"render_mode", "timeout"}) | WHERE
-"""Options of every environment that are no settings, or that say where it runs, which has settings of its own."""
 
 
 def is_batched(env_id: str) -> bool:
@@ -140,11 +137,15 @@ def make_env(
     if place.transport:
         from bam_envs.remote.remote_env import make_remote_env
 
-        return make_remote_env(env_id, require_one(place.transport), **place.link_options)
-    given = dict(env_kwargs or {})
-    kwargs = given if place.robot is None else place.robot_kwargs(env_id, given)
-    rendering = {} if render_mode is None else {"render_mode": render_mode}
-    return _made(env_id, lambda: gym.make(env_id, disable_env_checker=True, **{**kwargs, **rendering}))
+        if len(place.transport) > 1:
+            raise SettingsError(
+                f"--transport: expected one address, found {len(place.transport)}: {', '.join(place.transport)}"
+            )
+        return make_remote_env(env_id, place.transport[0], **place.link_options)
+    kwargs = dict(env_kwargs or {}) if place.robot is None else place.robot_kwargs(env_id, env_kwargs or {})
+    if render_mode is not None:
+        kwargs["render_mode"] = render_mode
+    return _made(env_id, lambda: gym.make(env_id, disable_env_checker=True, **kwargs))
 
 
 def parity_if_needed(
@@ -175,17 +176,6 @@ def parity_if_needed(
             tell(f"its spaces are robo-gym's own: {env_id} is made with parity=True")
             return {**given, "parity": True}, found
         raise
-
-
-def require_one(transports: tuple[str, ...]) -> str:
-    """The one address that there has to be.
-
-    Raises:
-        SettingsError: There are several.
-    """
-    if len(transports) > 1:
-        raise SettingsError(f"--transport: expected one address, found {len(transports)}: {', '.join(transports)}")
-    return transports[0]
 
 
 def make_vector_env(
@@ -232,22 +222,32 @@ def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: Place = HERE) -> Non
         CheckpointMismatch: Names the first thing that differs, and both values.
     """
     manifest = checkpoint.manifest
+    single = "single_" if isinstance(env, VectorEnv) else ""
     pairs = [
-        ("observation_space", manifest.observation_space, space_to_json(_single(env, "observation_space"))),
-        ("action_space", manifest.action_space, space_to_json(_single(env, "action_space"))),
+        ("observation_space", manifest.observation_space, space_to_json(getattr(env, f"{single}observation_space"))),
+        ("action_space", manifest.action_space, space_to_json(getattr(env, f"{single}action_space"))),
     ]
     describe = getattr(env.unwrapped, "describe", None)
     signals = {} if describe is None else describe()
     if signals and manifest.signals:
         pairs.append(("signals", _names_and_units(manifest.signals), _names_and_units(signals)))
-    for name, theirs, ours in pairs:
-        difference = first_difference(_plain(theirs), _plain(ours), name)
-        if difference is not None:
-            raise CheckpointMismatch(checkpoint.path, _mismatch(manifest.env, place, *difference))
+    difference = None
+    for name, *both in pairs:
+        theirs, ours = json.loads(json.dumps(both))  # tuples as lists
+        difference = difference or first_difference(theirs, ours, name)
     period = getattr(env.unwrapped, "period", None)
-    if period is not None and manifest.period is not None and not math.isclose(period, manifest.period, rel_tol=1e-9):
+    if difference is None:
+        if period is None or manifest.period is None or math.isclose(period, manifest.period, rel_tol=1e-9):
+            return
         difference = ("period [s]", manifest.period, float(period))
-        raise CheckpointMismatch(checkpoint.path, _mismatch(manifest.env, place, *difference))
+    name, theirs, ours = difference
+    place_text = f"at {place.text}" if place.transport else f"in {manifest.env} as installed"
+    remedy = "serve the version" if place.transport else "install the version"
+    raise CheckpointMismatch(
+        checkpoint.path,
+        f"{name} is {_short(theirs)} in the checkpoint and {_short(ours)} {place_text}; "
+        f"train it anew, or {remedy} it was trained with",
+    )
 
 
 def first_difference(theirs: Any, ours: Any, name: str) -> tuple[str, Any, Any] | None:
@@ -264,16 +264,7 @@ def first_difference(theirs: Any, ours: Any, name: str) -> tuple[str, Any, Any] 
 
 def _names_and_units(signals: Mapping[str, Any]) -> dict[str, Any]:
     """Of what `RobotEnv.describe` gives, the part that the policy's meaning hangs on."""
-    return {kind: [{key: row.get(key) for key in ("name", "unit")} for row in rows] for kind, rows in signals.items()}
-
-
-def _mismatch(env: str, place: Place, name: str, theirs: Any, ours: Any) -> str:
-    where = f"at {place.text}" if place.transport else f"in {env} as installed"
-    remedy = "serve the version" if place.transport else "install the version"
-    return (
-        f"{name} is {_short(theirs)} in the checkpoint and {_short(ours)} {where}; "
-        f"train it anew, or {remedy} it was trained with"
-    )
+    return {kind: [{key: one.get(key) for key in ("name", "unit")} for one in many] for kind, many in signals.items()}
 
 
 def _short(value: Any, most: int = 60) -> str:
@@ -281,36 +272,18 @@ def _short(value: Any, most: int = 60) -> str:
     return text if len(text) <= most else text[: most - 3] + "..."
 
 
-def _plain(value: Any) -> Any:
-    """As it is after a round trip through JSON (tuples are lists)."""
-    return json.loads(json.dumps(value))
-
-
-def _single(env: AnyEnv, name: str) -> gym.Space[Any]:
-    space: gym.Space[Any] = getattr(env, f"single_{name}" if isinstance(env, VectorEnv) else name)
-    return space
-
-
 def _made(env_id: str, make: Callable[[], T]) -> T:
     """What `make` returns; what it can raise for the caller's sake becomes one line."""
     try:
         return make()
-    except gym.error.Error as error:
-        raise SettingsError(f"{env_id} cannot be made: {_first_line(error)}") from error
-    except ModuleNotFoundError as error:
-        raise SettingsError(f"{env_id} cannot be made: {_missing(error)}") from error
-    except TypeError as error:
-        raise SettingsError(f"{env_id} cannot be made with these arguments: {_first_line(error)}") from error
-
-
-def _missing(error: Exception) -> str:
-    """Which module is missing, and what to do about it."""
-    # Gymnasium raises one of its own for module:Env-v0, which names no module; its cause does.
-    name = getattr(error, "name", None) or getattr(error.__cause__, "name", None) or _first_line(error)
-    if name.partition(".")[0] == "imageio":  # Gymnasium's MuJoCo environments import it for their pictures
-        return 'it needs imageio. Run: pip install "bam-train[video]"'
-    return f"it needs the module {name!r}; install it, or run this in the folder that has it"
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0].rstrip(".") if str(error).strip() else type(error).__name__
+    except (gym.error.Error, ModuleNotFoundError, TypeError) as error:
+        why = str(error).strip().partition("\n")[0].rstrip(".") or type(error).__name__
+        if isinstance(error, TypeError):
+            raise SettingsError(f"{env_id} cannot be made with these arguments: {why}") from error
+        if isinstance(error, ModuleNotFoundError):
+            # Gymnasium raises one of its own for module:Env-v0, which names no module; its cause does.
+            name = error.name or getattr(error.__cause__, "name", None) or why
+            why = f"it needs the module {name!r}; install it, or run this in the folder that has it"
+            if name.partition(".")[0] == "imageio":  # Gymnasium's MuJoCo environments import it for their pictures
+                why = 'it needs imageio. Run: pip install "bam-train[video]"'
+        raise SettingsError(f"{env_id} cannot be made: {why}") from error

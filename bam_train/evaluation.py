@@ -8,9 +8,8 @@ does after its end is not counted (it keeps stepping only because others are not
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -31,12 +30,6 @@ FIRST_SEED = 1_000_000
 
 _Z95 = 1.959963984540054
 """97.5 % quantile of the normal distribution, for a two-sided 95 % interval."""
-
-_MOST_ENVS = {True: 64, False: 16}
-"""Most environments stepped side by side: batched physics (True), Python environments one after the other (False)."""
-
-OnProgress = Callable[[int, int], None]
-"""Called with the episodes done and the episodes wanted."""
 
 
 class BatchPolicy(Protocol):
@@ -86,9 +79,7 @@ class EvaluationReport:
 
     def to_json(self) -> dict[str, Any]:
         """The report as plain JSON values."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        interval = self.success_interval
-        return {**values, "success_interval": None if interval is None else list(interval)}
+        return {**asdict(self), "success_interval": self.success_interval and list(self.success_interval)}
 
 
 def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:
@@ -106,6 +97,10 @@ def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:
 
 def summarise(env: str, episodes: Sequence[Episode]) -> EvaluationReport:
     """The report over `episodes` (at least one), which are in the order of their seeds."""
+
+    def finite(value: float) -> float | None:
+        return float(value) if math.isfinite(value) else None
+
     totals, lengths = np.array([e.total for e in episodes]), np.array([e.length for e in episodes])
     known = [e.success for e in episodes if e.success is not None]
     successes, n = sum(known), len(episodes)
@@ -116,10 +111,10 @@ def summarise(env: str, episodes: Sequence[Episode]) -> EvaluationReport:
         successes=successes if known else None,
         success_rate=successes / n if known else None,
         success_interval=wilson_interval(successes, n) if known else None,
-        return_mean=_finite(totals.mean()),
-        return_std=_finite(totals.std()) if np.isfinite(totals).all() else None,
-        return_min=_finite(totals.min()),
-        return_max=_finite(totals.max()),
+        return_mean=finite(totals.mean()),
+        return_std=finite(totals.std()) if np.isfinite(totals).all() else None,
+        return_min=finite(totals.min()),
+        return_max=finite(totals.max()),
         length_mean=float(lengths.mean()),
         length_std=float(lengths.std()),
     )
@@ -134,7 +129,7 @@ def evaluate(
     seed: int = FIRST_SEED,
     num_envs: int | None = None,
     env: VectorEnv[Any, Any, Any] | None = None,
-    on_progress: OnProgress | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
 ) -> EvaluationReport:
     """Run `episodes` seeded episodes of `env_id` under `policy` and summarise them.
 
@@ -146,7 +141,7 @@ def evaluate(
         seed: Seed of the first episode; episode k gets ``seed + k``.
         num_envs: Environments stepped side by side; by default as many as is quick and not more than `episodes`.
         env: A vector environment made by `make_vector_env` to use instead of making one; it is left open.
-        on_progress: Called after every wave of environments.
+        on_progress: Called after every wave of environments with the episodes done and the episodes wanted.
 
     Raises:
         SettingsError: `episodes`, `seed` or `num_envs` out of range.
@@ -156,12 +151,20 @@ def evaluate(
     check(seed, NonNegativeInt, "seed", SettingsError)
     check(episodes, PositiveInt, "episodes", SettingsError)
     check(num_envs, PositiveInt | None, "num_envs", SettingsError)
-    with _batch(env_id, env_kwargs, num_envs, episodes, env) as batch:
-        done: list[Episode] = []
+    own = env is None
+    if env is None:
+        env = make_vector_env(env_id, env_kwargs, num_envs or default_num_envs(env_id, episodes))
+    elif env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
+        raise SettingsError(f"env: expected autoreset mode SAME_STEP, found {env.metadata.get('autoreset_mode')}")
+    finite, done = FiniteVectorEnv(env, env_id), list[Episode]()
+    try:
         while len(done) < episodes:
-            done += play_wave(batch, policy, seed + len(done), min(batch.num_envs, episodes - len(done)))
+            done += play_wave(finite, policy, seed + len(done), min(env.num_envs, episodes - len(done)))
             if on_progress is not None:
                 on_progress(len(done), episodes)
+    finally:
+        if own:
+            env.close()
     return summarise(env_id, done)
 
 
@@ -176,8 +179,14 @@ def play_wave(env: VectorEnv[Any, Any, Any], policy: BatchPolicy, seed: int, cou
     seeds = [seed + i for i in range(env.num_envs)]
     loop = TemporalAgent(Agents(batch, _Wave(count), acting))
     loop(workspace, t=0, stop_variable="wave/done", seed=seeds)
-    last = {name: workspace.get(name, -1) for name in workspace}
-    return [_episode(last, seed, index) for index in range(count)]
+    last = {name: workspace.get(name, -1) for name in workspace}  # at the end it repeats until all have ended
+
+    def success(i: int) -> bool | None:
+        says = "env/info/is_success" in last and last["env/info/_is_success"][i]
+        return bool(last["env/info/is_success"][i]) if says else None
+
+    totals, lengths = last["env/cumulated_reward"], last["env/timestep"]
+    return [Episode(seed + i, float(totals[i]), int(lengths[i]), success(i)) for i in range(count)]
 
 
 def record_video(env: gym.Env[Any, Any], policy: Any, add: Callable[[Frame], Any], *, episodes: int, seed: int) -> int:
@@ -223,39 +232,7 @@ class _Wave(Agent):
         self.set(("wave/done", t), done)
 
 
-def _episode(last: Mapping[str, Any], seed: int, index: int) -> Episode:
-    """The episode of environment `index`, from the variables at its end, which repeat until all have ended."""
-    says = "env/info/is_success" in last and last["env/info/_is_success"][index]
-    success = bool(last["env/info/is_success"][index]) if says else None
-    return Episode(seed + index, float(last["env/cumulated_reward"][index]), int(last["env/timestep"][index]), success)
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
-@contextmanager
-def _batch(
-    env_id: str,
-    env_kwargs: Mapping[str, Any] | None,
-    num_envs: int | None,
-    episodes: int,
-    env: VectorEnv[Any, Any, Any] | None,
-) -> Iterator[VectorEnv[Any, Any, Any]]:
-    """The given vector environment, left open; or one of our own, closed at the end."""
-    if env is not None:
-        if env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
-            raise SettingsError(f"env: expected autoreset mode SAME_STEP, found {env.metadata.get('autoreset_mode')}")
-        yield FiniteVectorEnv(env, env_id)
-        return
-    own = FiniteVectorEnv(make_vector_env(env_id, env_kwargs, num_envs or default_num_envs(env_id, episodes)), env_id)
-    try:
-        yield own
-    finally:
-        own.close()
-
-
 def default_num_envs(env_id: str, episodes: int) -> int:
     """Environments that share `episodes` in the fewest waves, evenly: 100 episodes of ours are two waves of 50."""
-    most = _MOST_ENVS[is_batched(env_id)]
+    most = 64 if is_batched(env_id) else 16  # batched physics, or Python environments one after the other
     return math.ceil(episodes / math.ceil(episodes / most))

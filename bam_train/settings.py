@@ -142,7 +142,7 @@ def _checked(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _require_finite(name: str, value: Any) -> None:
-    """Refuse NaN and infinity, which JSON, and so a checkpoint, cannot hold."""
+    """Refuse NaN and infinity, which neither JSON nor a checkpoint can hold."""
     if isinstance(value, (dict, list)):
         for key, one in value.items() if isinstance(value, dict) else enumerate(value):
             _require_finite(f"{name}.{key}", one)
@@ -223,7 +223,18 @@ def read_config(path: str | Path) -> dict[str, Any]:
         SettingsError: No such file, not readable, not a table, or an unknown setting.
     """
     path = Path(path).expanduser()
-    return parse_config(str(path), _read_text(path))
+    if path.suffix not in (".toml", ".json"):
+        raise SettingsError(f"{path}: expected a .toml or .json file, found {path.suffix or 'no suffix'}")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        remedy = "Check the name after --config, or make one with --print-config"
+        raise SettingsError(f"{path}: no such file. {remedy}") from error
+    except OSError as error:
+        raise SettingsError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise SettingsError(f"{path}: is not text ({error.reason} at byte {error.start})") from error
+    return parse_config(str(path), text)
 
 
 def parse_config(name: str, text: str) -> dict[str, Any]:
@@ -243,30 +254,16 @@ def parse_config(name: str, text: str) -> dict[str, Any]:
     return values  # a flag may give what is None
 
 
-def _read_text(path: Path) -> str:
-    if path.suffix not in (".toml", ".json"):
-        raise SettingsError(f"{path}: expected a .toml or .json file, found {path.suffix or 'no suffix'}")
-    try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        remedy = "Check the name after --config, or make one with --print-config"
-        raise SettingsError(f"{path}: no such file. {remedy}") from error
-    except OSError as error:
-        raise SettingsError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise SettingsError(f"{path}: is not text ({error.reason} at byte {error.start})") from error
-
-
 def differences(wanted: Mapping[str, Any], found: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any, Any]]:
     """Name, wanted and found value of every entry of `wanted` that `found` has otherwise; tables are looked into."""
-    rows: list[tuple[str, Any, Any]] = []
+    differing: list[tuple[str, Any, Any]] = []
     for name, value in wanted.items():
         other = found.get(name)
         if isinstance(value, Mapping) and isinstance(other, Mapping):
-            rows += differences(value, other, f"{prefix}{name}.")
+            differing += differences(value, other, f"{prefix}{name}.")
         elif value != other or isinstance(value, bool) != isinstance(other, bool):
-            rows.append((prefix + name, value, other))
-    return rows
+            differing.append((prefix + name, value, other))
+    return differing
 
 
 def file_stem(env: str, algo: str, trainer: str = "sb3") -> str:

@@ -37,7 +37,11 @@ def require_video_path(path: Path) -> Path:
     if path.is_dir() or not os.access(path.parent, os.W_OK):
         why = "it is a folder" if path.is_dir() else "no permission"
         raise OutputError(f"{path}: cannot be written: {why}; choose another file")
-    _require_writer(path.suffix.lower())
+    try:
+        for module in ("PIL",) if path.suffix.lower() == ".gif" else ("imageio", "imageio_ffmpeg"):
+            importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        raise MissingExtra(str(error.name), "video", f"A {path.suffix.lower()} video") from error
     return path
 
 
@@ -115,11 +119,3 @@ def _mp4(path: Path, rate: float) -> Iterator[Callable[[Frame], None]]:
 
 
 _WRITERS = {".gif": _gif, ".mp4": _mp4}
-
-
-def _require_writer(suffix: str) -> None:
-    try:
-        for module in ("PIL",) if suffix == ".gif" else ("imageio", "imageio_ffmpeg"):
-            importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        raise MissingExtra(str(error.name), "video", f"A {suffix} video") from error

@@ -271,19 +271,11 @@ def default_of(field: dataclasses.Field[Any]) -> str:
 
 def flags_of(reference: str) -> str:
     """The flags of a program whose configuration is the dataclass ``"module:Class"``."""
-    return table(["flag", "default", "meaning"], _flag_rows(resolve(reference)))
-
-
-def _flag_rows(kind: type) -> list[list[object]]:
-    """One row for each flag; a field that is a dataclass itself stands for its own fields."""
-    docs = field_docs(kind)
-    rows: list[list[object]] = []
-    for field in dataclasses.fields(kind):
-        if isinstance(field.default_factory, type) and dataclasses.is_dataclass(field.default_factory):
-            rows += _flag_rows(field.default_factory)
-        elif "Suppress" not in str(get_type_hints(kind, include_extras=True)[field.name]):
-            rows.append([flag(kind, field), flag_default(field), docs[field.name]])
-    return rows
+    kind = resolve(reference)
+    docs, hints = field_docs(kind), get_type_hints(kind, include_extras=True)
+    shown = [field for field in dataclasses.fields(kind) if "Suppress" not in str(hints[field.name])]
+    rows: list[list[object]] = [[flag(kind, field), flag_default(field), docs[field.name]] for field in shown]
+    return table(["flag", "default", "meaning"], rows)
 
 
 def flag_default(field: dataclasses.Field[Any]) -> str:

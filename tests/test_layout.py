@@ -23,7 +23,7 @@ ORDER = {
         "testing",
     ],
     "bam_train": [
-        *("errors", "signals", "terminal_text", "atomic_file", "env_location", "settings", "finite_envs"),
+        *("errors", "signals", "atomic_file", "env_location", "settings", "finite_envs"),
         *("checkpoint", "policy", "environments", "video", "loop", "evaluation", "deploy", "trainers", "compat", "cli"),
     ],
 }

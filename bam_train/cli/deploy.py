@@ -10,13 +10,12 @@ import json as json_module
 import math
 import os
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
-from bam_train.cli.consent import guards_of, plan_lines, require_consent
-from bam_train.cli.console import is_terminal, make_console, say, tell
-from bam_train.cli.program import parse, run_program
+from bam_train.cli.console import guards_of, is_terminal, make_console, plan_lines, require_consent, say, tell
+from bam_train.cli.program import run_program
 from bam_train.signals import SignalMemory
 
 if TYPE_CHECKING:
@@ -24,8 +23,7 @@ if TYPE_CHECKING:
 
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.flags import DeployConfig
-    from bam_train.deploy.deployment import Watcher
-    from bam_train.deploy.journal import Journal
+    from bam_train.deploy.deployment import Deployment
     from bam_train.env_location import Place
 
 
@@ -35,11 +33,10 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
 
     startup = Startup()
     startup.mark("python and arguments")
-    place = checked_place(config)
+    place = _checked_place(config)
     from bam_envs.core.timing import Pacer
     from bam_train.checkpoint import Checkpoint
-    from bam_train.deploy.deployment import Deployment, stop_signals
-    from bam_train.deploy.report import DeployReport
+    from bam_train.deploy.deployment import Deployment
     from bam_train.environments import environment_of, make_env, require_fit
     from bam_train.policy import FrozenPolicy
 
@@ -53,8 +50,7 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     try:
         require_fit(checkpoint, env, place)
         pacer = Pacer(period_of(config, checkpoint, env))
-        journal = Journal(config.episodes, startup)
-        deployment = Deployment(env, policy, pacer, journal)
+        deployment = Deployment(env, policy, pacer, Journal(config.episodes, startup))
         signals.raise_again()
         deployment.connect()
         signals.raise_again()
@@ -64,11 +60,24 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
         env.close()  # type: ignore[no-untyped-call]
         raise
     startup.mark("environment")
+    return _run(config, checkpoint, place, deployment, signals)
+
+
+def _run(
+    config: DeployConfig, checkpoint: Checkpoint, place: Place, deployment: Deployment, signals: SignalMemory
+) -> int:
+    """Run the deployment and report it, also after a signal; returns the exit status."""
+    from bam_train.cli.deploy_display import PlainDisplay, live_display
+    from bam_train.deploy.deployment import stop_signals
+    from bam_train.deploy.journal import DeployReport
+
+    env, journal, pacer = deployment.env, deployment.journal, deployment.pacer
+    title = f"{checkpoint.path} on {checkpoint.manifest.env}{place.text and f' at {place.text}'}"
     with stop_signals() as switch:  # a second Ctrl-C must not lose the report
         switch.waiting += signals.came  # one that was lost: the deployment ends before it begins
-        title = f"{checkpoint.path} on {checkpoint.manifest.env}{place.text and f' at {place.text}'}"
-        with _display(title, env, journal) as watcher:
-            startup.mark("display")
+        plain = nullcontext(PlainDisplay(journal, say))
+        with live_display(make_console(), env, title, journal) if is_terminal() else plain as watcher:
+            journal.startup.mark("display")
             ending = deployment.run(watcher, seed=config.seed, switch=switch)
         if ending.status:
             say(f"bam-deploy: {ending.reason}")
@@ -80,18 +89,7 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     return ending.status
 
 
-@contextmanager
-def _display(title: str, env: gym.Env[Any, Any], journal: Journal) -> Iterator[Watcher]:
-    from bam_train.deploy.display import PlainDisplay, live_display
-
-    if not is_terminal():
-        yield PlainDisplay(journal, say)
-        return
-    with live_display(make_console(), env, title, journal) as display:
-        yield display
-
-
-def checked_place(config: DeployConfig) -> Place:
+def _checked_place(config: DeployConfig) -> Place:
     """Where the flags say that the environment runs; what cannot be is refused before anything is loaded.
 
     Raises:
@@ -156,14 +154,7 @@ def period_of(config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, An
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the console script."""
-    run_program(lambda: _main(arguments), "bam-deploy")
-
-
-def _main(arguments: Sequence[str] | None) -> int:
-    with SignalMemory() as signals:
-        from bam_train.cli.flags import DeployConfig
-
-        return deploy_checkpoint(parse(DeployConfig, "bam-deploy", arguments), signals)
+    run_program("bam-deploy", "bam_train.cli.flags:DeployConfig", deploy_checkpoint, arguments)
 
 
 if __name__ == "__main__":

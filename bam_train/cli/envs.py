@@ -8,7 +8,7 @@ from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.console import tell
-from bam_train.cli.program import parse, run_program
+from bam_train.cli.program import run_program
 
 if TYPE_CHECKING:
     from bam_train.cli.flags import EnvsConfig
@@ -24,53 +24,40 @@ def show_environments(config: EnvsConfig) -> None:
 
 
 def overview() -> list[dict[str, Any]]:
-    """One dict of plain values for each of our environments; imports no simulator."""
+    """Plain values of each of our environments; imports no simulator."""
     from bam_envs.core.registry import ENVIRONMENTS, resolve
     from bam_envs.robo_gym.table import ROBO_GYM
 
-    rows = []
-    for entry in ENVIRONMENTS.values():
-        task = resolve(entry.task)(1)
-        rows.append(
-            {
-                "id": entry.id,
-                "summary": entry.summary,
-                "observation": short_space(task.observation_space),
-                "action": short_space(task.action_space),
-                "episode_steps": entry.max_episode_steps,
-                "rate_hz": 1 / entry.period,
-                "robo_gym": [name for name, theirs in ROBO_GYM.items() if theirs.env_id == entry.id],
-            }
-        )
-    return rows
+    tasks = [(entry, resolve(entry.task)(1)) for entry in ENVIRONMENTS.values()]
+    return [
+        {
+            "id": entry.id,
+            "summary": entry.summary,
+            "observation": f"{task.observation_space.dtype} {task.observation_space.shape}",
+            "action": f"{task.action_space.dtype} {task.action_space.shape}",
+            "episode_steps": entry.max_episode_steps,
+            "rate_hz": 1 / entry.period,
+            "robo_gym": [name for name, theirs in ROBO_GYM.items() if theirs.env_id == entry.id],
+        }
+        for entry, task in tasks
+    ]
 
 
-def short_space(space: Any) -> str:
-    """A space in a few characters: ``float32 (23,)``, ``2 choices``."""
-    if hasattr(space, "n") and not isinstance(space.n, Sequence):
-        return f"{space.n} choices"
-    return f"{space.dtype} {space.shape}" if space.shape is not None else str(space)
-
-
-def overview_lines(rows: list[dict[str, Any]]) -> list[str]:
+def overview_lines(facts: list[dict[str, Any]]) -> list[str]:
     """The environments as a table, then robo-gym's names of them, two ids in a line."""
     keys = ("id", "observation", "action", "episode_steps", "rate_hz", "summary")
-    table = aligned(
-        [
-            ["id", "observation", "action", "steps", "Hz", "what to do"],
-            *([f"{row[key]:g}" if key == "rate_hz" else str(row[key]) for key in keys] for row in rows),
-        ]
-    )
-    pairs = {name.replace("Sim-v0", "{Sim,Rob}-v0"): row["id"] for row in rows for name in row["robo_gym"][::2]}
+    cells = [[f"{one[key]:g}" if key == "rate_hz" else str(one[key]) for key in keys] for one in facts]
+    table = aligned([["id", "observation", "action", "steps", "Hz", "what to do"], *cells])
+    pairs = {name.replace("Sim-v0", "{Sim,Rob}-v0"): one["id"] for one in facts for name in one["robo_gym"][::2]}
     more = "Details: bam-envs ID. Training: bam-train --env ID --algo ppo; any Gymnasium id will do."
     theirs = "robo-gym's ids work too, with robo-gym's options; Rob is the one with a live robot:"
     return [*table, "", theirs, *aligned(list(map(list, pairs.items()))), "", more]
 
 
-def aligned(rows: list[list[str]]) -> list[str]:
-    """The cells of a table in columns of one width each."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+def aligned(table: list[list[str]]) -> list[str]:
+    """The lines of a table, in columns of one width each."""
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    return ["  ".join(map(str.ljust, cells, widths)).rstrip() for cells in table]
 
 
 def details(name: str) -> dict[str, Any]:
@@ -111,40 +98,30 @@ def detail_lines(facts: dict[str, Any]) -> list[str]:
     lines.append(f"{steps}, {'no rate given' if facts['rate_hz'] is None else format(facts['rate_hz'], 'g') + ' Hz'}")
     if not facts["signals"]:
         lines += [f"{kind}: {json_module.dumps(facts[kind + '_space'])}" for kind in ("observation", "action")]
-    for kind, rows in facts["signals"].items():
-        lines += ["", kind, *_signal_lines(folded(rows))]
+    for kind, signals in facts["signals"].items():
+        columns = ("name", "low", "high", "scale", "unit", "meaning")
+        keys = [key for key in columns if any(key in one for one in signals)]
+        cells = [[_cell(one.get(key, "")) for key in keys] for one in folded(signals)]
+        lines += ["", kind, *(f"  {line}" for line in aligned([keys, *cells]))]
     return lines
 
 
-def folded(rows: list[dict[str, Any]], most: int = 16) -> list[dict[str, Any]]:
-    """`rows`, but one for each run of over `most` that differ by their number alone: ``f_scan_0 to f_scan_500``."""
+def _cell(value: str | float) -> str:
+    return value if isinstance(value, str) else f"{value:.4g}"
 
-    def sort_of(row: dict[str, Any]) -> dict[str, Any]:
-        return {**row, "name": row["name"].rstrip("0123456789")}
 
+def folded(signals: list[dict[str, Any]], most: int = 16) -> list[dict[str, Any]]:
+    """`signals`, but one for each run of over `most` that differ by their number alone: ``f_scan_0 to f_scan_500``."""
     shown = []
-    for _, group in groupby(rows, sort_of):
+    for _, group in groupby(signals, lambda one: {**one, "name": one["name"].rstrip("0123456789")}):
         run = list(group)
-        one = {**run[0], "name": f"{run[0]['name']} to {run[-1]['name']}"}
-        shown += [one] if len(run) > most else run
+        shown += run if len(run) <= most else [{**run[0], "name": f"{run[0]['name']} to {run[-1]['name']}"}]
     return shown
-
-
-def _signal_lines(rows: list[dict[str, Any]]) -> list[str]:
-    keys = [key for key in ("name", "low", "high", "scale", "unit", "meaning") if any(key in row for row in rows)]
-    cells = [[one if isinstance(one, str) else f"{one:.4g}" for one in (row.get(k, "") for k in keys)] for row in rows]
-    return [f"  {line}" for line in aligned([keys, *cells])]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the console script."""
-    run_program(lambda: _main(arguments), "bam-envs")
-
-
-def _main(arguments: Sequence[str] | None) -> None:
-    from bam_train.cli.flags import EnvsConfig
-
-    show_environments(parse(EnvsConfig, "bam-envs", arguments))
+    run_program("bam-envs", "bam_train.cli.flags:EnvsConfig", lambda config, _: show_environments(config), arguments)
 
 
 if __name__ == "__main__":

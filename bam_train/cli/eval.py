@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json as json_module
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.console import say, tell
-from bam_train.cli.program import parse, run_program
+from bam_train.cli.program import run_program
 
 if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
@@ -20,51 +21,53 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Subject:
+class _Subject:
     """What is evaluated, and where."""
 
     policy: FrozenPolicy
     env: str
     env_kwargs: dict[str, Any]
     facts: dict[str, Any]
-    """For the report: checkpoint, algorithm, steps."""
+    """For the report: checkpoint, algorithm, steps, and arguments of the environment that were asked for."""
     checkpoint: Checkpoint | None
     """None for a plain stable-baselines3 zip."""
 
 
-def evaluate_checkpoint(config: EvalConfig) -> int:
+def evaluate_checkpoint(config: EvalConfig) -> None:
     """The program, with its arguments read."""
-    from bam_train.environments import make_vector_env, require_fit
+    from bam_train.environments import make_env, make_vector_env, require_fit
     from bam_train.evaluation import default_num_envs, evaluate
     from bam_train.trainers.sb3.plain_sb3_zip import is_plain_sb3
-    from bam_train.video import require_video_path
+    from bam_train.video import picture, require_video_path
 
     video = None if config.video is None else require_video_path(config.video)
     path = config.checkpoint.expanduser()
     subject = _foreign(config, path) if is_plain_sb3(path) else _own(config, path)
-    if video is not None:
-        _require_picture(subject)
-    rows = make_vector_env(
-        subject.env, subject.env_kwargs, config.num_envs or default_num_envs(subject.env, config.episodes)
-    )
-    try:
+    if video is not None:  # one picture, before the work is done
+        with closing(make_env(subject.env, subject.env_kwargs, render_mode="rgb_array")) as env:
+            env.reset(seed=0)
+            picture(env)
+
+    def on_progress(done: int, episodes: int) -> None:
+        if done < episodes:
+            say(f"bam-eval: {done} of {episodes} episodes")
+
+    num_envs = config.num_envs or default_num_envs(subject.env, config.episodes)
+    with closing(make_vector_env(subject.env, subject.env_kwargs, num_envs)) as envs:
         if subject.checkpoint is not None:
-            require_fit(subject.checkpoint, rows)
+            require_fit(subject.checkpoint, envs)
         report = evaluate(
-            subject.policy, subject.env, episodes=config.episodes, seed=config.seed, env=rows, on_progress=_progress
+            subject.policy, subject.env, episodes=config.episodes, seed=config.seed, env=envs, on_progress=on_progress
         )
-    finally:
-        rows.close()
     if config.json:
         tell(json_module.dumps({**report.to_json(), **subject.facts}, allow_nan=False))
     else:
-        tell(*table(report, subject.facts))
+        tell(*_table(report, subject.facts))
     if video is not None:
         _record(config, subject, video)
-    return 0
 
 
-def _own(config: EvalConfig, path: Path) -> Subject:
+def _own(config: EvalConfig, path: Path) -> _Subject:
     """One of our checkpoints: nothing is unpickled, and torch is not imported."""
     from bam_train.checkpoint import Checkpoint
     from bam_train.environments import environment_of, require_env_kwargs
@@ -79,14 +82,10 @@ def _own(config: EvalConfig, path: Path) -> Subject:
         raise CheckpointMismatch(path, f"was trained by {manifest.algorithm}, not by {config.algo}")
     require_env_kwargs(env_id, asked)
     facts = _facts(path, manifest.algorithm, manifest.steps, asked)
-    return Subject(FrozenPolicy.from_checkpoint(checkpoint), env_id, {**env_kwargs, **asked}, facts, checkpoint)
+    return _Subject(FrozenPolicy.from_checkpoint(checkpoint), env_id, {**env_kwargs, **asked}, facts, checkpoint)
 
 
-def _facts(path: Path, algorithm: str, steps: int, asked: dict[str, Any]) -> dict[str, Any]:
-    return {"checkpoint": str(path), "algorithm": algorithm, "steps": steps, **({"env_kwargs": asked} if asked else {})}
-
-
-def _foreign(config: EvalConfig, path: Path) -> Subject:
+def _foreign(config: EvalConfig, path: Path) -> _Subject:
     """A plain stable-baselines3 zip, if the user trusts its maker."""
     from bam_envs.core.registry import resolve_id
     from bam_train.environments import parity_if_needed, require_env_kwargs
@@ -112,17 +111,21 @@ def _foreign(config: EvalConfig, path: Path) -> Subject:
     )
     load = partial(load_trusted, path, config.algo, env)
     env_kwargs, model = parity_if_needed(env, env_kwargs, load, lambda text: say(f"bam-eval: {text}"))
-    facts = _facts(path, config.algo, model.steps, env_kwargs)
-    return Subject(model.policy, env, env_kwargs, facts, None)
+    return _Subject(model.policy, env, env_kwargs, _facts(path, config.algo, model.steps, env_kwargs), None)
 
 
-def table(report: EvaluationReport, facts: dict[str, Any]) -> list[str]:
+def _facts(path: Path, algorithm: str, steps: int, asked: dict[str, Any]) -> dict[str, Any]:
+    return {"checkpoint": str(path), "algorithm": algorithm, "steps": steps, **({"env_kwargs": asked} if asked else {})}
+
+
+def _table(report: EvaluationReport, facts: dict[str, Any]) -> list[str]:
     """The report for people, line by line."""
     given = ", ".join(f"{name}={value!r}" for name, value in facts.get("env_kwargs", {}).items())
     success = "unknown: the environment does not report is_success"
     if report.success_rate is not None and report.success_interval is not None:
         interval = "95 % interval {:.1%} to {:.1%}".format(*report.success_interval)
         success = f"{report.success_rate:.1%} ({report.successes} of {report.episodes}; {interval})"
+    returns = "not finite" if report.return_std is None else f"{report.return_mean:.2f} ± {report.return_std:.2f}"
     extremes = "range not finite"
     if report.return_min is not None and report.return_max is not None:
         extremes = f"from {report.return_min:.2f} to {report.return_max:.2f}"
@@ -130,59 +133,27 @@ def table(report: EvaluationReport, facts: dict[str, Any]) -> list[str]:
         f"{facts['checkpoint']} ({facts['algorithm']}, {facts['steps']:,} steps) on {report.env}"
         + (f" with {given}" if given else ""),
         f"  success   {success}",
-        f"  return    {_spread(report.return_mean, report.return_std)}, {extremes}",
-        f"  length    {_spread(report.length_mean, report.length_std)} steps",
+        f"  return    {returns}, {extremes}",
+        f"  length    {report.length_mean:.2f} ± {report.length_std:.2f} steps",
         f"  episodes  {report.episodes}, seeds {report.seed} to {report.seed + report.episodes - 1}",
     ]
 
 
-def _spread(mean: float | None, deviation: float | None) -> str:
-    return "not finite" if mean is None or deviation is None else f"{mean:.2f} ± {deviation:.2f}"
-
-
-def _require_picture(subject: Subject) -> None:
-    """Take one picture, before the work is done."""
-    from bam_train.environments import make_env
-    from bam_train.video import picture
-
-    env = make_env(subject.env, subject.env_kwargs, render_mode="rgb_array")
-    try:
-        env.reset(seed=0)
-        picture(env)
-    finally:
-        env.close()  # type: ignore[no-untyped-call]
-
-
-def _record(config: EvalConfig, subject: Subject, path: Path) -> None:
+def _record(config: EvalConfig, subject: _Subject, path: Path) -> None:
     from bam_train.environments import control_period, make_env
     from bam_train.evaluation import record_video
     from bam_train.video import open_video
 
-    env = make_env(subject.env, subject.env_kwargs, render_mode="rgb_array")
-    period = control_period(env) or 1 / 30
     episodes = min(config.video_episodes, config.episodes)
-    try:
-        with open_video(path, 1 / period) as add:
-            count = record_video(env, subject.policy, add, episodes=episodes, seed=config.seed)
-    finally:
-        env.close()  # type: ignore[no-untyped-call]
+    env = make_env(subject.env, subject.env_kwargs, render_mode="rgb_array")
+    with closing(env), open_video(path, 1 / (control_period(env) or 1 / 30)) as add:
+        count = record_video(env, subject.policy, add, episodes=episodes, seed=config.seed)
     say(f"bam-eval: {path}: {episodes} episode{'' if episodes == 1 else 's'}, {count} pictures")
-
-
-def _progress(done: int, episodes: int) -> None:
-    if done < episodes:
-        say(f"bam-eval: {done} of {episodes} episodes")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the console script."""
-    run_program(lambda: _main(arguments), "bam-eval")
-
-
-def _main(arguments: Sequence[str] | None) -> int:
-    from bam_train.cli.flags import EvalConfig
-
-    return evaluate_checkpoint(parse(EvalConfig, "bam-eval", arguments))
+    run_program("bam-eval", "bam_train.cli.flags:EvalConfig", lambda config, _: evaluate_checkpoint(config), arguments)
 
 
 if __name__ == "__main__":

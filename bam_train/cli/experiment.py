@@ -5,12 +5,11 @@ from __future__ import annotations
 import argparse
 import contextlib
 import signal
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from bam_train.cli.consent import plan_lines, require_consent
+from bam_train.cli.console import plan_lines, require_consent, say
 from bam_train.signals import SignalMemory, handled, interrupt
 
 if TYPE_CHECKING:
@@ -142,7 +141,7 @@ def signals_ask() -> Iterator[Callable[[], bool]]:
             interrupt(number)
         came.append(number)
         again = "Ctrl-C again" if number == signal.SIGINT else "another signal"
-        print(f"finishing the update and saving; {again} quits at once", file=sys.stderr, flush=True)
+        say(f"finishing the update and saving; {again} quits at once")
 
     with handled(hear):
         yield lambda: bool(came)

@@ -1,7 +1,7 @@
 """The flags of the programs: one frozen dataclass a program, one field a flag, its docstring the line of ``--help``.
 
-The flags of `bam-serve` are in `serve_flags.py`, since they need the environments. Programs import this after they have
-begun to handle signals, as tyro takes a while.
+Programs import this after they have begun to handle signals, as tyro takes a while. It imports nothing of `bam_envs`,
+whose import registers the environments with Gymnasium and takes longer than ``--help`` may.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from bam_train.settings import TABLES, TrainSettings
 
 Count = Annotated[int, Meta(ge=1)]
 Seed = Annotated[int, Meta(ge=0)]
+Port = Annotated[int, Meta(ge=0, le=65535)]
 Positive = Annotated[float, Meta(gt=0, le=sys.float_info.max)]
 Assignments = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")]
 CheckpointFile = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CHECKPOINT")]
@@ -180,3 +181,53 @@ class EnvsConfig:
     """The environment to describe, e.g. bam/pick; without it, all of ours are listed."""
     json: bool = False
     """Print JSON."""
+
+
+@dataclass(frozen=True)
+class ServeConfig:
+    """Serve a Gymnasium environment, and the topics of its simulated robot, to clients of rosbridge, TCP or ROS 2."""
+
+    env: Annotated[str, tyro.conf.arg(metavar="ID")] = "bam/pick"
+    """Environment: any Gymnasium id."""
+    num_envs: Annotated[Count, tyro.conf.arg(metavar="N")] = 1
+    """Environments stepped together; several have no robot topics."""
+    set: Assignments = ()
+    """One keyword argument of the environment, any number of times: randomize=true."""
+    yes: bool = False
+    """Do not ask before clients may move a real robot (--set robot=ws://...)."""
+
+    # The fields of bam_envs.remote.ServeOptions:
+    port: Port = 9090
+    """Port of the rosbridge server; 0 takes a free one."""
+    bind: str = "127.0.0.1"
+    """Address to listen on; 127.0.0.1 is this computer alone, 0.0.0.0 every network it is in."""
+    namespace: str = ""
+    """Name before every topic and service, such as bam_001."""
+    tcp: Port | None = None
+    """Serve the environment on this TCP port too, which is faster; 0 takes a free one."""
+    via: str | None = None
+    """Offer everything through the rosbridge server at this address (ws://10.0.0.5:9090) instead of one here."""
+    rclpy: bool = False
+    """Be a ROS 2 node instead of a rosbridge server; needs rclpy."""
+    realtime: bool = False
+    """Time passes as on the clock: the default of an environment with a robot."""
+    fast: bool = False
+    """Time passes only with steps and commands, as fast as they come: the default of other environments."""
+    lease: Positive = 2.0
+    """A client that gives no sign of life for so long may lose command to another one [s]."""
+    cert: str | None = None
+    """Certificate in PEM, for wss:// instead of ws://."""
+    key: str | None = None
+    """Its key, if it is in another file."""
+    token_file: str | None = None
+    """File with a secret that clients must show; with --via, the one to show there."""
+    operator_token_file: str | None = None
+    """File with another secret: who shows that one may take command from others."""
+    no_token: bool = False
+    """Listen on a network without a token: anybody who reaches this computer may command what is served."""
+    ca_file: str | None = None
+    """With --via wss://: certificates to trust instead of the system's."""
+    image_format: str = "png"
+    """Images as png, which keeps every bit, or jpeg."""
+    gymapi_version: str | None = None
+    """Version of bam_msgs/GymAPI, where clients do not show theirs: 2025-05-24, 2025-06-17 or 2025-06-22 (default)."""

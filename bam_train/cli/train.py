@@ -12,18 +12,13 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from bam_train.cli.console import count, tell
-from bam_train.cli.program import parse, run_program
-from bam_train.signals import handled
+from bam_train.cli.program import run_program
+from bam_train.signals import before_quitting, handled
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.flags import TrainConfig
     from bam_train.settings import TrainSettings
-    from bam_train.trainers.base import Trainer
-    from bam_train.trainers.best_checkpoint import Output
-    from bam_train.trainers.run_folder import Copies, RunFolder
     from bam_train.trainers.training_run import TrainingRun
 
 _STARTED = time.monotonic()
@@ -32,92 +27,63 @@ _STARTED = time.monotonic()
 def train(config: TrainConfig) -> int:
     """Do what the flags say; returns the exit status."""
     from bam_train.checkpoint import Checkpoint
+    from bam_train.env_location import addresses
+    from bam_train.settings import NAMES, merge, read_assignments, read_config
+    from bam_train.trainers.resolve_settings import resolve, resolve_resumed
 
     checkpoint = None if config.resume is None else Checkpoint.open(config.resume)
-    settings = _settings(config, checkpoint)
+    file = {} if config.config is None else read_config(config.config)
+    flags = {name: getattr(config, name) for name in NAMES if getattr(config, name) is not None}
+    if "transport" in flags:
+        flags["transport"] = list(addresses(flags["transport"]))
+    given = merge(file, read_assignments(config.set), flags)
+    settings = resolve(given) if checkpoint is None else resolve_resumed(given, checkpoint)
     if config.print_config:
         tell(*json.dumps(settings.to_mapping(), indent=2).split("\n"))
         return 0
     return _train(config, settings, checkpoint)
 
 
-def _settings(config: TrainConfig, checkpoint: Checkpoint | None) -> TrainSettings:
-    from bam_train.env_location import addresses
-    from bam_train.settings import NAMES, merge, read_assignments, read_config
-    from bam_train.trainers.resolve_settings import resolve, resolve_resumed
-
-    file = {} if config.config is None else read_config(config.config)
-    flags = {name: getattr(config, name) for name in NAMES if getattr(config, name) is not None}
-    if "transport" in flags:
-        flags["transport"] = list(addresses(flags["transport"]))
-    given = merge(file, read_assignments(config.set), flags)
-    return resolve(given) if checkpoint is None else resolve_resumed(given, checkpoint)
-
-
 def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint | None) -> int:
-    """Train with complete settings; returns the exit status."""
-    from bam_train.cli.train_display import stderr_may_close
+    """Train with complete settings, and say how it went; returns the exit status."""
+    from bam_train.cli.train_display import make_display, stderr_may_close, summarise
+    from bam_train.settings import file_stem
     from bam_train.trainers import load_trainer
     from bam_train.trainers.best_checkpoint import choose_output
-    from bam_train.trainers.run_folder import Copies, require_room
+    from bam_train.trainers.run_folder import Copies, RunFolder, require_room
+    from bam_train.trainers.training_run import TrainingRun
 
-    require_room(config.runs.expanduser())
+    runs, title = config.runs.expanduser(), f"{settings.algo} on {settings.env}, seed {settings.seed}"
+    if checkpoint is not None:
+        title += f", going on from {checkpoint.path} at {count(checkpoint.manifest.steps)} steps"
+    require_room(runs)
     output = choose_output(settings, config.out, config.force, checkpoint)
     kind = load_trainer(settings.trainer)
     copies = None if config.copy_to is None else Copies(config.copy_to)
-    made = kind.create(settings) if checkpoint is None else kind.load(checkpoint, settings)
-    try:
-        folder = _folder(config.runs.expanduser(), made)
-    except BaseException:
-        made.close()
-        raise
-    with stderr_may_close():
-        return _run(made, folder, output, copies, _title(settings, checkpoint))
-
-
-def _folder(runs: Path, trainer: Trainer) -> RunFolder:
-    """The run's own folder, with its settings and log files."""
-    from bam_train.settings import file_stem
-    from bam_train.trainers.run_folder import RunFolder
-
-    settings = trainer.settings
-    folder = RunFolder(runs, file_stem(settings.env, settings.algo, settings.trainer))
-    folder.write_config(settings.to_mapping())
-    trainer.log_to(folder.tensorboard)
-    return folder
-
-
-def _title(settings: TrainSettings, checkpoint: Checkpoint | None) -> str:
-    """What is trained, and from where."""
-    title = f"{settings.algo} on {settings.env}, seed {settings.seed}"
-    if checkpoint is None:
-        return title
-    return f"{title}, going on from {checkpoint.path} at {count(checkpoint.manifest.steps)} steps"
-
-
-def _run(trainer: Trainer, folder: RunFolder, output: Output, copies: Copies | None, title: str) -> int:
-    """Train to the end and say how it went; returns the exit status."""
-    from bam_train.cli.train_display import make_display, summarise
-    from bam_train.trainers.training_run import TrainingRun
-
-    display = make_display(title)
-    run = TrainingRun(trainer, folder, output.path, display, output.best, copies=copies)
-    with stopped_by_signals(run) as came:
+    trainer = kind.create(settings) if checkpoint is None else kind.load(checkpoint, settings)
+    with stderr_may_close(), contextlib.ExitStack() as signals:
         try:
+            settings = trainer.settings  # as the trainer completed them
+            folder = RunFolder(runs, file_stem(settings.env, settings.algo, settings.trainer))
+            folder.write_config(settings.to_mapping())
+            trainer.log_to(folder.tensorboard)
+            display = make_display(title)
+            run = TrainingRun(trainer, folder, output.path, display, output.best, copies=copies)
+            came = signals.enter_context(_stopped_by_signals(run))
             with display:
                 for notice in [*output.notices, *trainer.notices]:
                     display.note(notice)
                 outcome = run.run()
         finally:
             trainer.close()
-        summarise(trainer.settings, outcome, folder, time.monotonic() - _STARTED)
+        summarise(settings, outcome, folder, time.monotonic() - _STARTED)
     if outcome.failure is not None:
         raise outcome.failure
     return 128 + came[0] if came else 0
 
 
 @contextlib.contextmanager
-def stopped_by_signals(run: TrainingRun) -> Iterator[list[int]]:
+def _stopped_by_signals(run: TrainingRun) -> Iterator[list[int]]:
     """Within this, the first signal asks `run` to stop after its update, the second ends the process there and then.
 
     Gives the signals that came. Once one came, the next ends the process even after leaving: what is left to do then is
@@ -125,14 +91,24 @@ def stopped_by_signals(run: TrainingRun) -> Iterator[list[int]]:
     """
     came: list[int] = []
 
+    def write(line: str) -> None:
+        """To standard error, not by print: the signal may have come in the middle of one."""
+        show_cursor = b"\x1b[?25h" if sys.stderr.isatty() else b""  # a live panel has hidden it
+        with contextlib.suppress(OSError):  # nobody reads it any more
+            os.write(2, show_cursor + line.encode())
+
     def stop(number: int) -> None:
-        if came:
-            _quit(run, number)
+        if came:  # end the process wherever it is: an exception might be caught, or wait for threads
+            kept = f"the last checkpoint on the disk is {run.last}" if run.last else "no checkpoint had been saved yet"
+            write(f"bam-train: quit at once; {kept}\n")
+            run.folder.remove_unfinished()
+            before_quitting()
+            os._exit(128 + number)
         came.append(number)
         doing = "all is saved; ending" if run.done else "finishing the update and saving"
         run.stop()
         again = "Ctrl-C again" if number == signal.SIGINT else "another signal"
-        _write(f"{doing}; {again} quits at once\n")
+        write(f"{doing}; {again} quits at once\n")
 
     with contextlib.ExitStack() as handlers:
         handlers.enter_context(handled(stop))
@@ -141,33 +117,9 @@ def stopped_by_signals(run: TrainingRun) -> Iterator[list[int]]:
             handlers.pop_all()
 
 
-def _quit(run: TrainingRun, number: int) -> None:
-    """End the process here, wherever it is: an exception might be caught, or wait for threads."""
-    from bam_train.signals import before_quitting
-
-    kept = f"the last checkpoint on the disk is {run.last}" if run.last else "no checkpoint had been saved yet"
-    _write(f"bam-train: quit at once; {kept}\n")
-    run.folder.remove_unfinished()
-    before_quitting()
-    os._exit(128 + number)
-
-
-def _write(line: str) -> None:
-    """To standard error, not by print: the signal may have come in the middle of one."""
-    show_cursor = b"\x1b[?25h" if sys.stderr.isatty() else b""  # a live panel has hidden it
-    with contextlib.suppress(OSError):  # nobody reads it any more
-        os.write(2, show_cursor + line.encode())
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the console script."""
-    run_program(lambda: _main(arguments), "bam-train")
-
-
-def _main(arguments: Sequence[str] | None) -> int:
-    from bam_train.cli.flags import TrainConfig
-
-    return train(parse(TrainConfig, "bam-train", arguments))
+    run_program("bam-train", "bam_train.cli.flags:TrainConfig", lambda config, _: train(config), arguments)
 
 
 if __name__ == "__main__":

@@ -11,16 +11,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from bam_train.cli.console import count, duration, is_terminal, make_console, number, percent, say
+from bam_train.cli.console import count, duration, is_terminal, make_console, number, percent, rich_text, say
 from bam_train.errors import OutputError
-from bam_train.terminal_text import rich_text
 
 if TYPE_CHECKING:
     from bam_train.evaluation import EvaluationReport
     from bam_train.settings import TrainSettings
     from bam_train.trainers.base import Progress, Statistics
     from bam_train.trainers.run_folder import RunFolder
-    from bam_train.trainers.training_run import Outcome
+    from bam_train.trainers.training_run import Best, Outcome
 
 LINE_EVERY = 1.0
 """Seconds between two plain lines about training at least."""
@@ -36,13 +35,11 @@ class _Droppable:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        """Write `text` if somebody reads."""
         with self._dropping():
             self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
-        """Pass on what was written if somebody reads."""
         with self._dropping():
             self._stream.flush()
 
@@ -58,11 +55,9 @@ class _Droppable:
                 os.close(null)
 
 
-@contextlib.contextmanager
-def stderr_may_close() -> Iterator[None]:
-    """Within, the run goes on whether or not somebody still reads standard error."""
-    with contextlib.redirect_stderr(_Droppable(sys.stderr)):
-        yield
+def stderr_may_close() -> contextlib.AbstractContextManager[Any]:
+    """Within this, the run goes on whether or not somebody still reads standard error."""
+    return contextlib.redirect_stderr(_Droppable(sys.stderr))
 
 
 def make_display(title: str) -> PlainDisplay:
@@ -79,12 +74,11 @@ class PlainDisplay:
     """
 
     def __init__(self, title: str, clock: Callable[[], float] = time.monotonic) -> None:
-        self.title = title
-        self._clock = clock
+        self._title, self._clock = title, clock
         self._said = float("-inf")
 
     def __enter__(self) -> PlainDisplay:
-        self.note(self.title)
+        self.note(self._title)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -97,11 +91,17 @@ class PlainDisplay:
         if self._clock() - self._said < LINE_EVERY:
             return
         self._said = self._clock()
-        self.note(f"{_steps(progress)}  {steps_per_second:,.0f} steps/s  {_scores(statistics)}  {_left(seconds_left)}")
+        success = "" if statistics.success_rate is None else f"success {percent(statistics.success_rate)}  "
+        left = "" if seconds_left is None else f"{duration(max(0.0, seconds_left))} left"
+        speed = f"{steps_per_second:,.0f} steps/s"
+        self.note(f"{_steps(progress)}  {speed}  {success}return {number(statistics.return_mean)}  {left}")
 
     def evaluated(self, steps: int, report: EvaluationReport, best: bool) -> None:
         """Say what an evaluation found."""
-        self.note(evaluation_line(steps, report, best))
+        success = "" if report.success_rate is None else f"success {percent(report.success_rate)}, "
+        rest = f"return {number(report.return_mean)}, {report.length_mean:.0f} steps an episode"
+        newest = ", the best so far" if best else ""
+        self.note(f"evaluation at {count(steps)} steps: {success}{rest} ({report.episodes} episodes){newest}")
 
     def note(self, text: str) -> None:
         """Say something."""
@@ -129,53 +129,32 @@ class LiveDisplay(PlainDisplay):
         self, progress: Progress, statistics: Statistics, steps_per_second: float, seconds_left: float | None
     ) -> None:
         """Change the panel."""
-        self._live.update(_panel(self.title, progress, statistics, steps_per_second, seconds_left))
+        from rich.panel import Panel
+        from rich.progress_bar import ProgressBar
+        from rich.table import Table
+
+        columns = {
+            "steps": _steps(progress),
+            "speed": f"{steps_per_second:,.0f} steps/s",
+            "success": percent(statistics.success_rate),
+            "return": number(statistics.return_mean),
+            "time left": duration(None if seconds_left is None else max(0.0, seconds_left)),
+        }
+        figures = Table.grid(padding=(0, 3))
+        figures.add_row(*columns, style="dim")
+        figures.add_row(*columns.values())
+        outer = Table.grid(expand=True)
+        outer.add_row(ProgressBar(total=progress.total, completed=min(progress.steps, progress.total)))
+        outer.add_row(figures)
+        self._live.update(Panel(outer, title=rich_text(self._title), title_align="left"))
 
     def note(self, text: str) -> None:
         """Say something above the panel."""
         self._console.print(rich_text(text), soft_wrap=True)
 
 
-def evaluation_line(steps: int, report: EvaluationReport, best: bool) -> str:
-    """One line about an evaluation."""
-    success = "" if report.success_rate is None else f"success {percent(report.success_rate)}, "
-    rest = f"return {number(report.return_mean)}, {report.length_mean:.0f} steps an episode"
-    newest = ", the best so far" if best else ""
-    return f"evaluation at {count(steps)} steps: {success}{rest} ({report.episodes} episodes){newest}"
-
-
-def _left(seconds: float | None) -> str:
-    return f"{duration(max(0.0, seconds))} left" if seconds is not None else ""
-
-
 def _steps(progress: Progress) -> str:
     return f"{count(progress.steps)} of {count(progress.total)} steps"
-
-
-def _scores(statistics: Statistics) -> str:
-    success = "" if statistics.success_rate is None else f"success {percent(statistics.success_rate)}  "
-    return f"{success}return {number(statistics.return_mean)}"
-
-
-def _panel(title: str, progress: Progress, statistics: Statistics, rate: float, left: float | None) -> Any:
-    from rich.panel import Panel
-    from rich.progress_bar import ProgressBar
-    from rich.table import Table
-
-    grid = Table.grid(padding=(0, 3))
-    columns = {
-        "steps": _steps(progress),
-        "speed": f"{rate:,.0f} steps/s",
-        "success": percent(statistics.success_rate),
-        "return": number(statistics.return_mean),
-        "time left": duration(None if left is None else max(0.0, left)),
-    }
-    grid.add_row(*columns, style="dim")
-    grid.add_row(*columns.values())
-    outer = Table.grid(expand=True)
-    outer.add_row(ProgressBar(total=progress.total, completed=min(progress.steps, progress.total)))
-    outer.add_row(grid)
-    return Panel(outer, title=rich_text(title), title_align="left")
 
 
 _REASONS = {"steps": "all steps done", "success": "success reached", "stopped": "stopped"}
@@ -190,37 +169,31 @@ def summarise(settings: TrainSettings, outcome: Outcome, folder: RunFolder, seco
         folder: Its files.
         seconds: Wall time since the program started [s].
     """
-    _draw(settings, folder)
+    from bam_train.trainers.run_folder import draw_curve
+
+    try:
+        draw_curve(folder.records(), f"{settings.algo} on {settings.env}, seed {settings.seed}", folder.curve)
+    except OutputError as error:
+        say(f"no learning curve: {error}")
     say()
     end = f"{_REASONS[outcome.reason]} at {count(outcome.steps)} steps, {duration(seconds)} in all"
     say(f"{settings.algo} on {settings.env}: {end}")
-    for name, text in _rows(outcome, folder):
-        say(f"  {name:<12}{text}")
+    if outcome.best is None and outcome.reason == "stopped":
+        say("  best        none yet: stopped before the first evaluation; the checkpoint is the newest state")
+    if outcome.checkpoint is not None and outcome.checkpoint.exists():
+        if outcome.best is not None:
+            say(f"  best        {_score_text(outcome.best)}")
+        say(f"  checkpoint  {_short(outcome.checkpoint)} ({outcome.checkpoint.stat().st_size / 1000:,.0f} kB)")
+    if outcome.last is not None:
+        older = "" if outcome.last_steps == outcome.steps else f" (after {count(outcome.last_steps)} steps)"
+        say(f"  last state  {_short(outcome.last)}{older}")
+    say(f"  run         {_short(folder.path)}/: learning-curve.png, progress.jsonl, config.json, tensorboard/")
     commands = _next_commands(settings, outcome)
     for line in ["next:", *(f"  {command}" for command in commands)] if commands else []:
         say(line)
 
 
-def _rows(outcome: Outcome, folder: RunFolder) -> list[tuple[str, str]]:
-    rows = []
-    if outcome.best is None and outcome.reason == "stopped":
-        rows.append(("best", "none yet: stopped before the first evaluation; the checkpoint is the newest state"))
-    if outcome.checkpoint is not None and outcome.checkpoint.exists():
-        if outcome.best is not None:
-            rows.append(("best", _score_text(outcome)))
-        size = outcome.checkpoint.stat().st_size / 1000
-        rows.append(("checkpoint", f"{_short(outcome.checkpoint)} ({size:,.0f} kB)"))
-    if outcome.last is not None:
-        older = "" if outcome.last_steps == outcome.steps else f" (after {count(outcome.last_steps)} steps)"
-        rows.append(("last state", f"{_short(outcome.last)}{older}"))
-    rows.append(("run", f"{_short(folder.path)}/: learning-curve.png, progress.jsonl, config.json, tensorboard/"))
-    return rows
-
-
-def _score_text(outcome: Outcome) -> str:
-    best = outcome.best
-    if best is None:
-        return "-"
+def _score_text(best: Best) -> str:
     success = ""
     if best.success_rate is not None:
         interval = best.success_interval
@@ -249,12 +222,3 @@ def _short(path: Path) -> str:
     """As short as it can be typed here."""
     absolute, here = path.resolve(), Path.cwd()
     return shlex.quote(str(absolute.relative_to(here) if absolute.is_relative_to(here) else absolute))
-
-
-def _draw(settings: TrainSettings, folder: RunFolder) -> None:
-    from bam_train.trainers.run_folder import draw_curve
-
-    try:
-        draw_curve(folder.records(), f"{settings.algo} on {settings.env}, seed {settings.seed}", folder.curve)
-    except OutputError as error:
-        say(f"no learning curve: {error}")

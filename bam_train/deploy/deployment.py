@@ -11,14 +11,14 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Protocol
 
 import gymnasium as gym
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, SafetyStop
 from bam_envs.core.timing import Pacer
-from bam_train.deploy.journal import EpisodeRecord, Journal
+from bam_train.deploy.journal import Ending, EpisodeRecord, Journal
 from bam_train.errors import BamTrainError
 from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, Workspace
 from bam_train.loop.robot_agent import SAYS_SUCCESS, SUCCESS
@@ -40,16 +40,6 @@ class Watcher(Protocol):
 
     def ended(self, record: EpisodeRecord, pacer: Pacer) -> None:
         """An episode ended."""
-
-
-@dataclass(frozen=True)
-class Ending:
-    """Why the loop stopped."""
-
-    reason: str
-    """``"episodes done"``, ``"interrupted"``, ``"link lost: ..."``, ``"safety stop: ..."`` or ``"fault: ..."``."""
-    status: int
-    """Exit status of the program: 0, 128 + the signal, 4, 3 or 1."""
 
 
 class Deployment:
@@ -83,12 +73,17 @@ class Deployment:
         window: int = WINDOW,
         sink: Sink | None = None,
     ) -> None:
-        self._robot, self._journal = _DeployedRobot(env), journal
+        self.env, self.pacer, self.journal = env, pacer, journal
+        self._robot = _DeployedRobot(env)
         self._workspace = Workspace(window=window, sink=None if sink is None else _silent_once_broken(sink))
-        self._signals = _SignalAgent()
-        policy_agent = PolicyAgent(policy, self._robot.observation_names, single=True)
-        own = (_JournalAgent(journal, pacer), policy_agent, _StartupAgent(journal))
-        self._loop = TemporalAgent(Agents(self._signals, self._robot, *own, *agents))
+        own = (
+            _Calls(lambda: self._robot.switch.raise_again()),  # a lost signal: the robot is sent nothing more
+            self._robot,
+            _JournalAgent(journal, pacer),
+            PolicyAgent(policy, self._robot.observation_names, single=True),
+            _Calls(lambda: journal.startup.finish("reset and first action")),
+        )
+        self._loop = TemporalAgent(Agents(*own, *agents))
 
     def connect(self) -> None:
         """Open the link to the robot, if there is one, without moving it: a missing robot shows before the loop."""
@@ -105,11 +100,14 @@ class Deployment:
         if switch is None:
             with stop_signals() as own:
                 return self.run(watcher, seed=seed, switch=own)
-        self._robot.switch = self._signals.switch = switch
+        self._robot.switch = switch
         try:
             try:
                 switch.arm()
-                self._episodes(watcher, seed)
+                for k in range(self.journal.wanted):
+                    self._loop(self._workspace, t=0, stop_variable="env/done", seed=seed + k, watcher=watcher)
+                    self._robot.halt()  # a sink may take its time, and so may the next reset
+                    self._workspace.flush()
             finally:  # inside the outer try: a signal that comes before this line is still caught
                 switch.armed = False
             ending = Ending("episodes done", 0)
@@ -123,12 +121,6 @@ class Deployment:
             raise
         ending = _unless_it_fails(ending, "closing", self._robot.close)
         return _unless_it_fails(ending, "recording", self._workspace.flush)  # of an episode that was cut short
-
-    def _episodes(self, watcher: Watcher, seed: int) -> None:
-        for k in range(self._journal.wanted):
-            self._loop(self._workspace, t=0, stop_variable="env/done", seed=seed + k, watcher=watcher)
-            self._robot.halt()  # a sink may take its time, and so may the next reset
-            self._workspace.flush()
 
 
 def _ending_of(error: Exception) -> Ending:
@@ -175,28 +167,28 @@ def fault_text(error: Exception) -> str:
 # ---- the agents beside robot and policy
 
 
-class _SignalAgent(Agent):
-    """Ends the loop for a signal whose exception was lost. Runs before the robot, which is then sent nothing more."""
+class _Calls(Agent):
+    """Calls something at every time."""
 
     reads = ()
     writes = ()
-    switch: StopSwitch | None = None
+
+    def __init__(self, call: Callable[[], None]) -> None:
+        super().__init__()
+        self._tell = call
 
     def forward(self, **kwargs: Any) -> None:
-        if self.switch is not None:
-            self.switch.raise_again()
+        self._tell()
 
 
 class _DeployedRobot(RobotAgent):
     """The robot; once the loop begins to close it, no signal interrupts that."""
 
-    switch: StopSwitch | None = None
+    switch: StopSwitch
     closing = False
 
     def close(self) -> None:
-        self.closing = True
-        if self.switch is not None:
-            self.switch.armed = False
+        self.closing, self.switch.armed = True, False
         super().close()
 
 
@@ -216,34 +208,18 @@ class _JournalAgent(Agent):
         if t == 0:
             self._record = self._journal.begin(seed)
             self._pacer.start()
-        else:
-            self._note(t, watcher)
+        else:  # the step that led to time t
+            record = self._record
+            info: dict[str, Any] = {}
+            if self.get((f"env/{SAYS_SUCCESS}", t))[0]:
+                info["is_success"] = self.get((f"env/{SUCCESS}", t))[0]
+            record.add(self.get(("env/reward", t))[0], info)
+            record.end = next((end for end in _ENDS if self.get((f"env/{end}", t))[0]), "stopped")
+            watcher.ticked(record, self.get(("action", t - 1))[0], self._pacer)
+            if record.complete:
+                watcher.ended(record, self._pacer)
         if not self.get(("env/done", t))[0]:
             self._pacer.wait()
-
-    def _note(self, t: int, watcher: Watcher) -> None:
-        """Add the step that led to time t."""
-        record = self._record
-        says = self.get((f"env/{SAYS_SUCCESS}", t))[0]
-        record.add(self.get(("env/reward", t))[0], {"is_success": self.get((f"env/{SUCCESS}", t))[0]} if says else {})
-        record.end = next((end for end in _ENDS if self.get((f"env/{end}", t))[0]), "stopped")
-        watcher.ticked(record, self.get(("action", t - 1))[0], self._pacer)
-        if record.complete:
-            watcher.ended(record, self._pacer)
-
-
-class _StartupAgent(Agent):
-    """Notes the time of the first action. Runs after the policy."""
-
-    reads = ()
-    writes = ()
-
-    def __init__(self, journal: Journal) -> None:
-        super().__init__()
-        self._startup = journal.startup
-
-    def forward(self, **kwargs: Any) -> None:
-        self._startup.finish("reset and first action")
 
 
 # ---- Ctrl-C and SIGTERM while a robot moves

@@ -1,14 +1,17 @@
-"""What has happened so far, kept up to date tick by tick so that a report can be made at any moment."""
+"""What has happened so far, kept up to date tick by tick, and the report that can be made of it at any moment."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
+if TYPE_CHECKING:
+    from bam_envs.core.timing import Lateness, Pacer
+    from bam_train.checkpoint import Checkpoint
 
 
 @dataclass
@@ -39,7 +42,7 @@ class EpisodeRecord:
 
     def to_json(self) -> dict[str, Any]:
         """Plain values; a return that is not finite is None."""
-        total = self.total if np.isfinite(self.total) else None
+        total = self.total if math.isfinite(self.total) else None
         return {"seed": self.seed, "length": self.length, "return": total, "success": self.success, "end": self.end}
 
 
@@ -111,3 +114,119 @@ class Journal:
             success = self.records[-1].success
             counts.update(completed=1, said=success is not None, succeeded=bool(success))
         return counts
+
+
+@dataclass(frozen=True)
+class Ending:
+    """Why a deployment ended."""
+
+    reason: str
+    """``"episodes done"``, ``"interrupted"``, ``"link lost: ..."``, ``"safety stop: ..."`` or ``"fault: ..."``."""
+    status: int
+    """Exit status of the program: 0, 128 + the signal, 4, 3 or 1."""
+
+
+MISSED_SHARE = 0.05
+"""More missed ticks than this share are worth a warning."""
+
+
+@dataclass(frozen=True)
+class DeployReport:
+    """The outcome of one deployment."""
+
+    checkpoint: Checkpoint
+    seed: int
+    """Of the first episode."""
+    ending: Ending
+    journal: Journal
+    pacer: Pacer
+    robot: str = "simulated here"
+    """What was driven: an address, or the simulation."""
+    guards: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """What the guards of a live robot did, by name; see `SafeRobot.report`."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values; times in the unit that their name says."""
+        journal, manifest, startup = self.journal, self.checkpoint.manifest, self.journal.startup
+        stages = {"total": startup.total, **startup.stages} if startup.finished else {}
+        return {
+            "stop_reason": self.ending.reason,
+            "episodes": journal.completed,
+            "successes": journal.successes,
+            "ticks": self.pacer.ticks,
+            "rate_hz": None if self.pacer.rate is None else round(self.pacer.rate, 3),
+            "target_rate_hz": None if self.pacer.period is None else round(1 / self.pacer.period, 3),
+            "lateness_ms": _milliseconds(self.pacer.lateness),
+            "missed_ticks": self.pacer.missed,
+            "warnings": self.warnings(),
+            "startup_cpu_s": {name: round(seconds, 3) for name, seconds in stages.items()} or None,
+            "seed": self.seed,
+            "env": manifest.env,
+            "algorithm": manifest.algorithm,
+            "checkpoint": str(self.checkpoint.path),
+            "robot": self.robot,
+            # A limit that is off is infinite, which JSON does not have.
+            "guards": {
+                name: {**guard, "limit": None} if guard.get("limit") == math.inf else dict(guard)
+                for name, guard in self.guards.items()
+            },
+            "per_episode": [record.to_json() for record in journal.records],
+        }
+
+    def warnings(self) -> list[str]:
+        """What a person should know of a deployment that ended well, too."""
+        missed, period = self.pacer.missed, self.pacer.period
+        planned = self.pacer.ticks + missed
+        if period is None or missed <= MISSED_SHARE * planned:
+            return []
+        return [
+            f"{missed} of {planned} ticks were missed: policy and robot take longer than the {1e3 * period:g} ms that "
+            "the policy was made for; use a faster computer, or stop what else runs on it"
+        ]
+
+    def lines(self) -> list[str]:
+        """The same for people, a few lines."""
+        reason, ticks, startup = self.ending.reason.rstrip("."), f"{self.pacer.ticks} ticks", self.journal.startup
+        stages = ", ".join(f"{name} {seconds:.2f}" for name, seconds in startup.stages.items())
+        return [
+            f"{reason}: {episodes_text(self.journal)}, {ticks}, {rate_text(self.pacer)}",
+            *([f"lateness {lateness_text(self.pacer)}"] if self.pacer.period is not None else []),
+            *([guards_text(self.guards)] if self.guards else []),
+            *([f"first action after {startup.total:.2f} s of CPU time: {stages}"] if startup.finished else []),
+        ]
+
+
+def episodes_text(journal: Journal) -> str:
+    """Such as ``5 of 5 episodes, 4 successes``."""
+    successes = journal.successes
+    text = f"{journal.completed} of {journal.wanted} episodes"
+    return text if successes is None else f"{text}, {successes} success{'' if successes == 1 else 'es'}"
+
+
+def rate_text(pacer: Pacer) -> str:
+    """Such as ``20.00 Hz of 20``."""
+    measured = "no rate yet" if pacer.rate is None else f"{pacer.rate:.2f} Hz"
+    return f"{measured}, no waiting" if pacer.period is None else f"{measured} of {1 / pacer.period:g}"
+
+
+def lateness_text(pacer: Pacer) -> str:
+    """Such as ``p50 0.08 ms, p99 0.30 ms, max 1.20 ms, 0 missed``."""
+    late = _milliseconds(pacer.lateness)
+    figures = [f"{name} {value:.2f} ms" for name, value in late.items()] if late else ["none yet"]
+    return ", ".join([*figures, f"{pacer.missed} missed"])
+
+
+def guards_text(guards: Mapping[str, Mapping[str, Any]]) -> str:
+    """Such as ``guards changed the command: joint speed (G8) in 3 ticks``."""
+    altered, held = (
+        ", ".join(f"{name} ({one['number']}) in {one[what]} ticks" for name, one in guards.items() if one.get(what))
+        for what in ("altered", "held")
+    )
+    changed = f"guards changed the command: {altered}" if altered else "no guard changed a command"
+    return f"{changed}; held the robot: {held}" if held else changed
+
+
+def _milliseconds(lateness: Lateness | None) -> dict[str, float] | None:
+    if lateness is None:
+        return None
+    return {name: round(1e3 * getattr(lateness, name), 3) for name in ("p50", "p99", "max")}

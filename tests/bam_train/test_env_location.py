@@ -58,7 +58,7 @@ def test_addresses(text, found):
             "--timeout is how long an answer of --transport is waited for; leave it out",
         ),
         (Place(timeout=5.0), "--timeout is how long an answer of --transport is waited for; leave it out"),
-        (Place(transport=("tcp://a:1",), timeout=0.0), "timeout: expected more than 0 s, found 0"),
+        (Place(transport=("tcp://a:1",), timeout=0.0), "--timeout: expected a number above 0, found 0.0"),
     ],
 )
 def test_what_excludes_each_other_is_refused(place, message):

@@ -15,8 +15,8 @@ from bam_envs.safety.gate import SafeRobot
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.reach import ReachTask
 from bam_envs.testing.drivers import DrivenRobot
-from bam_train.deploy.deployment import Deployment, Ending, fault_text
-from bam_train.deploy.journal import Journal, Startup
+from bam_train.deploy.deployment import Deployment
+from bam_train.deploy.journal import Ending, Journal
 
 
 class Right:
@@ -142,6 +142,7 @@ def test_the_time_limit_is_not_the_end_of_the_task(corridor):
         (ZeroDivisionError("division by zero"), "fault: ZeroDivisionError: division by zero"),
         (ValueError("two\nlines"), "fault: ValueError: two lines"),
         (KeyError(), "fault: KeyError"),
+        (RobotFault(), "fault: RobotFault"),
     ],
 )
 def test_a_fault_halts_and_is_named(corridor, error, reason):
@@ -181,8 +182,16 @@ def test_after_a_signal_whose_exception_is_discarded_nothing_more_is_sent(corrid
     assert env.robot.calls == ["halt", "close"]
 
 
-def test_a_second_signal_does_not_stop_the_halt(corridor):
-    env = Driven(gym.make(corridor, slow=True), lambda: os.kill(os.getpid(), signal.SIGINT))
+@pytest.mark.parametrize(
+    ("happens", "expected"),
+    [
+        (lambda: os.kill(os.getpid(), signal.SIGINT), Ending("interrupted", 130)),
+        (raises(RobotFault("link lost")), Ending("fault: link lost", 1)),
+    ],
+    ids=["a second signal", "a signal after a fault"],
+)
+def test_a_signal_does_not_stop_the_halt(corridor, happens, expected):
+    env = Driven(gym.make(corridor, slow=True), happens)
     halted = []
 
     def halt():
@@ -190,22 +199,7 @@ def test_a_second_signal_does_not_stop_the_halt(corridor):
         halted.append(True)
 
     env.robot.halt = halt
-    ending, _, _ = run(env)
-    assert ending == Ending("interrupted", 130)
-    assert halted == [True]
-
-
-def test_a_signal_while_a_fault_is_halted_changes_nothing(corridor):
-    env = Driven(gym.make(corridor, slow=True), raises(RobotFault("link lost")))
-    halted = []
-
-    def halt():
-        os.kill(os.getpid(), signal.SIGINT)
-        halted.append(True)
-
-    env.robot.halt = halt
-    ending, _, _ = run(env)
-    assert ending == Ending("fault: link lost", 1)
+    assert run(env)[0] == expected
     assert halted == [True]
 
 
@@ -251,28 +245,8 @@ def test_an_action_that_is_not_finite_never_reaches_the_robot(corridor):
     assert env.robot.calls == ["halt", "close"]
 
 
-def test_without_a_robot_there_is_nothing_to_halt(corridor):
-    assert run(gym.make(corridor))[0].status == 0
-
-
-def test_startup_stages_add_up():
-    clock = iter([0.25, 0.75, 1.0, 9.0])
-    startup = Startup(clock=lambda: next(clock))
-    startup.mark("python")
-    startup.mark("policy")
-    startup.finish("first action")
-    startup.finish("first action")
-    assert startup.stages == {"python": 0.25, "policy": 0.5, "first action": 0.25}
-    assert startup.total == 1.0
-
-
 def test_successes_are_unknown_where_the_environment_does_not_say(corridor):
     assert run(gym.make(corridor, says_success=False))[1].successes is None
-    assert Journal(3).successes == 0
-
-
-def test_fault_text_of_nothing():
-    assert fault_text(RobotFault()) == "RobotFault"
 
 
 def test_the_same_loop_drives_any_robot():
@@ -300,10 +274,6 @@ def test_the_same_loop_drives_any_robot():
     ],
 )
 def test_what_the_operator_looks_for_first_is_in_the_status(corridor, error, ending):
-    def happens():
-        raise error
-
-    env = Driven(gym.make(corridor), happens, at=1)
-    deployment = Deployment(env, Right(), Pacer(None), Journal(1, Startup()))
-    assert deployment.run(Silent(), seed=0) == ending
+    env = Driven(gym.make(corridor), raises(error), at=1)
+    assert run(env)[0] == ending
     assert "halt" in env.robot.calls

@@ -6,15 +6,14 @@ import pytest
 from rich.console import Console
 
 from bam_envs.core.timing import Pacer
-from bam_train.deploy.display import (
+from bam_train.cli.deploy_display import (
     LiveDisplay,
     PlainDisplay,
     action_labels,
-    action_rows,
-    bar,
+    action_lines,
     episode_line,
     live_display,
-    state_rows,
+    state_lines,
 )
 from bam_train.deploy.journal import EpisodeRecord, Journal
 
@@ -36,20 +35,6 @@ class Slack:
 
     def __init__(self, slack):
         self.slack = slack
-
-
-@pytest.mark.parametrize(
-    ("value", "expected"),
-    [
-        (-1.0, "#.........|.........."),
-        (0.0, "..........#.........."),
-        (0.5, "..........|....#....."),
-        (1.0, "..........|.........#"),
-        (7.0, "..........|.........#"),
-    ],
-)
-def test_bar(value, expected):
-    assert bar(value) == expected
 
 
 @pytest.mark.parametrize(
@@ -87,34 +72,46 @@ def test_redraws_are_rare_and_only_when_there_is_time(corridor):
     assert drawn == [1, 1, 2, 2, 3, 3]
 
 
-def test_action_rows():
-    action = np.array([0.5, -1.0], np.float32)
-    assert list(action_rows(("dx", "grip"), action)) == [
-        ("action", "dx   ..........|....#..... +0.500"),
+@pytest.mark.parametrize(
+    ("value", "bar"),
+    [
+        (-1.0, "#.........|.........."),
+        (0.0, "..........#.........."),
+        (0.5, "..........|....#....."),
+        (7.0, "..........|.........#"),
+    ],
+)
+def test_numbers_of_an_action(value, bar):
+    action = np.array([value, -1.0], np.float32)
+    assert list(action_lines(("dx", "grip"), action)) == [
+        ("action", f"dx   {bar} {value:+.3f}"),
         ("", "grip #.........|.......... -1.000"),
     ]
-    assert list(action_rows((), np.int64(3))) == [("action", "3")]
-    assert list(action_rows((), np.array([1, 0]))) == [("action", "0 1"), ("", "1 0")]
-    assert len(list(action_rows((), np.zeros(100)))) == 16
 
 
-def test_rows_of_a_robot():
+def test_choices_and_long_actions():
+    assert list(action_lines((), np.int64(3))) == [("action", "3")]
+    assert list(action_lines((), np.array([1, 0]))) == [("action", "0 1"), ("", "1 0")]
+    assert len(list(action_lines((), np.zeros(100)))) == 16
+
+
+def test_signals_of_a_robot():
     env = gym.make("bam/pick-v0")
-    assert list(state_rows(env)) == []
+    assert list(state_lines(env)) == []
     env.reset(seed=0)
-    rows = dict(state_rows(env))
-    assert list(rows) == ["joint position", "joint velocity", "gripper width", "object position", "object quaternion"]
-    assert rows["joint velocity"].endswith(" rad/s")
-    assert len(rows["joint position"].split()) == 7
-    assert len(rows["object quaternion"].split()) == 4
+    lines = dict(state_lines(env))
+    assert list(lines) == ["joint position", "joint velocity", "gripper width", "object position", "object quaternion"]
+    assert lines["joint velocity"].endswith(" rad/s")
+    assert len(lines["joint position"].split()) == 7
+    assert len(lines["object quaternion"].split()) == 4
     assert action_labels(env) == ("dx", "dy", "dz", "dyaw", "grip")
     env.close()
 
 
-def test_another_environment_has_no_rows(corridor):
+def test_an_environment_without_a_robot_has_no_signals():
     env = gym.make("CartPole-v1")
     env.reset(seed=0)
-    assert list(state_rows(env)) == []
+    assert list(state_lines(env)) == []
     assert action_labels(env) == ()
 
 

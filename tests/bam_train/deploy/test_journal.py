@@ -3,9 +3,17 @@ import math
 
 from bam_envs.core.timing import Pacer
 from bam_train.checkpoint import Checkpoint
-from bam_train.deploy.deployment import Ending
-from bam_train.deploy.journal import Journal, Startup
-from bam_train.deploy.report import DeployReport, episodes_text, lateness_text, rate_text
+from bam_train.deploy.journal import (
+    KEPT,
+    DeployReport,
+    Ending,
+    Journal,
+    Startup,
+    episodes_text,
+    guards_text,
+    lateness_text,
+    rate_text,
+)
 
 
 class Clock:
@@ -109,3 +117,33 @@ def test_running_free():
     assert rate_text(pacer) == "15.79 Hz, no waiting"
     assert lateness_text(pacer) == "none yet, 0 missed"
     assert episodes_text(Journal(1)) == "0 of 1 episodes, 0 successes"
+
+
+def test_what_the_guards_did():
+    speed = {"number": "G8", "limit": 1.0, "unit": "rad/s", "altered": 3, "stopped": 0}
+    finite = {"number": "G2", "limit": "", "unit": "", "altered": 0, "stopped": 0}
+    text = "guards changed the command: joint speed (G8) in 3 ticks"
+    assert guards_text({"joint speed": speed, "finite": finite}) == text
+    assert guards_text({"finite": finite}) == "no guard changed a command"
+
+
+def test_startup_stages_add_up():
+    clock = iter([0.25, 0.75, 1.0, 9.0])
+    startup = Startup(clock=lambda: next(clock))
+    startup.mark("python")
+    startup.mark("policy")
+    startup.finish("first action")
+    startup.finish("first action")
+    assert startup.stages == {"python": 0.25, "policy": 0.5, "first action": 0.25}
+    assert startup.total == 1.0
+
+
+def test_old_records_are_counted_and_forgotten():
+    journal = Journal(10**6)
+    assert journal.successes == 0
+    for seed in range(KEPT + 10):
+        record = journal.begin(seed)
+        record.end, record.success = "terminated", seed % 2 == 0
+    assert (journal.begun, journal.completed, journal.successes) == (KEPT + 10, KEPT + 10, KEPT // 2 + 5)
+    assert len(journal.records) == KEPT
+    assert journal.records[0].seed == 10

@@ -1,4 +1,4 @@
-"""Showing the loop: a live panel on a terminal, a line for each episode elsewhere."""
+"""What `bam-deploy` shows on standard error: a panel on a terminal, a line for each episode elsewhere."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ import gymnasium as gym
 import numpy as np
 
 from bam_envs.core.timing import Pacer
-from bam_train.deploy.journal import EpisodeRecord, Journal
-from bam_train.deploy.report import lateness_text, rate_text
-from bam_train.terminal_text import rich_text
+from bam_train.cli.console import rich_text
+from bam_train.deploy.journal import EpisodeRecord, Journal, lateness_text, rate_text
 
 if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
+    from rich.console import Console
     from rich.live import Live
 
 _MOST_NUMBERS = 16
@@ -76,40 +75,36 @@ class LiveDisplay:
     def ticked(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> None:
         """Redraw if it is time and there is time."""
         now = self._now()
-        if now - self._drawn >= self.EVERY and pacer.slack >= self.COST:
-            self._drawn = now
-            self._live.update(self._panel(record, action, pacer), refresh=True)
+        if now - self._drawn < self.EVERY or pacer.slack < self.COST:
+            return
+        self._drawn = now
+        from rich.console import Group
+        from rich.table import Table
+
+        table = Table.grid(padding=(0, 2))
+        for name, text in self._lines(record, action, pacer):
+            table.add_row(rich_text(name, "dim"), rich_text(text, no_wrap=True, overflow="ellipsis"))
+        self._live.update(Group(rich_text(self._title, "bold"), table), refresh=True)
 
     def ended(self, record: EpisodeRecord, pacer: Pacer) -> None:
         """Write how the episode went above the panel."""
         line = episode_line(self._journal.begun, self._journal.wanted, record)
         self._live.console.print(rich_text(line))
 
-    def _panel(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> RenderableType:
-        from rich.console import Group
-        from rich.table import Table
-
-        table = Table.grid(padding=(0, 2))
-        for name, text in self.rows(record, action, pacer):
-            table.add_row(rich_text(name, "dim"), rich_text(text, no_wrap=True, overflow="ellipsis"))
-        return Group(rich_text(self._title, "bold"), table)
-
-    def rows(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> Iterator[tuple[str, str]]:
+    def _lines(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> Iterator[tuple[str, str]]:
         """What the panel says, line by line: a name and a text; few enough for a screen of 24 lines."""
-        number, successes = self._journal.begun, self._journal.successes
-        yield (
-            "episode",
-            f"{number} of {self._journal.wanted}" + ("" if successes is None else f", {successes} succeeded"),
-        )
+        successes = self._journal.successes
+        succeeded = "" if successes is None else f", {successes} succeeded"
+        yield "episode", f"{self._journal.begun} of {self._journal.wanted}{succeeded}"
         yield "step", f"{record.length}, return {record.total:.2f}"
         yield "loop", rate_text(pacer)
         if pacer.period is not None:
             yield "lateness", lateness_text(pacer)
-        yield from action_rows(self._labels, action)
-        yield from state_rows(self._env)
+        yield from action_lines(self._labels, action)
+        yield from state_lines(self._env)
 
 
-def bar(value: float) -> str:
+def _bar(value: float) -> str:
     """A number of [-1, 1] as a mark on a line whose middle is 0; what is outside is at the end."""
     place = round((min(max(value, -1.0), 1.0) + 1) / 2 * _BAR)
     return "".join("#" if i == place else "|" if i == _BAR // 2 else "." for i in range(_BAR + 1))
@@ -128,17 +123,17 @@ def action_labels(env: gym.Env[Any, Any]) -> tuple[str, ...]:
     return () if describe is None else tuple(str(row["name"]) for row in describe()["action"])
 
 
-def action_rows(labels: tuple[str, ...], action: Any) -> Iterator[tuple[str, str]]:
+def action_lines(labels: tuple[str, ...], action: Any) -> Iterator[tuple[str, str]]:
     """One line for each number of the action, with a bar if it is not a choice."""
     numbers = np.ravel(action)
     width = max((len(label) for label in labels), default=1)
     for i, number in enumerate(numbers[:_MOST_NUMBERS]):
         label = (labels[i] if i < len(labels) else str(i) if len(numbers) > 1 else "").ljust(width)
-        text = f"{bar(float(number))} {number:+.3f}" if numbers.dtype.kind == "f" else str(number)
+        text = f"{_bar(float(number))} {number:+.3f}" if numbers.dtype.kind == "f" else str(number)
         yield "action" if i == 0 else "", f"{label} {text}".lstrip()
 
 
-def state_rows(env: gym.Env[Any, Any]) -> Iterator[tuple[str, str]]:
+def state_lines(env: gym.Env[Any, Any]) -> Iterator[tuple[str, str]]:
     """One line for each signal that the robot measured last; none if the environment is no `RobotEnv`."""
     signals = getattr(getattr(env.unwrapped, "state", None), "signals", None)
     if signals is None:
