@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -100,25 +101,17 @@ def test_an_existing_checkpoint_is_not_overwritten(bam_train, here):
     assert (here / "runs" / "CartPole-v1-ppo-3" / "last.zip").exists()
 
 
-def test_resume_counts_from_the_first_step(bam_train):
-    bam_train(out=Path("a.zip"))
-    last = Path("runs/CartPole-v1-ppo/last.zip")
-    status, _, err = bam_train(resume=last, steps=192)
-    assert status == 0
-    assert Checkpoint.open("runs/CartPole-v1-ppo-2/last.zip").manifest.steps == 192
-    assert "CartPole-v1 cannot save running episodes: new ones begin" in err
-    status, _, err = bam_train(resume=last)
-    assert (status, err) == (
-        1,
-        f"bam-train: {last}: has trained 128 of 128 steps already; give a larger total with --steps\n",
-    )
-
-
-def test_resume_needs_nothing_else(bam_train, here):
+def test_resume_counts_from_the_first_step_and_needs_nothing_else(bam_train):
     bam_train(steps=100, eval_every=1000)
+    last, checkpoint = Path("runs/CartPole-v1-ppo/last.zip"), Path("checkpoints/CartPole-v1-ppo.zip")
     nothing = dict.fromkeys(("env", "algo", "eval_every", "eval_episodes"))
-    assert bam_train(**{**nothing, "resume": Path("checkpoints/CartPole-v1-ppo.zip"), "steps": 160, "set": ()})[0] == 0
-    assert Checkpoint.open("runs/CartPole-v1-ppo-2/last.zip").manifest.steps == 160
+    status, _, err = bam_train(**nothing, resume=checkpoint, steps=192, set=())
+    assert status == 0
+    assert err.splitlines()[0] == f"ppo on CartPole-v1, seed 0, going on from {checkpoint} at 128 steps"
+    assert "CartPole-v1 cannot save running episodes: new ones begin" in err
+    assert Checkpoint.open("runs/CartPole-v1-ppo-2/last.zip").manifest.steps == 192
+    text = f"{last}: has trained 128 of 128 steps already; give a larger total with --steps"
+    assert bam_train(resume=last) == (1, "", f"bam-train: {text}\n")
 
 
 ERRORS = [
@@ -178,13 +171,6 @@ def test_a_wrong_value_in_a_file_names_the_file(bam_train, here):
     assert bam_train(config=Path("a.toml"), steps=None) == (1, "", line)
 
 
-def test_resume_says_from_where(bam_train):
-    bam_train()
-    last = Path("runs/CartPole-v1-ppo/last.zip")
-    _, _, err = bam_train(resume=last, steps=192)
-    assert err.splitlines()[0] == f"ppo on CartPole-v1, seed 0, going on from {last} at 128 steps"
-
-
 def test_a_nan_keeps_the_last_good_checkpoint(bam_train):
     status, _, err = bam_train(set=(*SHORT, "learning_rate=1e30"))
     assert status == 1
@@ -197,140 +183,156 @@ def test_a_nan_keeps_the_last_good_checkpoint(bam_train):
 # In a process of its own
 
 
-def started(here, *arguments):
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
-    flags = ["--env", "CartPole-v1", "--algo", "ppo", "--set", "n_steps=64", "--set", "policy_kwargs.net_arch=[8]"]
-    return subprocess.Popen(
-        [sys.executable, "-m", "bam_train.cli.train", *flags, *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=here,
-        env=environment,
-    )
+class Program:
+    """`bam-train` in a process that has imported what it needs, its standard error a pipe."""
+
+    def __init__(self, context, folder, *arguments):
+        reader, writer = context.Pipe(duplex=False)
+        flags = ["--env", "CartPole-v1", "--algo", "ppo", "--set", "n_steps=64", "--set", "policy_kwargs.net_arch=[8]"]
+        code = f"""
+import os, sys
+os.chdir({str(folder)!r})
+os.dup2(writer.fileno(), 2)
+sys.stderr = open(2, "w", buffering=1, closefd=False)
+from bam_train.cli.train import main
+main({[*flags, *arguments]!r})
+"""
+        self.process = context.Process(target=exec, args=(code, {"writer": writer}))
+        self.process.start()
+        self.stderr = os.fdopen(os.dup(reader.fileno()))
+        reader.close()
+        writer.close()
+
+    def send(self, number):
+        os.kill(self.process.pid, number)
+
+    def wait_for(self, words):
+        """Read standard error up to a line that holds `words`."""
+        assert any(words in line for line in self.stderr), f"never said {words!r}"
+
+    def end(self):
+        """The exit status, and what else it said."""
+        said = self.stderr.read()
+        self.process.join(20)
+        return self.process.exitcode, said
 
 
-def wait_for(process, words):
-    """Read standard error up to a line that holds `words`."""
-    for line in process.stderr:
-        if words in line:
-            return
-    raise AssertionError(f"never said {words!r}")
+@pytest.fixture
+def start(here):
+    """Starts a `Program`; all of them are forked from one process."""
+    context, programs = multiprocessing.get_context("forkserver"), []
+    imported = ("torch.utils.tensorboard", "matplotlib.pyplot", "onnxruntime", "stable_baselines3", "pytest")
+    context.set_forkserver_preload([*imported, "bam_train.trainers.sb3.sb3_trainer", "bam_train.trainers.training_run"])
+
+    def start(*arguments):
+        programs.append(Program(context, here, *arguments))
+        return programs[-1]
+
+    yield start
+    for program in programs:
+        program.process.kill()
+        program.process.join()
+        program.stderr.close()
 
 
 LONG = ("--steps", "10000000", "--eval-every", "256", "--eval-episodes", "1")
 
 
+def last_checkpoint(here):
+    return Checkpoint.open(here / "runs" / "CartPole-v1-ppo" / "last.zip").manifest
+
+
 @pytest.mark.parametrize(
-    ("number", "status", "again"),
-    [
-        (signal.SIGINT, 130, "Ctrl-C again"),
-        (signal.SIGTERM, 143, "another signal"),
-    ],
+    ("number", "status", "again", "times"),
+    [(signal.SIGINT, 130, "Ctrl-C again", 1), (signal.SIGTERM, 143, "another signal", 4)],
 )
-def test_a_signal_saves_and_ends_cleanly(here, number, status, again):
-    process = started(here, *LONG)
-    wait_for(process, "evaluation at 512 steps")
-    process.send_signal(number)
-    out, err = process.communicate(timeout=60)
-    assert (process.returncode, out) == (status, "")
-    assert f"finishing the update and saving; {again} quits at once" in err
-    assert "Traceback" not in err
-    last = Checkpoint.open(here / "runs" / "CartPole-v1-ppo" / "last.zip")
-    assert last.manifest.steps >= 512
-    assert err.splitlines()[-1] == "  bam-train --resume runs/CartPole-v1-ppo/last.zip"
-
-
-def test_two_signals_quit_at_once(here):
-    process = started(here, *LONG, "--set", "n_epochs=100000")
-    wait_for(process, "ppo on CartPole-v1, seed 0")
-    time.sleep(1.0)  # into the first update, which takes minutes
-    process.send_signal(signal.SIGINT)
-    wait_for(process, "finishing the update")
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=20)
-    assert process.returncode == 130
-    assert err == "bam-train: quit at once; no checkpoint had been saved yet\n"
-
-
-def test_a_signal_that_comes_twice_at_once_is_one(here):
-    """`timeout` sends SIGTERM to the program, and then to its group."""
-    process = started(here, *LONG)
-    wait_for(process, "evaluation at 512 steps")
-    for pause in (0.0, 0.001, 0.02):
+def test_a_signal_saves_and_ends_cleanly(start, here, number, status, again, times):
+    """`timeout` sends SIGTERM to the program, and then to its group: what comes again at once is one signal."""
+    program = start(*LONG)
+    program.wait_for("evaluation at 512 steps")
+    for pause in (0.0, 0.0, 0.001, 0.02)[:times]:
         time.sleep(pause)
-        process.send_signal(signal.SIGTERM)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 143, err
-    assert err.count("finishing the update and saving") == 1
+        program.send(number)
+    found, err = program.end()
+    assert found == status, err
+    assert err.count(f"finishing the update and saving; {again} quits at once") == 1
+    assert "Traceback" not in err
+    assert last_checkpoint(here).steps >= 512
     assert err.splitlines()[-1] == "  bam-train --resume runs/CartPole-v1-ppo/last.zip"
 
 
-def test_two_signals_while_saving_quit_at_once_too(here):
-    process = started(here, *LONG)
-    wait_for(process, "evaluation at 512 steps")
-    process.send_signal(signal.SIGINT)
+def test_two_signals_quit_at_once(start):
+    program = start(*LONG, "--set", "n_epochs=100000")
+    program.wait_for("ppo on CartPole-v1, seed 0")
+    time.sleep(1.0)  # into the first update, which takes minutes
+    program.send(signal.SIGINT)
+    program.wait_for("finishing the update")
+    program.send(signal.SIGINT)
+    assert program.end() == (130, "bam-train: quit at once; no checkpoint had been saved yet\n")
+
+
+def test_two_signals_while_saving_quit_at_once_too(start, here):
+    program = start(*LONG)
+    program.wait_for("evaluation at 512 steps")
+    program.send(signal.SIGINT)
     time.sleep(0.1)
-    process.send_signal(signal.SIGINT)
+    program.send(signal.SIGINT)
     before = time.monotonic()
-    _, err = process.communicate(timeout=20)
+    status, err = program.end()
     assert time.monotonic() - before < 2.0
-    assert process.returncode == 130
+    assert status == 130
     last = "runs/CartPole-v1-ppo/last.zip"
     assert err.splitlines()[-1] == f"bam-train: quit at once; the last checkpoint on the disk is {last}"
-    assert Checkpoint.open(here / last).manifest.steps >= 256
+    assert last_checkpoint(here).steps >= 256
     assert not list((here / "runs" / "CartPole-v1-ppo").glob(".*"))
 
 
-def test_stopped_before_the_first_evaluation(here):
-    process = started(here, "--steps", "10000000")
-    wait_for(process, "steps/s")
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
-    lines = [" ".join(line.split()) for line in err.splitlines()]
+def test_stopped_before_the_first_evaluation(start, here):
+    program = start("--steps", "10000000")
+    program.wait_for("steps/s")
+    program.send(signal.SIGINT)
+    lines = [" ".join(line.split()) for line in program.end()[1].splitlines()]
     assert "best none yet: stopped before the first evaluation; the checkpoint is the newest state" in lines
     assert lines[-1] == "bam-train --resume runs/CartPole-v1-ppo/last.zip"
     newest = Checkpoint.open(here / "checkpoints" / "CartPole-v1-ppo.zip").manifest
-    assert newest.steps == Checkpoint.open(here / "runs" / "CartPole-v1-ppo" / "last.zip").manifest.steps
-    assert newest.scores == {}
+    assert (newest.steps, newest.scores) == (last_checkpoint(here).steps, {})
 
 
-def test_a_run_folder_that_fills_up(here):
+def test_a_run_folder_that_fills_up(start):
     """A limit on the size of files stands in for a full disk."""
     import resource
 
-    process = started(here, "--steps", "4096", "--eval-every", "1024", "--eval-episodes", "1")
-    wait_for(process, "evaluation at 1024 steps")
-    _, hard = resource.prlimit(process.pid, resource.RLIMIT_FSIZE)
-    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (1, hard))
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 1
+    program = start("--steps", "2048", "--eval-every", "512", "--eval-episodes", "1")
+    program.wait_for("evaluation at 512 steps")
+    _, hard = resource.prlimit(program.process.pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(program.process.pid, resource.RLIMIT_FSIZE, (1, hard))
+    status, err = program.end()
+    assert status == 1
     assert "Traceback" not in err
-    assert any("all steps done at 4096 steps" in line for line in err.splitlines())
+    assert any("all steps done at 2048 steps" in line for line in err.splitlines())
     assert err.splitlines()[-1].startswith("bam-train: ")
     assert "cannot be written: File too large" in err.splitlines()[-1]
 
 
-def test_nobody_need_read(here):
-    process = started(here, "--steps", "2048", "--eval-every", "256", "--eval-episodes", "1")
-    wait_for(process, "ppo on CartPole-v1, seed 0")
-    process.stderr.close()
-    process.stdout.close()
-    assert process.wait(timeout=60) == 0
-    assert Checkpoint.open(here / "runs" / "CartPole-v1-ppo" / "last.zip").manifest.steps == 2048
+def test_nobody_need_read(start, here):
+    program = start("--steps", "1024", "--eval-every", "256", "--eval-episodes", "1")
+    program.wait_for("ppo on CartPole-v1, seed 0")
+    program.stderr.close()
+    program.process.join(60)
+    assert program.process.exitcode == 0
+    assert last_checkpoint(here).steps == 1024
     assert (here / "checkpoints" / "CartPole-v1-ppo.zip").exists()
 
 
-def test_kill_leaves_a_whole_checkpoint_that_can_be_gone_on_from(here):
-    process = started(here, *LONG)
-    wait_for(process, "evaluation at 1024 steps")
-    process.kill()
-    process.communicate(timeout=20)
-    last = Checkpoint.open(here / "runs" / "CartPole-v1-ppo" / "last.zip")
-    steps = last.manifest.steps + 64
-    resumed = started(here, "--resume", str(last.path), "--steps", str(steps), "--eval-episodes", "1")
-    _, err = resumed.communicate(timeout=60)
-    assert resumed.returncode == 0, err
+def test_kill_leaves_a_whole_checkpoint_that_can_be_gone_on_from(start, here):
+    program = start(*LONG)
+    program.wait_for("evaluation at 512 steps")
+    program.send(signal.SIGKILL)
+    program.end()
+    steps = last_checkpoint(here).steps + 64
+    resumed = start("--resume", "runs/CartPole-v1-ppo/last.zip", "--steps", str(steps), "--eval-episodes", "1")
+    status, err = resumed.end()
+    assert status == 0, err
     assert Checkpoint.open(here / "runs" / "CartPole-v1-ppo-2" / "last.zip").manifest.steps == steps
     assert Checkpoint.open(here / "checkpoints" / "CartPole-v1-ppo.zip").manifest.steps <= steps
 
