@@ -19,14 +19,15 @@ def environment():
 
 @pytest.fixture(scope="session")
 def run_script(environment):
-    """``run_script(name, *arguments, folder=…)`` in a process of its own; what came of it."""
+    """``run_script(name, *arguments, folder=…)`` in a process of its own, where `first` is imported from before all."""
 
-    def run(name, *arguments, folder, **variables):
+    def run(name, *arguments, folder, first=None, **variables):
         command = [sys.executable, str(ROOT / "scripts" / f"{name}.py"), *map(str, arguments)]
+        paths = {} if first is None else {"PYTHONPATH": os.pathsep.join([str(first), environment["PYTHONPATH"]])}
         return subprocess.run(
             command,
             cwd=folder,
-            env={**environment, **variables},
+            env={**environment, **paths, **variables},
             capture_output=True,
             text=True,
             check=False,
