@@ -34,8 +34,6 @@ class LaxServer:
     def __init__(self, ros="ros2"):
         self.frames = []
         """(connection, message) of every client, in order."""
-        self.release = threading.Event()
-        """Until it is set, the service ``/blocks`` does not answer, and its connection is not read."""
         self._spelling = ("secs", "nsecs") if ros == "ros1" else ("sec", "nanosec")
         self._listeners, self._subscribers, self._services = {}, {}, {}
         self._changed, self._loop, self._stop, self.port = threading.Condition(), None, None, 0
@@ -52,7 +50,6 @@ class LaxServer:
         return self
 
     def close(self):
-        self.release.set()
         self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join(DEADLINE)
         assert not self._thread.is_alive()
@@ -112,11 +109,8 @@ class LaxServer:
         answer["service"] = service
         if service == "/rosapi/get_time":
             return answer | {"values": {"time": dict(zip(self._spelling, divmod(time.time_ns(), 10**9), strict=True))}}
-        if service == "/blocks":
-            await asyncio.to_thread(self.release.wait, DEADLINE)
-            return answer | {"values": {}}
-        if service in self._services:
-            return answer | {"values": self._services[service](message["args"], Caller("x"))}
+        if service in self._services:  # until it has answered, its connection is not read
+            return answer | {"values": await asyncio.to_thread(self._services[service], message["args"], Caller("x"))}
         return answer | {"result": False, "values": f"Service {service} does not exist"}
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import NotReady, SafetyStop
+from bam_envs.core.timing import Deadline
 from bam_envs.live.building import live_robot
 from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.ros.codec import RobotInfo
@@ -66,15 +67,11 @@ def connected(server, robot_on):
         robot.close()
 
 
-@pytest.fixture
-def wait():
-    def until(found):
-        deadline = time.monotonic() + 5.0
-        while not found():
-            assert time.monotonic() < deadline
-            time.sleep(0.005)
-
-    return until
+def until(found):
+    deadline = Deadline(5.0)
+    while not found():
+        assert not deadline.passed
+        time.sleep(0.005)
 
 
 def test_a_robot_that_is_ready_moves(driver, connected, start_pose):
@@ -90,64 +87,68 @@ def test_a_robot_that_is_ready_moves(driver, connected, start_pose):
 
 
 @pytest.mark.parametrize(
-    ("topic", "message", "text"),
+    ("profile", "topic", "message", "text"),
     [
-        (SAFETY, {"mode": 3}, f"protective stop ({SAFETY})"),
-        (SAFETY, {"mode": 7}, f"robot emergency stop ({SAFETY})"),
-        (SAFETY, {"mode": 99}, f"safety mode 99 ({SAFETY})"),
-        (MODE, {"mode": 5}, f"idle, brakes engaged ({MODE})"),
-        (MODE, {"mode": -1}, f"no controller ({MODE})"),
-        (PROGRAM, {"data": False}, f"the external control program is not running ({PROGRAM})"),
-        (SPEED, {"data": 30.0}, f"the speed slider is at 30 % ({SPEED})"),
+        ("ur5e", SAFETY, {"mode": 1}, None),
+        ("ur5e", SAFETY, {"mode": 3}, "protective stop"),
+        ("ur5e", SAFETY, {"mode": 7}, "robot emergency stop"),
+        ("ur5e", SAFETY, {"mode": 99}, "safety mode 99"),
+        ("ur5e", SAFETY, [1], None),
+        ("ur5e", MODE, {"mode": 5}, "idle, brakes engaged"),
+        ("ur5e", MODE, {"mode": -1}, "no controller"),
+        ("ur5e", PROGRAM, {"data": False}, "the external control program is not running"),
+        ("ur5e", SPEED, {"data": 30.0}, "the speed slider is at 30 %"),
+        ("ur5e", SPEED, {"data": "fast"}, None),
+        ("ur5e", SPEED, {}, None),
+        ("mir100", "/robot_state", {"robotState": 10}, "emergency stop"),
+        ("mir100", "/robot_state", {"robot_state": 10}, "emergency stop"),
     ],
+)
+def test_what_a_message_says(profile, topic, message, text):
+    (readiness,) = (one for one in load_profile(profile).readiness if one.topic == topic)
+    assert readiness.trouble(message) == text
+
+
+@pytest.mark.parametrize(
+    ("topic", "message", "text"),
+    [(SAFETY, {"mode": 3}, "protective stop"), (SPEED, {"data": 30.0}, "the speed slider is at 30 %")],
 )
 def test_an_arm_that_is_not_ready_does_not_begin(driver, connected, start_pose, topic, message, text):
     driver.say_ready()
     driver.say(topic, **message)
     robot = connected()
-    assert robot.not_ready() == text
+    assert robot.not_ready() == f"{text} ({topic})"
     with pytest.raises(NotReady) as caught:
         robot.reset(ROW, start_pose)
     assert str(caught.value) == (
-        f"{driver.server.url}: not ready: {text}. Nothing moves before it is ready and reset() is called."
+        f"{driver.server.url}: not ready: {text} ({topic}). Nothing moves before it is ready and reset() is called."
     )
 
 
-@pytest.mark.parametrize("field", ["robotState", "robot_state"])
-def test_a_base(driver, connected, field):
-    driver.say("/robot_state", **{field: 10})
-    assert connected("mir100").not_ready() == "emergency stop (/robot_state)"
-
-
-def test_it_becomes_ready_without_a_new_connection(driver, connected, start_pose, wait):
-    driver.say(SAFETY, mode=3)
-    robot = connected()
-    driver.say(SAFETY, mode=1)
-    wait(lambda: robot.not_ready() is None)
-    robot.reset(ROW, start_pose)
-
-
-def test_a_stop_in_mid_episode_is_named_at_once(driver, connected, start_pose, wait):
+def test_a_stop_in_mid_episode_is_named_at_once(driver, connected, start_pose):
     driver.say_ready()
     robot = connected()
     command = robot.reset(ROW, start_pose).command
     robot.step(command)
     driver.say(SPEED, data=30.0)  # may dip while it moves: the guards look at what follows from it
-    wait(lambda: robot.not_ready() is not None)
+    until(lambda: robot.not_ready() is not None)
     robot.step(command)
     driver.say(SAFETY, mode=3)
-    wait(lambda: "protective" in robot.not_ready())
+    until(lambda: "protective" in robot.not_ready())
     with pytest.raises(NotReady, match="not ready: protective stop"):
         robot.step(command)
+    driver.say_ready()  # it becomes ready without a new connection
+    until(lambda: robot.not_ready() is None)
+    robot.reset(ROW, start_pose)
 
 
-def test_what_follows_from_it_is_told_with_it(driver, connected, start_pose, wait):
+def test_what_follows_from_it_is_told_with_it(driver, connected, start_pose):
     """The slider was pulled down while the arm moved: it does not follow any more, and why is said first."""
     driver.say_ready()
     robot = connected(frozen=True)
     command = robot.reset(ROW, start_pose).command.copy()
     driver.say(SPEED, data=30.0)
-    wait(lambda: robot.not_ready() is not None)
+    until(lambda: robot.not_ready() is not None)
     command[0, 0] += 0.3
 
     def go_on():
@@ -169,10 +170,11 @@ def test_what_follows_from_it_is_told_with_it(driver, connected, start_pose, wai
         ({}, "trajectory", "the controller scaled_joint_trajectory_controller is inactive"),
         ({"forward_position_controller": "unconfigured"}, "position", "forward_position_controller is unconfigured"),
         ({"forward_position_controller": "running"}, "position", None),  # as ROS 1 calls it
+        (None, "position", "the controller forward_position_controller is not loaded: ros2 control switch_controllers"),
     ],
 )
 def test_controllers(driver, connected, start_pose, change, way, text):
-    driver.controllers |= change
+    driver.controllers = {} if change is None else driver.controllers | change
     driver.offer_controllers()
     robot = connected(command=way)
     if text is None:
@@ -184,30 +186,16 @@ def test_controllers(driver, connected, start_pose, change, way, text):
             robot.reset(ROW, start_pose)
 
 
-def test_a_controller_that_is_not_loaded(driver, connected):
-    driver.controllers = {}
-    driver.offer_controllers()
-    assert connected().not_ready() == (
-        "the controller forward_position_controller is not loaded: "
-        "ros2 control switch_controllers --activate forward_position_controller"
-    )
-
-
 def test_what_is_not_said_is_in_the_description(driver, connected, start_pose):
-    driver.say(SAFETY, mode=1)
+    driver.server.advertise(SAFETY, "std_msgs/String")  # of another type: it is not listened to
     driver.say(MODE, state="on")  # of another version: it has no mode
     robot = connected()
     assert robot.not_ready() is None
     assert robot.info.text.endswith(
-        "wrist_3_joint, gripper_width; it does not say robot_mode, robot_program_running, speed_scaling, "
+        "wrist_3_joint, gripper_width; it does not say safety_mode, robot_mode, robot_program_running, speed_scaling, "
         "list_controllers)"
     )
     robot.reset(ROW, start_pose)
-
-
-def test_another_type_is_not_listened_to(driver, connected):
-    driver.server.advertise(SAFETY, "std_msgs/String")
-    assert "it does not say safety_mode, " in connected().info.text
 
 
 def test_a_robot_that_describes_itself_is_not_asked(server, driver, robot_on, simulation):
@@ -230,10 +218,3 @@ def test_what_the_server_cannot_pass_on_is_no_refusal(lax, robot_on, start_pose)
     inner._on_status({"op": "status", "level": "error", "msg": "unknown type", "id": f"subscribe:{SAFETY}"})
     robot.step(robot.reset(ROW, start_pose).command)
     robot.close()
-
-
-def test_what_is_no_value_says_nothing():
-    readiness = {one.topic: one for one in load_profile("ur5e").readiness}
-    assert readiness[SPEED].trouble({"data": "fast"}) is None
-    assert readiness[SPEED].trouble({}) is None
-    assert readiness[SAFETY].trouble([1]) is None

@@ -1,6 +1,7 @@
 """The newest messages as a state, and how old that is; clocks are the test's."""
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -92,16 +93,14 @@ def test_age_by_stamps_of_a_clock_that_is_off(state, clock):
     assert age == pytest.approx(0.49, abs=1e-3)
 
 
-def test_age_with_the_offset_of_the_server(state, clock):
-    state.server_offset = lambda: -3.0  # its clock is 3 s ahead
-    hear_all(state, WALL + clock.now + 3.0 - 0.25)
-    assert state.age() == pytest.approx(0.25, abs=1e-5)
-
-
-def test_a_clock_that_nobody_set_is_not_compared(state, clock):
-    state.server_offset = lambda: 0.0
-    hear_all(state, WALL + clock.now - 3600.0)
-    assert state.age() == 0.0
+@pytest.mark.parametrize(
+    ("ahead", "late", "age"),
+    [(3.0, 0.25, 0.25), (0.0, 3600.0, 0.0)],  # by the server's clock; a clock that nobody set is not compared
+)
+def test_age_with_the_offset_of_the_server(state, clock, ahead, late, age):
+    state.server_offset = lambda: -ahead
+    hear_all(state, WALL + clock.now + ahead - late)
+    assert state.age() == pytest.approx(age, abs=1e-5)
 
 
 def test_a_stamp_that_stands_still_is_stale(state, clock):
@@ -122,63 +121,27 @@ def test_a_simulators_clock_only_has_to_go_on(state, clock):
     assert state.age() == 1.0
 
 
-def test_a_source_may_be_slower_than_the_others(clock, tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text(
-        """
-name = "lift"
-kind = "arm"
-period = 0.1
-command = {labels = ["h"], units = "m", low = 0, high = 1, max_rate = 1}
-commands = {position = [{topic = "/go", type = "std_msgs/Float64", labels = ["h"], fields = ["data"]}]}
-[[signals]]
-name = "height"
-labels = ["h"]
-units = "m"
-low = 0
-high = 1
-[[state]]
-signal = "height"
-topic = "/height"
-type = "std_msgs/Float64"
-fields = ["data"]
-max_age = 0.5
-"""
-    )
-    profile = load_profile(path)
-    state = LiveState(profile, profile.spec(), clock)
-    hear(state, "/height", {"data": 0.25})
+def test_a_source_may_be_slower_than_the_others(clock):
+    profile = load_profile("ur5e")
+    profile = replace(profile, state=tuple(replace(source, max_age=0.5) for source in profile.state))
+    state = LiveState(profile, profile.spec(arm_spec("x", with_object=False)), clock)
+    hear_all(state, 0.0)
     clock.now += 0.45
-    assert state.age() == pytest.approx(0.05)  # 0.1 is allowed, and 0.4 more for this one
+    assert state.age() == pytest.approx(0.05)  # 0.1 is allowed, and 0.4 more for these
     assert state.read()[1] == 10.0  # without stamps, when it came
 
 
-def test_publishers_that_share_a_topic(clock, tmp_path):
-    path = tmp_path / "shared.yaml"
-    path.write_text(
-        """
-name: shared
-kind: arm
-robot: ur5e
-state:
-  - {signal: joint_position, topic: /joint_states, type: sensor_msgs/JointState, field: position, partial: true,
-     names: [shoulder_pan_joint, shoulder_lift_joint, elbow_joint, wrist_1_joint, wrist_2_joint, wrist_3_joint]}
-  - {signal: gripper_width, topic: /joint_states, type: sensor_msgs/JointState, field: position, partial: true,
-     names: [finger], scale: 2}
-commands:
-  all:
-    - {topic: /go, type: std_msgs/Float64MultiArray, labels: [shoulder_pan_joint, shoulder_lift_joint, elbow_joint,
-       wrist_1_joint, wrist_2_joint, wrist_3_joint, gripper_width]}
-"""
-    )
-    profile = load_profile(path)
+def test_publishers_that_share_a_topic(clock):
+    profile = load_profile("ur5e")
+    joint, finger = profile.source("joint_position"), profile.source("gripper_width")
+    shared = (replace(joint, partial=True), replace(finger, topic=joint.topic, names=("finger",), partial=True))
+    profile = replace(profile, state=shared, signals=(profile.signals[0], profile.signals[2]))
     state = LiveState(profile, profile.spec(), clock)
-    hear(state, "/joint_states", joints(1.0))
-    hear(state, "/joint_states", gripper(2.0, "finger"))
-    hear(state, "/joint_states", gripper(3.0, "mobile_base_wheel"))
+    for message in (joints(1.0), gripper(2.0, "finger"), gripper(3.0, "mobile_base_wheel")):
+        hear(state, "/joint_states", message)
     signals, _ = state.read()
     np.testing.assert_array_equal(signals["joint_position"], np.ones((1, 6)))
-    np.testing.assert_array_equal(signals["gripper_width"], [[0.1]])
+    np.testing.assert_array_equal(signals["gripper_width"], [[0.05]])
     hear(state, "/joint_states", gripper(4.0, "elbow_joint"))
     with pytest.raises(ProtocolError) as caught:
         state.read()
@@ -209,8 +172,7 @@ def test_ages_are_forgotten_with_the_connection(state, clock):
     assert state.age() == 0.0  # as quick as any of this connection
 
 
-def test_the_mailbox_keeps_the_newest():
-    clock = Clock()
+def test_the_mailbox_keeps_the_newest(clock):
     mailbox = Mailbox(clock)
     mailbox.put(("a", "b"), 1)
     clock.now = 11.0

@@ -1,7 +1,6 @@
 """Environments that command six joints: on an arm that has no gripper, and on one whose gripper is not theirs."""
 
 import json
-import logging
 
 import gymnasium as gym
 import numpy as np
@@ -84,15 +83,6 @@ def test_an_arm_without_gripper_runs_a_task_that_has_none(server, robot_on, make
     assert {name: row["stopped"] for name, row in env.unwrapped.robot.report().items() if row["stopped"]} == {}
 
 
-def test_a_gripper_is_told_nothing(server, robot_on, make):
-    scripted = robot_on(server)
-    scripted.signals["joint_position"][:], scripted.signals["gripper_width"][:] = START, HELD
-    assert run(make("bam/ur-reach-v0", server.url)) > 0.05
-    assert len(scripted.on(ARM)) > 12
-    assert scripted.on(GRIPPER) == []
-    np.testing.assert_array_equal(scripted.signals["gripper_width"], [HELD])
-
-
 def test_nothing_that_is_sent_names_the_gripper(lax, robot_on, make):
     """On a server that says nothing of its topics: neither subscribed, nor advertised, nor published."""
     bus = lax()
@@ -104,15 +94,17 @@ def test_nothing_that_is_sent_names_the_gripper(lax, robot_on, make):
     assert [one for one in said if "gripper" in one] == []
 
 
-def test_the_way_of_sending_commands_is_chosen_as_ever(server, robot_on):
+def test_trajectories_for_the_joints_alone(server, robot_on):
     scripted = robot_on(server)
     robot = live_robot(server.url, SIX, profile="ur5e", command="trajectory")
     robot.connect()
     state = robot.reset(ROW, Initial({"joint_position": scripted.signals["joint_position"][None].copy()}, ROW))
     robot.step(state.command)
     robot.close()
-    told = {topic for topic, _, _ in scripted.commands}
-    assert told == {"/scaled_joint_trajectory_controller/joint_trajectory", "/bam/halt"}
+    topic = "/scaled_joint_trajectory_controller/joint_trajectory"
+    assert {topic for topic, _, _ in scripted.commands} == {topic, "/bam/halt"}
+    assert scripted.on(topic)[0]["joint_names"] == list(SIX.command.labels)
+    assert scripted.on(topic)[-1]["points"][0]["positions"] == scripted.signals["joint_position"].tolist()
 
 
 @pytest.mark.parametrize("realtime", [False, True])
@@ -136,20 +128,6 @@ def test_a_served_arm_without_gripper_offers_none_and_says_so(serve):
         "than it describes."
     )
     np.testing.assert_array_equal(served.state.signals["joint_position"], [START])
-
-
-def test_a_halt_holds_the_joints_alone(server, robot_on, caplog):
-    """A real arm does not hear our halts: it is sent where it is."""
-    scripted = robot_on(server)
-    robot = RosbridgeRobot(server.url, load_profile("ur5e"), spec=SIX)
-    robot.connect()
-    with caplog.at_level(logging.WARNING):
-        robot.halt()
-        scripted.wait_for(lambda: len(scripted.commands) == 2)
-    assert scripted.on(ARM)[-1]["data"] == scripted.signals["joint_position"].tolist()
-    assert scripted.on(GRIPPER) == []
-    assert caplog.records == []
-    robot.close()
 
 
 def test_a_message_is_never_cut(tmp_path):

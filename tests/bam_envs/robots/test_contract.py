@@ -15,11 +15,6 @@ class TestFakeRobot(RobotContract):
         return FakeRobot(num_robots)
 
 
-class TestFakeRobotWithoutObject(RobotContract):
-    def make(self, num_robots: int) -> Robot:
-        return FakeRobot(num_robots, with_object=False)
-
-
 class TestSimulatedArm(RobotContract):
     def make(self, num_robots: int) -> Robot:
         return SimulatedArm(num_robots)

@@ -17,13 +17,22 @@ def started(n=1):
 
 
 def test_joints_are_exactly_where_they_were_told_to_be():
-    robot, state = started()
-    command = state.command + 0.1
-    command[0, 6] = 0.085
+    robot, before = started()
+    command = before.command + 0.1
     state = robot.step(command)
     np.testing.assert_array_equal(state.signals["joint_position"], command[:, :6])
+    np.testing.assert_array_equal(state.signals["gripper_width"], [[0.085]])  # cut to its limit
     np.testing.assert_allclose(state.signals["joint_velocity"], 2.0)
     np.testing.assert_array_equal(state.stamp, [0.05])
+    np.testing.assert_allclose(state.signals["object_position"], [[0.5, 0.1, 0.02]])
+    np.testing.assert_allclose(state.signals["object_quaternion"], [[np.cos(0.15), 0, 0, np.sin(0.15)]])
+    np.testing.assert_array_equal(robot.sent, [command])
+    robot.halt()
+    robot.close()
+    assert robot.halts == 2
+    with pytest.raises(ResetNeeded) as caught:
+        robot.step(command)
+    assert str(caught.value) == "The fake robot is not connected. Call connect() first."
 
 
 def test_no_joint_is_faster_than_its_max_rate():
@@ -31,37 +40,6 @@ def test_no_joint_is_faster_than_its_max_rate():
     after = robot.step(state.command + 1.0)
     np.testing.assert_allclose(after.signals["joint_position"], ARM_HOME[None] + np.pi * 0.05)
     np.testing.assert_allclose(robot.step(np.zeros((1, 7))).signals["gripper_width"], 0.085 - 0.15 * 0.05)
-
-
-def test_commands_are_cut_to_their_limits():
-    robot, state = started()
-    command = state.command.copy()
-    command[0, 6] = 1.0
-    np.testing.assert_array_equal(robot.step(command).signals["gripper_width"], [[0.085]])
-
-
-def test_the_object_stays_put():
-    robot, state = started()
-    np.testing.assert_allclose(state.signals["object_position"], [[0.5, 0.1, 0.02]])
-    np.testing.assert_allclose(state.signals["object_quaternion"], [[np.cos(0.15), 0, 0, np.sin(0.15)]])
-    after = robot.step(state.command)
-    np.testing.assert_array_equal(after.signals["object_position"], state.signals["object_position"])
-
-
-def test_it_tells_what_it_was_sent_and_how_often_it_was_halted():
-    robot, state = started()
-    robot.step(state.command)
-    robot.step(state.command + 1)
-    np.testing.assert_array_equal(robot.sent, [state.command, state.command + 1])
-    robot.halt()
-    robot.close()
-    assert robot.halts == 2
-
-
-def test_not_connected():
-    with pytest.raises(ResetNeeded) as caught:
-        FakeRobot().step(np.zeros((1, 7)))
-    assert str(caught.value) == "The fake robot is not connected. Call connect() first."
 
 
 def test_saved_and_restored():
