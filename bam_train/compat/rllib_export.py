@@ -1,8 +1,7 @@
 """From a checkpoint directory of RLlib to a checkpoint.zip that can be evaluated and deployed, and resumed if whole.
 
 A directory of RLlib's present API is restored by the installed RLlib, which runs what is in it, so only with ``trust``;
-one of the old layout is read without running anything. The file is long because every way in which directory and
-environment may differ has a refusal of its own.
+one of the old layout is read without running anything.
 """
 
 from __future__ import annotations
@@ -11,14 +10,13 @@ import contextlib
 import json
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium import spaces
@@ -29,8 +27,7 @@ from bam_envs.core.spaces import space_to_json
 from bam_envs.robo_gym.making import PLACES
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, safetensors_file, write_checkpoint
 from bam_train.compat.rllib_directory import Directory, find_policy
-from bam_train.compat.rllib_new_layout import Restored, algorithm_of, restore, states, training_settings
-from bam_train.compat.rllib_old_layout import read_old_policy
+from bam_train.compat.rllib_layouts import SavedPolicy, read_old_policy, restore, states, training_settings
 from bam_train.environments import (
     control_period,
     first_difference,
@@ -59,23 +56,6 @@ from bam_train.trainers.rllib.rllib_freezing import (
 
 EXPORTED = "exported"
 """Setting of the manifest that says where an exported checkpoint comes from; a run's own has none of this name."""
-
-
-@dataclass(frozen=True)
-class _Policy:
-    """What a directory says of one policy."""
-
-    directory: Directory
-    parts: PolicyParts
-    """Its spaces are the environment's own if the directory has them, else the network's."""
-    env: str | None
-    """Name of the environment; None if the directory does not say it."""
-    env_kwargs: Mapping[str, Any]
-    steps: int
-    whole: bool
-    """Whether the directory says what RLlib's connectors do before and after the network."""
-    restored: Restored | None = field(default=None, repr=False)
-    """What RLlib made of a directory of its present API."""
 
 
 @dataclass(frozen=True)
@@ -170,101 +150,88 @@ def export(
         SettingsError: The environment cannot be made.
     """
     directory = find_policy(given, policy)
-    found = _read(directory, trust, warn)
-    env_id, kwargs = _environment(found, env or (otherwise if found.env is None else None), trust, warn)
+    saved = _read(directory, trust, warn)
+    env_id, kwargs = _environment(saved, env or (otherwise if saved.env is None else None), trust, warn)
     require_env_kwargs(env_id, env_kwargs or {})
-    fitted = partial(_in_environment, found, env_id, warn)
+    fitted = partial(_in_environment, saved, env_id, warn)
     kwargs, (parts, signals, period) = parity_if_needed(env_id, {**kwargs, **(env_kwargs or {})}, fitted, warn)
-    parts = replace(parts, algorithm=_algorithm(found, algo))
+    parts = replace(parts, algorithm=_algorithm(saved, algo))
     graph = freeze(parts)
-    arrays, by = _golden(found, parts)
+    arrays, by = _golden(saved, parts)
     frozen = FrozenPolicy.from_graph(graph, *map(space_to_json, (parts.observation_space, parts.action_space)))
-    difference = _checked(directory, frozen, arrays, by)
-    made = directory, parts, env_id, kwargs, found.steps, signals, period
-    return Exported(*made, graph, arrays, by, difference, frozen, _training(found, parts, env_id, kwargs))
-
-
-def _read(directory: Directory, trust: bool, warn: Callable[[str], None]) -> _Policy:
-    """What the directory says.
-
-    Raises:
-        CheckpointMismatch: Only RLlib can read it, and it is not trusted, or RLlib is not installed.
-        CheckpointError: It is damaged.
-        PolicyError: Its policy cannot be frozen.
-    """
-    if directory.old_layout:
-        parts, config, steps = read_old_policy(directory)
-        env, kwargs = config.get("env"), config.get("env_config")
-        found = _Policy(directory, parts, None, {}, steps, whole=True)
-    else:
-        if not trust:
-            text = "is read by RLlib itself, which runs whatever code is in its pickles. If you trust its maker, add "
-            raise CheckpointMismatch(directory.given, f"{text}--trust-pickle")
-        if find_spec("ray") is None:
-            text = 'is read by RLlib itself, which is not installed. Run: pip install "bam-train[rllib]"'
-            raise CheckpointMismatch(directory.given, text)
-        warn(f"reading {directory.given} runs whatever code is in it (--trust-pickle)")
-        restored = restore(directory)
-        env, kwargs = restored.config.env, restored.config.env_config
-        parts = replace(restored.parts, algorithm=restored.parts.algorithm or algorithm_of(restored))
-        whole = restored.env_to_module is not None
-        found = _Policy(directory, parts, None, {}, restored.steps, whole, restored)
-    return replace(
-        found,
-        env=env if isinstance(env, str) else None,
-        env_kwargs=dict(kwargs) if isinstance(kwargs, Mapping) else {},
-    )
-
-
-def _training(found: _Policy, parts: PolicyParts, env_id: str, env_kwargs: Mapping[str, Any]) -> TrainSettings | str:
-    """Settings of a run that goes on from the directory, or why there is none."""
-    if found.restored is None:
-        return "it is not of RLlib's present API"
+    worst, _ = frozen.worst_difference(safetensors_file.parse(arrays))
+    if not worst <= TOLERANCE:  # NaN too
+        text = f"its frozen policy differs by {worst:.3g} from the actions of {by}"
+        raise PolicyError(f"{given}: {text}, expected at most {TOLERANCE}: this network cannot be exported")
     try:
-        return training_settings(found.directory, found.restored, parts, env_id, env_kwargs)
+        training: TrainSettings | str = training_settings(saved, parts, env_id, kwargs)
     except SettingsError as error:
-        return str(error)
+        training = str(error)
+    made = directory, parts, env_id, kwargs, saved.steps, signals, period
+    return Exported(*made, graph, arrays, by, worst, frozen, training)
 
 
-def _algorithm(found: _Policy, asked: str | None) -> str:
+def _read(directory: Directory, trust: bool, warn: Callable[[str], None]) -> SavedPolicy:
+    if directory.old_layout:
+        return read_old_policy(directory)
+    if not trust:
+        text = "is read by RLlib itself, which runs whatever code is in its pickles. If you trust its maker, add "
+        raise CheckpointMismatch(directory.given, f"{text}--trust-pickle")
+    if find_spec("ray") is None:
+        text = 'is read by RLlib itself, which is not installed. Run: pip install "bam-train[rllib]"'
+        raise CheckpointMismatch(directory.given, text)
+    warn(f"reading {directory.given} runs whatever code is in it (--trust-pickle)")
+    return restore(directory)
+
+
+def _algorithm(saved: SavedPolicy, asked: str | None) -> str:
     """Name of the algorithm; the directory of a policy alone only says whose network it has."""
-    own = found.parts.algorithm if re.fullmatch(r"\w{1,40}", found.parts.algorithm, re.ASCII) else ""
+    own = saved.parts.algorithm if re.fullmatch(r"\w{1,40}", saved.parts.algorithm, re.ASCII) else ""
     asked = None if asked is None else asked.lower()  # PPO, as RLlib says it
     if asked is not None and asked not in RLLIB_ALGORITHMS:
         raise UnknownName("algorithm", asked, RLLIB_ALGORITHMS)
     if asked is None and not own:
-        raise CheckpointMismatch(found.directory.given, "does not say which algorithm trained it; give --algo NAME")
-    known = found.restored is None or found.restored.whole
-    if asked is not None and own and asked != own and known:
-        raise CheckpointMismatch(found.directory.given, f"was trained by {own}, not by {asked}; leave --algo out")
+        raise CheckpointMismatch(saved.directory.given, "does not say which algorithm trained it; give --algo NAME")
+    if asked is not None and own and asked != own and saved.configured:
+        raise CheckpointMismatch(saved.directory.given, f"was trained by {own}, not by {asked}; leave --algo out")
     return asked or own
 
 
 def _environment(
-    found: _Policy, asked: str | None, trust: bool, warn: Callable[[str], None]
+    saved: SavedPolicy, asked: str | None, trust: bool, warn: Callable[[str], None]
 ) -> tuple[str, dict[str, Any]]:
     """Id and keyword arguments of the environment: what was asked for, else what the directory says."""
-    own = _own_environment(found, asked, trust)
+    own, given = _own_environment(saved, asked, trust), saved.directory.given
     if asked is None and own is None:
-        text = "does not say on which environment it was trained; give --env ID"
-        raise CheckpointMismatch(found.directory.given, text)
+        raise CheckpointMismatch(given, "does not say on which environment it was trained; give --env ID")
     env = resolve_id(asked) if asked is not None else str(own)
-    if own is not None and are_same(env, own):
-        given = _plain(found)
-        return env, {name: given[name] for name in given if entry_of(env) is None or name not in PLACES}
-    if found.env_kwargs:
-        names = ", ".join(map(str, found.env_kwargs))
-        warn(f"the env_config of its own environment ({names:.200}) is not given to {env}")
-    return env, {}
+    names = ", ".join(map(str, saved.env_kwargs))
+    if own is None or not are_same(env, own):
+        if names:
+            warn(f"the env_config of its own environment ({names:.200}) is not given to {env}")
+        return env, {}
+    try:
+        kwargs = json.loads(json.dumps(dict(saved.env_kwargs), allow_nan=False, default=_of_numpy))
+    except (TypeError, ValueError, RecursionError) as error:
+        text = f"its env_config holds more than plain values ({names}), which cannot be kept; train with plain ones"
+        raise CheckpointMismatch(given, text) from error
+    return env, {name: kwargs[name] for name in kwargs if entry_of(env) is None or name not in PLACES}
 
 
-def _own_environment(found: _Policy, asked: str | None, trust: bool) -> str | None:
+def _of_numpy(value: Any) -> Any:
+    """NumPy's numbers and arrays as Python's."""
+    if not isinstance(value, (np.ndarray, np.generic)):
+        raise TypeError(type(value).__name__)
+    return value.tolist()
+
+
+def _own_environment(saved: SavedPolicy, asked: str | None, trust: bool) -> str | None:
     """The environment that the directory names, if it is known here; its module is imported only if the user says so.
 
     Raises:
         CheckpointMismatch: It is not known, and no other was asked for.
     """
-    name, given = found.env, found.directory.given
+    name, given = saved.env, saved.directory.given
     module = (name or "").rpartition(":")[0]
     if name is None or (asked is not None and module and asked != name):
         return None
@@ -280,62 +247,40 @@ def _own_environment(found: _Policy, asked: str | None, trust: bool) -> str | No
         raise CheckpointMismatch(given, text) from error
 
 
-def _plain(found: _Policy) -> dict[str, Any]:
-    """The keyword arguments as JSON values; NumPy's numbers and arrays as Python's."""
-    try:
-        return dict(json.loads(json.dumps(dict(found.env_kwargs), allow_nan=False, default=_of_numpy)))
-    except (TypeError, ValueError, RecursionError) as error:
-        names = ", ".join(map(str, found.env_kwargs))
-        text = f"its env_config holds more than plain values ({names}), which cannot be kept; train with plain ones"
-        raise CheckpointMismatch(found.directory.given, text) from error
-
-
-def _of_numpy(value: Any) -> Any:
-    if not isinstance(value, (np.ndarray, np.generic)):
-        raise TypeError(type(value).__name__)
-    return value.tolist()
-
-
 def _in_environment(
-    found: _Policy, env_id: str, warn: Callable[[str], None], env_kwargs: dict[str, Any]
+    saved: SavedPolicy, env_id: str, warn: Callable[[str], None], env_kwargs: dict[str, Any]
 ) -> tuple[PolicyParts, dict[str, Any], float | None]:
-    """The parts with the environment's own spaces, its signals and its period."""
-    with contextlib.closing(make_env(env_id, env_kwargs)) as env:
-        parts = _fitted(found, env_id, env, warn)
-        describe = getattr(env.unwrapped, "describe", None)
-        return parts, {} if describe is None else describe(), control_period(env)
-
-
-def _fitted(found: _Policy, env_id: str, env: gym.Env[Any, Any], warn: Callable[[str], None]) -> PolicyParts:
-    """The parts with the environment's own spaces, which must be those that the policy was trained with.
+    """The parts with the environment's own spaces, its signals and its period.
 
     Raises:
-        CheckpointMismatch: Names the first difference.
+        CheckpointMismatch: Its spaces are not those that the policy was trained with; names the first difference.
     """
-    parts = found.parts
-    pairs = [("action_space", parts.action_space, env.action_space)]
-    if found.whole:
-        pairs.append(("observation_space", parts.observation_space, env.observation_space))
-    else:
-        parts = _guessed(found, env_id, env.observation_space, warn)
-    for name, theirs, ours in pairs:
-        differing = first_difference(_from_zero(space_to_json(theirs)), _from_zero(space_to_json(ours)), name)
+    with contextlib.closing(make_env(env_id, env_kwargs)) as env:
+        describe = getattr(env.unwrapped, "describe", None)
+        signals, period = describe() if describe else {}, control_period(env)
+        ours = env.observation_space, env.action_space
+    parts = saved.parts if saved.whole else _guessed(saved, env_id, ours[0], warn)
+    pairs = [("action_space", parts.action_space, ours[1])]
+    if saved.whole:
+        pairs.append(("observation_space", parts.observation_space, ours[0]))
+    for name, theirs, own in pairs:
+        differing = first_difference(_from_zero(space_to_json(theirs)), _from_zero(space_to_json(own)), name)
         if differing is not None:
             what, there, here = differing
             text = f"{what} is {_short(there)} in the directory and {_short(here)} in {env_id}"
-            raise CheckpointMismatch(found.directory.given, f"{text}; {_NAME_IT}")
+            raise CheckpointMismatch(saved.directory.given, f"{text}; {_NAME_IT}")
     if isinstance(parts.action_space, (spaces.Discrete, spaces.MultiDiscrete)) and np.any(parts.action_space.start):
         text = "RLlib counts actions from 0 whatever their start; it cannot be frozen"
         raise PolicyError(f"action space {parts.action_space}: {text}")
-    return replace(parts, observation_space=env.observation_space, action_space=env.action_space)
+    return replace(parts, observation_space=ours[0], action_space=ours[1]), signals, period
 
 
 _NAME_IT = "give the environment it was trained on with --env"
 
 
-def _guessed(found: _Policy, env_id: str, ours: AnySpace, warn: Callable[[str], None]) -> PolicyParts:
+def _guessed(saved: SavedPolicy, env_id: str, ours: AnySpace, warn: Callable[[str], None]) -> PolicyParts:
     """Parts of a policy alone, whose directory does not say what came before and after the network."""
-    parts, given = found.parts, found.directory.given
+    parts, given = saved.parts, saved.directory.given
     theirs = parts.observation_space
     if space_to_json(theirs) == space_to_json(ours):
         return parts
@@ -364,26 +309,17 @@ def _space(space: AnySpace) -> str:
     return f"{type(space).__name__}{space.shape}" if isinstance(space, spaces.Box) else _short(space_to_json(space))
 
 
-def _short(value: Any, most: int = 60) -> str:
+def _short(value: Any) -> str:
     text = json.dumps(value)
-    return text if len(text) <= most else text[: most - 3] + "..."
+    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _golden(found: _Policy, parts: PolicyParts) -> tuple[bytes, str]:
+def _golden(saved: SavedPolicy, parts: PolicyParts) -> tuple[bytes, str]:
     """Observations and actions for them, and what computed those: RLlib, of the old layout the network in PyTorch."""
-    if found.restored is not None:
-        policy = found.restored.policy((parts.observation_space, parts.action_space))
+    if saved.module is not None:
+        policy = saved.by_rllib((parts.observation_space, parts.action_space))
         return golden(parts, policy), f"RLlib {metadata.version('ray')}"
     observations = clear_observations(parts)
     with torch.no_grad():
         actions = FrozenModule(parts)(*map(torch.as_tensor, observations.values())).numpy()
     return pack(observations, np.asarray(actions, parts.action_space.dtype)), "PyTorch"
-
-
-def _checked(directory: Directory, policy: FrozenPolicy, arrays: bytes, by: str) -> float:
-    """Act on the golden observations; the largest difference."""
-    worst, _ = policy.worst_difference(safetensors_file.parse(arrays))
-    if not worst <= TOLERANCE:  # NaN too
-        text = f"its frozen policy differs by {worst:.3g} from the actions of {by}"
-        raise PolicyError(f"{directory.given}: {text}, expected at most {TOLERANCE}: this network cannot be exported")
-    return worst

@@ -5,8 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import subprocess
-import sys
+import runpy
 import zipfile
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import pytest
 
 from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import GOLDEN, MANIFEST, POLICY, safetensors_file, write_checkpoint
+from tests.one_ray import no_ray_fixture, one_ray_fixture, shared_ray_fixture  # noqa: F401
 
 
 class Corridor(gym.Env):
@@ -171,10 +171,9 @@ def always_right(numbers: int) -> bytes:
 
 
 @pytest.fixture(scope="session")
-def rllib_directories(tmp_path_factory):
+def rllib_directories(shared_ray, tmp_path_factory):
     """Checkpoint directories as RLlib writes them, and its own actions beside them; see ``make_directories.py``."""
+    shared_ray.start()
     root = tmp_path_factory.mktemp("rllib")
-    maker = Path(__file__).parent / "compat" / "make_directories.py"
-    done = subprocess.run([sys.executable, maker, root], capture_output=True, text=True, timeout=600, check=False)
-    assert done.returncode == 0, done.stderr[-2000:]
+    runpy.run_path(str(Path(__file__).parent / "compat" / "make_directories.py"), {"ROOT": str(root)}, "__main__")
     return root

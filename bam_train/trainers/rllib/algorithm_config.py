@@ -22,7 +22,13 @@ from bam_train.trainers.rllib.ray_resources import learners
 from bam_train.trainers.rllib.rllib_hyperparameters import training_arguments
 from bam_train.trainers.rllib.rllib_registration import register_foreign
 from bam_train.trainers.rllib.robot_env_runner import End, RobotEnvRunner, log_end
-from bam_train.trainers.rllib.runner_deaths import fault_tolerance, first_cause_of_death
+from bam_train.trainers.rllib.runner_deaths import (
+    PROBE_TIMEOUT,
+    RESTART_DELAY,
+    SAMPLE_TIMEOUT,
+    ReportingEnvRunner,
+    first_cause_of_death,
+)
 
 STEPS_AT_LEAST = 200
 """Steps of an iteration of an algorithm that updates after every few: its overhead is then small."""
@@ -44,33 +50,37 @@ def make_config(settings: TrainSettings, observation_space: Space[Any], action_s
     config.training(**training_arguments(values))
     config.learners(num_learners=number, num_gpus_per_learner=gpus_each)
     config.debugging(seed=seed, log_level="ERROR")
-    config.reporting(min_time_s_per_iteration=0, min_sample_timesteps_per_iteration=_least_steps(settings))
+    own_length = algorithm.on_policy or algorithm.offline
+    least = 0 if own_length else min(STEPS_AT_LEAST, settings.eval_every or STEPS_AT_LEAST)
+    config.reporting(min_time_s_per_iteration=0, min_sample_timesteps_per_iteration=least)
     if algorithm.offline:
-        return _offline(config, settings, observation_space, action_space)
+        from bam_train.trainers.rllib.recorded_episodes import add_data  # and with it pyarrow
+
+        return add_data(config, settings, observation_space, action_space)
     name = register_foreign(settings.env)
     config.environment(name, env_config=dict(settings.env_kwargs), disable_env_checking=True)
+    recurrent = values["model_config"]["use_lstm"]
+    batched = is_batched(settings.env) and isinstance(observation_space, spaces.Box) and not recurrent
+    if not batched:
+        config.callbacks(NotesEnds)
     config.env_runners(
+        env_runner_cls=RobotEnvRunner if batched else ReportingEnvRunner,
         num_env_runners=settings.num_env_runners,
         num_envs_per_env_runner=envs_each(settings),
         rollout_fragment_length=values["rollout_fragment_length"],
         env_to_module_connector=functools.partial(connectors, observation_space, settings.normalize),
+        sample_timeout_s=SAMPLE_TIMEOUT,
     )
-    if runs_batched(settings, observation_space):
-        config.env_runners(env_runner_cls=RobotEnvRunner)
-    else:
-        config.callbacks(NotesEnds)
-    return fault_tolerance(config)
+    return config.fault_tolerance(
+        restart_failed_env_runners=True,
+        delay_between_env_runner_restarts_s=RESTART_DELAY,
+        env_runner_health_probe_timeout_s=PROBE_TIMEOUT,
+    )
 
 
 def envs_each(settings: TrainSettings) -> int:
     """Environments of each runner: an equal share of `num_envs`, to the nearest whole number from 1."""
     return max(1, round(settings.num_envs / max(1, settings.num_env_runners)))
-
-
-def runs_batched(settings: TrainSettings, observation_space: Space[Any]) -> bool:
-    """Whether our own runner does: one batched simulation, a module without a state."""
-    plain = isinstance(observation_space, spaces.Box)
-    return is_batched(settings.env) and plain and not settings.hyperparameters["model_config"]["use_lstm"]
 
 
 def connectors(
@@ -89,20 +99,6 @@ def is_plain(space: Space[Any]) -> bool:
     return floats and len(space.shape or ()) in (1, 3)
 
 
-def _least_steps(settings: TrainSettings) -> int:
-    """How long an iteration is at least; on-policy algorithms say so themselves, offline ones take no step."""
-    algorithm = RLLIB_ALGORITHMS[settings.algo]
-    if algorithm.on_policy or algorithm.offline:
-        return 0
-    return min(STEPS_AT_LEAST, settings.eval_every or STEPS_AT_LEAST)
-
-
-def _offline(config: Any, settings: TrainSettings, observation_space: Space[Any], action_space: Space[Any]) -> Any:
-    from bam_train.trainers.rllib.recorded_episodes import add_data
-
-    return add_data(config, settings, observation_space, action_space)
-
-
 _REFUSALS = (
     *(AssertionError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError, OSError),
     UnsupportedSpaceException,
@@ -111,7 +107,7 @@ _REFUSALS = (
 
 @contextlib.contextmanager
 def refusals(settings: TrainSettings) -> Iterator[None]:
-    """What RLlib says about settings that cannot be, as our own error."""
+    """RLlib's errors about settings that cannot be, as our own error."""
     try:
         yield
     except BamTrainError:

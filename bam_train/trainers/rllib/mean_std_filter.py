@@ -44,22 +44,20 @@ class MeanStdFilter(_MeanStdFilter):  # type: ignore[misc]
         return np.asarray(np.clip(value, -own.clip, own.clip) if own.clip else value, np.float32)
 
     def __call__(self, *, episodes: list[Any], **kwargs: Any) -> Any:
-        """As RLlib's, one observation after the other; the deltas are mended afterwards."""
+        """As RLlib's, one observation after the other, with the deltas that a merge expects."""
         if self._filters is None:
             self._init_new_filters()
-        plain = isinstance(self._filters[None].running_stats, RunningStat) if None in self._filters else False
-        if not plain:
+        if None not in self._filters or not isinstance(self._filters[None].running_stats, RunningStat):
             return super().__call__(episodes=episodes, **kwargs)
-        space = self.observation_space
         for episode in self.single_agent_episode_iterator(episodes):
-            seen = np.asarray(episode.get_observations(indices=-1))
-            filtered = self.normalize(seen[None])[0].astype(seen.dtype)
+            observation = np.asarray(episode.get_observations(indices=-1))
+            filtered = self.normalize(observation[None])[0].astype(observation.dtype)
             episode.set_observations(at_indices=-1, new_data=filtered)
-            episode.observation_space = space
+            episode.observation_space = self.observation_space
         return kwargs["batch"]
 
     def set_state(self, state: Any) -> None:
-        """As RLlib's, which also takes over what another has not handed in yet: it would be counted twice.
+        """As RLlib's, but for the deltas of the sender, which would be counted twice.
 
         Raises:
             FormatError: A packed array holds more than numbers, which RLlib would unpickle.
@@ -69,12 +67,8 @@ class MeanStdFilter(_MeanStdFilter):  # type: ignore[misc]
                 unpacked_array(text)
         super().set_state(state)
         for own in self._filters.values():
-            for stat in _statistics(own):
+            for stat in tree.flatten(own.running_stats):
                 forget_deltas(stat)
-
-
-def _statistics(own: Any) -> list[RunningStat]:
-    return [stat for stat in tree.flatten(own.running_stats) if isinstance(stat, RunningStat)]
 
 
 def forget_deltas(stat: RunningStat) -> None:
@@ -86,20 +80,15 @@ def forget_deltas(stat: RunningStat) -> None:
 
 def push(stat: RunningStat, observations: Array) -> None:
     """Count observations (n, ...) into the statistics and into what the next merge is sent."""
-    more = observations.astype(np.float64)
-    mean = more.mean(axis=0)
-    squares = np.square(more - mean).sum(axis=0)
-    n = len(more)
-    stat.num_pushes = _combine(stat.num_pushes, stat.mean_array, stat.sum_sq_diff_array, n, mean, squares)
-    stat.num_pushes_delta = _combine(
-        stat.num_pushes_delta, stat.mean_delta_array, stat.sum_sq_diff_delta_array, n, mean, squares
-    )
+    new = observations.astype(np.float64)
+    n, new_mean = len(new), new.mean(axis=0)
+    new_squares = np.square(new - new_mean).sum(axis=0)
 
+    def combine(count: int, mean: Array, squares: Array) -> int:
+        both, delta = count + n, new_mean - mean
+        mean += delta * (n / both)
+        squares += new_squares + np.square(delta) * (count * n / both)
+        return both
 
-def _combine(count: int, mean: Array, squares: Array, n: int, more_mean: Array, more_squares: Array) -> int:
-    """Combine count, mean and sum of squares of two sets into the arrays of the first; the count of both."""
-    both = count + n
-    delta = more_mean - mean
-    mean += delta * (n / both)
-    squares += more_squares + np.square(delta) * (count * n / both)
-    return both
+    stat.num_pushes = combine(stat.num_pushes, stat.mean_array, stat.sum_sq_diff_array)
+    stat.num_pushes_delta = combine(stat.num_pushes_delta, stat.mean_delta_array, stat.sum_sq_diff_delta_array)

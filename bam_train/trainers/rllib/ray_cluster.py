@@ -1,7 +1,8 @@
 """Ray for one training run: a quiet one of its own on this computer, or a cluster that is there already.
 
 The own one listens on the loopback device only, asks for a token that nobody else has, keeps its files in a folder of
-its own, and is gone when the run ends, however it ends. A cluster is joined and left as it was.
+its own, and is gone when the run ends, however it ends. A cluster is joined and left as it was. Ray tries a silent
+address for minutes and may end the whole process; so a socket, then another process, tries it first.
 """
 
 from __future__ import annotations
@@ -11,9 +12,12 @@ import functools
 import importlib
 import logging
 import os
+import re
 import secrets
 import shutil
 import signal
+import socket
+import subprocess
 import sys
 import tempfile
 import threading
@@ -24,10 +28,9 @@ from typing import Any
 import ray
 import ray.rllib  # sets up its loggers
 
-from bam_train.errors import TrainingFailed
+from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.settings import TrainSettings
 from bam_train.signals import at_quit, interrupt, waiting
-from bam_train.trainers.rllib.ray_address import find, reach
 from bam_train.trainers.rllib.ray_resources import cores, gpus, require_resources
 
 try:
@@ -42,6 +45,12 @@ OBJECT_STORE = 200 * 2**20
 
 GRACE = 3.0
 """How long a process of Ray's may take to end by itself once Ray has shut down [s]."""
+
+SOCKET_TIMEOUT = 5.0
+"""How long the host of a cluster may take to accept a connection [s]."""
+
+REACH_TIMEOUT = 13.0
+"""How long joining a cluster may take then [s]; about 2 s are usual."""
 
 _TOKEN = secrets.token_hex(32)
 _LOGGERS = ("ray", "ray.rllib", "ray.tune", "ray.train", "ray.data")
@@ -59,25 +68,26 @@ def cluster(settings: TrainSettings) -> Iterator[None]:
 
     Raises:
         SettingsError: More is asked for than there is, or the address cannot be one.
-        TrainingFailed: Ray does not start, or the cluster does not answer or let us in; within 20 s.
+        TrainingFailed: Ray does not start, or the cluster does not answer or refuses us; within 20 s.
     """
-    with _quiet():
-        if ray.is_initialized():
-            require_resources(settings)
-            yield
-        elif settings.address is None:
-            require_resources(settings)
-            with _own(settings):
-                yield
-        else:
-            with _joined(settings.address):
-                require_resources(settings)
-                yield
+    with _quiet(), contextlib.ExitStack() as stack:
+        if settings.address is not None and not ray.is_initialized():
+            place = find(settings.address)
+            reach(place)
+            stack.callback(_shut_down)
+            with _starting():
+                ray.init(address=place, log_to_driver=False, configure_logging=False)
+        require_resources(settings)
+        if not ray.is_initialized():
+            stack.enter_context(_own(settings))
+        yield
+
+
+# A Ray of the run's own
 
 
 @contextlib.contextmanager
 def _own(settings: TrainSettings) -> Iterator[None]:
-    """A Ray of the run's own, on this computer alone."""
     before = set(psutil.Process().children())
     with own_folder() as folder, at_quit(lambda: _abandon(before, folder)), _private_token():
         try:
@@ -105,7 +115,9 @@ def _own(settings: TrainSettings) -> Iterator[None]:
                 started = _started_since(before)  # with their children: once a parent is gone, they cannot be found
                 with contextlib.suppress(Exception):  # whatever it says about its end, nothing of it must be left
                     _shut_down(wait_for_processes=True)
-                _end(started)
+                _, alive = psutil.wait_procs(started, timeout=GRACE)
+                _kill(alive)
+                psutil.wait_procs(alive, timeout=GRACE)
 
 
 def _started_since(before: set[Any]) -> list[Any]:
@@ -116,13 +128,6 @@ def _started_since(before: set[Any]) -> list[Any]:
         with contextlib.suppress(psutil.Error):
             found.update(child.children(recursive=True))
     return list(found)
-
-
-def _end(processes: list[Any]) -> None:
-    """Wait until all of them are gone; those that stay are killed."""
-    _, alive = psutil.wait_procs(processes, timeout=GRACE)
-    _kill(alive)
-    psutil.wait_procs(alive, timeout=GRACE)
 
 
 def _kill(processes: list[Any]) -> None:
@@ -148,7 +153,14 @@ def own_folder(root: str | None = None) -> Iterator[Path]:
         root: Folder to make it in, with a short name, as Ray's sockets in it need; None for the usual one.
     """
     root = root or ("/tmp" if os.path.isdir("/tmp") else tempfile.gettempdir())
-    _remove_abandoned(Path(root))
+    for path in Path(root).glob(f"{_PREFIX}*/{_LOCK}"):
+        with contextlib.suppress(OSError):  # somebody else's
+            lock = os.open(path, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
+            try:
+                if _locked(lock):
+                    shutil.rmtree(path.parent, ignore_errors=True)
+            finally:
+                os.close(lock)
     folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=root))
     lock = os.open(folder / _NEW, os.O_CREAT | os.O_RDWR, 0o600)
     try:
@@ -158,17 +170,6 @@ def own_folder(root: str | None = None) -> Iterator[Path]:
     finally:
         os.close(lock)
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _remove_abandoned(root: Path) -> None:
-    for path in root.glob(f"{_PREFIX}*/{_LOCK}"):
-        with contextlib.suppress(OSError):  # somebody else's
-            lock = os.open(path, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
-            try:
-                if _locked(lock):
-                    shutil.rmtree(path.parent, ignore_errors=True)
-            finally:
-                os.close(lock)
 
 
 def _locked(lock: int) -> bool:
@@ -188,19 +189,19 @@ def _private_token() -> Iterator[None]:
     if any(name in os.environ for name in (_MODE, *_TOKENS)):
         yield  # whoever set them knows
         return
+    raylet: Any = importlib.import_module("ray._raylet")
+
+    def read_again() -> None:
+        """Ray reads mode and token once, when it is imported."""
+        raylet.Config.initialize("")
+        raylet.AuthenticationTokenLoader.instance().reset_cache()
+
     try:
         with _environment(**{_MODE: "token", _TOKENS[0]: _TOKEN}):
-            _read_token_again()
+            read_again()
             yield
     finally:
-        _read_token_again()
-
-
-def _read_token_again() -> None:
-    """Ray reads mode and token once, when it is imported."""
-    raylet: Any = importlib.import_module("ray._raylet")
-    raylet.Config.initialize("")
-    raylet.AuthenticationTokenLoader.instance().reset_cache()
+        read_again()
 
 
 @contextlib.contextmanager
@@ -258,9 +259,12 @@ def _out_of_the_group() -> Iterator[None]:
         services.ConsolePopen = before
 
 
+# Any Ray
+
+
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Within this, Ray's and RLlib's loggers say nothing: `RunnerWatch` and errors say what the user needs to know."""
+    """Within this, Ray's and RLlib's loggers are silent: `RunnerWatch` and errors tell what the user needs to know."""
     loggers = [logging.getLogger(name) for name in _LOGGERS]
     before = [(logger, logger.handlers[:], logger.propagate) for logger in loggers]
     _hush()
@@ -269,6 +273,13 @@ def _quiet() -> Iterator[None]:
     finally:
         for logger, handlers, propagate in before:
             logger.handlers[:], logger.propagate = handlers, propagate
+
+
+def _hush() -> None:
+    """Take their handlers from the loggers of Ray; `ray.init` does that too, and leaves none."""
+    for name in _LOGGERS:
+        logger = logging.getLogger(name)
+        logger.handlers[:], logger.propagate = [logging.NullHandler()], False
 
 
 @contextlib.contextmanager
@@ -294,26 +305,6 @@ def _starting() -> Iterator[None]:
         _hush()
 
 
-def _hush() -> None:
-    """Take their handlers from the loggers of Ray; `ray.init` does that too, and leaves none."""
-    for name in _LOGGERS:
-        logger = logging.getLogger(name)
-        logger.handlers[:], logger.propagate = [logging.NullHandler()], False
-
-
-@contextlib.contextmanager
-def _joined(address: str) -> Iterator[None]:
-    """A cluster that is there already."""
-    place = find(address)
-    reach(place)
-    try:
-        with _starting():
-            ray.init(address=place, log_to_driver=False, configure_logging=False)
-        yield
-    finally:
-        _shut_down()
-
-
 def _shut_down(**given: bool) -> None:
     """Shut Ray down; its C++ part leaves SIGTERM to kill the process, so the handler is installed once more."""
     try:
@@ -322,3 +313,104 @@ def _shut_down(**given: bool) -> None:
         handler = signal.getsignal(signal.SIGTERM)
         if handler is not None and threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, handler)
+
+
+# A cluster that is there already
+
+
+def find(address: str) -> str:
+    """The ``host:port`` of a cluster.
+
+    Args:
+        address: ``auto``, or ``host:port``; as Ray has it, RAY_ADDRESS is what ``auto`` means if it is set.
+
+    Raises:
+        SettingsError: It is no address of a cluster.
+        TrainingFailed: ``auto``, and no cluster was started on this computer.
+    """
+    place, name = address, "address"
+    if address == "auto" and (variable := os.environ.get("RAY_ADDRESS")):
+        place, name = variable, "RAY_ADDRESS"
+    if place == "auto":
+        from ray._private.utils import read_ray_address  # what ``ray start`` wrote
+
+        place = read_ray_address() or ""
+        if not place:
+            raise TrainingFailed(
+                "no Ray cluster was started on this computer, so --address auto finds none. Start one with "
+                "ray start --head, give --address host:port, or leave --address out"
+            )
+    expected = f"{name}: expected auto or host:port, such as 10.0.0.5:6379, found {place!r}"
+    if place.startswith("ray://"):
+        raise SettingsError(
+            f"{expected}, which is for Ray's client. Run bam-train on a computer of the cluster and give --address auto"
+        )
+    parts = re.fullmatch(r"(\[[0-9a-fA-F:.]+\]|[^\s:/]+):(\d{1,5})", place)
+    if parts is None or not 0 < int(parts[2]) < 2**16:
+        raise SettingsError(expected)
+    return place
+
+
+_PROBE = """
+import logging, sys
+import ray
+from ray._raylet import GcsClient
+GcsClient(address=sys.argv[1])
+print("known", flush=True)
+ray.init(address=sys.argv[1], log_to_driver=False, logging_level=logging.CRITICAL)
+print("joined", flush=True)
+ray.shutdown()
+"""
+"""Joins a cluster, and prints how far it came."""
+
+
+def reach(place: str, timeout: float = REACH_TIMEOUT) -> None:
+    """Find out whether a run can join the cluster at ``host:port``.
+
+    Args:
+        place: Its address.
+        timeout: How long joining may take once the host has accepted a connection [s].
+
+    Raises:
+        TrainingFailed: Nothing answers there, what answers is no cluster, or it refuses us; says which.
+    """
+    host, _, port = place.rpartition(":")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), SOCKET_TIMEOUT).close()
+    except OSError as error:
+        why = error.strerror or str(error)
+        raise TrainingFailed(
+            f"{place}: no Ray cluster answers there ({why}). Check --address, and that ray start --head runs there "
+            "and no firewall is between"
+        ) from error
+    command = [sys.executable, "-c", _PROBE, place]
+    try:
+        said = subprocess.run(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=timeout, check=False
+        ).stdout
+    except subprocess.TimeoutExpired as error:
+        said = error.stdout or b""
+    text = said.decode(errors="replace")
+    if "joined" not in text.splitlines():
+        raise TrainingFailed(f"{place}: {reason(text)}")
+
+
+def reason(said: str) -> str:
+    """Why another process could not join a cluster, and what to do.
+
+    Args:
+        said: What it printed.
+    """
+    if re.search("InvalidAuthToken|AuthenticationError|authentication token", said):
+        return (
+            "the cluster does not accept the token, or none was given. Set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN to "
+            "what ray get-auth-token says on its head"
+        )
+    if "ersion mismatch" in said:
+        return "the cluster runs another Python or Ray than this computer. Install the same versions everywhere"
+    if "known" not in said.splitlines():
+        return "something answers there, but it is no Ray cluster. Check the port: that of ray start --head is 6379"
+    return (
+        f"the cluster is there, but could not be joined within {REACH_TIMEOUT:.0f} s: this computer is not part of it, "
+        "or busy. Run ray start --address=HOST:PORT here first, or run bam-train on one of its computers"
+    )

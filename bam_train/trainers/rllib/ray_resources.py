@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
 
 import ray
 
@@ -25,9 +24,7 @@ def gpus(settings: TrainSettings) -> int:
     """
     if settings.num_gpus is not None:
         return settings.num_gpus
-    text = os.environ.get(VARIABLE, "").strip()
-    if not text:
-        return 0
+    text = os.environ.get(VARIABLE, "").strip() or "0"
     if not (text.isascii() and text.isdigit()):
         raise SettingsError(f"{VARIABLE}: expected a whole number of GPUs, such as 1, found {text!r}. Mend or unset it")
     return int(text)
@@ -45,8 +42,8 @@ def learners(settings: TrainSettings) -> tuple[int, int]:
     if number == 0:
         return (0, wanted) if wanted <= 1 else (wanted, 1)
     if wanted not in (0, number):
-        said = _said_by(settings)
-        raise SettingsError(f"{said}: {number} learners use 0 or {number} GPUs, one each, found {wanted}")
+        name = VARIABLE if settings.num_gpus is None else "num_gpus"
+        raise SettingsError(f"{name}: {number} learners use 0 or {number} GPUs, one each, found {wanted}")
     return number, int(wanted > 0)
 
 
@@ -57,81 +54,60 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
-def asked(settings: TrainSettings) -> dict[str, int]:
-    """CPUs and GPUs that a run's processes ask Ray for: one CPU for each runner and each learner without a GPU.
-
-    The trainer's own process asks for none.
-    """
-    number, gpus_each = learners(settings)
-    return {"CPU": settings.num_env_runners + number * (gpus_each == 0), "GPU": number * gpus_each}
-
-
 def require_resources(settings: TrainSettings) -> None:
     """Refuse a run that asks for more than there is, on the cluster that runs in this process, else on this computer.
+
+    Each runner and each learner without a GPU asks Ray for a CPU, a learner with one for a GPU. The trainer's own
+    process asks for nothing, and learns on a GPU of this computer.
 
     Raises:
         SettingsError: Says what was asked for, what there is, and what to do.
     """
-    _require_own_gpu(settings)
+    import torch
+
+    number, gpus_each = learners(settings)
+    own_gpus = torch.cuda.device_count()
+    if number == 0:
+        _require_gpus(settings, gpus_each, own_gpus, "on this computer")
     joined = ray.is_initialized()
     where = "in the cluster" if joined else "on this computer"
-    there = ray.cluster_resources() if joined else {"CPU": cores(), "GPU": _own_gpus()}
-    wanted = asked(settings)
-    if wanted["GPU"] > there.get("GPU", 0):
-        raise SettingsError(_gpus_missing(settings, wanted["GPU"], int(there.get("GPU", 0)), where))
+    there = ray.cluster_resources() if joined else {"CPU": cores(), "GPU": own_gpus}
+    wanted = {"CPU": settings.num_env_runners + number * (gpus_each == 0), "GPU": number * gpus_each}
+    _require_gpus(settings, wanted["GPU"], int(there.get("GPU", 0)), where)
     if wanted["CPU"] > there.get("CPU", 0):
-        raise SettingsError(_cpus_missing(settings, wanted["CPU"], there, where, joined))
+        for_what = [_number(settings.num_env_runners, "env runner")] * (settings.num_env_runners > 0)
+        for_what += [_number(number, "learner")] * (number > 0 and not gpus_each)
+        add = "add computers with ray start" if joined else "join a cluster with --address"
+        raise SettingsError(
+            f"{' and '.join(for_what)} ask for {_number(wanted['CPU'], 'CPU')}, {int(there.get('CPU', 0))} {where}. "
+            f"Lower --num-env-runners or --num-learners, or {add}"
+        )
     if joined:
         _require_free(wanted)
 
 
-def _require_free(wanted: Mapping[str, int]) -> None:
+def _require_gpus(settings: TrainSettings, wanted: int, there: int, where: str) -> None:
+    if wanted > there:
+        unset = settings.num_gpus is None
+        remedy = f"Set it to {there}, or unset it" if unset else f"Give --num-gpus {there}"
+        name = VARIABLE if unset else "num_gpus"
+        raise SettingsError(f"{name}: {_number(wanted, 'GPU')} asked for, {there} {where}. {remedy}")
+
+
+def _require_free(wanted: dict[str, int]) -> None:
     """Refuse what others in the cluster use; a run that has just ended may hold it for some seconds more."""
     end = time.monotonic() + LONGEST_BUSY
-    while missing := [name for name, number in wanted.items() if number > ray.available_resources().get(name, 0)]:
+    while True:
+        free = ray.available_resources()
+        name = next((name for name, number in wanted.items() if number > free.get(name, 0)), None)
+        if name is None:
+            return
         if time.monotonic() > end:
-            name = missing[0]
-            free = int(ray.available_resources().get(name, 0))
             raise SettingsError(
-                f"{_number(wanted[name], name)} asked for, and {free} of the cluster's "
+                f"{_number(wanted[name], name)} asked for, and {int(free.get(name, 0))} of the cluster's "
                 f"{int(ray.cluster_resources()[name])} not in use by others. Ask for less, or wait for them"
             )
         time.sleep(0.2)
-
-
-def _require_own_gpu(settings: TrainSettings) -> None:
-    """The trainer's own process learns on a GPU of this computer."""
-    number, gpus_each = learners(settings)
-    if number == 0 and gpus_each > _own_gpus():
-        raise SettingsError(_gpus_missing(settings, gpus_each, _own_gpus(), "on this computer"))
-
-
-def _own_gpus() -> int:
-    import torch
-
-    return int(torch.cuda.device_count())
-
-
-def _said_by(settings: TrainSettings) -> str:
-    """What says how many GPUs."""
-    return VARIABLE if settings.num_gpus is None else "num_gpus"
-
-
-def _gpus_missing(settings: TrainSettings, wanted: int, there: int, where: str) -> str:
-    remedy = f"Set it to {there}, or unset it" if settings.num_gpus is None else f"Give --num-gpus {there}"
-    return f"{_said_by(settings)}: {_number(wanted, 'GPU')} asked for, {there} {where}. {remedy}"
-
-
-def _cpus_missing(settings: TrainSettings, wanted: int, there: Mapping[str, float], where: str, joined: bool) -> str:
-    found = int(there.get("CPU", 0))
-    number, gpus_each = learners(settings)
-    for_what = [_number(settings.num_env_runners, "env runner")] * (settings.num_env_runners > 0)
-    for_what += [_number(number, "learner")] * (number > 0 and not gpus_each)
-    add = "add computers with ray start" if joined else "join a cluster with --address"
-    return (
-        f"{' and '.join(for_what)} ask for {_number(wanted, 'CPU')}, {found} {where}. "
-        f"Lower --num-env-runners or --num-learners, or {add}"
-    )
 
 
 def _number(number: int, of_what: str) -> str:

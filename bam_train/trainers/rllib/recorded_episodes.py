@@ -30,6 +30,7 @@ from ray.rllib.utils.spaces.space_utils import normalize_action
 from bam_train.errors import SettingsError
 from bam_train.settings import TrainSettings
 from bam_train.trainers.rllib.rllib_registration import register_foreign
+from bam_train.trainers.zero_based_spaces import less_start
 
 Array = NDArray[Any]
 
@@ -38,6 +39,29 @@ COLUMNS = ("eps_id", "obs", "actions", "rewards", "new_obs", "terminateds", "tru
 
 _MOST_UPDATES = 100
 """Updates of an iteration."""
+
+
+def add_data(config: Any, settings: TrainSettings, observation_space: Space[Any], action_space: Space[Any]) -> Any:
+    """Let a configuration learn from the recorded episodes of a run; returns it.
+
+    Raises:
+        SettingsError: There are none, or they do not fit the environment.
+    """
+    _require_columns(settings.data or "", observation_space, action_space)
+    batch = int(settings.hyperparameters["train_batch_size_per_learner"])
+    updates = max(2, min(_MOST_UPDATES, min(settings.steps, settings.eval_every or settings.steps) // batch))
+    config.environment(
+        observation_space=observation_space, action_space=action_space, env_config=dict(settings.env_kwargs)
+    )
+    if config.is_online:  # CQL, as a kind of SAC, makes an environment that it then does not step
+        config.environment(register_foreign(settings.env), disable_env_checking=True)
+        config.env_runners(num_env_runners=0)
+    config.offline_data(
+        input_=[settings.data],
+        offline_data_class=RecordedData,
+        dataset_num_iters_per_learner=updates,
+    )
+    return config
 
 
 class RecordedData(OfflineData):  # type: ignore[misc]
@@ -97,129 +121,68 @@ def load(data: str, observation_space: Space[Any], action_space: Space[Any], gam
     Raises:
         SettingsError: There are no rows, or one has a value that is missing, not finite or not in its space.
     """
-    path, filesystem = open_data(data)
+    path, filesystem = _open(data)
     table = pyarrow.parquet.ParquetDataset(path, filesystem=filesystem).read(list(COLUMNS))
     shapes = {"obs": observation_space.shape, "new_obs": observation_space.shape, "actions": action_space.shape}
     columns = {
-        name: _sound(f"data: {data}: {name}", _column(table[name]), shapes.get(name) or ())
+        name: _column(f"data: {data}: {name}", table[name], shapes.get(name) or ())
         for name in COLUMNS
         if name != "eps_id"
     }
-    _require_choices(data, columns["actions"], action_space)
     rewards = columns["rewards"].astype(np.float32)
     episode = np.asarray(table["eps_id"].to_pylist())
     last = np.append(episode[1:] != episode[:-1], True) | columns["terminateds"] | columns["truncateds"]
+    total, targets = 0.0, np.empty_like(rewards)
+    for t in range(len(rewards) - 1, -1, -1):  # R_t = r_t + gamma R_{t+1}, 0 after an episode's last row
+        total = float(rewards[t]) + (0.0 if last[t] else gamma * total)
+        targets[t] = total
     return {
         "obs": columns["obs"].astype(observation_space.dtype),
         "new_obs": columns["new_obs"].astype(observation_space.dtype),
-        "actions": as_module(columns["actions"], action_space),
+        "actions": _for_module(f"data: {data}: actions", columns["actions"], action_space),
         "rewards": rewards,
         "terminateds": columns["terminateds"].astype(bool),
         "truncateds": columns["truncateds"].astype(bool),
-        "value_targets": returns(rewards, last, gamma),
+        "value_targets": targets,
         "weights": np.ones_like(rewards),
         "n_step": np.ones_like(rewards),
     }
 
 
-def returns(rewards: Array, last: Array, gamma: float) -> NDArray[np.float32]:
-    """Discounted rewards from each row to the end of its episode: R_t = r_t + gamma R_{t+1}, 0 after `last`.
-
-    Args:
-        rewards: (rows,).
-        last: Whether a row is its episode's last, (rows,) bool.
-        gamma: Discount.
-    """
-    total, targets = 0.0, np.empty(len(rewards), np.float32)
-    for t in range(len(rewards) - 1, -1, -1):
-        total = float(rewards[t]) + (0.0 if last[t] else gamma * total)
-        targets[t] = total
-    return targets
-
-
-def _column(column: Any) -> Array | None:
-    """A column as one array; that of (nested) lists has more axes. None if the lists differ in length."""
-    shape: list[int] = []
-    flat = column.combine_chunks()
-    while pyarrow.types.is_list(flat.type) or pyarrow.types.is_fixed_size_list(flat.type):
-        lengths = pyarrow.compute.unique(pyarrow.compute.list_value_length(flat)).to_pylist()
-        if len(lengths) > 1 or None in lengths:
-            return None
-        flat = flat.flatten()
-        shape.append(max(lengths, default=0))
-    values: Array = flat.to_numpy(zero_copy_only=False)
-    return values.reshape(-1, *shape) if shape else values
+def _column(name: str, column: Any, shape: tuple[int, ...]) -> Array:
+    """A column of numbers, or of (nested) lists of them, as one array (rows, *shape), if all of its rows are whole."""
+    found: list[int] | None = []
+    values = column.combine_chunks()
+    while found is not None and (pyarrow.types.is_list(values.type) or pyarrow.types.is_fixed_size_list(values.type)):
+        lengths = pyarrow.compute.unique(pyarrow.compute.list_value_length(values)).to_pylist()
+        whole = len(lengths) <= 1 and None not in lengths
+        found = [*found, max(lengths, default=0)] if whole else None
+        values = values.flatten()
+    if not len(column):
+        raise SettingsError(f"{name}: expected a row or more, found none")
+    if found is None or tuple(found) != shape:
+        text = "rows of different lengths" if found is None else f"shape {tuple(found)}"
+        raise SettingsError(f"{name}: expected rows of shape {shape}, found {text}")
+    array: Array = values.to_numpy(zero_copy_only=False).reshape(-1, *shape)
+    if array.dtype.kind not in "biuf" or not np.isfinite(array).all():
+        raise SettingsError(f"{name}: expected finite numbers, found others or rows without one. Record it again")
+    return array
 
 
-def _sound(what: str, values: Array | None, shape: tuple[int, ...]) -> Array:
-    """The column, if all of its rows are whole.
-
-    Args:
-        what: As errors name it.
-        values: (rows, ...); None if its rows are of different lengths.
-        shape: Of a row.
-    """
-    if values is None or (len(values) and values.shape[1:] != shape):
-        found = "rows of different lengths" if values is None else f"shape {values.shape[1:]}"
-        raise SettingsError(f"{what}: expected rows of shape {shape}, found {found}")
-    if not len(values):
-        raise SettingsError(f"{what}: expected a row or more, found none")
-    if values.dtype.kind not in "biuf" or not np.isfinite(values).all():
-        raise SettingsError(f"{what}: expected finite numbers, found others or rows without one. Record it again")
-    return values
-
-
-def _require_choices(data: str, actions: Array, space: Space[Any]) -> None:
-    """Refuse choices that there are not."""
-    if isinstance(space, spaces.Discrete):
-        least, most = np.asarray(space.start), np.asarray(space.start + space.n - 1)
-    elif isinstance(space, spaces.MultiDiscrete):
-        least, most = space.start, space.start + space.nvec - 1
-    else:
-        return
+def _for_module(name: str, actions: Array, space: Space[Any]) -> Array:
+    """The environment's actions (n, ...) as a module of RLlib gives them: from -1 to 1, or counted from 0."""
+    if not isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
+        return np.asarray(normalize_action(actions.astype(space.dtype), space), space.dtype)
+    choices = space.n if isinstance(space, spaces.Discrete) else space.nvec
+    least, most = np.asarray(space.start), np.asarray(space.start + choices - 1)
     wrong = actions[((actions < least) | (actions > most)).reshape(len(actions), -1).any(axis=1)]
     if len(wrong):
-        raise SettingsError(f"data: {data}: actions: expected {least} to {most}, found {wrong[0]}")
+        raise SettingsError(f"{name}: expected {least} to {most}, found {wrong[0]}")
+    return np.asarray(less_start(space, actions), np.int64)
 
 
-def as_module(actions: NDArray[Any], space: Space[Any]) -> NDArray[Any]:
-    """The environment's actions (n, ...) as a module of RLlib says them: from -1 to 1, counted from 0."""
-    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
-        return np.asarray(actions - space.start, np.int64)
-    scaled: NDArray[Any] = np.asarray(normalize_action(actions.astype(space.dtype), space), space.dtype)
-    return scaled
-
-
-def add_data(config: Any, settings: TrainSettings, observation_space: Space[Any], action_space: Space[Any]) -> Any:
-    """Let a configuration learn from the recorded episodes of a run; returns it.
-
-    Raises:
-        SettingsError: There are none, or they do not fit the environment.
-    """
-    path, filesystem = open_data(settings.data or "")
-    require_columns(settings.data or "", path, filesystem, observation_space, action_space)
-    batch = int(settings.hyperparameters["train_batch_size_per_learner"])
-    updates = max(2, min(_MOST_UPDATES, min(settings.steps, settings.eval_every or settings.steps) // batch))
-    config.environment(
-        observation_space=observation_space, action_space=action_space, env_config=dict(settings.env_kwargs)
-    )
-    if config.is_online:  # CQL, as a kind of SAC, makes an environment that it then does not step
-        config.environment(register_foreign(settings.env), disable_env_checking=True)
-        config.env_runners(num_env_runners=0)
-    config.offline_data(
-        input_=[settings.data],
-        offline_data_class=RecordedData,
-        dataset_num_iters_per_learner=updates,
-    )
-    return config
-
-
-def open_data(data: str) -> tuple[str, Any]:
-    """Path and filesystem of a folder of Parquet files, here or anywhere that fsspec knows.
-
-    Raises:
-        SettingsError: It is not there, is no such folder, or its filesystem needs a package that is not.
-    """
+def _open(data: str) -> tuple[str, Any]:
+    """Path and filesystem of a folder of Parquet files, here or anywhere that fsspec knows."""
     try:
         known, path = fsspec.core.url_to_fs(os.path.expanduser(data))
         files = [path] if known.isfile(path) else sorted(known.glob(f"{path.rstrip('/')}/**/*.parquet"))
@@ -233,14 +196,9 @@ def open_data(data: str) -> tuple[str, Any]:
     return str(path), pyarrow.fs.PyFileSystem(pyarrow.fs.FSSpecHandler(known))
 
 
-def require_columns(
-    data: str, path: str, filesystem: Any, observation_space: Space[Any], action_space: Space[Any]
-) -> None:
-    """Refuse files that lack a column, or whose observations or actions are of another size.
-
-    Raises:
-        SettingsError: Names the column, what was expected and what was found.
-    """
+def _require_columns(data: str, observation_space: Space[Any], action_space: Space[Any]) -> None:
+    """Refuse files that lack a column, or whose observations or actions are of another size."""
+    path, filesystem = _open(data)
     try:
         dataset = pyarrow.parquet.ParquetDataset(path, filesystem=filesystem)
         names = dataset.schema.names

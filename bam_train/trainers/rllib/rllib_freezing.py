@@ -35,7 +35,7 @@ from bam_train.trainers.frozen_network import (
     zeros,
 )
 from bam_train.trainers.rllib.state_pickles import unpacked_array
-from bam_train.trainers.zero_based_spaces import less_start
+from bam_train.trainers.zero_based_spaces import less_start, plus_start
 
 Array = NDArray[Any]
 AnySpace = spaces.Space[Any]
@@ -65,32 +65,27 @@ _HARMLESS_WARNINGS = {
 class Filter:
     """A `MeanStdFilter` that has stopped learning: clip((x - offset) / divisor, -limit, limit), in float64."""
 
-    count: int
-    """Number of observations seen."""
-    mean: Array
-    """Mean of these. Shape: the observation's."""
-    squares: Array
-    """Sum of squared differences from the mean. Shape: the observation's."""
+    offset: Array
+    """Mean of the observations seen, or zeros, float64. Shape: the observation's."""
+    divisor: Array
+    """Their deviation + 1e-6, or ones, float64. Shape: the observation's."""
     limit: float | None
     """`clip_by_value`; 0 and None do not clip."""
-    center: bool = True
+    center: bool
     """`de_mean_to_zero`."""
-    scale: bool = True
+    scale: bool
     """`de_std_to_one`."""
 
-    @property
-    def offset(self) -> Array:
-        """What is subtracted, float64."""
-        return np.asarray(self.mean, np.float64) if self.center else np.zeros(np.shape(self.mean))
-
-    @property
-    def divisor(self) -> Array:
-        """The float32 deviation + 1e-6, as float64; RLlib takes 0 for the deviation of fewer than two observations."""
-        if not self.scale:
-            return np.ones(np.shape(self.mean))
-        variance = np.asarray(self.squares) / (self.count - 1.0) if self.count > 1 else np.zeros(np.shape(self.mean))
+    @classmethod
+    def of(cls, stats: Mapping[str, Any], limit: float | None, center: bool, scale: bool) -> Filter:
+        """The filter with these statistics, RLlib's `RunningStat` as a state; it computes the deviation in float32."""
+        count = int(stats["num_pushes"])
+        mean, squares = (unpacked_array(stats[name]) for name in ("mean_array", "sum_sq_diff_array"))
+        variance = squares / (count - 1.0) if count > 1 else np.zeros(squares.shape)
         deviation = np.sqrt(np.maximum(variance.astype(np.float32), 0)) + np.float32(_SMALL_NUMBER)
-        return np.asarray(deviation, np.float64)
+        offset = mean if center else np.zeros(mean.shape)
+        divisor = deviation if scale else np.ones(mean.shape)
+        return cls(offset.astype(np.float64), divisor.astype(np.float64), limit, bool(center), bool(scale))
 
 
 @dataclass(frozen=True)
@@ -148,23 +143,19 @@ def _preprocessing(connectors: list[Any]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for piece in connectors:
         kinds = [base.__name__ for base in type(piece).__mro__]  # ours is a subclass of RLlib's filter
-        if "FlattenObservations" in kinds:
-            if getattr(piece, "_keys_to_remove", None):
-                raise PolicyError("FlattenObservations that removes keys cannot be frozen")
-            require_once("FlattenObservations", "flatten" in found)
-            found |= {"flatten": True, "filter_first": "filter" in found}
-        elif "MeanStdFilter" in kinds:
-            require_once("MeanStdFilter", "filter" in found)
-            found["filter"] = _filter_of(piece)
-        else:
+        name, field = ("MeanStdFilter", "filter") if "MeanStdFilter" in kinds else ("FlattenObservations", "flatten")
+        if name not in kinds:
             require_layout_only(piece)
+            continue
+        if field in found:
+            raise PolicyError(f"connectors {name}, {name} cannot be frozen: expected one of them")
+        if field == "filter":
+            found["filter"] = _filter_of(piece)
+            continue
+        if getattr(piece, "_keys_to_remove", None):
+            raise PolicyError("FlattenObservations that removes keys cannot be frozen")
+        found |= {"flatten": True, "filter_first": "filter" in found}
     return found
-
-
-def require_once(name: str, again: bool) -> None:
-    """Refuse a second connector of one kind."""
-    if again:
-        raise PolicyError(f"connectors {name}, {name} cannot be frozen: expected one of them")
 
 
 def require_layout_only(piece: Any, known: Sequence[str] = ()) -> None:
@@ -175,17 +166,13 @@ def require_layout_only(piece: Any, known: Sequence[str] = ()) -> None:
 
 
 def _filter_of(connector: Any) -> Filter:
-    state = connector.get_state()
-    if len(state) != 1:
-        raise PolicyError(f"MeanStdFilter: expected one agent, found {len(state)}")
-    (own,) = state.values()
-    if len(own["running_stats"]) != 1:
-        found = len(own["running_stats"])
-        raise PolicyError(f"MeanStdFilter: expected one array, found {found}; put FlattenObservations before it")
-    (stats,) = own["running_stats"]
-    mean, squares = (unpacked_array(stats[name]) for name in ("mean_array", "sum_sq_diff_array"))
-    center, scale = bool(own["de_mean_to_zero"]), bool(own["de_std_to_one"])
-    return Filter(int(stats["num_pushes"]), mean, squares, own["clip_by_value"], center, scale)
+    agents = list(connector.get_state().values())
+    if len(agents) != 1:
+        raise PolicyError(f"MeanStdFilter: expected one agent, found {len(agents)}")
+    own, stats = agents[0], agents[0]["running_stats"]
+    if len(stats) != 1:
+        raise PolicyError(f"MeanStdFilter: expected one array, found {len(stats)}; put FlattenObservations before it")
+    return Filter.of(stats[0], own["clip_by_value"], own["de_mean_to_zero"], own["de_std_to_one"])
 
 
 def leaf_spaces(space: AnySpace) -> dict[str, AnySpace]:
@@ -221,26 +208,36 @@ def freeze(parts: PolicyParts) -> bytes:
         PolicyError: The network or a space is of a kind that cannot be frozen.
     """
     module = FrozenModule(parts)
-    return onnx_file(module, module.example_inputs(), ["action"], _HARMLESS_WARNINGS)
+    return onnx_file(module, module.inputs, ["action"], _HARMLESS_WARNINGS)
 
 
 class FrozenModule(Layer):
-    """A policy on the CPU, from raw observations to actions; a copy that shares nothing with the live one."""
+    """A policy on the CPU, from raw observations to actions; a copy that shares nothing with the live one.
+
+    Attributes:
+        inputs: A batch of two zeros for every input, by name.
+    """
 
     def __init__(self, parts: PolicyParts) -> None:
         super().__init__()
-        self.raw = leaf_spaces(parts.observation_space)
-        self.is_dict = isinstance(parts.observation_space, spaces.Dict)
-        self.observation = _Observation(parts)
+        leaves = leaf_spaces(parts.observation_space)
+        self.inputs = zeros(leaves, isinstance(parts.observation_space, spaces.Dict))
+        self.observation = _Observation(parts, leaves)
         self.network = copy.deepcopy(parts.network).cpu()
         self.head = _head(parts)
         self.outputs = flat_width(parts.action_space)
         self.eval().requires_grad_(False)
-        self._require_fit()
-
-    def example_inputs(self) -> dict[str, torch.Tensor]:
-        """A batch of two zeros for every input, by name."""
-        return zeros(self.raw, self.is_dict)
+        try:  # once: weights, observation and action space must belong together
+            with torch.no_grad():
+                found = self.scores(*self.inputs.values()).shape[1]
+                self(*self.inputs.values())
+        except PolicyError:
+            raise
+        except (RuntimeError, ValueError, TypeError, IndexError, KeyError, AttributeError) as error:
+            reason = " ".join(str(error).split())
+            raise PolicyError(f"the weights do not fit the spaces: {reason:.200}") from error
+        if found < self.outputs:
+            raise PolicyError(f"the network has {found} outputs, expected {self.outputs} or more for the action space")
 
     def scores(self, *observation: torch.Tensor) -> torch.Tensor:
         """Return what the action is made of, (n, k) float32: means, logits or values.
@@ -254,28 +251,18 @@ class FrozenModule(Layer):
         """Return the action, (n, ...)."""
         return self.head(self.scores(*observation))
 
-    def _require_fit(self) -> None:
-        """Run once: weights, observation and action space must belong together."""
-        try:
-            with torch.no_grad():
-                found = self.scores(*self.example_inputs().values()).shape[1]
-                self(*self.example_inputs().values())
-        except PolicyError:
-            raise
-        except (RuntimeError, ValueError, TypeError, IndexError, KeyError, AttributeError) as error:
-            reason = " ".join(str(error).split())
-            raise PolicyError(f"the weights do not fit the spaces: {reason:.200}") from error
-        if found < self.outputs:
-            raise PolicyError(f"the network has {found} outputs, expected {self.outputs} or more for the action space")
-
 
 class _Network(Layer):
     """The forward pass of an RLModule, up to the input of its action distribution or DQN's values."""
 
     def __init__(self, module: Any) -> None:
         super().__init__()
-        self.module = module
-        self.squash = isinstance(module.action_space, spaces.Box) and _squashes(module)
+        self.module, self.squash = module, False
+        if isinstance(module.action_space, spaces.Box):
+            # Whether the deterministic action is the tanh of the mean depends on Ray's version: try a mean of 0.5.
+            logits = next(module.parameters()).detach().cpu().new_full((1, 2), 0.5)
+            value = module.get_inference_action_dist_cls().from_logits(logits).to_deterministic().sample()
+            self.squash = abs(float(value[0, 0]) - math.tanh(0.5)) < 1e-3
 
     def __deepcopy__(self, memo: dict[int, Any]) -> _Network:
         from ray.rllib.core.models.torch.heads import TorchFreeLogStdMLPHead, TorchMLPHead
@@ -311,50 +298,35 @@ class _Network(Layer):
         return (support * logits.softmax(-1)).sum(-1)
 
 
-def _squashes(module: Any) -> bool:
-    """Whether the deterministic action is the tanh of the mean, which depends on Ray's version: try a mean of 0.5."""
-    logits = next(module.parameters()).detach().cpu().new_full((1, 2), 0.5)
-    value = module.get_inference_action_dist_cls().from_logits(logits).to_deterministic().sample()
-    return abs(float(value[0, 0]) - math.tanh(0.5)) < 1e-3
-
-
 class _Observation(Layer):
     """What RLlib's connectors do: one-hot, flatten, normalise in float64, float32."""
 
-    def __init__(self, parts: PolicyParts) -> None:
+    def __init__(self, parts: PolicyParts, leaves: Mapping[str, Any]) -> None:
         super().__init__()
-        leaves = leaf_spaces(parts.observation_space)
-        _require_encodable(parts, leaves)
-        shape = next(iter(leaves.values())).shape or ()
-        self.leaves = nn.ModuleList(_encoder(leaf) if parts.flatten else nn.Identity() for leaf in leaves.values())
+        space, flatten, shape = parts.observation_space, parts.flatten, next(iter(leaves.values())).shape or ()
+        if not flatten and not isinstance(space, spaces.Box):
+            raise PolicyError(f"observation: a {type(space).__name__} without FlattenObservations cannot be frozen")
+        early_filter = parts.filter is not None and (parts.filter_first or not flatten)  # would round whole numbers
+        if early_filter and not (isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating)):
+            raise PolicyError("observation: MeanStdFilter of anything but a Box of floats cannot be frozen")
+        self.leaves = nn.ModuleList(_encoder(leaf) if flatten else nn.Identity() for leaf in leaves.values())
         early, late = (parts.filter, None) if parts.filter_first else (None, parts.filter)
         self.early = nn.Identity() if early is None else _Normalised(early, shape)
-        self.late = nn.Identity() if late is None else _Normalised(late, (-1,) if parts.flatten else shape)
+        self.late = nn.Identity() if late is None else _Normalised(late, (-1,) if flatten else shape)
 
     def forward(self, tensors: tuple[torch.Tensor, ...]) -> torch.Tensor:
         encoded = [leaf(self.early(tensor)) for leaf, tensor in zip(self.leaves, tensors, strict=True)]
         return to(self.late(encoded[0] if len(encoded) == 1 else torch.cat(encoded, 1)), torch.float32)
 
 
-def _require_encodable(parts: PolicyParts, leaves: Mapping[str, Any]) -> None:
-    """Refuse what RLlib's own networks do not take, and what normalising would round to whole numbers."""
-    space = parts.observation_space
-    if not parts.flatten and not isinstance(space, spaces.Box):
-        raise PolicyError(f"observation: a {type(space).__name__} without FlattenObservations cannot be frozen")
-    early = parts.filter is not None and (parts.filter_first or not parts.flatten)
-    if early and not (isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating)):
-        raise PolicyError("observation: MeanStdFilter of anything but a Box of floats cannot be frozen")
-
-
 def _encoder(space: Any) -> nn.Module:
+    """Of a Box or MultiBinary: one vector, float32."""
     if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
         return OneHot(space)
     return _Numbers(len(space.shape))
 
 
 class _Numbers(Layer):
-    """A Box or MultiBinary as one vector, float32."""
-
     def __init__(self, dimensions: int) -> None:
         super().__init__()
         self.dimensions = dimensions
@@ -459,18 +431,18 @@ class RLlibPolicy:
         """The actions for n observations, (n, ...), in the environment's action space."""
         from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
-        seen, acted = self._spaces
+        space, action_space = self._spaces
         episodes = [
-            SingleAgentEpisode(observations=[one], observation_space=seen, action_space=acted)
-            for one in (less_start(seen, observation) for observation in observations)  # RLlib counts from 0
+            SingleAgentEpisode(observations=[one], observation_space=space, action_space=action_space)
+            for one in (less_start(space, observation) for observation in observations)  # RLlib counts from 0
         ]
         given = {"rl_module": self._module, "episodes": episodes, "explore": self._explore, "shared_data": {}}
         forward = self._module.forward_exploration if self._explore else self._module.forward_inference
         with torch.no_grad():
             batch = self._after(batch=forward(self._before(batch={}, **given)), **given)
         actions = np.stack([np.asarray(one) for one in batch.get("actions_for_env", batch["actions"])])
-        start = acted.start if isinstance(acted, (spaces.Discrete, spaces.MultiDiscrete)) else 0
-        return np.asarray(actions + start, np.int64 if isinstance(acted, spaces.Discrete) else acted.dtype)
+        dtype = np.int64 if isinstance(action_space, spaces.Discrete) else action_space.dtype
+        return np.asarray(plus_start(action_space, actions), dtype)
 
 
 def golden(parts: PolicyParts, policy: RLlibPolicy, n: int = 256, seed: int = 0) -> bytes:
@@ -497,10 +469,9 @@ def clear_observations(parts: PolicyParts, n: int = 256, seed: int = 0) -> dict[
 
 def one_by_one(observations: Mapping[str, Array]) -> list[Any]:
     """The observations of a batch, as an environment gives them."""
-    count = len(next(iter(observations.values())))
     if "" in observations:
-        return [observations[""][k] for k in range(count)]
-    return [{key: array[k] for key, array in observations.items()} for k in range(count)]
+        return list(observations[""])
+    return [dict(zip(observations, one, strict=True)) for one in zip(*observations.values(), strict=True)]
 
 
 def draw(parts: PolicyParts, n: int, rng: np.random.Generator) -> dict[str, Array]:
@@ -508,20 +479,11 @@ def draw(parts: PolicyParts, n: int, rng: np.random.Generator) -> dict[str, Arra
 
     Normalised numbers are drawn about their running mean, so that few of them end at the filter's limits.
     """
-    moments = _moments(parts)
-    return {
-        key: draw_array(leaf, n, rng, moments.get(key)) for key, leaf in leaf_spaces(parts.observation_space).items()
-    }
-
-
-def _moments(parts: PolicyParts) -> dict[str, tuple[Array, Array]]:
-    """Mean and deviation of every array whose numbers are normalised."""
-    if parts.filter is None:
-        return {}
-    mean, spread, at, found = parts.filter.offset.ravel(), parts.filter.divisor.ravel(), 0, {}
+    drawn, at = {}, 0
     for key, leaf in leaf_spaces(parts.observation_space).items():
-        width = flat_width(leaf)
-        if isinstance(leaf, spaces.Box):
-            found[key] = (mean[at : at + width].reshape(leaf.shape), spread[at : at + width].reshape(leaf.shape))
-        at += width
-    return found
+        moments, part = None, slice(at, at := at + flat_width(leaf))
+        if parts.filter is not None and isinstance(leaf, spaces.Box):
+            mean, spread = (numbers.ravel()[part] for numbers in (parts.filter.offset, parts.filter.divisor))
+            moments = mean.reshape(leaf.shape), spread.reshape(leaf.shape)
+        drawn[key] = draw_array(leaf, n, rng, moments)
+    return drawn

@@ -14,7 +14,7 @@ import dataclasses
 import inspect
 import json
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from ray.rllib.connectors.env_to_module.mean_std_filter import MeanStdFilter
@@ -63,41 +63,20 @@ _NONE_HERE = {
 
 _OF_THE_OLD_STACK = frozenset(
     {
-        "optimizer",
-        "learner_class",
-        "learner_connector",
-        "add_default_connectors_to_learner_pipeline",
-        "learner_config_dict",
-        "num_aggregator_actors_per_learner",
-        "max_requests_in_flight_per_aggregator_actor",
-        "max_requests_in_flight_per_sampler_worker",
-        "max_requests_in_flight_per_aggregator_worker",
-        "num_aggregation_workers",
-        "store_buffer_in_checkpoints",
-        "before_learn_on_batch",
-        "categorical_distribution_temperature",
-        "num_gpu_loader_threads",
-        "num_multi_gpu_tower_stacks",
-        "minibatch_buffer_size",
-        "replay_proportion",
-        "replay_buffer_num_slots",
-        "learner_queue_size",
-        "learner_queue_timeout",
-        "timeout_s_sampler_manager",
-        "timeout_s_aggregator_manager",
-        "opt_type",
-        "decay",
-        "momentum",
-        "target_update_frequency",
-        "training_intensity",
-        "bc_iters",
+        *("optimizer", "learner_class", "learner_connector", "add_default_connectors_to_learner_pipeline"),
+        *("learner_config_dict", "num_aggregator_actors_per_learner", "max_requests_in_flight_per_aggregator_actor"),
+        *("max_requests_in_flight_per_sampler_worker", "max_requests_in_flight_per_aggregator_worker"),
+        *("num_aggregation_workers", "store_buffer_in_checkpoints", "before_learn_on_batch"),
+        *("categorical_distribution_temperature", "num_gpu_loader_threads", "num_multi_gpu_tower_stacks"),
+        *("minibatch_buffer_size", "replay_proportion", "replay_buffer_num_slots", "learner_queue_size"),
+        *("learner_queue_timeout", "timeout_s_sampler_manager", "timeout_s_aggregator_manager", "opt_type", "decay"),
+        *("momentum", "target_update_frequency", "training_intensity", "bc_iters"),
     }
 )
 _OLD_HERE = {"impala": {"epsilon"}, "appo": {"epsilon", "use_critic"}}
 """Names that are old in one algorithm and current in another."""
 
 _OF_CONNECTORS = frozenset({"self", "kwargs", "multi_agent", "update_stats"})
-
 
 _OURS = ("model_config", "rollout_fragment_length", "log_std_init", "action_init_scale")
 """Hyperparameters that ``training()`` does not take."""
@@ -111,8 +90,7 @@ def complete(algorithm: Algorithm, given: Mapping[str, Any]) -> dict[str, Any]:
     """
     config = algorithm.load()()
     defaults = _defaults(algorithm, config)
-    for name in given:
-        _require_known(name, [*defaults, "model_config"], f"{algorithm.name} hyperparameter", NAMES)
+    _require_known(given, [*defaults, "model_config"], f"{algorithm.name} hyperparameter", NAMES)
     values = {
         name: _fit(name, given[name], _hint(name, hint, default)) if name in given else _plain(default)
         for name, (hint, default) in defaults.items()
@@ -130,15 +108,11 @@ def complete_normalize(given: bool | Mapping[str, Any]) -> bool | dict[str, Any]
     """Check the arguments of `MeanStdFilter`."""
     if isinstance(given, bool):
         return given
-    parameters = {
-        name: row
-        for name, row in inspect.signature(MeanStdFilter.__init__).parameters.items()
-        if name not in _OF_CONNECTORS
+    _require_known(given, inspect.signature(MeanStdFilter).parameters.keys() - _OF_CONNECTORS, "normalize argument")
+    return {
+        name: fit(f"normalize.{name}", value, float if name == "clip_by_value" else bool)
+        for name, value in given.items()
     }
-    for name in given:
-        _require_known(name, parameters, "normalize argument")
-    hints = {name: float if name == "clip_by_value" else bool for name in parameters}
-    return {name: fit(f"normalize.{name}", value, hints[name]) for name, value in given.items()}
 
 
 def training_arguments(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -221,8 +195,7 @@ def _complete_buffer(config: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     if buffer is None:
         raise SettingsError(f"replay_buffer_config.type: expected {' or '.join(_BUFFERS)}, found {values['type']!r}")
     known = {*inspect.signature(buffer).parameters, *default} - _OF_CONNECTORS
-    for name in given:
-        _require_known(name, known, "replay_buffer_config argument")
+    _require_known(given, known, "replay_buffer_config argument")
     capacity = fit("replay_buffer_config.capacity", values["capacity"], int)
     if capacity < 1:
         raise SettingsError(f"replay_buffer_config.capacity: expected at least 1, found {capacity}")
@@ -232,32 +205,32 @@ def _complete_buffer(config: Any, given: Mapping[str, Any]) -> dict[str, Any]:
 def _complete_model(config: Any, given: Any) -> dict[str, Any]:
     """Check ``model_config`` and add RLlib's defaults."""
     given = fit("model_config", given, dict)
-    known = {row.name: row for row in dataclasses.fields(DefaultModelConfig)}
     hints = {
         name: typing.Optional[str] if name.endswith("_initializer") else hint  # noqa: UP045 - not a function
         for name, hint in typing.get_type_hints(DefaultModelConfig).items()
     }
     own = dataclasses.asdict(DefaultModelConfig()) | config._model_config_auto_includes
-    for name in given:
-        _require_known(name, known, "model_config argument")
+    _require_known(given, hints, "model_config argument")
     return {
         name: fit(f"model_config.{name}", given[name], _hint(name, hints[name], own[name]))
         if name in given
         else _plain(own[name])
-        for name in known
+        for name in hints
     }
 
 
-def _require_known(name: str, known: Iterable[str], what: str, others: Iterable[str] = ()) -> None:
-    if name in known:
-        return
-    if name in ELSEWHERE:
-        raise SettingsError(f"{name} is not a hyperparameter here: use {ELSEWHERE[name]}")
-    if name in _NONE_HERE:
-        raise SettingsError(f"{name}: there is none here; {_NONE_HERE[name]}. Leave it out")
-    if name in _OF_THE_OLD_STACK:
-        raise SettingsError(f"{name} cannot be set: it belongs to RLlib's old API stack, or bam-train takes care of it")
-    raise SettingsError(f"Unknown {what} {name!r}. {did_you_mean(name, [*known, *others])}")
+def _require_known(given: Iterable[str], known: Collection[str], what: str, others: Iterable[str] = ()) -> None:
+    for name in given:
+        if name in known:
+            continue
+        if name in ELSEWHERE:
+            raise SettingsError(f"{name} is not a hyperparameter here: use {ELSEWHERE[name]}")
+        if name in _NONE_HERE:
+            raise SettingsError(f"{name}: there is none here; {_NONE_HERE[name]}. Leave it out")
+        if name in _OF_THE_OLD_STACK:
+            text = "it belongs to RLlib's old API stack, or bam-train takes care of it"
+            raise SettingsError(f"{name} cannot be set: {text}")
+        raise SettingsError(f"Unknown {what} {name!r}. {did_you_mean(name, [*known, *others])}")
 
 
 # Numbers, schedules and layers that no algorithm can learn with; some of them RLlib takes, and then hangs
@@ -276,11 +249,8 @@ _RANGES = ranges(
         ),
         NonNegative: (
             *("action_init_scale", "entropy_coeff", "vf_loss_coeff", "vf_coeff", "kl_coeff", "beta", "sigma0"),
-            *(
-                "num_steps_sampled_before_learning_starts",
-                "target_network_update_freq",
-                "top_quantiles_to_drop_per_net",
-            ),
+            *("num_steps_sampled_before_learning_starts", "target_network_update_freq"),
+            "top_quantiles_to_drop_per_net",
         ),
     }
 )
@@ -289,11 +259,7 @@ _LAST = {name: NonNegative if kind is Positive else kind for name, kind in _RANG
 
 
 def _require_ranges(values: Mapping[str, Any]) -> None:
-    """Refuse what no algorithm can learn with among complete hyperparameters.
-
-    Raises:
-        SettingsError: Names it, what was expected and what was found.
-    """
+    """Refuse what no algorithm can learn with among complete hyperparameters."""
     for name, value in values.items():
         if isinstance(value, bool):
             continue
@@ -303,33 +269,18 @@ def _require_ranges(values: Mapping[str, Any]) -> None:
             raise SettingsError(f"{name}: expected a whole number or 'auto', found {value!r}")
         elif name == "target_entropy" and value not in (None, "auto"):
             raise SettingsError(f"{name}: expected a number or 'auto', found {value!r}")
-        elif name == "n_step" and value is not None:
-            _require_span(name, value)
+        elif name == "n_step" and value is not None:  # drawn between two numbers
+            if not 1 <= value[0] <= value[1]:
+                raise SettingsError(f"{name}: expected [least, most] of at least 1, found {value!r}")
         elif isinstance(value, list):
-            _require_schedule(name, value)
-    _require_layers(values["model_config"])
-
-
-def _require_span(name: str, value: list[int]) -> None:
-    """Least and most of a number that is drawn."""
-    if not 1 <= value[0] <= value[1]:
-        raise SettingsError(f"{name}: expected [least, most] of at least 1, found {value!r}")
-
-
-def _require_schedule(name: str, value: list[list[float]]) -> None:
-    """Steps that rise from 0, with a value at each."""
-    steps = [pair[0] for pair in value if len(pair) == 2]
-    if len(steps) < max(2, len(value)) or steps[0] != 0 or sorted(set(steps)) != steps:
-        text = "expected a number or a schedule [[0, value], [step, value], ...] with rising steps"
-        raise SettingsError(f"{name}: {text}, found {value!r}")
-    check(value[0][1], _RANGES.get(name, Finite), name, SettingsError)
-    for _, number in value[1:]:
-        check(number, _LAST.get(name, Finite), name, SettingsError)
-
-
-def _require_layers(model_config: Mapping[str, Any]) -> None:
-    """Every layer has a neuron, and there is one layer at least before the heads."""
-    for name, sizes in model_config.items():
+            steps = [pair[0] for pair in value if len(pair) == 2]
+            if len(steps) < max(2, len(value)) or steps[0] != 0 or sorted(set(steps)) != steps:
+                text = "expected a number or a schedule [[0, value], [step, value], ...] with rising steps"
+                raise SettingsError(f"{name}: {text}, found {value!r}")
+            check(value[0][1], _RANGES.get(name, Finite), name, SettingsError)
+            for _, number in value[1:]:
+                check(number, _LAST.get(name, Finite), name, SettingsError)
+    for name, sizes in values["model_config"].items():
         if not name.endswith("_hiddens") or sizes is None:
             continue
         if any(size < 1 for size in sizes) or (name == "fcnet_hiddens" and not sizes):

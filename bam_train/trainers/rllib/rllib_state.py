@@ -55,33 +55,28 @@ def load(checkpoint: Checkpoint, algorithm: Any) -> None:
     require_version(checkpoint)
     state = read(checkpoint)
     with _fitting(checkpoint, FOLDER):
-        _set(algorithm, state)
-        hand_out(algorithm)
+        algorithm.metrics.set_state(state["metrics_logger"])
+        if algorithm.env_runner_group is None:  # `Algorithm.set_state` expects runners
+            algorithm.learner_group.set_state(state["learner_group"])
+            algorithm._iteration = state["training_iteration"]
+        else:
+            algorithm.set_state(state)
+            hand_out(algorithm)
     if checkpoint.has(EXTRAS):
         with _fitting(checkpoint, EXTRAS):
-            set_extras(algorithm, json.loads(checkpoint.read(EXTRAS)))
+            give = functools.partial(_give, extras=json.loads(checkpoint.read(EXTRAS)))
+            for result in algorithm.learner_group.foreach_learner(give):
+                result.get()  # raises what went wrong there
 
 
 @contextmanager
 def _fitting(checkpoint: Checkpoint, member: str) -> Iterator[None]:
-    """What a state does to an algorithm that it does not fit, as our own error."""
+    """The errors of an algorithm that is given a state that does not fit it, as our own."""
     try:
         yield
     except (RuntimeError, ValueError, KeyError, TypeError, IndexError, AttributeError, AssertionError) as error:
-        reason = " ".join(str(error).split())
-        raise AlteredCheckpoint(
-            checkpoint.path, member, f"{member} does not fit these settings: {reason:.200}"
-        ) from error
-
-
-def _set(algorithm: Any, state: dict[str, Any]) -> None:
-    """What ``Algorithm.set_state`` does, which expects runners, and tells them how far the run is only after this."""
-    algorithm.metrics.set_state(state["metrics_logger"])
-    if algorithm.env_runner_group is not None:
-        algorithm.set_state(state)
-        return
-    algorithm.learner_group.set_state(state["learner_group"])
-    algorithm._iteration = state["training_iteration"]
+        text = f"{member} does not fit these settings: {' '.join(str(error).split()):.200}"
+        raise AlteredCheckpoint(checkpoint.path, member, text) from error
 
 
 def read(checkpoint: Checkpoint) -> dict[str, Any]:
@@ -95,25 +90,19 @@ def read(checkpoint: Checkpoint) -> dict[str, Any]:
         path = PurePosixPath(name)
         if not name.startswith(FOLDER) or path.name not in STATES:
             continue
+        try:
+            state = read_state(checkpoint.read(name))
+            if not isinstance(state, dict):
+                raise FormatError(f"holds a {type(state).__name__}, expected a table of names")
+        except FormatError as error:
+            raise AlteredCheckpoint(checkpoint.path, name, f"{name} {error}. Train anew, or get it again") from error
         inner = tree
         for part in path.parent.relative_to(FOLDER).parts:
             inner = inner.setdefault(part, {})
-        inner.update(_state(checkpoint, name))
+        inner.update(state)
     if not tree:
         raise AlteredCheckpoint(checkpoint.path, FOLDER, f"has no {FOLDER}; it was not made by RLlib")
     return tree
-
-
-def _state(checkpoint: Checkpoint, name: str) -> dict[str, Any]:
-    """One member, which must be a table by name."""
-    try:
-        state = read_state(checkpoint.read(name))
-    except FormatError as error:
-        raise AlteredCheckpoint(checkpoint.path, name, f"{name} {error}. Train anew, or get it again") from error
-    if not isinstance(state, dict):
-        text = f"{name} holds a {type(state).__name__}, expected a table of names"
-        raise AlteredCheckpoint(checkpoint.path, name, f"{text}. Train anew, or get it again")
-    return state
 
 
 def hand_out(algorithm: Any) -> None:
@@ -126,11 +115,8 @@ def hand_out(algorithm: Any) -> None:
     if group is None:
         return
     weights = algorithm.learner_group.get_state(components="learner/rl_module", inference_only=True)["learner"]
-    connectors = algorithm.env_runner.get_state(not_components="rl_module")
-    state = {
-        **connectors,
-        "rl_module": weights["rl_module"],
-    }  # without a number, so that it is not taken for an old one
+    state = algorithm.env_runner.get_state(not_components="rl_module")
+    state["rl_module"] = weights["rl_module"]  # without a number, so that it is not taken for an old one
     algorithm.env_runner.set_state(state)
     group.foreach_env_runner("set_state", kwargs={"state": state}, local_env_runner=False)
 
@@ -148,19 +134,14 @@ def start_actions(algorithm: Any, log_std: float | None, scale: float) -> None:
     group = algorithm.learner_group
     weights = group.get_weights()
     for module in weights.values():
-        for name in [name for name in module if name.startswith("pi.")]:
-            if name.endswith("log_std") and log_std is not None:
+        layers = {name: int(name.split(".")[3]) for name in module if name.startswith("pi.net.mlp.")}
+        last = max(layers.values(), default=-1)
+        for name in module:
+            if name.startswith("pi.") and name.endswith("log_std") and log_std is not None:
                 module[name] = np.full_like(module[name], log_std)
-            elif name in last_layer(module):
+            elif layers.get(name) == last:
                 module[name] = module[name] * np.float32(scale)
     group.set_weights(weights)
-
-
-def last_layer(module: Mapping[str, Any]) -> set[str]:
-    """Names of weight and bias of the policy head's last layer: the highest ``pi.net.mlp.<k>``."""
-    layers = [name.split(".") for name in module if name.startswith("pi.net.mlp.")]
-    highest = max((int(parts[3]) for parts in layers), default=-1)
-    return {".".join(parts) for parts in layers if int(parts[3]) == highest}
 
 
 def require_version(checkpoint: Checkpoint) -> None:
@@ -192,10 +173,8 @@ def undisturbed() -> Iterator[None]:
         torch.set_rng_state(before[2])
 
 
-# What RLlib's learners keep beside their state
-
 Extras = dict[str, dict[str, float]]
-"""Attribute of the learner to module to number."""
+"""What RLlib's learners keep beside their state: attribute of the learner to module to number."""
 
 _NAMES = (
     "curr_kl_coeffs_per_module",
@@ -212,15 +191,9 @@ is.
 
 
 def extras_of(algorithm: Any) -> Extras:
-    """Attribute of the learner to module to number; {} if it has none. All learners have the same."""
+    """What the learners keep beside their state; {} if there is nothing. All learners have the same."""
     results = list(algorithm.learner_group.foreach_learner(_take))
     return dict(results[0].get()) if results else {}
-
-
-def set_extras(algorithm: Any, extras: Mapping[str, Mapping[str, float]]) -> None:
-    """Give them to every learner."""
-    for result in algorithm.learner_group.foreach_learner(functools.partial(_give, extras=extras)):
-        result.get()  # raises what went wrong there
 
 
 def _take(learner: Any) -> Extras:
@@ -240,15 +213,10 @@ def _give(learner: Any, extras: Mapping[str, Mapping[str, float]]) -> None:
     for name, numbers in extras.items():
         table = getattr(learner, name)
         for key, number in numbers.items():
-            if isinstance(table[key], Scheduler):
-                _set_schedule(table[key], number)
-            elif isinstance(table[key], torch.Tensor):
-                table[key].data.fill_(number)  # in place: an optimiser may hold it
-            else:
+            value = table[key]
+            if isinstance(value, Scheduler):  # where it is until the first update's end; a fixed number stays
+                value = value.get_current_value() if value.use_schedule else None
+            if isinstance(value, torch.Tensor):
+                value.data.fill_(number)  # in place: an optimiser may hold it
+            elif value is not None:
                 table[key] = number
-
-
-def _set_schedule(schedule: Scheduler, number: float) -> None:
-    """Where it is until the first update's end says so; a fixed number stays."""
-    if schedule.use_schedule:
-        schedule.get_current_value().data.fill_(number)

@@ -1,7 +1,6 @@
 """`RLlibTrainer`: a run of an algorithm of RLlib that can be stopped, saved and resumed between two iterations.
 
-The file is long because a trainer has many small methods: those of the protocol `Trainer`, and what each of them asks
-of RLlib. Configuration, states, freezing and the cluster have modules of their own.
+Configuration, states, freezing and the cluster have modules of their own.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium import Space, spaces
+from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 from ray.rllib.core import DEFAULT_MODULE_ID
 
@@ -35,54 +34,47 @@ from bam_train.trainers.resolve_settings import own_settings
 from bam_train.trainers.rllib import rllib_state
 from bam_train.trainers.rllib.algorithm_config import envs_each, make_config, refusals
 from bam_train.trainers.rllib.ray_cluster import cluster
-from bam_train.trainers.rllib.rllib_freezing import PolicyParts, RLlibPolicy, freeze, golden, parts_of
+from bam_train.trainers.rllib.rllib_freezing import RLlibPolicy, freeze, golden, parts_of
 from bam_train.trainers.rllib.rllib_hyperparameters import complete, complete_normalize
 from bam_train.trainers.rllib.robot_env_runner import ENDS
 from bam_train.trainers.rllib.runner_deaths import RunnerWatch
 
-_FINITE = "expected finite numbers: try a smaller lr"
 _EPISODES = 100
 """Training episodes behind the means of `Statistics`."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Seen:
-    """What one environment of the run says of itself."""
-
-    observation_space: Space[Any]
-    action_space: Space[Any]
-    signals: dict[str, Any]
-    period: float | None
-
-    @classmethod
-    def of(cls, settings: TrainSettings) -> Seen:
-        """Make one and look."""
-        with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
-            describe = getattr(env.unwrapped, "describe", None)
-            signals = describe() if describe else {}
-            return cls(env.observation_space, env.action_space, signals, control_period(env))
 
 
 class RLlibTrainer:
     """A run of one algorithm of RLlib; made by `create` or `load`."""
 
-    def __init__(self, settings: TrainSettings, seen: Seen, seed: int) -> None:
-        self.settings, self._seen = settings, seen
-        self.notices = _shares(settings)
+    def __init__(self, settings: TrainSettings, seed: int) -> None:
+        self.settings = settings
+        self.notices: list[str] = []
+        with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
+            self._spaces = env.observation_space, env.action_space
+            describe = getattr(env.unwrapped, "describe", None)
+            self._signals, self._period = describe() if describe else {}, control_period(env)
         self._ends = {name: deque[float](maxlen=_EPISODES) for name in ("return", "length", "success")}
         self._result: dict[str, Any] = {}
         self._steps = 0
         self._tensorboard: TensorBoard | None = None
         self._spare: Any = None
+        runners, each = settings.num_env_runners, envs_each(settings)
+        if runners and each * runners != settings.num_envs:
+            self.notices.append(
+                f"num_envs: {settings.num_envs} are not shared evenly by {runners} env runners: {each} each, "
+                f"{each * runners} in all"
+            )
         logging.getLogger("ray.rllib").setLevel(logging.ERROR)
         torch.set_num_threads(settings.threads)
         with contextlib.ExitStack() as stack:
             stack.enter_context(cluster(settings))
             with refusals(settings):
-                self._config = make_config(settings, seen.observation_space, seen.action_space, seed)
+                self._config = make_config(settings, *self._spaces, seed)
                 self.algorithm = self._config.build_algo()
             stack.callback(self.algorithm.stop)
-            _remove_empty_folder(Path(self.algorithm.logdir))
+            with contextlib.suppress(OSError):  # a folder below ~/ray_results, into which RLlib then writes nothing
+                Path(self.algorithm.logdir).rmdir()
+                Path(self.algorithm.logdir).parent.rmdir()
             self._watch = RunnerWatch(self.algorithm)
             self._open = stack.pop_all()
 
@@ -91,11 +83,18 @@ class RLlibTrainer:
         """Check the algorithm's own settings and fill in its defaults."""
         algorithm = RLLIB_ALGORITHMS[settings.algo]
         _require_fitting(settings)
-        seen = Seen.of(settings)
-        algorithm.require_actions(settings.env, type(seen.action_space).__name__)
-        _require_no_bytes(settings.env, seen.observation_space)
+        with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
+            space, action_space = env.observation_space, env.action_space
+        algorithm.require_actions(settings.env, type(action_space).__name__)
+        if isinstance(space, spaces.Box) and len(space.shape) == 3 and not np.issubdtype(space.dtype, np.floating):
+            raise SettingsError(  # RLlib's networks fail on these in the first update
+                f"{settings.env}: the rllib trainer takes images of floats, found {space.dtype} of shape {space.shape}."
+                " Scale them in the environment (gymnasium.wrappers.TransformObservation), or use --trainer sb3"
+            )
         values = complete(algorithm, settings.hyperparameters)
-        _require_two_critics(values, seen.action_space)
+        if isinstance(action_space, spaces.Discrete) and values.get("twin_q") is False:
+            # RLlib 2.60's SAC fails on one critic of choices in the first update
+            raise SettingsError("twin_q: expected true, as actions are choices, found false. Leave it out")
         return dataclasses.replace(
             settings,
             hyperparameters=values,
@@ -106,7 +105,7 @@ class RLlibTrainer:
     @classmethod
     def create(cls, settings: TrainSettings) -> RLlibTrainer:
         """Set up a new run of complete settings."""
-        trainer = cls(settings, Seen.of(settings), settings.seed)
+        trainer = cls(settings, settings.seed)
         values = settings.hyperparameters
         with trainer._or_close():
             rllib_state.start_actions(trainer.algorithm, values["log_std_init"], values["action_init_scale"])
@@ -121,11 +120,15 @@ class RLlibTrainer:
         with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
             require_fit(checkpoint, env)
         steps = checkpoint.manifest.steps
-        trainer = cls(settings, Seen.of(settings), settings.seed + steps)  # other episodes than the first ones again
+        trainer = cls(settings, settings.seed + steps)  # other episodes than the first ones again
         with trainer._or_close():
             rllib_state.load(checkpoint, trainer.algorithm)
         trainer._steps = steps
-        trainer.notices += _not_saved(settings)
+        algorithm = RLLIB_ALGORITHMS[settings.algo]
+        if not algorithm.offline:
+            lost = "running episodes" if algorithm.on_policy else "running episodes and replay buffers"
+            text = f"RLlib saves no {lost}: new ones begin, so the rest differs from an unbroken run"
+            trainer.notices.append(text)
         return trainer
 
     @contextlib.contextmanager
@@ -154,36 +157,38 @@ class RLlibTrainer:
                 return
 
     def _iterate(self) -> None:
-        with _without_false_alarms():
+        with warnings.catch_warnings():  # TQC compares every quantile with every other, which torch takes for a mistake
+            warnings.filterwarnings("ignore", "Using a target size", UserWarning)
             self._result, news = self._watch.train()
         self.notices += news
-        before, self._steps = self._steps, self._count()
+        before, sampled = self._steps, self._result.get("env_runners", {})
+        if RLLIB_ALGORITHMS[self.settings.algo].offline:
+            self._steps = int(self._learnt().get("num_module_steps_trained_lifetime", before))
+        else:
+            self._steps = int(sampled.get("num_env_steps_sampled_lifetime", before))
         if self._steps == before:  # every runner was gone
             return
-        ends = self._result.get("env_runners", {}).get(ENDS, {})
         for name, values in self._ends.items():
-            said = np.atleast_1d(np.asarray(ends.get(name, ()), np.float64))  # RLlib makes a number of a list of one
-            values.extend(said[~np.isnan(said)].tolist())  # where no episode ended, RLlib may say NaN
-        self._require_finite()
-        if self._tensorboard is not None:
-            self._tensorboard.write(self._metrics() | self._means(), self.steps)
+            ended = np.atleast_1d(np.asarray(sampled.get(ENDS, {}).get(name, ()), np.float64))  # of one, RLlib's number
+            values.extend(ended[~np.isnan(ended)].tolist())  # where no episode ended, RLlib may give NaN
+        # A loss that is NaN makes the weights so, and RLlib reports NaN for no update too.
+        if not all(bool(torch.isfinite(one).all()) for one in self._module().parameters()):
+            raise TrainingFailed(
+                f"the policy's weights are NaN or infinite at step {self.steps}; expected finite numbers: try a "
+                "smaller lr"
+            )
+        means = {f"episodes/{name}": float(np.mean(values)) for name, values in self._ends.items() if values}
+        self.log(self._metrics() | means)
 
-    def _count(self) -> int:
-        if RLLIB_ALGORITHMS[self.settings.algo].offline:
-            return int(self._learned("num_module_steps_trained_lifetime"))
-        return int(self._result.get("env_runners", {}).get("num_env_steps_sampled_lifetime", self._steps))
-
-    def _learned(self, name: str) -> float:
-        return float(self._result.get("learners", {}).get(DEFAULT_MODULE_ID, {}).get(name, self._steps))
+    def _learnt(self) -> dict[str, Any]:
+        found: dict[str, Any] = self._result.get("learners", {}).get(DEFAULT_MODULE_ID, {})
+        return found
 
     def _metrics(self) -> dict[str, float]:
         """The learner's own numbers, finite ones only."""
-        said = self._result.get("learners", {}).get(DEFAULT_MODULE_ID, {})
-        numbers = {f"train/{name}": _number(value) for name, value in said.items()}
-        return {name: value for name, value in numbers.items() if value is not None and math.isfinite(value)}
-
-    def _means(self) -> dict[str, float]:
-        return {f"episodes/{name}": float(np.mean(values)) for name, values in self._ends.items() if values}
+        arrays = {f"train/{name}": np.asarray(value) for name, value in self._learnt().items()}
+        numbers = {name: float(one) for name, one in arrays.items() if one.ndim == 0 and one.dtype.kind in "fiu"}
+        return {name: number for name, number in numbers.items() if math.isfinite(number)}
 
     def _statistics(self) -> Statistics:
         means = {name: float(np.mean(values)) if values else None for name, values in self._ends.items()}
@@ -195,73 +200,51 @@ class RLlibTrainer:
             metrics=self._metrics(),
         )
 
-    def _require_finite(self) -> None:
-        """No weight is NaN or infinite; a loss that is makes the weights so, and RLlib reports NaN for no update too.
-
-        Raises:
-            TrainingFailed: One is.
-        """
-        if not all(bool(torch.isfinite(one).all()) for one in self._module().parameters()):
-            raise TrainingFailed(f"the policy's weights are NaN or infinite at step {self.steps}; {_FINITE}")
-
     def _module(self) -> Any:
         """The module of this process that has the newest weights."""
-        group = self.algorithm.learner_group
+        group, runner = self.algorithm.learner_group, self.algorithm.env_runner
         if group.is_local:
             return group._learner.module[DEFAULT_MODULE_ID].unwrapped()
-        module = self._own_module()
+        if runner is not None:
+            module = runner.module
+        else:  # one that is there for nothing else
+            if self._spare is None:
+                spec = self._config.get_rl_module_spec(spaces={DEFAULT_MODULE_ID: self._spaces}, inference_only=True)
+                self._spare = spec.build()
+            module = self._spare
         weights = group.get_state(components=f"learner/rl_module/{DEFAULT_MODULE_ID}", inference_only=True)
         module.set_state(weights["learner"]["rl_module"][DEFAULT_MODULE_ID])
         return module
 
-    def _own_module(self) -> Any:
-        """Of the runner in this process; without one, a module that is there for nothing else."""
-        if self.algorithm.env_runner is not None:
-            return self.algorithm.env_runner.module
-        if self._spare is None:
-            spaces = self._seen.observation_space, self._seen.action_space
-            spec = self._config.get_rl_module_spec(spaces={DEFAULT_MODULE_ID: spaces}, inference_only=True)
-            self._spare = spec.build()
-        return self._spare
-
-    def _env_to_module(self) -> Any:
+    def _of(self, kind: Any, module: Any, **given: Any) -> Any:
+        """The module as `parts_of` or as an `RLlibPolicy`."""
         runner = self.algorithm.env_runner
-        return None if runner is None else runner._env_to_module
-
-    def _parts(self, module: Any) -> PolicyParts:
-        pair = self._seen.observation_space, self._seen.action_space
-        return parts_of(module, self._env_to_module(), self._config, pair)
-
-    def _run_by_rllib(self, module: Any, explore: bool = False) -> RLlibPolicy:
-        pair = self._seen.observation_space, self._seen.action_space
-        return RLlibPolicy(module, self._env_to_module(), self._config, pair, explore=explore)
+        return kind(module, None if runner is None else runner._env_to_module, self._config, self._spaces, **given)
 
     def save(self, path: Path, scores: Mapping[str, Any], notes: Mapping[str, Any]) -> Checkpoint:
         """Write a checkpoint that can be resumed and deployed."""
         with rllib_state.undisturbed():
             module = copy.deepcopy(self._module())  # of appo and impala, a thread goes on learning
-            parts = self._parts(module)
+            parts = self._of(parts_of, module)
             members = {
                 "bam/policy.onnx": freeze(parts),
-                "bam/golden.safetensors": golden(parts, self._run_by_rllib(module)),
+                "bam/golden.safetensors": golden(parts, self._of(RLlibPolicy, module)),
                 **rllib_state.members(self.algorithm, notes),
             }
-        seen = self._seen
-        spaces = seen.observation_space, seen.action_space
-        known = {"signals": seen.signals, "period": seen.period, "steps": self.steps, "scores": scores}
-        return write_checkpoint(path, manifest(self.settings, spaces, known), members)
+        known = {"signals": self._signals, "period": self._period, "steps": self.steps, "scores": scores}
+        return write_checkpoint(path, manifest(self.settings, self._spaces, known), members)
 
     def freeze(self) -> FrozenPolicy:
         """The policy as it is now."""
         with rllib_state.undisturbed():
-            graph = freeze(self._parts(self._module()))
-        spaces = space_to_json(self._seen.observation_space), space_to_json(self._seen.action_space)
-        return FrozenPolicy.from_graph(graph, *spaces)
+            graph = freeze(self._of(parts_of, self._module()))
+        return FrozenPolicy.from_graph(graph, *map(space_to_json, self._spaces))
 
     def exploring(self) -> RLlibPolicy:
         """The policy as it is now, drawing its actions as in training."""
         with rllib_state.undisturbed():
-            return self._run_by_rllib(self._module(), explore=True)
+            policy: RLlibPolicy = self._of(RLlibPolicy, self._module(), explore=True)
+            return policy
 
     @contextlib.contextmanager
     def undisturbed(self) -> Iterator[None]:
@@ -306,73 +289,15 @@ def _require_fitting(settings: TrainSettings) -> None:
     if settings.data is not None and not offline:
         names = ", ".join(sorted(row.name for row in RLLIB_ALGORITHMS.values() if row.offline))
         raise SettingsError(f"data: {settings.algo} learns in the environment; leave it out, or use one of: {names}")
-    if offline:
-        _require_offline(settings)
-
-
-def _require_no_bytes(env: str, space: Space[Any]) -> None:
-    """Refuse images of whole numbers, which RLlib's networks fail on in the first update."""
-    if isinstance(space, spaces.Box) and len(space.shape) == 3 and not np.issubdtype(space.dtype, np.floating):
-        raise SettingsError(
-            f"{env}: the rllib trainer takes images of floats, found {space.dtype} of shape {space.shape}. Scale "
-            "them in the environment (gymnasium.wrappers.TransformObservation), or use --trainer sb3"
-        )
-
-
-def _require_two_critics(values: Mapping[str, Any], space: Space[Any]) -> None:
-    """Refuse one critic of choices, which RLlib 2.60's SAC fails on in the first update."""
-    if isinstance(space, spaces.Discrete) and values.get("twin_q") is False:
-        raise SettingsError("twin_q: expected true, as actions are choices, found false. Leave it out")
-
-
-def _require_offline(settings: TrainSettings) -> None:
-    if settings.data is None:
+    if offline and settings.data is None:
         raise SettingsError(
             f"data: {settings.algo} learns from recorded episodes, found none. Give a folder of Parquet files with "
             "bam-train --data, such as scripts/record_parquet.py writes"
         )
-    if settings.num_env_runners:
+    if offline and settings.num_env_runners:
         raise SettingsError(f"num_env_runners: {settings.algo} learns from recorded episodes alone; leave it out")
-    if settings.normalize:
+    if offline and settings.normalize:
         raise SettingsError(f"normalize: {settings.algo} takes recorded observations as they are; leave it out")
-
-
-def _shares(settings: TrainSettings) -> list[str]:
-    """What runners that cannot share the environments out evenly have."""
-    wanted, runners, each = settings.num_envs, settings.num_env_runners, envs_each(settings)
-    if not runners or each * runners == wanted:
-        return []
-    return [f"num_envs: {wanted} are not shared evenly by {runners} env runners: {each} each, {each * runners} in all"]
-
-
-def _not_saved(settings: TrainSettings) -> list[str]:
-    """What a resumed run begins anew."""
-    algorithm = RLLIB_ALGORITHMS[settings.algo]
-    if algorithm.offline:
-        return []
-    lost = "running episodes" if algorithm.on_policy else "running episodes and replay buffers"
-    return [f"RLlib saves no {lost}: new ones begin, so the rest differs from an unbroken run"]
-
-
-def _remove_empty_folder(folder: Path) -> None:
-    """RLlib makes a folder of its own below ~/ray_results, and then writes nothing there."""
-    with contextlib.suppress(OSError):
-        folder.rmdir()
-        folder.parent.rmdir()
-
-
-@contextlib.contextmanager
-def _without_false_alarms() -> Iterator[None]:
-    """TQC compares every quantile with every other, which torch takes for a mistake."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Using a target size", UserWarning)
-        yield
-
-
-def _number(value: Any) -> float | None:
-    """A number of RLlib's results; None if it is something else."""
-    array = np.asarray(value)
-    return float(array) if array.ndim == 0 and array.dtype.kind in "fiu" else None
 
 
 class TensorBoard:

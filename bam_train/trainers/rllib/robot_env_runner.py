@@ -10,6 +10,7 @@ The file is long because each method of its one large class stands in for one of
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import os
 import uuid
@@ -20,7 +21,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from ray.rllib.callbacks.utils import make_callback
 from ray.rllib.core.columns import Columns
@@ -32,6 +32,7 @@ from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 from ray.rllib.utils.metrics import RLMODULE_INFERENCE_TIMER, WEIGHTS_SEQ_NO
 from ray.rllib.utils.spaces.space_utils import clip_action, unsquash_action
 
+from bam_envs.core.registry import resolve_id
 from bam_train.environments import is_batched, make_vector_env
 from bam_train.errors import SettingsError
 from bam_train.finite_envs import FiniteVectorEnv
@@ -56,36 +57,32 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
 
     def __init__(self, *, config: Any, **kwargs: Any) -> None:
         super().__init__(config=config, **kwargs)
-        self._filter = self._find_filter()
-        self._seen: Array = np.empty(0)
+        self._observation: Array = np.empty(0)
+        """What the module sees next, (n, ...)."""
         self._running = Running(self.num_envs)
         self._ended: list[End] = []
+        pieces = list(self._env_to_module.connectors)
+        filters = [piece for piece in pieces if type(piece).__module__ == MeanStdFilter.__module__]
+        self._filter: MeanStdFilter | None = filters[0] if filters else None
+        others = [type(piece).__name__ for piece in pieces if piece not in filters]
+        found = ", ".join(name for name in others if name not in _DEFAULT_PIECES)
+        if found or config._module_to_env_connector is not None:
+            raise SettingsError(
+                "RobotEnvRunner: expected the MeanStdFilter of bam_train.trainers.rllib.mean_std_filter or no "
+                f"connector, found {found or 'a module-to-env connector'}; leave env_runner_cls out to use RLlib's own "
+                "runner"
+            )
         if self.module is not None and self.module.is_stateful():
             raise SettingsError(
                 "RobotEnvRunner: expected a module without a state, found a recurrent one; leave it out"
             )
-
-    def _find_filter(self) -> MeanStdFilter | None:
-        """The filter among the connectors, which are otherwise RLlib's own."""
-        pieces = list(self._env_to_module.connectors)
-        own = [piece for piece in pieces if type(piece).__module__ == MeanStdFilter.__module__]
-        strange = [
-            type(piece).__name__ for piece in pieces if piece not in own and type(piece).__name__ not in _DEFAULT_PIECES
-        ]
-        if strange or self.config._module_to_env_connector is not None:
-            found = ", ".join(strange) or "a module-to-env connector"
-            raise SettingsError(
-                "RobotEnvRunner: expected the MeanStdFilter of bam_train.trainers.rllib.mean_std_filter or no "
-                f"connector, found {found}; leave env_runner_cls out to use RLlib's own runner"
-            )
-        return own[0] if own else None
 
     def make_env(self) -> None:
         """One vector environment, with automatic resets in the same step."""
         if self.env is not None:
             self.env.close()
         name = self.config.env
-        env_id = name if name in gym.registry else _with_version(name)
+        env_id = name if name in gym.registry else resolve_id(name)
         if not is_batched(env_id):
             raise SettingsError(
                 f"RobotEnvRunner: expected one of our environments, found {name!r}; leave env_runner_cls out"
@@ -93,8 +90,6 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
         kwargs = dict(self.config.env_config)
         with _cores(self.config.num_cpus_per_env_runner if self.worker_index else None):
             self.env = FiniteVectorEnv(make_vector_env(env_id, kwargs, self.config.num_envs_per_env_runner), env_id)
-        if self.env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
-            raise SettingsError(f"{env_id}: expected environments that restart in the same step")
         self.num_envs = self.env.num_envs
         self._needs_initial_reset = True
         context = EnvContext(kwargs, worker_index=self.worker_index or 0, num_workers=self.num_workers)
@@ -123,14 +118,14 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
         if force_reset or num_episodes is not None or self._needs_initial_reset:
             self._begin()
         self._needs_initial_reset = num_episodes is not None
-        while True:
+        episodes = None
+        while episodes is None:
             if num_timesteps is not None:
                 episodes = self._collect(math.ceil(num_timesteps / self.num_envs), explore, random_actions)
             else:
                 episodes = self._collect_episodes(num_episodes or 1, explore, random_actions)
-            if episodes is not None:
-                break
-            self._begin()  # the environment failed and was made anew: what was collected is lost
+            if episodes is None:
+                self._begin()  # the environment failed and was made anew: what was collected is lost
         steps = sum(map(len, episodes))
         self._log_env_steps(metric=self._metrics_num_env_steps_sampled, num_steps=steps)
         self._increase_sampled_metrics(steps, sum(episode.is_done for episode in episodes))
@@ -138,102 +133,84 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
 
     def _begin(self) -> None:
         """Begin an episode everywhere; environment i of the k-th runner is seeded by how many come before it."""
-        seed = self._first_seed() if self._needs_initial_reset else None
+        seed, index = None, self.worker_index or 0
+        if self._needs_initial_reset and self._seed is not None:
+            seed = int(self._seed - index + max(0, index - 1) * self.num_envs)
         observations, _ = self._try_env_reset(seed=seed, options=None)
-        self._seen = self._as_seen(observations)
+        self._observation = self._filtered(observations)
         self._running = Running(self.num_envs)
 
-    def _first_seed(self) -> int | None:
-        if self._seed is None:
-            return None
-        index = self.worker_index or 0
-        return int(self._seed - index + max(0, index - 1) * self.num_envs)
-
-    def _as_seen(self, observations: Array) -> Array:
+    def _filtered(self, observations: Array) -> Array:
         """Observations as the module sees them: a copy, for the environment may write into its own."""
         return np.array(observations) if self._filter is None else self._filter.normalize(observations)
 
-    def _collect(self, steps: int, explore: bool, random_actions: bool) -> list[SingleAgentEpisode] | None:
-        """Step every environment `steps` times; None if the environment failed."""
-        rollout = Rollout(self.num_envs, steps, self._seen)
-        for _ in range(steps):
-            if not self._step(rollout, explore, random_actions):
-                return None
-        return self._cut(rollout)
-
     def _collect_episodes(self, count: int, explore: bool, random_actions: bool) -> list[SingleAgentEpisode] | None:
-        """Step every environment until `count` episodes have ended, and return these."""
+        """Step every environment until `count` episodes have ended, and return these; None if one failed."""
         done: list[SingleAgentEpisode] = []
-        pieces: dict[str, list[SingleAgentEpisode]] = {}
+        begun: dict[str, SingleAgentEpisode] = {}
         while len(done) < count:
             collected = self._collect(32, explore, random_actions)
             if collected is None:
                 return None
-            for episode in sorted(collected, key=lambda one: one.t_started):
-                pieces.setdefault(episode.id_, []).append(episode)
-                if episode.is_done:
-                    done.append(_joined(pieces.pop(episode.id_)))
+            for piece in sorted(collected, key=lambda one: one.t_started):
+                episode = begun.setdefault(piece.id_, piece)
+                if episode is not piece:
+                    episode.concat_episode(piece)
+                if piece.is_done:
+                    done.append(begun.pop(piece.id_))
         return done[:count]
 
-    def _step(self, rollout: Rollout, explore: bool, random_actions: bool) -> bool:
-        """One step of every environment; False if the environment failed and was made anew."""
-        columns, actions = self._random() if random_actions else self._act(rollout.steps, explore)
-        results = self._try_env_step(actions)
-        if results == ENV_STEP_FAILURE:
-            return False
-        observations, rewards, terminated, truncated, infos = results
-        ended = np.flatnonzero(terminated | truncated)
-        if len(ended):
-            finals = self._as_seen(np.asarray(infos["final_obs"])[ended])
-            rollout.end(ended, finals, infos.get("final_info", {}).get("is_success"))
-        self._seen = self._as_seen(observations)
-        rollout.add(columns, rewards, terminated, truncated, self._seen)
-        return True
-
-    def _random(self) -> tuple[dict[str, Array], Array]:
-        actions = self.env.action_space.sample()
-        return {Columns.ACTIONS: actions}, actions
-
-    def _act(self, step: int, explore: bool) -> tuple[dict[str, Array], Array]:
-        """What the module says, and the actions as the environment takes them."""
-        batch = {Columns.OBS: torch.from_numpy(self._seen).to(self._device)}
-        with torch.inference_mode(), self.metrics.log_time(RLMODULE_INFERENCE_TIMER):
-            if explore:
-                runners = self.config.num_env_runners or 1
-                own = self.num_env_steps_sampled_lifetime // runners + step * self.num_envs
-                said = self.module.forward_exploration(batch, t=own * runners)
+    def _collect(self, steps: int, explore: bool, random_actions: bool) -> list[SingleAgentEpisode] | None:
+        """Step every environment `steps` times; None if the environment failed and was made anew."""
+        rollout = Rollout(self.num_envs, steps, self._observation)
+        for _ in range(steps):
+            if random_actions:
+                actions = self.env.action_space.sample()
+                columns = {Columns.ACTIONS: actions}
             else:
-                said = self.module.forward_inference(batch)
-            said = self._sampled(dict(said), explore)
-        columns = {name: value.cpu().numpy() for name, value in said.items() if isinstance(value, torch.Tensor)}
-        return columns, self._for_env(columns[Columns.ACTIONS])
-
-    def _sampled(self, said: dict[str, Any], explore: bool) -> dict[str, Any]:
-        """With actions, drawn from their distribution if the module did not choose them itself."""
-        if Columns.ACTIONS in said:
-            return said
-        kind = self.module.get_exploration_action_dist_cls() if explore else self.module.get_inference_action_dist_cls()
-        distribution = kind.from_logits(said[Columns.ACTION_DIST_INPUTS])
-        if not explore:
-            return {**said, Columns.ACTIONS: distribution.to_deterministic().sample()}
-        actions = distribution.sample()
-        return {**said, Columns.ACTIONS: actions, Columns.ACTION_LOGP: distribution.logp(actions)}
-
-    def _for_env(self, actions: Array) -> Array:
-        """RLlib's `NormalizeAndClipActions`, for the whole batch."""
-        space = self.env.single_action_space
-        if self.config.normalize_actions:
-            actions = unsquash_action(actions, space)
-        elif self.config.clip_actions:
-            actions = clip_action(actions, space)
-        return np.asarray(actions, space.dtype)
-
-    def _cut(self, rollout: Rollout) -> list[SingleAgentEpisode]:
+                columns, actions = self._act(rollout.steps, explore)
+            results = self._try_env_step(actions)
+            if results == ENV_STEP_FAILURE:
+                return None
+            observations, rewards, terminated, truncated, infos = results
+            ended = np.flatnonzero(terminated | truncated)
+            if len(ended):
+                finals = self._filtered(np.asarray(infos["final_obs"])[ended])
+                rollout.end(ended, finals, infos.get("final_info", {}).get("is_success"))
+            self._observation = self._filtered(observations)
+            rollout.add(columns, rewards, terminated, truncated, self._observation)
         space = self._env_to_module.observation_space
         extra = {WEIGHTS_SEQ_NO: self._weights_seq_no}
         episodes, ends = rollout.episodes(self._running, space, self.env.single_action_space, extra)
         self._ended += ends
         return episodes
+
+    def _act(self, step: int, explore: bool) -> tuple[dict[str, Array], Array]:
+        """The module's outputs with its actions, each (n, ...), and the actions as the environment takes them."""
+        batch = {Columns.OBS: torch.from_numpy(self._observation).to(self._device)}
+        with torch.inference_mode(), self.metrics.log_time(RLMODULE_INFERENCE_TIMER):
+            if explore:
+                runners = self.config.num_env_runners or 1
+                own = self.num_env_steps_sampled_lifetime // runners + step * self.num_envs
+                outputs = self.module.forward_exploration(batch, t=own * runners)
+            else:
+                outputs = self.module.forward_inference(batch)
+            outputs = dict(outputs)
+            if Columns.ACTIONS not in outputs:  # the module did not choose them itself
+                module = self.module
+                kind = module.get_exploration_action_dist_cls if explore else module.get_inference_action_dist_cls
+                distribution = kind().from_logits(outputs[Columns.ACTION_DIST_INPUTS])
+                drawn = (distribution if explore else distribution.to_deterministic()).sample()
+                outputs[Columns.ACTIONS] = drawn
+                if explore:
+                    outputs[Columns.ACTION_LOGP] = distribution.logp(drawn)
+        columns = {name: value.cpu().numpy() for name, value in outputs.items() if isinstance(value, torch.Tensor)}
+        actions, space = columns[Columns.ACTIONS], self.env.single_action_space
+        if self.config.normalize_actions:  # RLlib's `NormalizeAndClipActions`, for the whole batch
+            actions = unsquash_action(actions, space)
+        elif self.config.clip_actions:
+            actions = clip_action(actions, space)
+        return columns, np.asarray(actions, space.dtype)
 
     def get_metrics(self) -> Any:
         """RLlib's metrics of the episodes that ended since the last call, and how each of them went."""
@@ -276,21 +253,6 @@ _DEFAULT_PIECES = frozenset(
         "NumpyToTensor",
     }
 )
-
-
-def _with_version(name: str) -> str:
-    """The id that a name without a version means."""
-    from bam_envs.core.registry import resolve_id
-
-    return resolve_id(name)
-
-
-def _joined(pieces: list[SingleAgentEpisode]) -> SingleAgentEpisode:
-    """One whole episode out of its pieces."""
-    whole, *others = pieces
-    for piece in others:
-        whole.concat_episode(piece)
-    return whole
 
 
 @dataclass(frozen=True)
@@ -399,55 +361,40 @@ class Rollout:
         """
         ended, open_, ends = [], [], []
         for env_id in range(len(self.rewards)):
-            start = 0
             done = self.terminated[env_id, : self.steps] | self.truncated[env_id, : self.steps]
-            for stop in (np.flatnonzero(done) + 1).tolist():
-                ended.append(self._piece(env_id, start, stop, running, observation_space, action_space, extra))
-                self._go_on(running, env_id, start, stop)
+            bounds = np.unique([0, *(np.flatnonzero(done) + 1), self.steps]).tolist()
+            for start, stop in itertools.pairwise(bounds):
+                observations = self.observations[env_id, start : stop + 1].copy()
+                terminated, truncated = bool(self.terminated[env_id, stop - 1]), bool(self.truncated[env_id, stop - 1])
+                if terminated or truncated:
+                    observations[-1] = self._finals[env_id, stop - 1][0]
+                rewards = self.rewards[env_id, start:stop].copy()
+                columns = {name: _buffer(values[env_id, start:stop].copy()) for name, values in self._columns.items()}
+                episode = SingleAgentEpisode(
+                    id_=running.ids[env_id],
+                    observations=_buffer(observations, observation_space),
+                    observation_space=observation_space,
+                    actions=_buffer(columns.pop(Columns.ACTIONS).data, action_space),
+                    action_space=action_space,
+                    rewards=_buffer(rewards),
+                    infos=[{}] * (stop - start + 1),
+                    terminated=terminated,
+                    truncated=truncated and not terminated,
+                    extra_model_outputs=columns
+                    | {name: _buffer(np.full(stop - start, value)) for name, value in extra.items()},
+                    t_started=int(running.lengths[env_id]),
+                    len_lookback_buffer=0,
+                )
+                running.lengths[env_id] += stop - start
+                running.returns[env_id] += rewards.sum(dtype=np.float64)
+                if not (terminated or truncated):
+                    open_.append(episode)
+                    continue
+                ended.append(episode)
                 success = self._finals[env_id, stop - 1][1]
                 ends.append(End(int(running.lengths[env_id]), float(running.returns[env_id]), success))
                 running.restart(env_id)
-                start = stop
-            if start < self.steps:
-                open_.append(self._piece(env_id, start, self.steps, running, observation_space, action_space, extra))
-                self._go_on(running, env_id, start, self.steps)
         return ended + open_, ends
-
-    def _go_on(self, running: Running, env_id: int, start: int, stop: int) -> None:
-        running.lengths[env_id] += stop - start
-        running.returns[env_id] += self.rewards[env_id, start:stop].sum(dtype=np.float64)
-
-    def _piece(
-        self,
-        env_id: int,
-        start: int,
-        stop: int,
-        running: Running,
-        observation_space: gym.Space[Any],
-        action_space: gym.Space[Any],
-        extra: Mapping[str, Any],
-    ) -> SingleAgentEpisode:
-        observations = self.observations[env_id, start : stop + 1].copy()
-        terminated, truncated = bool(self.terminated[env_id, stop - 1]), bool(self.truncated[env_id, stop - 1])
-        if terminated or truncated:
-            observations[-1] = self._finals[env_id, stop - 1][0]
-        columns = {name: _buffer(values[env_id, start:stop].copy()) for name, values in self._columns.items()}
-        fixed = {name: _buffer(np.full(stop - start, value)) for name, value in extra.items()}
-        before = int(running.lengths[env_id])
-        return SingleAgentEpisode(
-            id_=running.ids[env_id],
-            observations=_buffer(observations, observation_space),
-            observation_space=observation_space,
-            actions=_buffer(columns.pop("actions").data, action_space),
-            action_space=action_space,
-            rewards=_buffer(self.rewards[env_id, start:stop].copy()),
-            infos=[{}] * (stop - start + 1),
-            terminated=terminated,
-            truncated=truncated and not terminated,
-            extra_model_outputs={**columns, **fixed},
-            t_started=before,
-            len_lookback_buffer=0,
-        )
 
 
 def _buffer(values: Array, space: gym.Space[Any] | None = None) -> InfiniteLookbackBuffer:

@@ -57,7 +57,7 @@ class FaultReporting:
             super().__init__(**named)
         except Exception as error:
             if index := int(named.get("worker_index") or 0):
-                report(index, _own_cause(error))
+                _report(index, _own_cause(error))
             raise
 
     def sample(self, *arguments: Any, **named: Any) -> Any:
@@ -66,9 +66,8 @@ class FaultReporting:
             return super().sample(*arguments, **named)  # type: ignore[misc]
         except Exception as error:
             cause = _own_cause(error)
-            index = int(getattr(self, "worker_index", 0) or 0)
-            if index:
-                report(index, cause)
+            if index := int(getattr(self, "worker_index", 0) or 0):
+                _report(index, cause)
                 raise
             raise cause from None if cause is not error else cause.__cause__
 
@@ -82,26 +81,27 @@ class ReportingEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[
         super().make_env()
 
 
-def report(index: int, error: BaseException) -> None:
+def _report(index: int, error: BaseException) -> None:
     """Keep why the runner with this index dies."""
     text = f"{type(error).__name__}: {' '.join(str(error).split())}"[:LONGEST_CAUSE].rstrip(": ")
     internal_kv._internal_kv_put(_key(index), text.encode())
 
 
 def cause_of_death(index: int) -> str | None:
-    """Why the runner with this index died last, as far as it could say; the next call does not say it again."""
+    """Why the runner with this index died last, if it could report it; the next call does not say it again."""
     text: bytes | None = internal_kv._internal_kv_get(_key(index))
-    if text is not None:
-        internal_kv._internal_kv_del(_key(index))
-    return None if text is None else text.decode(errors="replace")
+    if text is None:
+        return None
+    internal_kv._internal_kv_del(_key(index))
+    return text.decode(errors="replace")
 
 
 def first_cause_of_death(number: int) -> str | None:
-    """Why the first that died of runners 1 to `number` did, as far as one could say."""
+    """Why the first that died of runners 1 to `number` did, if one could report it."""
     if not internal_kv._internal_kv_initialized():
         return None
-    said = ((index, cause_of_death(index)) for index in range(1, number + 1))
-    return next((f"env runner {index} died ({why})" for index, why in said if why), None)
+    causes = ((index, cause_of_death(index)) for index in range(1, number + 1))
+    return next((f"env runner {index} died ({why})" for index, why in causes if why), None)
 
 
 def _key(index: int) -> bytes:
@@ -114,32 +114,11 @@ def _own_cause(error: Exception) -> Exception:
     return cause if type(error) is RuntimeError and not error.args and isinstance(cause, Exception) else error
 
 
-def fault_tolerance(config: Any) -> Any:
-    """Make an `AlgorithmConfig` go on when a runner or a computer dies in mid-training.
-
-    `env_runner_cls` must be set before, if at all.
-
-    Args:
-        config: Changed in place.
-
-    Returns:
-        The same config.
-    """
-    if config.env_runner_cls is None:
-        config.env_runners(env_runner_cls=ReportingEnvRunner)
-    config.env_runners(sample_timeout_s=SAMPLE_TIMEOUT)
-    return config.fault_tolerance(
-        restart_failed_env_runners=True,
-        delay_between_env_runner_restarts_s=RESTART_DELAY,
-        env_runner_health_probe_timeout_s=PROBE_TIMEOUT,
-    )
-
-
 class RunnerWatch:
     """Looks after the runners of an algorithm, before each of its training steps and after the last of an iteration.
 
     Args:
-        algorithm: RLlib's, made of a config that `fault_tolerance` has seen; from now on it is trained by `train`.
+        algorithm: RLlib's, of a config of `make_config`; from now on it is trained by `train`.
         clock: Monotonic time [s].
     """
 
@@ -154,7 +133,7 @@ class RunnerWatch:
         self._cause = ""
         self._lines: list[str] = []
         if self._all:
-            self._restore_as_it_does = algorithm.restore_env_runners
+            self._rllibs_restore = algorithm.restore_env_runners
             algorithm.restore_env_runners = self._restore  # an algorithm without samples may never leave its loop
 
     def train(self) -> tuple[dict[str, Any], list[str]]:
@@ -180,14 +159,19 @@ class RunnerWatch:
         return result, lines
 
     def _restore(self, group: Any) -> list[int]:
-        """Stands before the algorithm's own `restore_env_runners`."""
+        """Replaces the algorithm's own `restore_env_runners`, which it calls."""
         if group is not self._group:
-            return list(self._restore_as_it_does(group))
+            return list(self._rllibs_restore(group))
         self._look()
-        back = list(self._restore_as_it_does(group))
+        back = list(self._rllibs_restore(group))
         self._gone -= set(back)
         self._lines += [f"env runner {index} is back" for index in sorted(back)]
-        self._require_somebody()
+        now = self._clock()
+        if self._gone < self._all:
+            self._seen_at = now
+        elif (waited := now - self._seen_at) > LONGEST_ALONE:
+            text = f"all {len(self._all)} env runners died{self._cause}, and none came back in {waited:.0f} s"
+            raise ProcessesLost(text)
         return back
 
     def _look(self) -> None:
@@ -200,23 +184,12 @@ class RunnerWatch:
             why = cause_of_death(index)
             self._cause = f" ({why})" if why else ""
             self._lines.append(f"env runner {index} died{self._cause}: what it had not delivered yet is lost")
-            self._deaths[index].append(self._update)
-            self._require_few_deaths(index)
+            deaths = self._deaths[index]
+            deaths.append(self._update)
+            updates = self._update - deaths[0] + 1
+            if len(deaths) > MOST_DEATHS and updates <= WINDOW:
+                within = f"{updates} update{'s' if updates > 1 else ''}"
+                raise ProcessesLost(f"env runner {index} died {len(deaths)} times within {within}{self._cause}")
         left = len(self._all) - len(self._gone)
         goes_on = f"training goes on with {left} of {len(self._all)} env runners"
         self._lines.append(goes_on if left else "no env runner is left: waiting for one to come back")
-
-    def _require_few_deaths(self, index: int) -> None:
-        deaths = self._deaths[index]
-        updates = self._update - deaths[0] + 1
-        if len(deaths) > MOST_DEATHS and updates <= WINDOW:
-            within = f"{updates} update{'s' if updates > 1 else ''}"
-            raise ProcessesLost(f"env runner {index} died {len(deaths)} times within {within}{self._cause}")
-
-    def _require_somebody(self) -> None:
-        now = self._clock()
-        if self._gone < self._all:
-            self._seen_at = now
-        elif now - self._seen_at > LONGEST_ALONE:
-            waited = f"{now - self._seen_at:.0f} s"
-            raise ProcessesLost(f"all {len(self._all)} env runners died{self._cause}, and none came back in {waited}")

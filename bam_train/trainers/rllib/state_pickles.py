@@ -31,29 +31,23 @@ class RefusedPickle(FormatError):  # noqa: N818 - reads as what happened
     """A pickle names a function or class that is not read."""
 
     def __init__(self, name: str) -> None:
-        said = "".join(letter if letter.isprintable() else "?" for letter in name[:120])
-        super().__init__(f"names {said}, which is not read without running it")
+        printable = "".join(letter if letter.isprintable() else "?" for letter in name[:120])
+        super().__init__(f"names {printable}, which is not read without running it")
 
 
 class Unread:
-    """An object that is not read: it takes whatever a pickle does with it, and does nothing."""
+    """An object that is not read: it accepts whatever a pickle does with it, and does nothing."""
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Unread:
-        """Take any arguments, for every call makes a new one."""
+        """Ignore any arguments."""
         return object.__new__(cls)
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None: ...
-
-    def __call__(self, *args: Any, **kwargs: Any) -> Unread:
-        """Call nothing."""
+    def _ignore(self, *args: Any, **kwargs: Any) -> Unread:
         return self
 
-    def __setstate__(self, state: Any) -> None: ...
+    __call__ = __setstate__ = __setitem__ = append = _ignore
 
-    def __setitem__(self, key: Any, value: Any) -> None: ...
-
-    def append(self, value: Any) -> None:
-        """Keep nothing."""
+    def __init__(self, *args: Any, **kwargs: Any) -> None: ...
 
 
 def read_state(data: bytes, *, skip_objects: bool = False) -> Any:
@@ -68,7 +62,11 @@ def read_state(data: bytes, *, skip_objects: bool = False) -> Any:
         FormatError: Truncated, damaged, or made to exhaust its reader.
     """
     try:
-        _require_sane(data)
+        for count, (instruction, argument, _) in enumerate(pickletools.genops(data), 1):
+            if count > _MOST_INSTRUCTIONS:
+                raise FormatError(f"has more than {_MOST_INSTRUCTIONS} instructions")
+            if "PUT" in instruction.name and int(argument or 0) > count:  # memory for as many values is taken
+                raise FormatError(f"numbers a value {argument} after {count} instructions")
         value = _Reader(io.BytesIO(data), skip_objects).load()
         _count(value, {})
     except FormatError:
@@ -95,15 +93,6 @@ def unpacked_array(text: str) -> Array:
         raise FormatError(f"a packed array cannot be read: {error}") from error
 
 
-def _require_sane(data: bytes) -> None:
-    """Refuse too many instructions, and numbers of values that only exhaust memory."""
-    for count, (instruction, argument, _) in enumerate(pickletools.genops(data), 1):
-        if count > _MOST_INSTRUCTIONS:
-            raise FormatError(f"has more than {_MOST_INSTRUCTIONS} instructions")
-        if "PUT" in instruction.name and int(argument or 0) > count:
-            raise FormatError(f"numbers a value {argument} after {count} instructions")
-
-
 def _count(value: Any, sizes: dict[int, int]) -> int:
     """How many values there are in one, written out; a value in itself and too many are refused."""
     if not isinstance(value, (dict, list, tuple, set, frozenset)):
@@ -125,14 +114,12 @@ class _Reader(pickle.Unpickler):
         self._skip_objects = skip_objects
 
     def find_class(self, module: str, name: str) -> Any:
-        """The stand-in of that name."""
         known = _KNOWN.get((module.replace("numpy.core.", "numpy._core."), name))
         if known is None and not self._skip_objects:
             raise RefusedPickle(f"{module}.{name}")
         return known or Unread
 
     def persistent_load(self, pid: Any) -> Any:
-        """Refuse objects from outside."""
         raise RefusedPickle(f"the outside object {pid!r:.40}")
 
 
@@ -175,10 +162,13 @@ class _Scalar(_StandIn):
 
 
 class _Array(np.ndarray[Any, Any]):
-    """`numpy.ndarray`, as `numpy._core.multiarray._reconstruct` makes it: filled when its state is set."""
+    """`numpy.ndarray`, as `numpy._core.multiarray._reconstruct` makes it: filled when its state is set.
+
+    `_Reconstruct` alone makes one, so that no memory is taken that the file does not fill.
+    """
 
     def __new__(cls, *args: Any) -> Any:
-        """Refuse: `_Reconstruct` alone makes one, so that no memory is taken that the file does not fill."""
+        """Refuse."""
         raise RefusedPickle("numpy.ndarray called")
 
     def __setstate__(self, state: Any) -> None:

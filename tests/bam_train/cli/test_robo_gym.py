@@ -16,7 +16,7 @@ from bam_train.cli.eval import main as evaluate
 from bam_train.cli.export import main
 from bam_train.compat.rllib_directory import find_policy
 from bam_train.compat.rllib_export import export
-from bam_train.compat.rllib_old_layout import read_old_policy
+from bam_train.compat.rllib_layouts import read_old_policy
 from bam_train.errors import CheckpointMismatch
 
 THEIRS = Path(__file__).parents[1] / "robo_gym"
@@ -105,7 +105,7 @@ def test_neither_fits():
 def test_where_it_ran_is_no_argument():
     """An address and a window of that run are not of the policy."""
     directory = find_policy(THEIRS / BASE)
-    assert read_old_policy(directory)[1]["env_config"] == {"ip": "127.0.0.1", "gui": False}
+    assert read_old_policy(directory).env_kwargs == {"ip": "127.0.0.1", "gui": False}
     assert export(THEIRS / BASE).env_kwargs == {"parity": True}
 
 

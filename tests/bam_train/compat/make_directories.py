@@ -1,14 +1,13 @@
-"""Run with a folder: RLlib writes checkpoint directories of its present API, and its own actions beside them.
+"""RLlib writes checkpoint directories of its present API into the folder ROOT, and its own actions beside them.
 
-In a process of its own, so that the tests neither start Ray nor import RLlib for them. ``NAME.npz`` holds observations
-and what RLlib's own restoring (`RLModule.from_checkpoint`) does on them.
+``NAME.npz`` holds observations and what RLlib's own restoring (`RLModule.from_checkpoint`) does on them. It runs as
+``__main__``, so that a directory holds our own classes and not their names.
 """
 
-import sys
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
-import ray
 import torch
 from ray.rllib.algorithms.dqn import DQNConfig
 from ray.rllib.algorithms.ppo import PPOConfig
@@ -18,7 +17,6 @@ from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.core.rl_module.rl_module import RLModule, RLModuleSpec
 from ray.rllib.core.rl_module.torch import TorchRLModule
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
-from ray.tune.trainable import trainable
 
 POLICY = "learner_group/learner/rl_module/default_policy"
 
@@ -65,6 +63,8 @@ def make(folder, config, env, *, train=False, pieces=(), spec=None):
         algorithm.train()
     algorithm.save_to_path(folder)
     algorithm.stop()
+    if not any(Path(algorithm.logdir).iterdir()):
+        Path(algorithm.logdir).rmdir()
     observations, actions = acted(folder)
     np.savez(f"{folder}.npz", observation=observations, action=actions)
 
@@ -89,11 +89,8 @@ def acted(folder):
 
 
 if __name__ == "__main__":
-    root = sys.argv[1]
-    trainable.DEFAULT_STORAGE_PATH = root  # else ~/ray_results
-    ray.init("local", include_dashboard=False, log_to_driver=False, logging_level="error", num_cpus=1)
+    root = globals()["ROOT"]
     ppo = PPOConfig().training(minibatch_size=50, num_epochs=1, train_batch_size_per_learner=100)
     make(f"{root}/ppo", ppo, "Pendulum-v1", train=True, pieces=[MeanStdFilter])
     make(f"{root}/dqn", DQNConfig(), "CartPole-v1")
     make(f"{root}/own", PPOConfig(), Swings, spec=RLModuleSpec(module_class=OwnModule))
-    ray.shutdown()

@@ -43,7 +43,7 @@ def test_actions_are_those_of_rllibs_own_restoring(name, below):
 
 def test_relative_paths(monkeypatch):
     monkeypatch.chdir(HERE / "ppo" / OLD)
-    assert export(Path()).parts.filter.count > 99
+    assert export(Path()).parts.filter.offset.any()
 
 
 class Payload:

@@ -20,7 +20,7 @@ import ray
 from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.settings import TrainSettings
 from bam_train.signals import Terminated
-from bam_train.trainers.rllib.ray_cluster import cluster, own_folder
+from bam_train.trainers.rllib.ray_cluster import cluster, own_folder, reach
 from bam_train.trainers.rllib.ray_resources import cores
 
 pytestmark = pytest.mark.slow
@@ -31,26 +31,18 @@ def settings(**given):
 
 
 @pytest.fixture(autouse=True)
-def home(tmp_path, monkeypatch):
+def home(no_ray, tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH", "RAY_ADDRESS"):
         monkeypatch.delenv(name, raising=False)
     return tmp_path
 
 
-@pytest.fixture(autouse=True)
-def _others():
-    """Processes of other tests, such as multiprocessing's tracker, are not Ray's."""
-    OTHERS.clear()
-    OTHERS.update(psutil.Process().children(recursive=True))
-
-
-OTHERS = set()
-
-
+@pytest.fixture
 def started():
-    """Processes that Ray runs for this one."""
-    return [process for process in psutil.Process().children(recursive=True) if process not in OTHERS]
+    """Processes that Ray runs for this one, which those of other tests are not, such as multiprocessing's tracker."""
+    others = psutil.Process().children(recursive=True)
+    return lambda: [process for process in psutil.Process().children(recursive=True) if process not in others]
 
 
 def listening(processes):
@@ -70,7 +62,7 @@ def folders(processes):
 STUBBORN = "import signal, time; signal.signal(15, signal.SIG_IGN); print(flush=True); time.sleep(60)"
 
 
-def test_one_of_its_own_is_here_alone_and_gone_afterwards(home, capfd):
+def test_one_of_its_own_is_here_alone_and_gone_afterwards(home, started, capfd):
     environment, handlers, came = dict(os.environ), logging.getLogger("ray").handlers[:], []
     before = signal.signal(signal.SIGTERM, lambda number, _: came.append(number))
     handler = signal.getsignal(signal.SIGTERM)
@@ -118,7 +110,7 @@ def is_caught(number):
     return bool(int(mask, 16) >> (number - 1) & 1)
 
 
-def test_another_ctrl_c_at_the_end_leaves_nothing_either(monkeypatch):
+def test_another_ctrl_c_at_the_end_leaves_nothing_either(started, monkeypatch):
     processes, found, shutdown = [], [], ray.shutdown
 
     def disturbed(**given):
@@ -171,15 +163,6 @@ def test_a_sigterm_that_ray_takes_while_it_starts(monkeypatch):
     assert caught.value.signal == signal.SIGTERM
 
 
-def test_too_much_is_refused_before_anything_is_started(monkeypatch):
-    monkeypatch.setattr(ray, "init", lambda **_: pytest.fail("Ray was started"))
-    with (
-        pytest.raises(SettingsError, match="1000 env runners ask for 1000 CPUs"),
-        cluster(settings(num_env_runners=1000)),
-    ):
-        pass
-
-
 def test_a_ray_that_does_not_start(monkeypatch):
     def fail(**_):
         raise RuntimeError("Failed to start GCS.\nLast 0 lines of error files:")
@@ -187,9 +170,11 @@ def test_a_ray_that_does_not_start(monkeypatch):
     monkeypatch.setattr(ray, "init", fail)
     with pytest.raises(TrainingFailed) as caught, cluster(settings()):
         pass
-    assert str(caught.value) == (
-        "Ray does not start on this computer: Failed to start GCS. Is there enough memory and disk?"
-    )
+    text = "Ray does not start on this computer: Failed to start GCS. Is there enough memory and disk?"
+    assert str(caught.value) == text
+    too_much = cluster(settings(num_env_runners=1000))  # refused before anything is started
+    with pytest.raises(SettingsError, match="1000 env runners ask for 1000 CPUs"), too_much:
+        pass
 
 
 def test_a_folder_goes_away_and_takes_those_that_were_left_with_it(tmp_path):
@@ -206,13 +191,13 @@ def test_a_folder_goes_away_and_takes_those_that_were_left_with_it(tmp_path):
     assert list(tmp_path.iterdir()) == [other]
 
 
+@pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning")  # the child does nothing but end
 def test_the_lock_of_a_folder_ends_with_its_process(tmp_path):
-    code = (
-        "import os, sys; from bam_train.trainers.rllib.ray_cluster import own_folder\n"
-        "with own_folder(sys.argv[1]): os._exit(9)"
-    )
-    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], timeout=120, check=False)
-    assert done.returncode == 9
+    child = os.fork()
+    if not child:
+        with own_folder(str(tmp_path)):
+            os._exit(9)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
     (left,) = tmp_path.iterdir()
     with own_folder(str(tmp_path)):
         assert not left.exists()
@@ -233,55 +218,42 @@ from bam_train.settings import TrainSettings
 from bam_train.trainers.rllib.ray_cluster import cluster
 given = {"env": "bam/reach-v0", "algo": "ppo", "trainer": "rllib", "address": sys.argv[1]}
 def join():
-    with cluster(TrainSettings.from_mapping(given | {"num_env_runners": int(sys.argv[2])})):
+    with cluster(TrainSettings.from_mapping(given)):
         print(int(ray.cluster_resources()["CPU"]), "CPU")
+    with cluster(TrainSettings.from_mapping(given | {"num_env_runners": 2})):
+        pass
 sys.exit(guarded(join, "bam-train"))
 """
 
-HERE_ALONE = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
-TOKEN = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0123456789abcdef" * 4}
+TOKEN = "0123456789abcdef" * 4
 
 
-@pytest.fixture
-def joinable():
-    """A cluster that another process has started, with a token; its address, and that process."""
-    command, environment = [sys.executable, "-c", CLUSTER], {**os.environ, **HERE_ALONE, **TOKEN}
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-    ) as process:
+def test_a_cluster_is_joined_and_left_as_it_was(monkeypatch):
+    """One that another process has started, with a token."""
+    monkeypatch.setenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # here alone
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    monkeypatch.setenv("RAY_AUTH_TOKEN", TOKEN)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", CLUSTER], **pipes) as process:
         try:
-            yield process.stdout.readline().strip(), process
+            address = process.stdout.readline().strip()
+            processes = psutil.Process(process.pid).children(recursive=True)
+            joining = subprocess.Popen([sys.executable, "-c", JOIN, address], **pipes)
+            monkeypatch.setenv("RAY_AUTH_TOKEN", "f" * 64)
+            with pytest.raises(TrainingFailed) as caught:
+                reach(address)
+            out, err = joining.communicate(timeout=120)
+            assert all(process.is_running() for process in processes if "IDLE" not in process.name())
         finally:
             process.communicate("\n", timeout=60)
-
-
-def join(address, runners=0, **variables):
-    """Joins a cluster in another process; its status, and what it says."""
-    environment = {**os.environ, **HERE_ALONE, "PYTHONPATH": os.pathsep.join(sys.path), **variables}
-    done = subprocess.run(
-        [sys.executable, "-c", JOIN, address, str(runners)],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        env=environment,
-        check=False,
+    assert str(caught.value) == (
+        f"{address}: the cluster does not accept the token, or none was given. Set RAY_AUTH_MODE=token, and "
+        "RAY_AUTH_TOKEN to what ray get-auth-token says on its head"
     )
-    return done.returncode, done.stdout + done.stderr
-
-
-def test_a_cluster_is_joined_and_left_as_it_was(joinable):
-    address, process = joinable
-    processes = psutil.Process(process.pid).children(recursive=True)
-    assert join(address, **TOKEN) == (0, "1 CPU\n")
-    assert join(address, runners=2, **TOKEN) == (
+    assert (joining.returncode, out, err) == (
         1,
+        "1 CPU\n",
         "bam-train: 2 env runners ask for 2 CPUs, 1 in the cluster. "
         "Lower --num-env-runners or --num-learners, or add computers with ray start\n",
     )
-    refused = (
-        1,
-        f"bam-train: {address}: the cluster does not accept the token, or none was given. Set RAY_AUTH_MODE=token, and "
-        "RAY_AUTH_TOKEN to what ray get-auth-token says on its head\n",
-    )
-    assert join(address, RAY_AUTH_MODE="token", RAY_AUTH_TOKEN="f" * 64) == refused
-    assert all(process.is_running() for process in processes if "IDLE" not in process.name())

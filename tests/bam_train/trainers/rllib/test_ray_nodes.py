@@ -5,8 +5,11 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import sys
 import time
 
+import gymnasium as gym
+import numpy as np
 import pytest
 
 pytest.importorskip("ray.rllib")
@@ -28,7 +31,7 @@ PATIENCE = 240.0
 
 
 @pytest.fixture
-def nodes(monkeypatch):
+def nodes(no_ray, monkeypatch):
     """A cluster of two nodes with one CPU each, and its second node."""
     for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS"):
         monkeypatch.delenv(name, raising=False)
@@ -41,7 +44,7 @@ def nodes(monkeypatch):
             cluster.shutdown()
 
 
-def train_settings(address, **given):
+def train_settings(address, batch=BATCH, **given):
     return resolve(
         {
             "env": "bam/reach",
@@ -51,7 +54,12 @@ def train_settings(address, **given):
             "num_envs": 8,
             "num_env_runners": 2,
             "address": address,
-            "hyperparameters": {"train_batch_size_per_learner": BATCH, "minibatch_size": 128, "num_epochs": 1},
+            "hyperparameters": {
+                "train_batch_size_per_learner": batch,
+                "minibatch_size": 128,
+                "num_epochs": 1,
+                "model_config": {"fcnet_hiddens": [8]},
+            },
             **given,
         }
     )
@@ -77,7 +85,7 @@ class Plan:
     def __call__(self, progress):
         self.steps.append(progress.steps)
         if time.monotonic() - self.since > PATIENCE:
-            pytest.fail(f"nothing came of {self.stages[0].__name__}; {self.trainer.notices}")
+            pytest.fail(f"{len(self.stages)} stages are left; {self.trainer.notices}")
         if self.stages[0]():
             self.stages.pop(0)
             self.since = time.monotonic()
@@ -108,11 +116,7 @@ def test_a_runner_and_a_node_die_in_mid_training(nodes, tmp_path):
             cluster.remove_node(second, allow_graceful=False)
             return True
 
-        def three_more_updates():
-            plan.later = getattr(plan, "later", 0) + 1
-            return plan.later == 3
-
-        killed, second_index = None, None
+        later = iter(range(4))
         plan = Plan(trainer, [kill_a_runner])
         trainer.train(10**9, plan)
         killed, second_index = sorted(places, key=lambda index: places[index][0] == second.node_id)
@@ -120,7 +124,7 @@ def test_a_runner_and_a_node_die_in_mid_training(nodes, tmp_path):
             after(f"env runner {killed} is back"),
             kill_a_node,
             after(f"env runner {second_index} died: what it had not delivered yet is lost"),
-            three_more_updates,
+            lambda: next(later) == 2,
         ]
         trainer.train(10**9, plan)
 
@@ -139,67 +143,65 @@ def test_a_runner_and_a_node_die_in_mid_training(nodes, tmp_path):
         assert Checkpoint.open(saved.path).manifest.steps == trainer.steps
 
 
-BROKEN = """
-import gymnasium as gym
-import numpy as np
+class Blind(gym.Env):
+    """Cannot be made in a process of Ray's."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+    made_in = os.getpid()
+
+    def __init__(self):
+        if os.getpid() != self.made_in:
+            raise ConnectionError("no display here")
+
 
 class Broken(gym.Env):
+    """Fails after 300 steps."""
+
     observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
     action_space = gym.spaces.Discrete(2)
     steps = 0
 
     def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
         return np.zeros(2, np.float32), {}
 
     def step(self, action):
         self.steps += 1
-        if self.steps > 600:
+        if self.steps > 300:
             raise ConnectionError("the simulator is gone")
         return np.zeros(2, np.float32), 0.0, self.steps % 20 == 0, False, {}
 
-gym.register("test/Broken-v0", entry_point=Broken)
-"""
+
+@pytest.fixture
+def registered(one_ray):
+    """Registers an environment of this file, which runners get as a whole, and not by its name; its id."""
+    ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
+
+    def register(kind):
+        gym.register("test/Faulty-v0", entry_point=kind)
+        return "test/Faulty-v0"
+
+    yield register
+    ray.cloudpickle.unregister_pickle_by_value(sys.modules[__name__])
+    del gym.registry["test/Faulty-v0"]
 
 
-def test_a_runner_that_dies_again_and_again(tmp_path, monkeypatch):
-    (tmp_path / "broken.py").write_text(BROKEN)
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+def test_a_runner_that_dies_again_and_again(registered, tmp_path, monkeypatch):
     monkeypatch.setattr("bam_train.trainers.rllib.runner_deaths.MOST_DEATHS", 1)
-    settings = train_settings(None, env="broken:test/Broken-v0", num_envs=1, num_env_runners=1)
+    settings = train_settings(None, 256, env=registered(Broken), num_envs=1, num_env_runners=1)
     with contextlib.closing(RLlibTrainer.create(settings)) as trainer:
         with pytest.raises(ProcessesLost) as caught:
             trainer.train(10**9, Plan(trainer, [lambda: False]))
         assert str(caught.value).startswith("env runner 1 died 2 times within ")
         assert str(caught.value).endswith(" updates (ConnectionError: the simulator is gone)")
-        assert trainer.steps >= BATCH
+        assert trainer.steps >= 256
         assert Checkpoint.open(trainer.save(tmp_path / "one.zip", {}, {}).path).manifest.steps == trainer.steps
 
 
-BLIND = """
-import gymnasium as gym, numpy as np, ray
-
-class Blind(gym.Env):
-    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
-    action_space = gym.spaces.Discrete(2)
-
-    def __init__(self):
-        if ray.is_initialized():
-            raise ConnectionError("no display here")
-
-gym.register("test/Blind-v0", entry_point=Blind)
-"""
-
-
-def test_an_environment_that_no_runner_can_make(tmp_path, monkeypatch):
-    (tmp_path / "blind.py").write_text(BLIND)
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
-    settings = train_settings(None, env="blind:test/Blind-v0", num_envs=1, num_env_runners=1)
+def test_an_environment_that_no_runner_can_make(registered):
+    settings = train_settings(None, env=registered(Blind), num_envs=1, num_env_runners=1)
     with pytest.raises(SettingsError) as caught:
         RLlibTrainer.create(settings)
     assert str(caught.value) == (
-        "ppo on blind:test/Blind-v0 cannot be set up: env runner 1 died (ConnectionError: no display here)"
+        "ppo on test/Faulty-v0 cannot be set up: env runner 1 died (ConnectionError: no display here)"
     )
-    assert not ray.is_initialized()

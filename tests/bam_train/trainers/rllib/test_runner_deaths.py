@@ -9,11 +9,10 @@ import pytest
 pytest.importorskip("ray.rllib")
 
 from ray.exceptions import RayError
-from ray.rllib.algorithms.ppo import PPOConfig
 
 from bam_train.errors import ProcessesLost, TrainingFailed
 from bam_train.trainers.rllib import runner_deaths
-from bam_train.trainers.rllib.runner_deaths import RunnerWatch, fault_tolerance
+from bam_train.trainers.rllib.runner_deaths import RunnerWatch
 
 
 class Algorithm:
@@ -51,15 +50,10 @@ def causes(monkeypatch):
 
 
 def test_nothing_happens():
-    watch = RunnerWatch(Algorithm([QUIET] * 30))
-    assert watch.train() == ({"iterations left": 29}, [])
-    assert [watch.train()[1] for _ in range(29)] == [[]] * 29
-
-
-def test_without_runners():
-    algorithm = Algorithm([[]], runners=0)
-    assert RunnerWatch(algorithm).train() == ({"iterations left": 0}, [])
-    assert "restore_env_runners" not in vars(algorithm)
+    watch = RunnerWatch(Algorithm([QUIET] * 3))
+    assert [watch.train() for _ in range(3)] == [({"iterations left": left}, []) for left in (2, 1, 0)]
+    without = Algorithm([[]], runners=0)
+    assert RunnerWatch(without).train() == ({"iterations left": 0}, [])
 
 
 def test_runners_of_others_are_left_alone():
@@ -158,17 +152,3 @@ def test_a_cluster_that_is_gone():
         RunnerWatch(algorithm).train()
     assert not isinstance(caught.value, ProcessesLost)
     assert str(caught.value) == ("a process of the cluster that training needs is gone (The actor died: the learner)")
-
-
-def test_a_config():
-    config = fault_tolerance(PPOConfig())
-    assert config.restart_failed_env_runners is True
-    assert (config.env_runner_health_probe_timeout_s, config.delay_between_env_runner_restarts_s) == (0.25, 1.0)
-    assert config.env_runner_cls is runner_deaths.ReportingEnvRunner
-
-
-def test_a_runner_class_that_was_chosen_stays():
-    class Own(runner_deaths.ReportingEnvRunner):
-        pass
-
-    assert fault_tolerance(PPOConfig().env_runners(env_runner_cls=Own)).env_runner_cls is Own

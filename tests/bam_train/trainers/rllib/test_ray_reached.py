@@ -1,4 +1,4 @@
-"""Addresses of clusters: typed, found, silent, or somebody else's."""
+"""Addresses of clusters: typed, found, silent, or somebody else's; no cluster is started."""
 
 from __future__ import annotations
 
@@ -12,20 +12,17 @@ pytest.importorskip("ray.rllib")
 from ray._private import utils as ray_utils
 
 from bam_train.errors import SettingsError, TrainingFailed
-from bam_train.trainers.rllib import ray_address as address
-from bam_train.trainers.rllib.ray_address import find, reach
+from bam_train.trainers.rllib import ray_cluster
+from bam_train.trainers.rllib.ray_cluster import find, reach, reason
 
 
 @pytest.fixture
-def listener():
-    """Accepts connections, and says nothing."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        yield f"127.0.0.1:{server.getsockname()[1]}"
-
-
-@pytest.fixture(autouse=True)
-def no_variable(monkeypatch):
+def started_here(monkeypatch):
+    """What ``ray start`` on this computer wrote."""
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    found = ["10.0.0.5:6379"]
+    monkeypatch.setattr(ray_utils, "read_ray_address", lambda: found[0])
+    return found
 
 
 @pytest.mark.parametrize("place", ["10.0.0.5:6379", "head.local:1234", "[::1]:6379"])
@@ -33,25 +30,20 @@ def test_an_address_is_taken_as_it_is(place):
     assert find(place) == place
 
 
-def test_auto_is_the_cluster_of_this_computer(monkeypatch):
-    monkeypatch.setattr(ray_utils, "read_ray_address", lambda: "10.0.0.5:6379")
+def test_auto_is_the_cluster_of_this_computer_or_the_variables(started_here, monkeypatch):
     assert find("auto") == "10.0.0.5:6379"
     monkeypatch.setenv("RAY_ADDRESS", "10.0.0.6:6379")
     assert find("auto") == "10.0.0.6:6379"
-
-
-def test_what_the_variable_says_may_be_auto_too_and_is_named_if_it_is_wrong(monkeypatch):
-    monkeypatch.setattr("ray._private.utils.read_ray_address", lambda: "10.0.0.6:6380")
     monkeypatch.setenv("RAY_ADDRESS", "auto")
-    assert find("auto") == "10.0.0.6:6380"
+    assert find("auto") == "10.0.0.5:6379"
     monkeypatch.setenv("RAY_ADDRESS", "local")
     with pytest.raises(SettingsError, match=r"^RAY_ADDRESS: expected auto or host:port, .* found 'local'$"):
         find("auto")
-    assert find("10.0.0.5:6379") == "10.0.0.5:6379"
+    assert find("10.0.0.7:6379") == "10.0.0.7:6379"
 
 
-def test_auto_without_a_cluster(monkeypatch):
-    monkeypatch.setattr(ray_utils, "read_ray_address", lambda: None)
+def test_auto_without_a_cluster(started_here):
+    started_here[0] = None
     with pytest.raises(TrainingFailed) as caught:
         find("auto")
     assert str(caught.value) == (
@@ -77,10 +69,8 @@ def test_an_address_for_rays_client():
 def test_nobody_listens():
     with socket.create_server(("127.0.0.1", 0)) as server:
         place = f"127.0.0.1:{server.getsockname()[1]}"
-    before = time.monotonic()
     with pytest.raises(TrainingFailed) as caught:
         reach(place)
-    assert time.monotonic() - before < 5.0
     assert str(caught.value) == (
         f"{place}: no Ray cluster answers there (Connection refused). Check --address, and that ray start --head runs "
         "there and no firewall is between"
@@ -97,33 +87,26 @@ def test_a_host_that_swallows_everything(monkeypatch):
         reach("[::1]:6379")
 
 
-def test_a_listener_that_says_nothing(listener, monkeypatch):
-    monkeypatch.setattr(address, "REACH_TIMEOUT", 2.0)
+def test_a_listener_that_never_answers():
     before = time.monotonic()
-    with pytest.raises(TrainingFailed) as caught:
-        reach(listener)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        place = f"127.0.0.1:{server.getsockname()[1]}"
+        with pytest.raises(TrainingFailed) as caught:
+            reach(place, timeout=0.5)
     assert time.monotonic() - before < 10.0
     assert str(caught.value) == (
-        f"{listener}: something answers there, but it is no Ray cluster. "
-        "Check the port: that of ray start --head is 6379"
+        f"{place}: something answers there, but it is no Ray cluster. Check the port: that of ray start --head is 6379"
     )
-
-
-def test_it_all_takes_less_than_twenty_seconds():
-    assert address.SOCKET_TIMEOUT + address.REACH_TIMEOUT <= 18.0
+    assert ray_cluster.SOCKET_TIMEOUT + ray_cluster.REACH_TIMEOUT <= 18.0  # of the 20 s that are promised
 
 
 @pytest.mark.parametrize(
-    ("came", "said", "start"),
+    ("said", "start"),
     [
-        ("known", "", "the cluster is there, but could not be joined within 13 s: this computer is not part of it"),
-        (
-            "there",
-            "RuntimeError: Version mismatch: The cluster was started with: Ray: 2.50",
-            "the cluster runs another",
-        ),
-        ("there", "AuthenticationError: RPC error: InvalidAuthToken", "the cluster does not accept the token"),
+        ("known\n", "the cluster is there, but could not be joined within 13 s: this computer is not part of it"),
+        ("RuntimeError: Version mismatch: The cluster was started with: Ray: 2.50", "the cluster runs another"),
+        ("AuthenticationError: RPC error: InvalidAuthToken", "the cluster does not accept the token"),
     ],
 )
-def test_reasons(came, said, start):
-    assert address.reason(came, said).startswith(start)
+def test_reasons(said, start):
+    assert reason(said).startswith(start)

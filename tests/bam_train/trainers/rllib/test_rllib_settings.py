@@ -1,0 +1,191 @@
+"""Settings of RLlib's runs and files of recorded episodes, checked without Ray."""
+
+from __future__ import annotations
+
+import pytest
+from gymnasium.spaces import Box, Discrete
+
+pytest.importorskip("ray")
+
+from bam_train.errors import SettingsError
+from bam_train.settings import TrainSettings
+from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
+from bam_train.trainers.resolve_settings import resolve
+from bam_train.trainers.rllib import rllib_hyperparameters as hyperparameters
+from bam_train.trainers.rllib.algorithm_config import envs_each
+from bam_train.trainers.rllib.recorded_episodes import load
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*:DeprecationWarning:ray")  # Ray's own, of its data library
+
+
+@pytest.mark.parametrize(("number", "runners", "each"), [(64, 0, 64), (64, 2, 32), (64, 3, 21), (5, 2, 2), (1, 4, 1)])
+def test_runners_share_the_environments(number, runners, each):
+    assert envs_each(TrainSettings(env="bam/reach-v0", algo="ppo", num_envs=number, num_env_runners=runners)) == each
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"algo": "pp"}, "Unknown algorithm 'pp'. Did you mean 'ppo'?"),
+        ({"hyperparameters": {"gama": 0.9}}, "Unknown ppo hyperparameter 'gama'. Did you mean 'gamma'?"),
+        (
+            {"hyperparameters": {"train_batch_size": 9}},
+            "train_batch_size is not a hyperparameter here: use train_batch",
+        ),
+        (
+            {"env": "CartPole-v1", "algo": "sac", "hyperparameters": {"twin_q": False}},
+            "twin_q: expected true, as actions are choices, found false. Leave it out",
+        ),
+        *(
+            ({"hyperparameters": {old: 1}}, f"{old} is not a hyperparameter here: use {now}")
+            for old, now in (
+                ("num_workers", "--num-env-runners"),
+                ("num_rollout_workers", "--num-env-runners"),
+                ("num_envs_per_worker", "--num-envs"),
+                ("observation_filter", "normalize=true"),
+                ("learning_rate", "lr"),
+            )
+        ),
+        *(
+            ({"hyperparameters": {old: 1}}, f"{old}: there is none here; {why}")
+            for old, why in (
+                ("num_gpus_per_worker", "env runners use no GPU, and --num-gpus is for the learners"),
+                ("log_level", "RLlib's log is off"),
+                ("horizon", "the environment ends its episodes"),
+            )
+        ),
+        (
+            {"hyperparameters": {"lr": "fast"}},
+            "lr: expected a number or a schedule [[step, value], ...], found 'fast'",
+        ),
+        ({"hyperparameters": {"lr": -1}}, "lr: expected a number above 0, found -1"),
+        *(
+            (
+                {"hyperparameters": {name: schedule}},
+                f"{name}: expected a number or a schedule [[0, value], [step, value]",
+            )
+            for name in ("lr", "entropy_coeff")
+            for schedule in ([], [[0, 1e-3]], [[5, 1e-3], [9, 0.0]], [[0, 1e-3], [9, 0.0], [8, 0.0]], [[0, 1e-3], [9]])
+        ),
+        ({"hyperparameters": {"lr": [[0, 1e-3], [9, -1]]}}, "lr: expected a number of at least 0, found -1"),
+        ({"hyperparameters": {"gamma": None}}, "gamma: expected a number, found None"),
+        ({"hyperparameters": {"num_epochs": None}}, "num_epochs: expected a whole number, found None"),
+        ({"hyperparameters": {"model_config": 5}}, "model_config: expected a table of named values, found 5"),
+        *(
+            (
+                {"hyperparameters": {"model_config": {"fcnet_hiddens": sizes}}},
+                "model_config.fcnet_hiddens: expected one",
+            )
+            for sizes in ([], [0], [8, -3])
+        ),
+        (
+            {"hyperparameters": {"model_config": {"head_fcnet_hiddens": [0]}}},
+            "model_config.head_fcnet_hiddens: expected",
+        ),
+        ({"algo": "sac", "hyperparameters": {"n_step": 0}}, "n_step: expected a whole number of at least 1, found 0"),
+        (
+            {"algo": "sac", "hyperparameters": {"target_entropy": "x"}},
+            "target_entropy: expected a number or 'auto', found",
+        ),
+        ({"algo": "sac", "hyperparameters": {"n_step": [3, 1]}}, "n_step: expected [least, most] of at least 1, found"),
+        (
+            {"algo": "sac", "hyperparameters": {"initial_alpha": -1}},
+            "initial_alpha: expected a number above 0, found -1",
+        ),
+        *(
+            ({"algo": "sac", "hyperparameters": {"replay_buffer_config": buffer}}, f"replay_buffer_config{text}")
+            for buffer, text in (
+                ({"capacty": 9}, " argument 'capacty'. Did you mean 'capacity'?"),
+                ({"capacity": 0}, ".capacity: expected at least 1, found 0"),
+                ({"type": "Foo"}, ".type: expected EpisodeReplayBuffer or PrioritizedEpisodeReplayBuffer, found 'Foo'"),
+            )
+        ),
+        ({"hyperparameters": {"model_config": {"fcnet_hidden": []}}}, "Unknown model_config argument 'fcnet_hidden'"),
+        ({"algo": "dqn"}, "dqn does not fit bam/reach-v0: it takes Discrete actions, found Box"),
+        ({"algo": "bc"}, "data: bc learns from recorded episodes, found none"),
+        ({"data": "x"}, "data: ppo learns in the environment"),
+        ({"device": "cuda"}, "device: rllib learns on the CPU, or on as many GPUs as --num-gpus says; found 'cuda'."),
+        ({"transport": ["tcp://127.0.0.1:1"]}, "transport: the rllib trainer makes its environments"),
+        ({"normalize": {"clip_value": 1}}, "Unknown normalize argument 'clip_value'. Did you mean 'clip_by_value'?"),
+    ],
+)
+def test_settings_are_refused(given, text):
+    with pytest.raises(SettingsError) as caught:
+        resolve({"env": "bam/reach", "algo": "ppo", "trainer": "rllib", **given})
+    assert text in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("algo", "given"),
+    [
+        ("ppo", {"lr": [[0, 1e-3], [900, 0.0]], "entropy_coeff": [[0, 0.1], [900, 0.0]], "grad_clip": None}),
+        ("ppo", {"model_config": {"head_fcnet_hiddens": []}, "minibatch_size": None}),
+        ("sac", {"n_step": [1, 3], "target_entropy": -2.0, "actor_lr": [[0, 1e-3], [900, 0.0]]}),
+        ("sac", {"replay_buffer_config": {"type": "EpisodeReplayBuffer", "capacity": 1e4}}),
+    ],
+)
+def test_settings_that_look_odd_and_are_not(algo, given):
+    values = hyperparameters.complete(RLLIB_ALGORITHMS[algo], given)
+    for name in given.keys() - {"model_config", "replay_buffer_config"}:
+        assert values[name] == given[name]
+
+
+@pytest.mark.parametrize("name", sorted(RLLIB_ALGORITHMS))
+def test_complete_settings_stay_as_they_are(name):
+    values = hyperparameters.complete(RLLIB_ALGORITHMS[name], {})
+    assert hyperparameters.complete(RLLIB_ALGORITHMS[name], values) == values
+
+
+def test_the_preset_belongs_to_its_trainer():
+    assert resolve({"env": "bam/pick", "algo": "ppo", "trainer": "rllib"}).hyperparameters["action_init_scale"] == 0.01
+    assert "n_steps" in resolve({"env": "bam/pick", "algo": "ppo"}).hyperparameters
+
+
+def recorded(folder, **columns):
+    """Six steps of two episodes of `test/Sampled-v0`, but for some columns."""
+    import pyarrow
+    import pyarrow.parquet
+
+    observed = [[0.1 * k, 0.5] for k in range(6)]
+    rows = {
+        "eps_id": ["a"] * 3 + ["b"] * 3,
+        "obs": observed,
+        "actions": [-1, 0] * 3,
+        "rewards": [1.0] * 6,
+        "new_obs": observed,
+        "terminateds": [False, False, True] * 2,
+        "truncateds": [False] * 6,
+    }
+    pyarrow.parquet.write_table(pyarrow.table(rows | columns), folder / "a.parquet")
+    return str(folder)
+
+
+@pytest.mark.parametrize(
+    ("columns", "text"),
+    [
+        ({"actions": [-1, 0, 7, 0, 0, 0]}, "actions: expected -1 to 0, found 7"),
+        ({"actions": ["x"] * 6}, "actions: expected finite numbers, found others"),
+        ({"rewards": [1.0, None, 1.0, 1.0, 1.0, 1.0]}, "rewards: expected finite numbers, found others"),
+        ({"obs": [[float("nan"), 0.0]] * 6}, "obs: expected finite numbers, found others"),
+        (
+            {"obs": [[0.0, 0.0], [1.0], [0.0, 1.0, 2.0]] * 2},
+            "obs: expected rows of shape (2,), found rows of different",
+        ),
+        (
+            {name: [] for name in ("eps_id", "obs", "actions", "rewards", "new_obs", "terminateds", "truncateds")},
+            "found none",
+        ),
+    ],
+    ids=["choice", "text", "null", "nan", "ragged", "empty"],
+)
+def test_recorded_rows_that_are_not_whole(columns, text, tmp_path):
+    with pytest.raises(SettingsError) as caught:
+        load(recorded(tmp_path, **columns), Box(-1, 1, (2,)), Discrete(2, start=-1), 0.9)
+    assert text in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_value_targets_are_what_is_earned_to_the_end_of_an_episode(tmp_path):
+    table = load(recorded(tmp_path), Box(-1, 1, (2,)), Discrete(2, start=-1), 0.5)
+    assert table["value_targets"].tolist() == [1.75, 1.5, 1.0] * 2
+    assert table["actions"].tolist() == [0, 1] * 3  # counted from 0

@@ -1,0 +1,41 @@
+"""One Ray for every test that trains with it: the first one starts it, and the tests of Ray itself stop it."""
+
+import contextlib
+
+import pytest
+
+
+class SharedRay:
+    def __init__(self):
+        self._stack = contextlib.ExitStack()
+
+    def start(self):
+        ray = pytest.importorskip("ray")
+        if not ray.is_initialized():
+            from bam_train.settings import TrainSettings
+            from bam_train.trainers.rllib.ray_cluster import cluster
+
+            self._stack.enter_context(cluster(TrainSettings(env="bam/reach-v0", algo="ppo", trainer="rllib")))
+
+    def stop(self):
+        self._stack.close()
+
+
+@pytest.fixture(scope="session", name="shared_ray")
+def shared_ray_fixture():
+    """For fixtures of other scopes: ``shared_ray.start()``."""
+    shared = SharedRay()
+    yield shared
+    shared.stop()
+
+
+@pytest.fixture(name="one_ray")
+def one_ray_fixture(shared_ray):
+    """Ray, for as long as nobody stops it."""
+    shared_ray.start()
+
+
+@pytest.fixture(name="no_ray")
+def no_ray_fixture(shared_ray):
+    """No Ray runs in this process."""
+    shared_ray.stop()
