@@ -129,11 +129,7 @@ class _Head(Struct):
 
 
 def parse_manifest(path: Path, data: bytes) -> Manifest:
-    """Read a manifest; fields that this version does not know are left out.
-
-    Args:
-        path: The checkpoint, for errors.
-        data: The member's bytes.
+    """Read the manifest of the checkpoint at `path`; fields that this version does not know are left out.
 
     Raises:
         NewerFormat: Written by a newer bam-train.
@@ -152,11 +148,7 @@ def parse_manifest(path: Path, data: bytes) -> Manifest:
 
 
 def manifest_bytes(path: Path, values: Mapping[str, Any]) -> bytes:
-    """Write a manifest from exactly its fields.
-
-    Args:
-        path: The checkpoint, for errors.
-        values: Every field of `Manifest` but for ``format``.
+    """Write the manifest of the checkpoint at `path` from every field of `Manifest` but for ``format``.
 
     Raises:
         CheckpointError: A field is missing, unknown, of the wrong type or not JSON.

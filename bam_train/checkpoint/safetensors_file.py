@@ -24,10 +24,7 @@ _MARKS = {"$array", "$scalar", "$tensor", "$tuple", "$items", "$float"}
 
 
 def dump(arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Write arrays as one safetensors file.
-
-    Args:
-        arrays: Any shapes; dtypes bool, (u)int8-64, float16-64.
+    """Write arrays of bool, (u)int8-64 and float16-64 as one safetensors file.
 
     Raises:
         FormatError: An array's dtype cannot be stored.
@@ -101,12 +98,7 @@ def pack(tree: Any) -> tuple[bytes, bytes]:
 
 
 def unpack(skeleton: bytes, arrays: bytes, to_tensor: Callable[[np.ndarray], Any] | None = None) -> Any:
-    """Turn what `pack` wrote into the tree again.
-
-    Args:
-        skeleton: The JSON.
-        arrays: The safetensors.
-        to_tensor: Makes a torch tensor of an array; tensors stay arrays without it.
+    """Turn what `pack` wrote into the tree again; tensors become arrays without `to_tensor`, which makes them.
 
     Raises:
         FormatError: The two do not belong together, or are not as `pack` writes them.

@@ -30,11 +30,7 @@ class ArraySpec:
     high: np.ndarray | None = None
 
     def checked(self, value: Any, batch: tuple[int, ...]) -> np.ndarray:
-        """Return the value as an array that can be copied into this one.
-
-        Args:
-            value: (*batch, *shape).
-            batch: Axes before the shape: () or (n,).
+        """Return the value, (*batch, *shape), as an array that can be copied into this one; the batch is () or (n,).
 
         Raises:
             PolicyError: The shape or the kind of number does not fit, or a Discrete is not in its range.
@@ -56,10 +52,7 @@ class ArraySpec:
 
 
 def observation_arrays(space: Mapping[str, Any]) -> list[ArraySpec]:
-    """List the arrays of an observation space; that of a Dict are named observation.<key>.
-
-    Args:
-        space: As written by `bam_envs.core.spaces.space_to_json`.
+    """List the arrays of an observation space in JSON form; those of a Dict are named observation.<key>.
 
     Raises:
         PolicyError: The space is of another kind than a policy takes.

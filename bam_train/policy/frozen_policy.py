@@ -110,11 +110,10 @@ class FrozenPolicy:
         return cls(OnnxSession(onnx), observation_space, action_space)
 
     def reset(self, env_ids: Any = None) -> None:
-        """Forget what was observed, at the start of an episode.
+        """Forget what was observed, at the start of an episode; it only matters if `recurrent`.
 
         Args:
-            env_ids: Indices or a mask of the environments whose episode starts; None for all. Only matters if
-                `recurrent`.
+            env_ids: Indices or a mask of the environments whose episode starts; None for all.
         """
         if env_ids is None:
             self._state = None
@@ -123,9 +122,8 @@ class FrozenPolicy:
                 for state in self._state.values():
                     state[env_ids] = 0
             except IndexError as error:
-                raise PolicyError(
-                    f"reset: env_ids {env_ids!r} do not fit a state of {len(state)} environments"
-                ) from error
+                text = f"reset: env_ids {env_ids!r} do not fit a state of {len(state)} environments"
+                raise PolicyError(text) from error
 
     def act(self, observation: Any) -> Any:
         """Return the action for one observation.
@@ -142,11 +140,8 @@ class FrozenPolicy:
         buffer = self._buffer
         if buffer is None:
             return self._act({name: value[None] for name, value in self._checked(observation, ()).items()})[0]
-        if (
-            type(observation) is not np.ndarray
-            or observation.dtype is not self._dtype
-            or observation.shape != self._shape
-        ):
+        is_array = type(observation) is np.ndarray
+        if not (is_array and observation.dtype is self._dtype and observation.shape == self._shape):
             observation = self._arrays[0].checked(observation, ())
         buffer[0] = observation
         return _int64(self._session.run(self._inputs, self._outputs)[0])[0]
@@ -161,9 +156,6 @@ class FrozenPolicy:
 
         Returns:
             A new array, (n, ...).
-
-        Raises:
-            PolicyError: The observations do not fit.
         """
         first = observations
         if self._is_dict and isinstance(observations, Mapping) and observations:

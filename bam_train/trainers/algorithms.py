@@ -45,11 +45,7 @@ class Algorithm:
         return _resolve(self.reference)
 
     def require_actions(self, env: str, kind: str) -> None:
-        """Refuse an action space that this algorithm cannot learn on.
-
-        Args:
-            env: Environment id, as the error names it.
-            kind: Class name of its action space.
+        """Refuse `env` if this algorithm cannot learn on its `kind` of action space, such as ``Box``.
 
         Raises:
             SettingsError: Names the algorithms of the same trainer that can, from the same source of episodes.

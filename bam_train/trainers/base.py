@@ -130,12 +130,9 @@ class Trainer(Protocol):
 def manifest(
     settings: TrainSettings, spaces: tuple[Space[Any], Space[Any]], known: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the manifest's fields.
+    """The manifest's fields; `known` has those that only the trainer knows: signals, period, steps and scores.
 
-    Args:
-        settings: Complete ones of the run.
-        spaces: The environment's own, of observations and of actions.
-        known: The fields that only the trainer knows: signals, period, steps and scores.
+    The spaces are the environment's own, of observations and of actions.
     """
     return {
         "env": settings.env,

@@ -15,7 +15,7 @@ from bam_train.checkpoint.manifest import AGAIN
 from bam_train.errors import AlteredCheckpoint, CheckpointError, OutputError
 from bam_train.settings import TrainSettings, file_stem, read_config
 from bam_train.trainers.resolve_settings import CHANGEABLE
-from bam_train.trainers.run_folder import require_writable
+from bam_train.trainers.run_folder import require_room
 from bam_train.trainers.training_run import Best
 
 NOTES = "bam/resume/notes.json"
@@ -34,9 +34,7 @@ class Output:
 
 
 def choose_output(settings: TrainSettings, out: Path | None, force: bool, resumed: Checkpoint | None) -> Output:
-    """Choose where the best checkpoint goes, and find out whether it can be written there.
-
-    What killed runs left half written there is removed.
+    """Choose where the best checkpoint goes; what killed runs left half written there is removed.
 
     Args:
         settings: Of the run.
@@ -50,9 +48,13 @@ def choose_output(settings: TrainSettings, out: Path | None, force: bool, resume
     own = None if resumed is None else _own_best(resumed)
     usual = FOLDER / f"{file_stem(settings.env, settings.algo, settings.trainer)}.zip"
     wanted = (out or (own.path if own else usual)).expanduser()
-    if wanted.suffix != ".zip" and not wanted.is_dir():
+    if wanted.is_dir():
+        raise OutputError(
+            f"{wanted}: is a folder; give the name of a file in it, such as --out {wanted / 'policy.zip'}"
+        )
+    if wanted.suffix != ".zip":
         raise OutputError(f"{wanted}: expected a file name that ends in .zip. Choose another one with --out")
-    require_writable(wanted)
+    require_room(wanted, "--out", wanted.parent)
     remove_orphans(wanted.resolve())
     if own is not None and wanted.resolve() == own.path:
         return Output(wanted, own.best)

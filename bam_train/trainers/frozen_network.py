@@ -84,10 +84,10 @@ def onnx_file(
     outputs: Sequence[str],
     quiet: Mapping[str, Any] | None = None,
 ) -> bytes:
-    """Trace a module into an ONNX file; the first axis of every input and output is the batch.
+    """Trace a module on the CPU into an ONNX file; the first axis of every input and output is the batch.
 
     Args:
-        module: On the CPU.
+        module: What to trace.
         inputs: An example of each, in the order of ``forward``, by name.
         outputs: Their names.
         quiet: Beginnings of warnings that say nothing here, with their categories.
@@ -124,11 +124,7 @@ def affordable(observation: Iterable[Any], n: int) -> int:
 def draw_array(space: Any, n: int, rng: np.random.Generator, moments: tuple[Array, Array] | None) -> Array:
     """Draw n values of a space that is no Dict, (n, ...).
 
-    Args:
-        space: Theirs.
-        n: How many.
-        rng: Where from.
-        moments: Mean and deviation of numbers that the policy normalises, so that few of them end at its limits.
+    Numbers that the policy normalises have `moments`, mean and deviation, so that few of them end at its limits.
     """
     shape = (n, *space.shape)
     if isinstance(space, spaces.MultiBinary):
@@ -152,10 +148,7 @@ def draw_array(space: Any, n: int, rng: np.random.Generator, moments: tuple[Arra
 def clearest(module: Any, observations: Mapping[str, Array], n: int) -> dict[str, Array]:
     """The n observations whose choice is clearest: where two choices tie, rounding decides, and that proves nothing.
 
-    Args:
-        module: The frozen policy as a torch module, with ``scores`` and ``head.margin``.
-        observations: By key, (m, ...) each.
-        n: At most.
+    The module is a frozen policy with ``scores`` and ``head.margin``; the observations are (m, ...) each, by key.
     """
     with torch.no_grad():
         margin = module.head.margin(module.scores(*map(torch.as_tensor, observations.values()))).numpy()

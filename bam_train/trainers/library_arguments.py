@@ -30,15 +30,10 @@ def linear_start(text: str) -> float | None:
 
 
 def fit(name: str, value: Any, hint: Any) -> Any:
-    """Return `value` if `hint` takes it; a whole float becomes an int where only an int is taken (``1e6``).
-
-    Args:
-        name: What the value is for, as errors name it.
-        value: A JSON value.
-        hint: An annotation of the library.
+    """Return the JSON `value` if the library's annotation takes it; a whole float (``1e6``) becomes an int for it.
 
     Raises:
-        SettingsError: It does not fit; names the thing, the expected and the found.
+        SettingsError: It does not fit; carries `name`, the expected and the found.
     """
     if fits(value, hint):
         return value

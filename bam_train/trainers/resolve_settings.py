@@ -41,7 +41,7 @@ def resolve(given: Mapping[str, Any]) -> TrainSettings:
     for name in ("env", "algo"):
         if given.get(name) is None:
             raise SettingsError(f"{name}: expected a name, found nothing. Give --{name} NAME")
-    env = resolve_env(given["env"], elsewhere=bool(given.get("transport")))
+    env = _resolve_env(given["env"], elsewhere=bool(given.get("transport")))
     trainer = given.get("trainer") or "sb3"
     require_algorithm(trainer, given["algo"])
     entry = entry_of(env)
@@ -121,7 +121,7 @@ def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSe
     elsewhere = bool(given.get("transport"))
     own, asked = own_settings(checkpoint, given.get("env"), elsewhere=elsewhere), dict(given)
     if given.get("env") is not None:
-        asked["env"] = resolve_env(given["env"], elsewhere=elsewhere)
+        asked["env"] = _resolve_env(given["env"], elsewhere=elsewhere)
     if asked.get("normalize") is True and own.get("normalize"):
         del asked["normalize"]
     settings = TrainSettings.from_mapping(merge(own, asked), str(checkpoint.path))
@@ -145,17 +145,8 @@ def _require_same(differing: list[tuple[str, Any, Any]], checkpoint: Checkpoint)
         raise CheckpointMismatch(checkpoint.path, text)
 
 
-def resolve_env(name: str, *, elsewhere: bool = False) -> str:
-    """The full id of an environment.
-
-    Args:
-        name: With or without its version.
-        elsewhere: It runs on another computer, and need not be installed on this one.
-
-    Raises:
-        UnknownName: No such environment; it carries the closest match.
-        InvalidValue: ``module:Env-v0`` whose module is not there.
-    """
+def _resolve_env(name: str, *, elsewhere: bool = False) -> str:
+    """The full id of an environment, which need not be installed here if it runs `elsewhere`."""
     try:
         return resolve_id(name)
     except UnknownName:

@@ -99,13 +99,7 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def unwritable(path: Path, error: Exception, flag: str) -> OutputError:
-    """The error for a file that cannot be written.
-
-    Args:
-        path: The file.
-        error: What the system, or who wrote it, said.
-        flag: What chooses another place.
-    """
+    """The error for a file that cannot be written because of `error`; `flag` chooses another place."""
     cause = error.__cause__ if isinstance(error.__cause__, OSError) else error
     why = getattr(cause, "strerror", None) or cause
     if isinstance(cause, (NotADirectoryError, FileExistsError)):
@@ -114,30 +108,13 @@ def unwritable(path: Path, error: Exception, flag: str) -> OutputError:
     return OutputError(f"{path}: cannot be written: {why}. Choose another place with {flag}")
 
 
-def require_writable(path: Path) -> None:
-    """Find out before training whether a checkpoint can be written to `path`; nothing is left behind.
-
-    Args:
-        path: Where the checkpoint will go.
+def require_room(path: Path, flag: str = "--runs", folder: Path | None = None) -> None:
+    """Find out before training whether `path`, which `flag` chose, can be written in its folder; nothing is left there.
 
     Raises:
-        OutputError: It is a folder, its folder cannot be written to, or the disk is full.
+        OutputError: Its folder cannot be written to, or the disk is full.
     """
-    if path.is_dir():
-        raise OutputError(f"{path}: is a folder; give the name of a file in it, such as --out {path / 'policy.zip'}")
-    _require_room(path, path.parent, "--out")
-
-
-def require_room(root: Path) -> None:
-    """Find out before training whether the folder that runs are kept in can be written to; it is not made yet.
-
-    Raises:
-        OutputError: It cannot be written to, or the disk is full.
-    """
-    _require_room(root, root, "--runs")
-
-
-def _require_room(path: Path, folder: Path, flag: str) -> None:
+    folder = path if folder is None else folder
     there = next(one for one in (folder, *folder.absolute().parents) if one.exists())
     try:
         with tempfile.TemporaryFile(dir=there):
@@ -152,12 +129,9 @@ def _require_room(path: Path, folder: Path, flag: str) -> None:
 
 
 def draw_curve(records: Sequence[dict[str, Any]], title: str, path: Path) -> None:
-    """Draw return (and success, if the environment knows it) over steps into a PNG.
+    """Draw return (and success, if the environment knows it) over steps into a PNG at `path`.
 
-    Args:
-        records: Those of ``progress.jsonl``; "training" ones make thin lines, "evaluation" ones dots.
-        title: Heading.
-        path: The picture.
+    The records are those of ``progress.jsonl``; "training" ones make thin lines, "evaluation" ones dots.
 
     Raises:
         OutputError: It cannot be written.
@@ -171,12 +145,10 @@ def draw_curve(records: Sequence[dict[str, Any]], title: str, path: Path) -> Non
     figure = Figure(figsize=(8, 2.6 * len(names) + 0.8), layout="constrained")
     FigureCanvasAgg(figure)
     plots = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
-    styles: dict[str, Any] = {
-        "training": {"linewidth": 1, "alpha": 0.7},
-        "evaluation": {"marker": "o", "markersize": 4},
-    }
+    lines: dict[str, Any] = {"linewidth": 1, "alpha": 0.7}
+    dots: dict[str, Any] = {"marker": "o", "markersize": 4}
     for axes, name in zip(plots, names, strict=True):
-        for kind, style in styles.items():
+        for kind, style in (("training", lines), ("evaluation", dots)):
             known = [record for record in records if record["kind"] == kind and record.get(name) is not None]
             if known:
                 axes.plot([one["steps"] for one in known], [one[name] for one in known], label=kind, **style)

@@ -44,9 +44,6 @@ _GOLDEN = 256  # golden actions, fewer if observations are large
 _KINDS = "Box, Discrete, MultiDiscrete or MultiBinary"
 
 
-# Observation
-
-
 def leaves(space: spaces.Space[Any]) -> dict[str, Any]:
     """The spaces in a Dict by key; any other space just by ``""``."""
     return dict(space.spaces) if isinstance(space, spaces.Dict) else {"": space}
@@ -70,14 +67,9 @@ class _Numbers(Layer):
 
 
 def _encoder(key: str, raw: spaces.Space[Any], seen: spaces.Space[Any], statistics: Any, scale: bool) -> nn.Module:
-    """Return what turns one raw array into what the policy's feature extractor takes.
+    """Return what turns an array of the environment's space `raw` into what the policy's feature extractor takes.
 
-    Args:
-        key: Of a Dict, for errors.
-        raw: As the environment gives it.
-        seen: As the policy was built for; its image's channels may have been moved to the front.
-        statistics: Mean, standard deviation and limit of VecNormalize, or None.
-        scale: Whether the policy divides images by 255.
+    The policy was built for the space `seen`: channels of an image may have been moved to the front.
     """
     if isinstance(raw, (spaces.Discrete, spaces.MultiDiscrete)):
         return OneHot(raw)
@@ -89,9 +81,6 @@ def _encoder(key: str, raw: spaces.Space[Any], seen: spaces.Space[Any], statisti
             f"observation {key!r}: the policy takes shape {seen.shape}, the environment gives {raw.shape}"
         )
     return _Numbers(statistics, channels_last, scale and is_image_space(seen))
-
-
-# Network
 
 
 class _Chain(Layer):
@@ -161,9 +150,6 @@ def _mean_of_quantiles(layers: nn.Sequential, quantiles: int) -> nn.Sequential:
     mean.weight.data = weight.float()
     mean.bias.data = last.bias.detach().double().reshape(quantiles, mean.out_features).mean(0).float()
     return nn.Sequential(*hidden, mean)
-
-
-# Action
 
 
 class _Continuous(Layer):
@@ -290,9 +276,6 @@ def _moments(normaliser: VecNormalize | None, key: str) -> tuple[np.ndarray, np.
         return None
     rms = normaliser.obs_rms[key] if key else normaliser.obs_rms
     return rms.mean, np.sqrt(rms.var + normaliser.epsilon)
-
-
-# Golden actions
 
 
 def golden(

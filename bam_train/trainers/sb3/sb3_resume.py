@@ -42,19 +42,15 @@ _REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "
 class Waiting:
     """What is put back only when training takes its next step: setting up draws random numbers and resets noise."""
 
+    checkpoint: Checkpoint
+    """Where it comes from."""
     random: dict[str, Any]
     noise: list[Any]
     same_episodes: bool
     """Whether the episodes that ran when the checkpoint was saved go on."""
-    checkpoint: Checkpoint
-    """Where it comes from."""
 
     def restore(self, model: Any) -> None:
-        """Put it back.
-
-        Raises:
-            AlteredCheckpoint: It does not fit the model.
-        """
+        """Put it back; raises AlteredCheckpoint if it does not fit the model."""
         with _fits(self.checkpoint, STATE):
             for one, previous in zip(_correlated_noises(model), self.noise, strict=True):
                 one.noise_prev = previous
@@ -64,7 +60,7 @@ class Waiting:
 def members(
     model: Any, venv: VecEnv, normaliser: VecNormalize | None, waiting: Waiting | None, notes: Mapping[str, Any]
 ) -> dict[str, bytes]:
-    """Everything that the run needs to go on.
+    """Everything that the run needs to go on, by name in its checkpoint.
 
     Args:
         model: The model, between two updates.
@@ -123,7 +119,7 @@ def load(checkpoint: Checkpoint, model: Any, venv: VecEnv, normaliser: VecNormal
         else:  # `learn` begins new episodes, seeded by how far the run is
             model._last_obs = None
             venv.seed(model.seed + model.num_timesteps)
-        waiting = Waiting(tree["random"], tree["noise"], same, checkpoint)
+        waiting = Waiting(checkpoint, tree["random"], tree["noise"], same)
     if checkpoint.has(f"{REPLAY}.json"):
         with _fits(checkpoint, REPLAY):
             saved = _read(checkpoint, REPLAY)
@@ -177,15 +173,12 @@ def _load_counters(model: Any, tree: Mapping[str, Any]) -> None:
     Raises:
         ValueError: One is of another kind, or what was seen last has another shape than the environments'.
     """
-    for names, kinds, most, what in (
-        (_COUNTS, (int,), 2**53, "a count"),
-        (_SHARES, (int, float), 1, "a share of the run"),
-    ):
-        for name in names:
-            if name in tree:
-                if type(tree[name]) not in kinds or not -1 <= tree[name] <= most:
-                    raise ValueError(f"{name}: expected {what}, found {tree[name]!r:.40}")
-                setattr(model, name, tree[name])
+    for name in (*_COUNTS, *_SHARES):
+        kinds, most, what = ((int,), 2**53, "a count") if name in _COUNTS else ((int, float), 1, "a share of the run")
+        if name in tree:
+            if type(tree[name]) not in kinds or not -1 <= tree[name] <= most:
+                raise ValueError(f"{name}: expected {what}, found {tree[name]!r:.40}")
+            setattr(model, name, tree[name])
     for name in _LAST:
         value = tree["last"][name]
         if value is not None:  # as it is before the first step

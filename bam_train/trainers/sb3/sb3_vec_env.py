@@ -91,8 +91,7 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
     def interrupt(self, last: Observations) -> None:
         """Somebody else used the environments: at the next step the running episodes are truncated, and new ones begin.
 
-        Args:
-            last: What was observed last in the running episodes; None if there are none.
+        The `last` observations are those of the running episodes; None if there are none.
         """
         self._interrupted = last
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,7 @@ import numpy as np
 import pytest
 
 from bam_train.atomic_file import remove_orphans, replacing
-from bam_train.checkpoint import MANIFEST, Checkpoint, next_free_path, safetensors_file, write_checkpoint, zip_members
-from bam_train.checkpoint import checkpoint as module
+from bam_train.checkpoint import MANIFEST, Checkpoint, next_free_path, safetensors_file, write_checkpoint
 from bam_train.checkpoint.manifest import WHERE
 from bam_train.errors import (
     AlteredCheckpoint,
@@ -92,11 +92,6 @@ def test_the_same_content_makes_the_same_bytes(path: Path, tmp_path: Path):
     assert again.manifest == Checkpoint.open(path).manifest
 
 
-def test_writing_returns_what_reading_returns(tmp_path: Path):
-    written = write_checkpoint(tmp_path / "a.zip", {**FIELDS, "settings": {"net_arch": (64, 64)}}, MEMBERS)
-    assert written == Checkpoint.open(tmp_path / "a.zip")
-
-
 def test_home_and_relative_paths_and_new_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)
@@ -105,20 +100,16 @@ def test_home_and_relative_paths_and_new_folders(tmp_path: Path, monkeypatch: py
     assert [entry.name for entry in (tmp_path / "runs").iterdir()] == ["a.zip"]
 
 
-def test_a_link_is_followed(path: Path, tmp_path: Path):
+def test_a_link_is_followed_and_permissions_follow_the_umask(path: Path, tmp_path: Path):
     link = tmp_path / "best.zip"
     link.symlink_to(path)
-    write_checkpoint(link, {**FIELDS, "steps": 11}, MEMBERS)
-    assert link.is_symlink()
-    assert Checkpoint.open(path).manifest.steps == 11
-
-
-def test_permissions_follow_the_umask(tmp_path: Path):
     before = os.umask(0o027)
     try:
-        path = write_checkpoint(tmp_path / "a.zip", FIELDS, MEMBERS).path
+        write_checkpoint(link, {**FIELDS, "steps": 11}, MEMBERS)
     finally:
         os.umask(before)
+    assert link.is_symlink()
+    assert Checkpoint.open(path).manifest.steps == 11
     assert path.stat().st_mode & 0o777 == 0o640
 
 
@@ -159,23 +150,19 @@ def test_truncated_at_any_byte_is_refused(path: Path, tmp_path: Path):
             Checkpoint.open(bad)
 
 
-def test_what_is_no_file_is_refused(tmp_path: Path):
-    with pytest.raises(NotACheckpoint, match=r"none\.zip: no such file\. Train one with bam-train, or check the name"):
-        Checkpoint.open(tmp_path / "none.zip")
-    with pytest.raises(NotACheckpoint, match=r": is a folder, expected a checkpoint\.zip\. Give the file in it"):
-        Checkpoint.open(tmp_path)
+def test_what_is_no_checkpoint_is_refused(tmp_path: Path):
     (tmp_path / "file").write_text("text")
-    with pytest.raises(NotACheckpoint, match=r"cannot be read: Not a directory\. Check its permissions"):
-        Checkpoint.open(tmp_path / "file" / "a.zip")
-    with pytest.raises(NotACheckpoint, match=r"file: not a whole zip file: truncated, altered"):
-        Checkpoint.open(tmp_path / "file")
-
-
-def test_a_foreign_zip_is_refused_with_the_way_to_run_it(tmp_path: Path):
     with zipfile.ZipFile(tmp_path / "sb3.zip", "w") as archive:
         archive.writestr("data", "{}")
-    with pytest.raises(NotACheckpoint, match=r"has no bam/manifest\.json: .* bam-eval --trust-pickle --env"):
-        Checkpoint.open(tmp_path / "sb3.zip")
+    for name, text in [
+        ("none.zip", r"none\.zip: no such file\. Train one with bam-train, or check the name"),
+        (".", r": is a folder, expected a checkpoint\.zip\. Give the file in it"),
+        ("file/a.zip", r"cannot be read: Not a directory\. Check its permissions"),
+        ("file", "file: not a whole zip file: truncated, altered"),
+        ("sb3.zip", r"has no bam/manifest\.json: .* bam-eval --trust-pickle --env"),
+    ]:
+        with pytest.raises(NotACheckpoint, match=text):
+            Checkpoint.open(tmp_path / name)
 
 
 @pytest.mark.parametrize("name", [name for name in MEMBERS if not name.startswith("bam/resume/")])
@@ -193,14 +180,13 @@ def test_a_changed_missing_or_extra_member_is_named(path: Path, name: str):
         Checkpoint.open(path)
 
 
-def test_a_member_that_is_there_twice_is_refused(path: Path):
+def test_a_member_that_is_there_twice_or_packed_otherwise_is_refused(path: Path):
+    whole = path.read_bytes()
     with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
         archive.writestr("data", b"other")
     with pytest.raises(AlteredCheckpoint, match="holds data twice"):
         Checkpoint.open(path)
-
-
-def test_another_packing_is_refused(path: Path):
+    path.write_bytes(whole)
     with zipfile.ZipFile(path, "a", zipfile.ZIP_BZIP2) as archive:
         archive.writestr("more", b"other")
     with pytest.raises(AlteredCheckpoint, match="more is packed by method 12, expected deflate"):
@@ -292,27 +278,30 @@ def test_fields_of_a_later_minor_version_are_left_out(path: Path):
     assert Checkpoint.open(path).manifest.env == "bam/pick-v0"
 
 
-def test_a_huge_manifest_is_not_read(path: Path):
-    rewrite(path, {MANIFEST: b" " * (2**23 + 1)})
-    with pytest.raises(AlteredCheckpoint, match=r"manifest\.json has 8388609 bytes, expected at most 8388608"):
+@pytest.mark.parametrize(
+    ("names", "text"),
+    [
+        (map(str, range(10_000)), r"has 10006 members, expected at most 10000\. Copy it again"),
+        (
+            (str(i).zfill(60_000) for i in range(80)),
+            r"lists members in \d+ bytes, expected at most 4194304",
+        ),
+    ],
+)
+def test_a_list_of_members_that_only_an_attack_has_is_refused(path: Path, names: Iterable[str], text: str):
+    with zipfile.ZipFile(path, "a") as archive:
+        for name in names:
+            archive.writestr(name, b"")
+    with pytest.raises(NotACheckpoint, match=text):
         Checkpoint.open(path)
 
 
-def test_sizes_that_only_an_attack_has_are_refused(path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_members_that_overlap_are_refused(path: Path):
     whole = path.read_bytes()
     entry = whole.index(b"PK\x01\x02")
     path.write_bytes(whole[: entry + 20] + struct.pack("<I", len(whole) * 2) + whole[entry + 24 :])
     with pytest.raises(NotACheckpoint, match=r"(claims \d+ bytes of members in a file of|Overlapped entries)"):
         Checkpoint.open(path)
-    path.write_bytes(whole)
-    for name, limit, text in [
-        ("_MOST_DIRECTORY", 100, r"lists members in \d+ bytes, expected at most 100\. Copy it again"),
-        ("MOST_MEMBERS", 5, r"has 6 members, expected at most 5\. Copy it again"),
-    ]:
-        with monkeypatch.context() as patched:
-            patched.setattr(zip_members, name, limit)
-            with pytest.raises(NotACheckpoint, match=text):
-                Checkpoint.open(path)
 
 
 @pytest.mark.parametrize(
@@ -322,7 +311,7 @@ def test_sizes_that_only_an_attack_has_are_refused(path: Path, monkeypatch: pyte
         ("bam/golden.safetensors", 10**9),
         ("bam/resume/state.json", 10**9),
         ("bam/resume/replay.safetensors", 2**37),
-        ("bam/manifest.json", 10**8),
+        ("bam/manifest.json", 2**23 + 1),
         ("extra", 10**10),
         ("data", 10**10),
     ],
@@ -361,24 +350,22 @@ def test_what_only_going_on_needs_is_verified_when_it_is_read(path: Path, monkey
     checkpoint = Checkpoint.open(path)
     with pytest.raises(AlteredCheckpoint, match=r"bam/resume/counters\.json was altered: its sha256 is "):
         checkpoint.json("bam/resume/counters.json")
-    monkeypatch.setattr(module.os, "sysconf", lambda name: 4)
+    monkeypatch.setattr(os, "sysconf", lambda name: 4)
     with pytest.raises(CheckpointError, match=r"counters\.json has 13 bytes, more than half of this computer's memory"):
         checkpoint.read("bam/resume/counters.json")
 
 
-def test_what_could_not_be_read_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(zip_members._MOST_BYTES, "bam/policy.onnx", 100)
-    with pytest.raises(CheckpointError, match=r"member 'bam/policy\.onnx' has 200 bytes, expected at most 100"):
-        write_checkpoint(tmp_path / "a.zip", FIELDS, MEMBERS)
+def test_what_could_not_be_read_is_not_written(tmp_path: Path):
+    with pytest.raises(
+        CheckpointError, match=r"member 'bam/resume/a\.json' has 16777217 bytes, expected at most 16777216"
+    ):
+        write_checkpoint(tmp_path / "a.zip", FIELDS, {"bam/resume/a.json": bytes(2**24 + 1)})
 
 
-def test_a_member_that_is_not_there_is_named(path: Path):
-    with pytest.raises(AlteredCheckpoint, match=r"has no bam/x; it holds bam/golden\.safetensors, bam/policy\.onnx, "):
-        Checkpoint.open(path).read("bam/x")
-
-
-def test_members_of_the_wrong_kind_are_named(path: Path):
+def test_members_that_are_missing_or_of_the_wrong_kind_are_named(path: Path):
     checkpoint = Checkpoint.open(path)
+    with pytest.raises(AlteredCheckpoint, match=r"has no bam/x; it holds bam/golden\.safetensors, bam/policy\.onnx, "):
+        checkpoint.read("bam/x")
     with pytest.raises(AlteredCheckpoint, match=r"bam/policy\.onnx cannot be read: not a safetensors file"):
         checkpoint.arrays("bam/policy.onnx")
     with pytest.raises(AlteredCheckpoint, match=r"policy\.pth is not JSON"):
@@ -398,22 +385,15 @@ def test_a_file_replaced_after_it_was_opened_is_noticed(path: Path):
         checkpoint.read("data")
 
 
-def test_another_environment_is_refused(path: Path):
-    checkpoint = Checkpoint.open(path)
-    checkpoint.requires_env("bam/pick-v0")
-    with pytest.raises(
-        CheckpointMismatch, match=r"was trained on bam/pick-v0, not on bam/reach-v0\. Use --env bam/pick-v0"
-    ):
-        checkpoint.requires_env("bam/reach-v0")
-
-
-def test_robo_gyms_name_of_its_environment_is_no_other(path: Path):
+def test_another_environment_is_refused_and_a_name_of_robo_gym_is_no_other(path: Path):
     write_checkpoint(path, {**FIELDS, "env": "bam/mir100-navigation-v0"}, MEMBERS)
     checkpoint = Checkpoint.open(path)
-    for name in ("NoObstacleNavigationMir100Sim-v0", "NoObstacleNavigationMir100Rob-v0"):
+    for name in ("bam/mir100-navigation-v0", "NoObstacleNavigationMir100Sim-v0", "NoObstacleNavigationMir100Rob-v0"):
         checkpoint.requires_env(name)
-    with pytest.raises(CheckpointMismatch, match="not on ObstacleAvoidanceMir100Sim-v0"):
-        checkpoint.requires_env("ObstacleAvoidanceMir100Sim-v0")
+    text = r"was trained on bam/mir100-navigation-v0, not on \S+\. Use --env bam/mir100-navigation-v0"
+    for name in ("bam/reach-v0", "ObstacleAvoidanceMir100Sim-v0"):
+        with pytest.raises(CheckpointMismatch, match=text):
+            checkpoint.requires_env(name)
 
 
 @pytest.mark.parametrize(
@@ -437,29 +417,27 @@ def test_names_that_would_break_the_file_are_refused(tmp_path: Path, name: str):
         write_checkpoint(tmp_path / "a.zip", FIELDS, {name: b""})
 
 
-def test_no_space_leaves_the_old_file_and_nothing_else(path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize(
+    ("call", "fault", "raised", "text"),
+    [
+        (
+            "fsync",
+            OSError(errno.ENOSPC, "No space left on device"),
+            OutputError,
+            r"No space left on device\. Choose anot",
+        ),
+        ("replace", KeyboardInterrupt(), KeyboardInterrupt, "^$"),
+    ],
+)
+def test_a_fault_leaves_the_old_file_and_nothing_else(
+    path: Path, monkeypatch: pytest.MonkeyPatch, call: str, fault: BaseException, raised: Any, text: str
+):
+    def fail(*_: object) -> None:
+        raise fault
+
     whole = path.read_bytes()
-
-    def full(descriptor: int) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(module.os, "fsync", full)
-    with pytest.raises(
-        OutputError, match=r"cannot be written: No space left on device\. Choose another place with --out"
-    ):
-        write_checkpoint(path, FIELDS, {})
-    assert path.read_bytes() == whole
-    assert list(path.parent.iterdir()) == [path]
-
-
-def test_an_interrupt_leaves_the_old_file_and_nothing_else(path: Path, monkeypatch: pytest.MonkeyPatch):
-    whole = path.read_bytes()
-
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(module.os, "replace", interrupted)
-    with pytest.raises(KeyboardInterrupt):
+    monkeypatch.setattr(os, call, fail)
+    with pytest.raises(raised, match=text):
         write_checkpoint(path, FIELDS, {})
     assert path.read_bytes() == whole
     assert list(path.parent.iterdir()) == [path]
@@ -508,13 +486,3 @@ def test_killed_while_writing_leaves_the_old_file_whole(path: Path):
         remove_orphans(path)
         assert sorted(path.parent.glob("*.tmp")) == sorted([*others, alive])
     assert not alive.exists()
-
-
-def test_reading_imports_nothing_heavy():
-    script = "import sys, bam_train.checkpoint; print(sorted({name.split('.')[0] for name in sys.modules}))"
-    done = subprocess.run(
-        [sys.executable, "-c", script], env={"PYTHONPATH": os.pathsep.join(sys.path)}, capture_output=True
-    )
-    for name in ("torch", "gymnasium", "bam_envs", "onnxruntime", "onnx", "stable_baselines3"):
-        assert f"'{name}'" not in done.stdout.decode()
-    assert "'numpy'" in done.stdout.decode()

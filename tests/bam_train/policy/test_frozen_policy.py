@@ -14,7 +14,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from bam_train.checkpoint import safetensors_file, write_checkpoint
-from bam_train.errors import CheckpointError, NotACheckpoint, PolicyError
+from bam_train.errors import PolicyError
 from bam_train.policy import FrozenPolicy
 
 BOX3 = {"type": "Box", "shape": [3], "dtype": "float32", "low": "-inf", "high": [1.0, "inf", 2.0]}
@@ -72,10 +72,7 @@ def test_an_action_is_computed_and_belongs_to_the_caller():
 
 
 def test_an_observation_of_one_number():
-    nodes = [
-        node("Unsqueeze", ["observation", "axis"], ["h"]),
-        node("Gemm", ["h", "w"], ["action"]),
-    ]
+    nodes = [node("Unsqueeze", ["observation", "axis"], ["h"]), node("Gemm", ["h", "w"], ["action"])]
     constants = {"axis": np.array([1]), "w": np.array([[2.0, -1.0]], np.float32)}
     graph = onnx_of(nodes, {"observation": ("float32", [])}, {"action": ("float32", [2])}, **constants)
     policy = FrozenPolicy.from_graph(graph, {**BOX3, "shape": [], "high": "inf"}, BOX2)
@@ -125,7 +122,6 @@ def test_an_observation_that_does_not_fit_is_refused(policy: FrozenPolicy, obser
     [
         (np.zeros((2, 4), np.float32), r"observation: expected shape \(2, 3\) \(float32\), found \(2, 4\)"),
         (np.zeros((0, 3), np.float32), r"observations: expected one or more, found shape \(0, 3\)"),
-        (np.float32(1), r"observations: expected one or more, found shape \(\)"),
         ({}, r"observations: expected one or more, found shape \(\)"),
     ],
 )
@@ -198,12 +194,6 @@ def test_environments_have_states_of_their_own():
     assert policy.act_batch(ones[:2]).shape == (2, 2)
 
 
-def test_a_policy_without_memory_has_nothing_to_reset(policy: FrozenPolicy):
-    policy.reset()
-    policy.reset([0])
-    assert not policy.recurrent
-
-
 @pytest.mark.parametrize(
     ("observation_space", "action_space", "text"),
     [
@@ -260,10 +250,6 @@ def test_a_graph_that_cannot_be_run_is_refused(op: str, inputs: dict[str, Any], 
 def test_what_is_not_a_graph_is_refused():
     with pytest.raises(PolicyError, match="the policy cannot be read: not an ONNX file"):
         FrozenPolicy.from_graph(b"nonsense", BOX3, BOX2)
-    value = ("float32", [3])
-    graph = onnx_of([node("Tanh", ["observation"], ["x"])], {"observation": value}, {"action": value})
-    with pytest.raises(PolicyError, match=r"onnxruntime .* cannot run the policy: .*action"):
-        FrozenPolicy.from_graph(graph, BOX3, BOX2)
 
 
 # From a checkpoint
@@ -321,20 +307,6 @@ def test_golden_actions_that_do_not_fit_are_refused(tmp_path: Path, arrays: dict
         FrozenPolicy.load(path)
 
 
-def test_a_missing_file_or_member_is_named(tmp_path: Path):
-    with pytest.raises(NotACheckpoint, match="no such file"):
-        FrozenPolicy.load(tmp_path / "a.zip")
-
-
-def test_damage_is_refused_before_anything_runs(tmp_path: Path):
-    path = save(tmp_path / "a.zip")
-    whole = path.read_bytes()
-    where = whole.index(b"bam/policy.onnx") + 60
-    path.write_bytes(whole[:where] + bytes([whole[where] ^ 1]) + whole[where + 1 :])
-    with pytest.raises(CheckpointError, match=r"bam/policy\.onnx"):
-        FrozenPolicy.load(path)
-
-
 def test_nothing_is_unpickled(tmp_path: Path):
     """SB3's own `data` runs code when SB3 opens it; ours never looks at it."""
     cloudpickle = pytest.importorskip("cloudpickle")
@@ -382,9 +354,8 @@ def test_many_policies_may_run_in_many_threads(tmp_path: Path):
 
 def test_importing_the_policy_imports_neither_onnxruntime_nor_anything_heavy():
     script = "import sys, bam_train.policy; print(sorted({name.split('.')[0] for name in sys.modules}))"
-    done = subprocess.run(
-        [sys.executable, "-c", script], env={"PYTHONPATH": os.pathsep.join(sys.path)}, capture_output=True, text=True
-    )
+    environment = {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
     for name in ("torch", "gymnasium", "bam_envs", "onnxruntime", "onnx", "stable_baselines3"):
         assert f"'{name}'" not in done.stdout
     assert "'bam_train'" in done.stdout

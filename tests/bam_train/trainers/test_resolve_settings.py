@@ -4,105 +4,87 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import gymnasium as gym
 import pytest
 
 from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.tcp_server import TcpServer
-from bam_train.checkpoint import Checkpoint, write_checkpoint
+from bam_train.checkpoint import write_checkpoint
 from bam_train.errors import AlteredCheckpoint, CheckpointMismatch, OutputError, SettingsError
-from bam_train.settings import TrainSettings
 from bam_train.trainers import load_trainer, require_algorithm
-from bam_train.trainers import presets as presets_module
+from bam_train.trainers.algorithms import ALGORITHMS
 from bam_train.trainers.best_checkpoint import choose_output
-from bam_train.trainers.presets import list_presets, read_preset
+from bam_train.trainers.presets import list_presets, preset_name, read_preset
 from bam_train.trainers.resolve_settings import resolve, resolve_resumed
 from bam_train.trainers.training_run import Best
 
 
-@pytest.fixture
-def preset(monkeypatch):
-    """One preset, of CartPole-v1 and ppo."""
-    values = {"steps": 7000, "num_envs": 4, "hyperparameters": {"gamma": 0.9, "policy_kwargs": {"net_arch": [8]}}}
-    monkeypatch.setattr(
-        "bam_train.trainers.resolve_settings.read_preset",
-        lambda env, algo, trainer: values if (env, algo, trainer) == ("CartPole-v1", "ppo", "sb3") else {},
-    )
+def test_later_layers_win():
+    """The environment's preset, above the trainer's defaults and below what is given."""
+    preset = read_preset("bam/reach-v0", "ppo")
+    network = {"policy_kwargs": {"ortho_init": False}}
+    settings = resolve({"env": "bam/reach", "algo": "ppo", "num_envs": 2, "hyperparameters": network})
+    tuned, found = preset["hyperparameters"], settings.hyperparameters
+    assert (settings.steps, settings.num_envs) == (preset["steps"], 2)
+    assert (found["gamma"], found["vf_coef"]) == (tuned["gamma"], 0.5)
+    assert found["policy_kwargs"] == {**tuned.get("policy_kwargs", {}), "ortho_init": False}
+    assert resolve({"env": "CartPole-v1", "algo": "dqn"}).hyperparameters["learning_rate"] == 1e-4
 
 
-def test_later_layers_win(preset):
-    given = {
-        "env": "CartPole-v1",
-        "algo": "ppo",
-        "num_envs": 2,
-        "hyperparameters": {"policy_kwargs": {"ortho_init": False}},
-    }
-    settings = resolve(given)
-    assert (settings.steps, settings.num_envs, settings.eval_every) == (7000, 2, 1000)
-    assert settings.hyperparameters["gamma"] == 0.9
-    assert settings.hyperparameters["policy_kwargs"] == {"net_arch": [8], "ortho_init": False}
-    assert settings.hyperparameters["gae_lambda"] == 0.95
-
-
-def test_without_a_preset_there_are_the_defaults():
-    settings = resolve({"env": "CartPole-v1", "algo": "dqn"})
-    assert (settings.steps, settings.num_envs, settings.trainer) == (100_000, 1, "sb3")
-    assert settings.hyperparameters["learning_rate"] == 1e-4
-
-
-@pytest.fixture
-def served():
-    """Address of two environments."""
+def test_there_are_as_many_environments_as_the_servers_have():
     with TcpServer(EnvServer(gym.make_vec("bam/reach-v0", num_envs=2))) as server:
-        yield server.url
+        given = {"env": "bam/reach", "algo": "ppo", "transport": [server.url]}
+        assert resolve(given).num_envs == 2
+        assert resolve({**given, "num_envs": 2}).num_envs == 2
+        with pytest.raises(SettingsError) as caught:
+            resolve({**given, "num_envs": 8})
+    assert str(caught.value) == f"num_envs: 8 were asked for, and there are 2 at {server.url}; leave it out"
 
 
-def test_there_are_as_many_environments_as_the_servers_have(served):
-    given = {"env": "bam/reach", "algo": "ppo", "transport": [served]}
-    assert resolve(given).num_envs == 2
-    assert resolve({**given, "num_envs": 2}).num_envs == 2
-    with pytest.raises(SettingsError) as caught:
-        resolve({**given, "num_envs": 8})
-    assert str(caught.value) == f"num_envs: 8 were asked for, and there are 2 at {served}; leave it out"
+PPO = {"env": "bam/reach", "algo": "ppo"}
+ROBO_GYM = {"env": "NoObstacleNavigationMir100Sim", "algo": "ppo"}
 
 
-def test_an_environment_elsewhere_has_its_own_arguments():
-    with pytest.raises(SettingsError) as caught:
-        resolve({"env": "bam/reach", "algo": "ppo", "transport": ["tcp://a:1"], "env_kwargs": {"randomize": True}})
-    assert str(caught.value) == (
-        "env_kwargs: randomize: the environment runs at tcp://a:1; give its arguments to bam-serve there"
-    )
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"env": "bam/pik"}, "Unknown environment 'bam/pik'. Did you mean 'bam/pick-v0'?"),
+        ({"env": "no_such_module:A-v0"}, "needs the module 'no_such_module', which is neither installed"),
+        ({"algo": "sacc"}, "Unknown algorithm 'sacc'. Did you mean 'sac'?"),
+        ({"algo": None}, "algo: expected a name, found nothing. Give --algo NAME"),
+        ({"algo": "a2c", "trainer": "rllib"}, "Unknown algorithm 'a2c'. It is one of sb3's; those of rllib are: appo"),
+        (
+            {"env": "CartPole-v1", "algo": "sac"},
+            "sac does not fit CartPole-v1: it takes Box actions, found Discrete. Use one of: ",
+        ),
+        ({"trainer": "sb"}, "Unknown trainer 'sb'. Did you mean 'sb3'?"),
+        ({"data": "a.parquet"}, "data: the sb3 trainer has no use for it; leave it out, or add --trainer rllib"),
+        (
+            {"transport": ["tcp://a:1"], "env_kwargs": {"randomize": True}},
+            "env_kwargs: randomize: the environment runs at tcp://a:1; give its arguments to bam-serve there",
+        ),
+        *(
+            ({"env_kwargs": {name: "ws://a:1"}}, f"env_kwargs: unknown setting '{name}' of bam/reach-v0.")
+            for name in ("robot", "transport", "profile", "ca_file", "token_file")
+        ),
+        (
+            {**ROBO_GYM, "env_kwargs": {"ur_model": "ur10e"}},
+            "env_kwargs: unknown setting 'ur_model' of NoObstacleNavigationMir100Sim-v0. Choose from: gazebo_gui, gui,",
+        ),
+    ],
+)
+def test_what_cannot_be_is_one_line(given, text):
+    with pytest.raises((SettingsError, UnknownName, InvalidValue)) as caught:
+        resolve({**PPO, **given})
+    assert text in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["robot", "transport", "profile", "ca_file", "token_file"])
-def test_where_an_environment_runs_is_none_of_its_arguments(name):
-    with pytest.raises(SettingsError, match=rf"^env_kwargs: unknown setting '{name}' of bam/reach-v0\."):
-        resolve({"env": "bam/reach", "algo": "ppo", "env_kwargs": {name: "ws://a:1"}})
-
-
-def test_names_are_completed_and_unknown_ones_refused():
-    assert resolve({"env": "bam/reach", "algo": "sac"}).env == "bam/reach-v0"
-    with pytest.raises(UnknownName, match=r"^Unknown environment 'bam/pik'\. Did you mean 'bam/pick-v0'\?$"):
-        resolve({"env": "bam/pik", "algo": "ppo"})
-    with pytest.raises(SettingsError, match=r"^Unknown algorithm 'sacc'\. Did you mean 'sac'\?$"):
-        resolve({"env": "bam/pick", "algo": "sacc"})
-    with pytest.raises(SettingsError, match=r"^Unknown algorithm 'a2c'\. It is one of sb3's; those of rllib are: appo"):
-        resolve({"env": "bam/pick", "algo": "a2c", "trainer": "rllib"})
-    with pytest.raises(
-        SettingsError, match=r"^sac does not fit CartPole-v1: it takes Box actions, found Discrete\. Use one of: "
-    ):
-        resolve({"env": "CartPole-v1", "algo": "sac"})
-    with pytest.raises(InvalidValue, match=r"needs the module 'no_such_module', which is neither installed"):
-        resolve({"env": "no_such_module:A-v0", "algo": "ppo"})
-    with pytest.raises(SettingsError, match=r"^algo: expected a name, found nothing\. Give --algo NAME$"):
-        resolve({"env": "CartPole-v1"})
-    with pytest.raises(SettingsError, match=r"^Unknown trainer 'sb'\. Did you mean 'sb3'\?$"):
-        resolve({"env": "CartPole-v1", "algo": "ppo", "trainer": "sb"})
-
-
-def test_the_tables_agree():
+def test_the_table_of_trainers():
     with pytest.raises(SettingsError, match=r"^Unknown trainer 'x'\. Choose from: rllib, sb3\.$"):
         load_trainer("x")
     require_algorithm("sb3", "recurrent-ppo")
@@ -111,21 +93,13 @@ def test_the_tables_agree():
 
 @pytest.mark.parametrize("name", list_presets())
 def test_every_preset_is_complete_and_of_an_environment_of_ours(name):
-    from bam_envs.core.registry import ENVIRONMENTS
-    from bam_train.trainers.algorithms import ALGORITHMS
-    from bam_train.trainers.presets import preset_name
-
     runs = [(trainer, algo) for trainer, table in ALGORITHMS.items() for algo in table]
     found = [(env, *run) for env in ENVIRONMENTS for run in runs if preset_name(env, run[1], run[0]) == name]
     assert len(found) == 1
     env, trainer, algo = found[0]
     assert read_preset(env, algo, trainer)
     resolve({"env": env, "algo": algo, "trainer": trainer})
-
-
-def test_there_is_no_preset_of_a_foreign_environment():
     assert read_preset("CartPole-v1", "ppo") == {}
-    assert presets_module.preset_name("bam/pick-v0", "ppo") == "pick-ppo.toml"
 
 
 def fields(settings, steps, **extra):
@@ -156,8 +130,6 @@ def saved(tmp_path):
     settings = resolve({"env": "CartPole-v1", "algo": "ppo", "steps": 6000, "normalize": True, "seed": 3})
 
     def write(path, steps=3000, best=None, scores=None, **changes):
-        from dataclasses import replace
-
         members = {"bam/resume/notes.json": json.dumps({"best": best}).encode()}
         return write_checkpoint(path, fields(replace(settings, **changes), steps, scores=scores or {}), members)
 
@@ -263,11 +235,17 @@ def test_what_is_learnt_may_not_change(saved, asked, name, found, wanted):
     )
 
 
-def test_an_unknown_setting_is_unknown_also_when_resuming(saved):
-    with pytest.raises(SettingsError, match=r"^Unknown ppo hyperparameter 'gama'\. Did you mean 'gamma'\?$"):
-        resolve_resumed({"hyperparameters": {"gama": 1}}, saved.checkpoint)
-    with pytest.raises(SettingsError, match=r"^settings: unknown setting 'stps'\. Did you mean 'steps'\?$"):
-        resolve_resumed({"stps": 1}, saved.checkpoint)
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"hyperparameters": {"gama": 1}}, "Unknown ppo hyperparameter 'gama'. Did you mean 'gamma'?"),
+        ({"stps": 1}, "settings: unknown setting 'stps'. Did you mean 'steps'?"),
+    ],
+)
+def test_an_unknown_setting_is_unknown_also_when_resuming(saved, given, text):
+    with pytest.raises(SettingsError) as caught:
+        resolve_resumed(given, saved.checkpoint)
+    assert str(caught.value) == text
 
 
 def test_a_run_that_is_done_says_so(saved, tmp_path):
@@ -291,12 +269,9 @@ def here(saved, tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_the_default_place(saved, here):
+def test_an_existing_checkpoint_is_kept(saved, here):
     output = choose_output(saved.settings, None, False, None)
     assert (str(output.path), output.best, output.notices) == ("checkpoints/CartPole-v1-ppo.zip", None, ())
-
-
-def test_an_existing_checkpoint_is_kept(saved, here):
     saved(here / "checkpoints" / "CartPole-v1-ppo.zip")
     saved(here / "checkpoints" / "CartPole-v1-ppo-2.zip")
     orphan = here / "checkpoints" / ".CartPole-v1-ppo-2.zip.q0_w9e3r.tmp"
@@ -311,26 +286,35 @@ def test_an_existing_checkpoint_is_kept(saved, here):
     assert str(choose_output(saved.settings, None, True, None).path) == "checkpoints/CartPole-v1-ppo.zip"
 
 
-def test_a_name_without_zip(saved, here):
-    with pytest.raises(
-        OutputError, match=r"^policy: expected a file name that ends in \.zip\. Choose another one with --out$"
-    ):
-        choose_output(saved.settings, type(here)("policy"), False, None)
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("policy", r"^policy: expected a file name that ends in \.zip\. Choose another one with --out$"),
+        (".", r"^\.: is a folder; give the name of a file in it, such as --out policy\.zip$"),
+    ],
+)
+def test_a_name_that_is_none_of_a_checkpoint(saved, here, name, text):
+    with pytest.raises(OutputError, match=text):
+        choose_output(saved.settings, Path(name), False, None)
+
+
+BEST = {"steps": 2000, "success_rate": None, "return_mean": 90.0}
 
 
 def test_a_resumed_run_goes_on_improving_its_own_best(saved, here):
-    best = {"steps": 2000, "success_rate": None, "return_mean": 90.0, "path": str(here / "best.zip")}
+    best = {**BEST, "path": str(here / "best.zip")}
     saved(here / "best.zip", steps=2000, best=best)
     last = saved(here / "last.zip", steps=3000, best=best)
-    output = choose_output(saved.settings, None, False, last)
-    assert output.path == here / "best.zip"
-    assert output.best == Best(2000, None, 90.0)
+    longer = replace(saved.settings, steps=9000)
+    for settings in (saved.settings, longer):
+        output = choose_output(settings, None, False, last)
+        assert (output.path, output.best) == (here / "best.zip", Best(2000, None, 90.0))
     assert choose_output(saved.settings, here / "other.zip", False, last).best is None
 
 
 @pytest.mark.parametrize("there", ["nothing", "another run", "another time", "no checkpoint"])
 def test_what_is_not_its_own_best_is_left_alone(saved, here, there):
-    best = {"steps": 2000, "success_rate": None, "return_mean": 90.0, "path": str(here / "best.zip")}
+    best = {**BEST, "path": str(here / "best.zip")}
     if there == "another run":
         saved(here / "best.zip", steps=2000, seed=9)
     elif there == "another time":
@@ -342,7 +326,7 @@ def test_what_is_not_its_own_best_is_left_alone(saved, here, there):
 
 
 def test_the_best_of_before_keeps_its_interval(saved, here):
-    best = {"steps": 2000, "success_rate": 0.5, "return_mean": 90.0, "path": str(here / "best.zip")}
+    best = {**BEST, "success_rate": 0.5, "path": str(here / "best.zip")}
     saved(here / "best.zip", steps=2000, best=best, scores={"success_interval": [0.3, 0.7], "episodes": 20})
     output = choose_output(saved.settings, None, False, saved(here / "last.zip", best=best))
     assert output.best == Best(2000, 0.5, 90.0, (0.3, 0.7), 20)
@@ -351,7 +335,7 @@ def test_the_best_of_before_keeps_its_interval(saved, here):
 @pytest.mark.parametrize("folder", ["none", "another run", "no settings"])
 def test_a_forged_note_makes_no_other_file_be_overwritten(saved, here, folder):
     """All that a stranger can know is right: settings and steps of somebody's best, and where it usually lies."""
-    best = {"steps": 2000, "success_rate": None, "return_mean": -1e9, "path": str(here / "best.zip")}
+    best = {**BEST, "return_mean": -1e9, "path": str(here / "best.zip")}
     saved(here / "best.zip", steps=2000)
     {
         "none": (here / "config.json").unlink,
@@ -364,7 +348,7 @@ def test_a_forged_note_makes_no_other_file_be_overwritten(saved, here, folder):
 
 def test_a_best_checkpoint_goes_on_in_its_own_place(saved, here):
     (here / "config.json").unlink()
-    best = {"steps": 2000, "success_rate": None, "return_mean": 90.0, "path": str(here / "best.zip")}
+    best = {**BEST, "path": str(here / "best.zip")}
     output = choose_output(saved.settings, None, False, saved(here / "best.zip", steps=2000, best=best))
     assert (output.path, output.best) == (here / "best.zip", Best(2000, None, 90.0))
 
@@ -401,50 +385,13 @@ def test_notes_of_another_form_are_refused(saved, here, notes, message):
 
 @pytest.mark.parametrize("path", ["", "\0", "/", "/dev/null", "x" * 5000, "\ud800"])
 def test_a_path_that_is_none_is_no_best(saved, here, path):
-    best = {"steps": 2000, "success_rate": None, "return_mean": 90.0, "path": path}
+    best = {**BEST, "path": path}
     output = choose_output(saved.settings, None, False, saved(here / "last.zip", best=best))
     assert (str(output.path), output.best) == ("checkpoints/CartPole-v1-ppo.zip", None)
 
 
-def test_settings_of_another_time_to_stop_are_the_same_run(saved, here):
-    best = {"steps": 2000, "success_rate": None, "return_mean": 90.0, "path": str(here / "best.zip")}
-    saved(here / "best.zip", steps=2000, best=best)
-    longer = TrainSettings.from_mapping({**saved.settings.to_mapping(), "steps": 9000})
-    assert choose_output(longer, None, False, saved(here / "last.zip", best=best)).path == here / "best.zip"
-    assert isinstance(saved.checkpoint, Checkpoint)
-
-
 def test_a_name_of_robo_gym_is_tuned_as_the_environment():
     ours = resolve({"env": "bam/mir100-navigation", "algo": "ppo"})
-    theirs = resolve({"env": "NoObstacleNavigationMir100Sim", "algo": "ppo", "env_kwargs": {"ip": "127.0.0.1"}})
+    theirs = resolve({**ROBO_GYM, "env_kwargs": {"ip": "127.0.0.1"}})
     assert (theirs.env, theirs.env_kwargs) == ("NoObstacleNavigationMir100Sim-v0", {"ip": "127.0.0.1"})
     assert replace(theirs, env=ours.env, env_kwargs=ours.env_kwargs) == ours
-
-
-@pytest.mark.parametrize(("name", "closest"), [("ur_modle", "ur_model"), ("fix_shoulder_pan", "fix_base")])
-def test_an_argument_that_neither_robo_gym_nor_we_have(name, closest):
-    given = {"env": "EndEffectorPositioningURSim", "algo": "ppo", "env_kwargs": {name: "ur5"}}
-    with pytest.raises(SettingsError) as caught:
-        resolve(given)
-    assert str(caught.value) == (
-        f"env_kwargs: unknown setting {name!r} of EndEffectorPositioningURSim-v0. Did you mean {closest!r}?"
-    )
-
-
-def test_only_what_an_id_takes_is_offered():
-    given = {"env": "NoObstacleNavigationMir100Sim", "algo": "ppo", "env_kwargs": {"ur_model": "ur10e"}}
-    with pytest.raises(SettingsError) as caught:
-        resolve(given)
-    assert str(caught.value) == (
-        "env_kwargs: unknown setting 'ur_model' of NoObstacleNavigationMir100Sim-v0. Choose from: gazebo_gui, gui, ip, "
-        "lower_bound_port, max_episode_steps, parity, randomize, rs_state_to_info, rviz_gui, server_manager_port, "
-        "upper_bound_port."
-    )
-
-
-@pytest.mark.parametrize("env", ["bam/ur-reach-v0", "EndEffectorPositioningURSim-v0"])
-@pytest.mark.parametrize("name", ["parity", "randomize"])
-def test_a_flag_in_env_kwargs_is_true_or_false(env, name):
-    with pytest.raises(SettingsError) as caught:
-        resolve({"env": env, "algo": "ppo", "env_kwargs": {name: "yes"}})
-    assert str(caught.value) == f"env_kwargs: {name}= of {env} must be True or False, not 'yes'."

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from bam_train.atomic_file import replacing
 from bam_train.errors import OutputError
-from bam_train.trainers.run_folder import RunFolder, draw_curve, require_room, require_writable
+from bam_train.trainers.run_folder import Copies, RunFolder, draw_curve, require_room
 
 
 def test_each_run_has_a_folder_of_its_own(tmp_path):
@@ -36,58 +38,43 @@ def test_config_and_records(tmp_path):
     folder.add({"kind": "training", "steps": 1})
     folder.add({"kind": "evaluation", "steps": 2})
     assert json.loads((folder.path / "config.json").read_text()) == {"env": "bam/pick-v0"}
+    with (folder.path / "progress.jsonl").open("a") as file:
+        file.write('{"kind": "trai')  # then the disk was full
     assert [record["steps"] for record in folder.records()] == [1, 2]
 
 
-def test_a_folder_that_cannot_be_made(tmp_path):
+def test_folders_and_records_that_cannot_be_written(tmp_path):
     (tmp_path / "runs").write_text("")
-    with pytest.raises(
-        OutputError, match=r"runs: cannot be written: \S+runs is a file, expected a folder\. .* --runs$"
-    ):
-        RunFolder(tmp_path / "runs", "a")
-    with pytest.raises(
-        OutputError, match=r"deeper: cannot be written: \S+runs is a file, expected a folder\. .* --runs$"
-    ):
-        RunFolder(tmp_path / "runs" / "deeper", "a")
-
-
-def test_records_that_cannot_be_written(tmp_path):
     folder = RunFolder(tmp_path, "a")
     shutil.rmtree(folder.path)
-    with pytest.raises(
-        OutputError, match=r"progress\.jsonl: cannot be written: No such file or directory\. Choose another"
-    ):
-        folder.add({"steps": 1})
+    in_the_way = r": cannot be written: \S+runs is a file, expected a folder\. .* --runs$"
+    for write, text in [
+        (lambda: RunFolder(tmp_path / "runs", "a"), f"runs{in_the_way}"),
+        (lambda: RunFolder(tmp_path / "runs" / "deeper", "a"), f"deeper{in_the_way}"),
+        (lambda: folder.add({}), r"progress\.jsonl: cannot be written: No such file or directory\. Choose another"),
+    ]:
+        with pytest.raises(OutputError, match=text):
+            write()
 
 
-def test_a_place_that_can_be_written(tmp_path):
-    require_writable(tmp_path / "deep" / "er" / "a.zip")
+def test_places_that_can_be_written_and_places_that_cannot(tmp_path, monkeypatch):
+    def require(path):
+        require_room(path, "--out", path.parent)
+
+    require(tmp_path / "deep" / "er" / "a.zip")
     require_room(tmp_path / "runs")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_places_that_cannot(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match=r"is a folder; give the name of a file in it, such as --out "):
-        require_writable(tmp_path)
     with pytest.raises(OutputError, match=r"a\.zip: cannot be written: .*\. Choose another place with --out$"):
-        require_writable(tmp_path / "file" / "a.zip")
+        require(tmp_path / "file" / "a.zip")
     with pytest.raises(OutputError, match=r"^/proc/nowhere/a\.zip: cannot be written: "):
-        require_writable(type(tmp_path)("/proc/nowhere/a.zip"))
+        require(Path("/proc/nowhere/a.zip"))
+    with pytest.raises(OutputError, match=r"file: cannot be written: .* is a file, expected a folder\. .* --runs$"):
+        require_room(tmp_path / "file")
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1_500_000))
     expected = r"the disk has 1\.5 MB free, expected at least 20 MB\. Choose another place with --out$"
     with pytest.raises(OutputError, match=expected):
-        require_writable(tmp_path / "a.zip")
-    with pytest.raises(OutputError, match=r"runs: the disk has 1\.5 MB free, .*\. Choose another place with --runs$"):
-        require_room(tmp_path / "runs")
-
-
-def test_a_record_that_a_full_disk_cut_off_is_left_out(tmp_path):
-    folder = RunFolder(tmp_path, "a")
-    folder.add({"steps": 1})
-    with (folder.path / "progress.jsonl").open("a") as file:
-        file.write('{"kind": "trai')
-    assert folder.records() == [{"steps": 1}]
+        require(tmp_path / "a.zip")
 
 
 @pytest.mark.parametrize("success", [None, 0.5])
@@ -102,3 +89,69 @@ def test_the_learning_curve_is_a_picture(tmp_path, success):
     draw_curve([], "nothing yet", tmp_path / "b.png")
     with pytest.raises(OutputError, match=r"c\.png: cannot be written: No such file or directory$"):
         draw_curve(records, "", tmp_path / "no" / "c.png")
+
+
+# Copies: a folder of this computer and one in memory stand in for a bucket
+
+
+@pytest.fixture
+def fsspec():
+    return pytest.importorskip("fsspec")
+
+
+@pytest.fixture
+def checkpoint(tmp_path, fsspec):
+    path = tmp_path / "pick-ppo.zip"
+    path.write_bytes(b"one")
+    return path
+
+
+def test_into_a_folder_that_is_made(checkpoint, tmp_path):
+    Copies(f"file://{tmp_path}/far/away").copy(checkpoint)
+    checkpoint.write_bytes(b"two")
+    Copies(f"file://{tmp_path}/far/away/").copy(checkpoint)
+    assert [(path.name, path.read_bytes()) for path in (tmp_path / "far" / "away").iterdir()] == [
+        ("pick-ppo.zip", b"two")
+    ]
+
+
+def test_under_a_name_of_its_own_and_into_a_bucket(checkpoint, tmp_path, fsspec):
+    Copies(f"file://{tmp_path}/far/best.zip").copy(checkpoint)
+    assert (tmp_path / "far" / "best.zip").read_bytes() == b"one"
+    Copies("memory://bucket/runs").copy(checkpoint)
+    assert fsspec.filesystem("memory").cat("/bucket/runs/pick-ppo.zip") == b"one"
+
+
+def test_a_copy_that_cannot_be_made(checkpoint, tmp_path):
+    url = f"file://{checkpoint}/in/a/file"
+    with pytest.raises(OutputError) as caught:
+        Copies(url).copy(checkpoint)
+    assert str(caught.value).startswith(f"{url}: {checkpoint} could not be copied there: NotADirectoryError: ")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("url", "text"),
+    [
+        ("/mnt/share", "/mnt/share: --copy-to expects an address, such as s3://bucket/runs/, or a file's: file:///…"),
+        ("nowhere://x/", "nowhere://x/: cannot be copied to: Protocol not known: nowhere"),
+    ],
+)
+def test_addresses_that_cannot_be(fsspec, url, text):
+    with pytest.raises(OutputError) as caught:
+        Copies(url)
+    assert str(caught.value) == text
+
+
+def test_without_fsspec(monkeypatch):
+    monkeypatch.setitem(sys.modules, "fsspec.core", None)
+    with pytest.raises(
+        OutputError, match=r"^--copy-to needs fsspec, which is not installed\. Run: pip install fsspec$"
+    ):
+        Copies("s3://bucket/")
+
+
+def test_a_kind_of_address_whose_package_is_missing(fsspec, monkeypatch):
+    monkeypatch.setitem(sys.modules, "s3fs", None)
+    with pytest.raises(OutputError, match=r"^s3://bucket/: cannot be copied to: .*s3fs"):
+        Copies("s3://bucket/")

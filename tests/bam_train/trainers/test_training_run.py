@@ -110,7 +110,7 @@ class Watcher:
 def start(tmp_path, monkeypatch):
     """Makes a run whose evaluations are looked up by step; asks for seeds are in ``start.seeds``."""
 
-    def start(results, clock=None, best=None, copies=None, **extra):
+    def start(results, clock=None, best=None, copies=None, begin=0, **extra):
         given = {"env": "test/Count-v0", "algo": "ppo", "steps": 100, "eval_every": 30, "eval_episodes": 10, "seed": 7}
         settings = TrainSettings.from_mapping({**given, **extra})
         start.seeds = []
@@ -123,6 +123,7 @@ def start(tmp_path, monkeypatch):
 
         monkeypatch.setattr(run_module, "evaluate", evaluate)
         trainer, watcher = Counter(settings, clock), Watcher()
+        trainer.steps = begin
         folder = RunFolder(tmp_path / "runs", "count-ppo")
         run = TrainingRun(trainer, folder, tmp_path / "out.zip", watcher, best, clock or Clock(), copies)
         return run, trainer, watcher
@@ -139,8 +140,9 @@ def test_evaluations_are_due_every_so_many_steps_and_at_the_end(start):
     assert trainer.logged[0] == {"eval/return_mean": 0.0, "eval/success_rate": 0.1}
 
 
-def test_a_run_too_short_for_an_evaluation_is_evaluated_once(start):
-    run, _, watcher = start({100: report(0.5)}, eval_every=1000)
+@pytest.mark.parametrize("every", [1000, None])
+def test_a_run_too_short_for_an_evaluation_is_evaluated_once(start, every):
+    run, _, watcher = start({100: report(0.5)}, eval_every=every)
     outcome = run.run()
     assert watcher.evaluations == [(100, 0.5, 0.0, True)]
     assert outcome.checkpoint.read_text() == "100"
@@ -214,26 +216,20 @@ def test_success_that_nobody_reports_never_ends_a_run(start):
     assert watcher.notes == ["test/Count-v0 reports no is_success, so --until-success has no effect"]
 
 
-def test_asked_to_stop_it_saves_and_ends_without_an_evaluation(start, monkeypatch):
-    run, _, watcher = start({30: report(0.5)})
+def test_asked_to_stop_it_saves_and_ends_without_an_evaluation(start):
+    run, _, watcher = start({30: report(0.5)}, Clock())
     watcher.training = lambda progress, *rest: run.stop() if progress.steps == 50 else None
-    monkeypatch.setattr(run_module, "RECORD_EVERY", 0.0)
     outcome = run.run()
     assert (outcome.reason, outcome.steps) == ("stopped", 50)
     assert outcome.last.read_text() == "50"
     assert outcome.best.steps == 30
 
 
-def test_it_saves_every_half_minute_without_evaluations(start):
-    run, trainer, _ = start({1000: report(0.5)}, Clock(), steps=1000, eval_every=1000)
+@pytest.mark.parametrize(("takes", "saves"), [(0.0, [30, 340, 650, 960, 1000]), (2.0, [30, 1000])])
+def test_it_saves_every_half_minute_without_evaluations_and_less_often_if_it_is_slow(start, takes, saves):
+    run, trainer, _ = start({1000: report(0.5)}, Clock(takes), steps=1000, eval_every=1000)
     run.run()
-    assert [row[1] for row in trainer.saved if row[0] == "last.zip"] == [30, 340, 650, 960, 1000, 1000]
-
-
-def test_slow_saving_is_done_less_often(start):
-    run, trainer, _ = start({2000: report(0.5)}, Clock(save_takes=2.0), steps=2000, eval_every=2000)
-    run.run()
-    assert [row[1] for row in trainer.saved if row[0] == "last.zip"] == [30, 1040, 2000, 2000]
+    assert [row[1] for row in trainer.saved if row[0] == "last.zip"] == [*saves, 1000]
 
 
 @pytest.mark.parametrize(
@@ -311,14 +307,12 @@ def test_full_disks_everywhere_do_not_end_training_either(start):
     assert outcome.failure is None
 
 
-def test_records_that_cannot_be_written_do_not_end_training(start, monkeypatch):
-    def full(record):
-        raise OutputError("progress.jsonl: full")
-
+def test_records_that_cannot_be_written_do_not_end_training(start):
     run, _, watcher = start({step: report(0.1) for step in (30, 60, 90, 100)})
-    monkeypatch.setattr(run.folder, "add", full)
-    assert str(run.run().failure) == "progress.jsonl: full"
-    assert watcher.notes == ["progress.jsonl: full. Training goes on, and some records are missing"]
+    (run.folder.path / "progress.jsonl").mkdir()
+    failure = str(run.run().failure)
+    assert failure.startswith(f"{run.folder.path / 'progress.jsonl'}: cannot be written: Is a directory. ")
+    assert watcher.notes == [f"{failure}. Training goes on, and some records are missing"]
 
 
 def test_a_few_episodes_are_not_better_than_many(start):
@@ -333,9 +327,9 @@ def test_a_few_episodes_are_not_better_than_many(start):
 
 
 def test_a_resumed_run_keeps_a_better_best(start):
-    run, trainer, _ = start({60: report(0.5), 90: report(0.7), 100: report(0.6)}, best=Best(20, 0.8, 3.0))
+    results = {60: report(0.5), 90: report(0.7), 100: report(0.6)}
+    run, _, _ = start(results, best=Best(20, 0.8, 3.0), begin=30)
     run.out.write_text("20")
-    trainer.steps = run._evaluated_at = 30
     outcome = run.run()
     assert (outcome.best.steps, outcome.checkpoint.read_text()) == (20, "20")
 
@@ -362,40 +356,22 @@ def test_records(start):
     assert watcher.rates[0] == (10, 10.0, 9.0)
 
 
-def test_settings_without_a_number_of_steps_between_evaluations(start):
-    run, _, watcher = start({100: report(0.5)})
-    run.settings = replace(run.settings, eval_every=None)
-    run.run()
-    assert [row[0] for row in watcher.evaluations] == [100]
-
-
 def test_where_there_are_no_other_environments_training_lends_its_own(start):
     run, trainer, _ = start({100: report(0.5)}, eval_every=100)
     trainer.rows = object()  # `evaluate` of the fixture looks at it
     assert run.run().best.success_rate == 0.5
 
 
-def test_a_lost_link_loses_nothing_that_was_learnt(start, tmp_path):
+@pytest.mark.parametrize(
+    "link", [LinkLost("tcp://a:9: the link dropped."), ProcessesLost("env runner 2 died 6 times within 20 updates")]
+)
+def test_a_lost_link_or_process_loses_nothing_that_was_learnt(start, link):
     run, trainer, _ = start({30: report(0.5)})
-    trainer.link = LinkLost("tcp://127.0.0.1:9: the link dropped.")
-    last = run.folder.last
+    trainer.link, last = link, run.folder.last
     with pytest.raises(TrainingFailed) as caught:
         run.run()
-    assert str(caught.value) == (
-        f"at step 60: tcp://127.0.0.1:9: the link dropped. What was learnt is kept: go on with --resume {last}"
-    )
-    assert last.read_text() == "60"
-
-
-def test_lost_processes_lose_nothing_that_was_learnt(start):
-    run, trainer, _ = start({30: report(0.5)})
-    trainer.link = ProcessesLost("env runner 2 died 6 times within 20 updates")
-    last = run.folder.last
-    with pytest.raises(TrainingFailed) as caught:
-        run.run()
-    assert str(caught.value) == (
-        f"at step 60: env runner 2 died 6 times within 20 updates. What was learnt is kept: go on with --resume {last}"
-    )
+    said = str(link).rstrip(".")
+    assert str(caught.value) == f"at step 60: {said}. What was learnt is kept: go on with --resume {last}"
     assert last.read_text() == "60"
 
 

@@ -1,6 +1,8 @@
+import base64
 import json
 import zipfile
 
+import cloudpickle
 import numpy as np
 import pytest
 from stable_baselines3 import PPO
@@ -78,28 +80,37 @@ def test_the_frozen_policy_acts_as_the_model(plain):
     model, path = plain
     foreign = load_trusted(path, "ppo", "CartPole-v1")
     observations = np.random.default_rng(0).normal(size=(200, 4)).astype(np.float32)
-    assert foreign.steps == 64
+    assert foreign.steps == load_trusted(path, "a2c", "CartPole-v1").steps == 64  # the same policy in the same file
     assert (
         foreign.policy.act_batch(observations).tolist() == model.predict(observations, deterministic=True)[0].tolist()
     )
 
 
-def test_refused_without_trust(plain, capsys):
-    _, path = plain
-    assert run(capsys, path, "--env", "CartPole-v1", "--algo", "ppo") == (
-        1,
-        "",
-        f"bam-eval: {path}: a plain stable-baselines3 file, not made by bam-train. Loading it runs whatever code is in "
-        "it: if you trust its maker, add --trust-pickle, --env and --algo\n",
-    )
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        (
+            ("--env", "CartPole-v1", "--algo", "ppo"),
+            "{path}: a plain stable-baselines3 file, not made by bam-train. Loading it runs whatever code is in it: "
+            "if you trust its maker, add --trust-pickle, --env and --algo",
+        ),
+        (
+            ("--trust-pickle", "--algo", "ppo"),
+            "{path}: a plain stable-baselines3 file does not say what it is; give --env and --algo",
+        ),
+        (
+            ("--trust-pickle", "--env", "CartPole-v1", "--algo", "pppo"),
+            "Unknown algorithm 'pppo'. Did you mean 'ppo'?",
+        ),
+    ],
+)
+def test_what_it_is_has_to_be_said_and_trusted(plain, capsys, arguments, error):
+    path = plain[1]
+    assert run(capsys, path, *arguments) == (1, "", f"bam-eval: {error.format(path=path)}\n")
 
 
 def test_nothing_is_unpickled_without_trust(plain, capsys, tmp_path):
     """Its ``data`` would make a file when loaded."""
-    import base64
-
-    import cloudpickle
-
     flag = tmp_path / "flag"
 
     class Evil:
@@ -113,15 +124,6 @@ def test_nothing_is_unpickled_without_trust(plain, capsys, tmp_path):
     status, _, _ = run(capsys, path, "--env", "CartPole-v1", "--algo", "ppo")
     assert status == 1
     assert not flag.exists()
-
-
-def test_what_it_is_has_to_be_said(plain, capsys):
-    _, path = plain
-    assert run(capsys, path, "--trust-pickle", "--algo", "ppo") == (
-        1,
-        "",
-        f"bam-eval: {path}: a plain stable-baselines3 file does not say what it is; give --env and --algo\n",
-    )
 
 
 def test_evaluated_with_a_warning(plain, capsys):
@@ -149,11 +151,6 @@ def total(model, seed):
     return result
 
 
-def test_an_unknown_algorithm(plain, capsys):
-    status, _, err = run(capsys, plain[1], "--trust-pickle", "--env", "CartPole-v1", "--algo", "pppo")
-    assert (status, err) == (1, "bam-eval: Unknown algorithm 'pppo'. Did you mean 'ppo'?\n")
-
-
 @pytest.mark.parametrize(("algo", "env"), [("sac", "Pendulum-v1"), ("dqn", "CartPole-v1"), ("ppo", "Pendulum-v1")])
 def test_another_algorithm_or_environment(plain, algo, env):
     with pytest.raises(CheckpointMismatch) as caught:
@@ -162,11 +159,6 @@ def test_another_algorithm_or_environment(plain, algo, env):
     assert text.startswith(f"{plain[1]}: {algo.upper()}.load cannot use it with {env}: ")
     assert text.endswith(". Check --algo and --env")
     assert "\n" not in text
-
-
-def test_kinds_that_share_a_policy_load_as_each_other(plain):
-    """An A2C file is not told from a PPO one by SB3 either; the frozen policy is the same."""
-    assert load_trusted(plain[1], "a2c", "CartPole-v1").steps == 64
 
 
 @pytest.mark.parametrize("asked", [(), ("--set", "env_kwargs.parity=true")])

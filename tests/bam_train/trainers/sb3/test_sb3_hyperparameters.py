@@ -72,6 +72,15 @@ def test_the_policy_fits_what_is_observed(name, space, policy):
             {"action_noise": "pink_0.1"},
             'action_noise: expected "normal_0.1" or "ornstein-uhlenbeck_0.1", found \'pink_0.1\'',
         ),
+        ("ppo", {"gamma": 1.5}, "gamma: expected a number from 0 to 1, found 1.5"),
+        ("sac", {"tau": 2}, "tau: expected a number from 0 to 1, found 2"),
+        ("ppo", {"learning_rate": 0}, "learning_rate: expected a number above 0, found 0"),
+        ("ppo", {"learning_rate": "lin_0"}, "learning_rate: expected a number above 0, found 0.0"),
+        ("ppo", {"learning_rate": float("nan")}, "learning_rate: expected a number above 0, found nan"),
+        ("ppo", {"n_steps": 0}, "n_steps: expected a whole number of at least 1, found 0"),
+        ("ppo", {"batch_size": -4}, "batch_size: expected a whole number of at least 1, found -4"),
+        ("td3", {"train_freq": [0, "step"]}, "train_freq: expected a whole number of at least 1, found 0"),
+        ("sac", {"learning_starts": -1}, "learning_starts: expected a number of at least 0, found -1"),
     ],
 )
 def test_what_does_not_fit_is_one_line(name, given, message):
@@ -112,14 +121,6 @@ def test_normalize():
         complete_normalize({"norm_rewards": False}, 0.9)
 
 
-@pytest.mark.parametrize(
-    ("name", "kind"), [("sac", "Discrete"), ("dqn", "Box"), ("dqn", "MultiDiscrete"), ("ppo", "Text")]
-)
-def test_an_algorithm_that_does_not_fit_the_actions(name, kind):
-    with pytest.raises(SettingsError, match=rf"^{name} does not fit Some-v0: it takes .* actions, found {kind}\. "):
-        SB3_ALGORITHMS[name].require_actions("Some-v0", kind)
-
-
 def test_the_line_about_actions_names_what_fits():
     with pytest.raises(SettingsError) as caught:
         SB3_ALGORITHMS["dqn"].require_actions("bam/pick-v0", "Box")
@@ -127,28 +128,6 @@ def test_the_line_about_actions_names_what_fits():
         "dqn does not fit bam/pick-v0: it takes Discrete actions, found Box. "
         "Use one of: a2c, crossq, ddpg, ppo, recurrent-ppo, sac, td3, tqc, trpo."
     )
-
-
-@pytest.mark.parametrize(
-    ("name", "given", "line"),
-    [
-        ("ppo", {"gamma": 1.5}, "gamma: expected a number from 0 to 1, found 1.5"),
-        ("ppo", {"gae_lambda": -0.1}, "gae_lambda: expected a number from 0 to 1, found -0.1"),
-        ("sac", {"tau": 2}, "tau: expected a number from 0 to 1, found 2"),
-        ("ppo", {"learning_rate": 0}, "learning_rate: expected a number above 0, found 0"),
-        ("ppo", {"learning_rate": "lin_0"}, "learning_rate: expected a number above 0, found 0.0"),
-        ("ppo", {"learning_rate": float("nan")}, "learning_rate: expected a number above 0, found nan"),
-        ("ppo", {"n_steps": 0}, "n_steps: expected a whole number of at least 1, found 0"),
-        ("ppo", {"batch_size": -4}, "batch_size: expected a whole number of at least 1, found -4"),
-        ("ppo", {"n_epochs": 0}, "n_epochs: expected a whole number of at least 1, found 0"),
-        ("td3", {"train_freq": [0, "step"]}, "train_freq: expected a whole number of at least 1, found 0"),
-        ("sac", {"learning_starts": -1}, "learning_starts: expected a number of at least 0, found -1"),
-    ],
-)
-def test_numbers_that_cannot_be(name, given, line):
-    with pytest.raises(SettingsError) as caught:
-        complete(SB3_ALGORITHMS[name], given, NUMBERS)
-    assert str(caught.value) == line
 
 
 def test_schedules_and_auto_are_in_range():

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
+import base64
+import hashlib
 import json
 import os
+import pickle
 import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -21,37 +22,28 @@ from bam_train.trainers.sb3 import sb3_resume as resume
 from bam_train.trainers.sb3.sb3_trainer import SB3Trainer
 
 SMALL = {"net_arch": [16, 16]}
-OFF = {"batch_size": 16, "learning_starts": 60, "gradient_steps": 2, "train_freq": 4, "policy_kwargs": SMALL}
+ON = {"n_steps": 16, "batch_size": 48, "policy_kwargs": SMALL}
+OFF = {"batch_size": 16, "learning_starts": 30, "gradient_steps": 2, "train_freq": 4, "policy_kwargs": SMALL}
+DISCRETE, NORMALISED = {"env_kwargs": {"discrete": True}}, {"normalize": True}
+SCHEDULES = {"learning_rate": "lin_1e-3", "clip_range": "lin_0.2"}
+TOTAL = 192
 
 RUNS = {
-    "ppo": ("ppo", {"n_steps": 32, "batch_size": 96, "n_epochs": 2, "policy_kwargs": SMALL}, {}),
-    "ppo-sde-normalised": (
-        "ppo",
-        {"n_steps": 32, "batch_size": 96, "use_sde": True, "sde_sample_freq": 4},
-        {"normalize": True},
-    ),
-    "ppo-discrete": ("ppo", {"n_steps": 32, "batch_size": 96, "n_epochs": 2}, {"env_kwargs": {"discrete": True}}),
-    "ppo-schedule": (
-        "ppo",
-        {"n_steps": 32, "batch_size": 96, "learning_rate": "lin_1e-3", "clip_range": "lin_0.2"},
-        {},
-    ),
+    "ppo": ("ppo", {**ON, "n_epochs": 2}, {}),
+    "ppo-sde-normalised": ("ppo", {**ON, "n_epochs": 2, "use_sde": True, "sde_sample_freq": 4}, NORMALISED),
+    "ppo-schedule-discrete": ("ppo", {**ON, "n_epochs": 2, **SCHEDULES}, DISCRETE),
     "a2c": ("a2c", {}, {}),
-    "trpo": ("trpo", {"n_steps": 32, "batch_size": 96}, {}),
-    "recurrent-ppo": (
-        "recurrent-ppo",
-        {"n_steps": 32, "batch_size": 96, "n_epochs": 2, "policy_kwargs": {"lstm_hidden_size": 8}},
-        {},
-    ),
+    "trpo": ("trpo", ON, {}),
+    "recurrent-ppo": ("recurrent-ppo", {**ON, "n_epochs": 2, "policy_kwargs": {"lstm_hidden_size": 8}}, {}),
     "sac": ("sac", OFF, {}),
-    "sac-full-buffer": ("sac", {**OFF, "buffer_size": 90, "use_sde": True}, {"normalize": True}),
+    "sac-full-buffer": ("sac", {**OFF, "buffer_size": 60, "use_sde": True}, NORMALISED),
     "sac-fixed-entropy": ("sac", {**OFF, "ent_coef": 0.1, "n_steps": 3}, {}),
     "td3": ("td3", {**OFF, "action_noise": "normal_0.1"}, {}),
     "ddpg": ("ddpg", {**OFF, "action_noise": "ornstein-uhlenbeck_0.2"}, {}),
     "tqc": ("tqc", OFF, {}),
     "crossq": ("crossq", OFF, {}),
-    "dqn": ("dqn", {**OFF, "target_update_interval": 40}, {"env_kwargs": {"discrete": True}}),
-    "qrdqn": ("qrdqn", {**OFF, "target_update_interval": 40}, {"env_kwargs": {"discrete": True}}),
+    "dqn": ("dqn", {**OFF, "target_update_interval": 40}, DISCRETE),
+    "qrdqn": ("qrdqn", {**OFF, "target_update_interval": 40}, DISCRETE),
 }
 
 
@@ -62,49 +54,53 @@ def everything(trainer: SB3Trainer) -> dict[str, bytes]:
     return resume.members(trainer.model, trainer.venv, trainer.model.get_vec_normalize_env(), None, {})
 
 
-def settings(env, name, steps=384):
+def settings(env, name, steps=TOTAL):
     algo, hyperparameters, extra = RUNS[name]
     given = {"env": env, "algo": algo, "steps": steps, "num_envs": 3, "hyperparameters": hyperparameters, **extra}
     return SB3Trainer.complete(TrainSettings.from_mapping(given))
 
 
+def trained(settings, until=TOTAL):
+    """A run that stopped after an update."""
+    trainer = SB3Trainer.create(settings)
+    trainer.train(settings.steps, lambda progress: progress.steps < until)
+    return trainer
+
+
 @pytest.mark.parametrize("name", RUNS)
 def test_half_and_half_is_the_whole(walk, tmp_path, name):
-    whole = SB3Trainer.create(settings(walk, name))
-    whole.train(384, lambda progress: True)
-
-    half = SB3Trainer.create(settings(walk, name))
-    half.train(384, lambda progress: progress.steps < 192)
-    assert 192 <= half.steps < 384
+    whole = trained(settings(walk, name))
+    half = trained(settings(walk, name), TOTAL // 2)
+    assert TOTAL // 2 <= half.steps < TOTAL
     half.save(tmp_path / "half.zip", {}, {})
 
     torch.manual_seed(123)  # whatever another process drew
     np.random.seed(321)
     rest = SB3Trainer.load(Checkpoint.open(tmp_path / "half.zip"))
     assert rest.notices == []
-    rest.train(384, lambda progress: True)
+    rest.train(TOTAL, lambda progress: True)
     assert rest.steps == whole.steps
     assert everything(rest) == everything(whole)
 
 
 @pytest.mark.parametrize(
     ("name", "fall"),
-    [("ppo-schedule", "clip_range and learning_rate change"), ("dqn", "exploration_fraction changes"), ("sac", None)],
+    [
+        ("ppo-schedule-discrete", "clip_range and learning_rate change"),
+        ("dqn", "exploration_fraction changes"),
+        ("sac", None),
+    ],
 )
 def test_another_total_is_another_schedule_and_said(walk, tmp_path, name, fall):
-    half = SB3Trainer.create(settings(walk, name, steps=192))
-    half.train(192, lambda progress: False)
-    half.save(tmp_path / "half.zip", {}, {})
+    trained(settings(walk, name, steps=96), 1).save(tmp_path / "half.zip", {}, {})
     rest = SB3Trainer.load(Checkpoint.open(tmp_path / "half.zip"), settings(walk, name))
-    expected = f"{fall} over all of --steps, which were 192 and are 384: the result differs from an unbroken run's"
+    expected = f"{fall} over all of --steps, which were 96 and are {TOTAL}: the result differs from an unbroken run's"
     assert rest.notices == ([expected] if fall else [])
 
 
 def test_saving_freezing_and_looking_disturb_nothing(walk, tmp_path):
-    quiet = SB3Trainer.create(settings(walk, "sac"))
-    quiet.train(240, lambda progress: True)
-    expected = everything(quiet)
-    watched = SB3Trainer.create(settings(walk, "sac"))
+    expected = everything(trained(settings(walk, "sac", steps=96)))
+    watched = SB3Trainer.create(settings(walk, "sac", steps=96))
 
     def look(progress):
         progress.statistics()
@@ -112,18 +108,16 @@ def test_saving_freezing_and_looking_disturb_nothing(walk, tmp_path):
         with watched.undisturbed():
             torch.rand(3)
             np.random.rand(3)
-        if progress.steps > 150:
+        if progress.steps > 70:
             watched.save(tmp_path / "a.zip", {}, {})
         return True
 
-    watched.train(240, look)
+    watched.train(96, look)
     assert everything(watched) == expected
 
 
 def test_a_loaded_run_can_be_saved_before_it_goes_on(walk, tmp_path):
-    first = SB3Trainer.create(settings(walk, "ddpg"))
-    first.train(384, lambda progress: progress.steps < 192)
-    first.save(tmp_path / "a.zip", {}, {})
+    trained(settings(walk, "ddpg"), 1).save(tmp_path / "a.zip", {}, {})
     SB3Trainer.load(Checkpoint.open(tmp_path / "a.zip")).save(tmp_path / "b.zip", {}, {})
     one, two = Checkpoint.open(tmp_path / "a.zip"), Checkpoint.open(tmp_path / "b.zip")
     members = [name for name in one.manifest.sha256 if name.startswith("bam/")]
@@ -134,70 +128,42 @@ def test_a_loaded_run_can_be_saved_before_it_goes_on(walk, tmp_path):
 
 PROGRAM = """
 import hashlib, sys
-from pathlib import Path
 from bam_train.checkpoint import Checkpoint
-from bam_train.settings import TrainSettings
 from bam_train.trainers.sb3 import sb3_resume as resume
 from bam_train.trainers.sb3.sb3_trainer import SB3Trainer
-import json
-given, first, total, path = json.loads(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), Path(sys.argv[4])
-if path.exists():
+for path in sys.argv[1:]:
     trainer = SB3Trainer.load(Checkpoint.open(path))
-else:
-    trainer = SB3Trainer.create(SB3Trainer.complete(TrainSettings.from_mapping(given)))
-trainer.train(total, lambda progress: progress.steps < first)
-if trainer.steps < total:
-    trainer.save(path, {}, {})
-for episode in trainer.model.ep_info_buffer:
-    episode["t"] = 0
-state = resume.members(trainer.model, trainer.venv, None, None, {})
-print(trainer.steps, hashlib.sha256(b"".join(state.values())).hexdigest())
+    trainer.train(trainer.settings.steps, lambda progress: True)
+    for episode in trainer.model.ep_info_buffer:
+        episode["t"] = 0
+    state = resume.members(trainer.model, trainer.venv, None, None, {})
+    print(trainer.steps, hashlib.sha256(b"".join(state.values())).hexdigest())
 """
 
 
-@contextlib.contextmanager
-def a_new_process(given, first, total, path):
-    """Within, the program runs; what it gives is called for what it printed."""
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
-    command = [sys.executable, "-c", PROGRAM, json.dumps(given), str(first), str(total), str(path)]
-
-    def printed():
-        out, err = process.communicate(timeout=300)
-        assert process.returncode == 0, err
-        return out.split()
-
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-    ) as process:
-        try:
-            yield printed
-        finally:
-            process.kill()
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("algo", "hyperparameters"),
-    [
-        ("ppo", {"n_steps": 125, "batch_size": 100, "n_epochs": 3}),
-        ("sac", {"learning_starts": 400, "train_freq": 25, "gradient_steps": 10, "batch_size": 64}),
-    ],
-)
-def test_2k_steps_saved_and_2k_more_in_a_new_process_are_4k(tmp_path, algo, hyperparameters):
-    given = {"env": "bam/pick-v0", "algo": algo, "steps": 4000, "num_envs": 8, "hyperparameters": hyperparameters}
-    with a_new_process(given, 4000, 4000, tmp_path / "whole.zip") as whole:
-        with a_new_process(given, 2000, 4000, tmp_path / "half.zip") as half:
-            assert half()[0] == "2000"
-        with a_new_process(given, 4000, 4000, tmp_path / "half.zip") as rest:
-            assert rest() == (expected := whole())
-    assert expected[0] == "4000"
+def test_half_a_run_in_simulation_goes_on_in_a_new_process(tmp_path):
+    runs = {
+        "ppo": {"n_steps": 50, "batch_size": 100, "n_epochs": 3},
+        "sac": {"learning_starts": 300, "train_freq": 25, "gradient_steps": 5, "batch_size": 64},
+    }
+    given = {"env": "bam/pick-v0", "steps": 800, "num_envs": 8}
+    expected = []
+    for algo, hyperparameters in runs.items():
+        mapping = {**given, "algo": algo, "hyperparameters": hyperparameters}
+        complete = SB3Trainer.complete(TrainSettings.from_mapping(mapping))
+        trained(complete, 400).save(tmp_path / f"{algo}.zip", {}, {})
+        state = everything(trained(complete, 800))
+        expected.append(f"800 {hashlib.sha256(b''.join(state.values())).hexdigest()}")
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
+    command = [sys.executable, "-c", PROGRAM, *(str(tmp_path / f"{algo}.zip") for algo in runs)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment, check=False)
+    assert done.stdout.splitlines() == expected, done.stderr
 
 
 def test_a_foreign_environment_begins_new_episodes_and_says_so(corridor, tmp_path):
     given = {"env": corridor, "algo": "ppo", "steps": 128, "hyperparameters": {"n_steps": 32, "batch_size": 32}}
-    trainer = SB3Trainer.create(SB3Trainer.complete(TrainSettings.from_mapping(given)))
-    trainer.train(128, lambda progress: progress.steps < 64)
-    trainer.save(tmp_path / "a.zip", {}, {})
+    trained(SB3Trainer.complete(TrainSettings.from_mapping(given)), 64).save(tmp_path / "a.zip", {}, {})
     resumed = [SB3Trainer.load(Checkpoint.open(tmp_path / "a.zip")) for _ in range(2)]
     expected = "test/Corridor-v0 cannot save running episodes: new ones begin, so the rest differs from an unbroken run"
     assert resumed[0].notices == [expected]
@@ -209,9 +175,7 @@ def test_a_foreign_environment_begins_new_episodes_and_says_so(corridor, tmp_pat
 
 
 def test_a_resume_state_of_another_network_is_refused(walk, tmp_path):
-    small = SB3Trainer.create(settings(walk, "ppo"))
-    small.train(384, lambda progress: False)
-    small.save(tmp_path / "a.zip", {}, {})
+    trained(settings(walk, "ppo"), 1).save(tmp_path / "a.zip", {}, {})
     checkpoint = Checkpoint.open(tmp_path / "a.zip")
     other = TrainSettings.from_mapping(
         {**checkpoint.manifest.settings, "hyperparameters": {"policy_kwargs": {"net_arch": [4]}}}
@@ -223,9 +187,8 @@ def test_a_resume_state_of_another_network_is_refused(walk, tmp_path):
 @pytest.fixture(scope="module")
 def half(tmp_path_factory):
     """A checkpoint that any run may go on from, once what a stranger changed is found."""
-    given = {"env": "CartPole-v1", "algo": "ppo", "hyperparameters": {"n_steps": 32, "batch_size": 32}}
-    trainer = SB3Trainer.create(SB3Trainer.complete(TrainSettings.from_mapping({**given, "steps": 64})))
-    trainer.train(64, lambda progress: False)
+    given = {"env": "CartPole-v1", "algo": "ppo", "hyperparameters": {"n_steps": 32, "batch_size": 32}, "steps": 64}
+    trainer = trained(SB3Trainer.complete(TrainSettings.from_mapping(given)), 1)
     path = tmp_path_factory.mktemp("half") / "half.zip"
     trainer.save(path, {}, {})
     return path
@@ -281,27 +244,13 @@ class Evil:
         return Path.touch, (self.path,)
 
 
-def test_nothing_of_stable_baselines3_is_unpickled_when_a_run_goes_on(walk, tmp_path):
-    import base64
-    import hashlib
-    import pickle
-
-    trainer = SB3Trainer.create(settings(walk, "ppo"))
-    trainer.train(384, lambda progress: False)
-    trainer.save(tmp_path / "a.zip", {}, {})
-    with zipfile.ZipFile(tmp_path / "a.zip") as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    data = json.loads(members["data"])
-    evil = base64.b64encode(pickle.dumps(Evil(tmp_path / "was-here"))).decode()
+def test_nothing_of_stable_baselines3_is_unpickled_when_a_run_goes_on(half, tmp_path, forge):
+    path, evil = tmp_path / "forged.zip", base64.b64encode(pickle.dumps(Evil(tmp_path / "was-here"))).decode()
+    path.write_bytes(half.read_bytes())
+    data = json.loads(Checkpoint.open(path).read("data"))
     data["clip_range"] = {":type:": "x", ":serialized:": evil}
-    members["data"] = json.dumps(data).encode()
-    manifest = json.loads(members["bam/manifest.json"])
-    manifest["sha256"]["data"] = hashlib.sha256(members["data"]).hexdigest()
-    members["bam/manifest.json"] = json.dumps(manifest).encode()
-    with zipfile.ZipFile(tmp_path / "b.zip", "w") as archive:
-        for name, content in members.items():
-            archive.writestr(name, content)
-    resumed = SB3Trainer.load(Checkpoint.open(tmp_path / "b.zip"))
-    resumed.train(384, lambda progress: True)
+    forge(path, {"data": json.dumps(data).encode()})
+    resumed = SB3Trainer.load(Checkpoint.open(path))
+    resumed.train(128, lambda progress: True)
     resumed.freeze()
     assert not (tmp_path / "was-here").exists()
