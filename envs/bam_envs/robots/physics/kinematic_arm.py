@@ -8,17 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.core.errors import InvalidValue, ResetNeeded
+from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds, Initial, RobotState, checked_command
 from bam_envs.robots.physics.contacts import GROUND, TABLE, ArmContacts
 from bam_envs.robots.physics.obstacles import RADIUS, Obstacles
 from bam_envs.robots.physics.shapes import BLUE, GREY, RED, WOOD, Drawn, Shape, View
-from bam_envs.robots.ur import DEFAULT_MODEL, START, UrModel, ur_spec
+from bam_envs.robots.ur import DEFAULT_MODEL, START, ur_spec
 from bam_envs.robots.ur import ur_model as model_called
 from bam_envs.robots.ur5e import TOOL_LENGTH
 
@@ -32,23 +33,30 @@ class KinematicArm(Drawn):
 
     Args:
         num_robots: How many are stepped together.
-        model: Which arm.
+        ur_model: ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e.
         period: Time between two commands [s].
         obstacle: Whether a ball flies about, seen by a tracker.
         randomize: Each episode the arm lags behind its set points by another share, 0 to 0.3 of the way.
     """
 
+    floor, mark_radius = GROUND, 0.025
+
     def __init__(
-        self, num_robots: int, model: UrModel, period: float, obstacle: bool = False, *, randomize: bool = False
+        self,
+        num_robots: int = 1,
+        *,
+        ur_model: str = DEFAULT_MODEL,
+        period: float,
+        obstacle: bool = False,
+        randomize: bool = False,
     ) -> None:
+        model = model_called(ur_model)
         self.num_robots, self.model, self.randomize = num_robots, model, randomize
-        self.floor, self.mark_radius = GROUND, 0.025
         self.spec = ur_spec(model, period, obstacle)
         self._tool = replace(model.geometry, tool=TOOL_LENGTH)
         self._contacts = ArmContacts(model)
-        self._with_obstacle = obstacle
-        self._obstacles: Obstacles | None = None
-        self._connected, self._halts = False, 0
+        self._obstacles = Obstacles(num_robots) if obstacle else None
+        self._halts = 0
         self._low, self._high = np.array(self.spec.command.low), np.array(self.spec.command.high)
         self._reach = np.array(self.spec.command.max_rate) * period
         self._position = np.tile(START, (num_robots, 1))
@@ -57,12 +65,6 @@ class KinematicArm(Drawn):
         self._stamp = np.zeros(num_robots)
         self._collided = np.zeros(num_robots, dtype=bool)
         self._command = self._position
-
-    def connect(self) -> None:
-        """Commands are taken from now on."""
-        if self._with_obstacle and self._obstacles is None:
-            self._obstacles = Obstacles(self.num_robots)
-        self._connected = True
 
     @property
     def setpoint(self) -> Array:
@@ -90,12 +92,8 @@ class KinematicArm(Drawn):
         self._collided[env_ids] = self._touching()[env_ids]
         return self._measure()
 
-    def step(self, command: Array) -> RobotState:
-        """Send `command` (n, 6), joint positions [rad], and measure one period later."""
-        return next(self.slices(command, 1))
-
     def slices(self, command: Array, parts: int) -> Iterator[RobotState]:
-        """Send `command` (n, 6), and give the state after each of `parts` equal parts of the period.
+        """Send `command` (n, 6) [rad], and give the state after each of `parts` equal parts of the period.
 
         A halt between two parts holds for the rest of the period.
         """
@@ -133,19 +131,9 @@ class KinematicArm(Drawn):
             signals["object_quaternion"] = np.tile([1.0, 0.0, 0.0, 0.0], (self.num_robots, 1))
         return RobotState(signals, self._stamp, self._command, {"collision": self._collided})
 
-    def _require_link(self) -> None:
-        if not self._connected:
-            raise ResetNeeded("The simulated robot is not connected. Call reset() first.")
-
     def halt(self) -> None:
         """Hold where it is."""
         self._halts += 1
-
-    def close(self) -> None:
-        """Halt; no command is taken until `connect`."""
-        self.halt()
-        self.close_picture()
-        self._connected = False
 
     def picture(self) -> tuple[list[Shape], View]:
         """The arm of environment 0, its table and its ball, from so far away that the arm fits."""
@@ -180,21 +168,7 @@ class KinematicArm(Drawn):
 _ARRAYS = ("position", "velocity", "share", "stamp", "collided", "command")
 
 
-def reach_arm(num_robots: int = 1, *, randomize: bool = False, ur_model: str = DEFAULT_MODEL) -> KinematicArm:
-    """The arm at 10 Hz."""
-    return KinematicArm(num_robots, model_called(ur_model), 0.1, randomize=randomize)
-
-
-def empty_arm(num_robots: int = 1, *, randomize: bool = False, ur_model: str = DEFAULT_MODEL) -> KinematicArm:
-    """The arm at 20 Hz."""
-    return KinematicArm(num_robots, model_called(ur_model), 0.05, randomize=randomize)
-
-
-def obstacle_arm(num_robots: int = 1, *, randomize: bool = False, ur_model: str = DEFAULT_MODEL) -> KinematicArm:
-    """The arm at 20 Hz, and a ball that flies about."""
-    return KinematicArm(num_robots, model_called(ur_model), 0.05, obstacle=True, randomize=randomize)
-
-
-def isaac_arm(num_robots: int = 1, *, randomize: bool = False, ur_model: str = "ur10") -> KinematicArm:
-    """The arm at 30 Hz."""
-    return KinematicArm(num_robots, model_called(ur_model), 1 / 30, randomize=randomize)
+reach_arm = partial(KinematicArm, period=0.1)
+empty_arm = partial(KinematicArm, period=0.05)
+obstacle_arm = partial(KinematicArm, period=0.05, obstacle=True)
+isaac_arm = partial(KinematicArm, period=1 / 30, ur_model="ur10")

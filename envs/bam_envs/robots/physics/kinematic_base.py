@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.core.errors import InvalidValue, ResetNeeded
+from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds, Initial, RobotState, checked_command
 from bam_envs.robots.mir100 import (
     BACK_MASKED,
@@ -45,16 +46,6 @@ GAIN_SPREAD = 0.05
 """A randomised drive goes at most this much faster or slower than it is told."""
 
 
-def open_floor(num_robots: int = 1, *, randomize: bool = False) -> SimulatedBase:
-    """Bases on a floor without end, whose lasers are off."""
-    return SimulatedBase(num_robots, room=None, with_scans=False, randomize=randomize)
-
-
-def lab(num_robots: int = 1, *, randomize: bool = False) -> SimulatedBase:
-    """Bases with their lasers in a room of 5.7 x 7.7 m and three boxes each."""
-    return SimulatedBase(num_robots, boxes=3, randomize=randomize)
-
-
 class SimulatedBase(Drawn):
     """Bases with the signals of a MiR100, each in a room of its own.
 
@@ -69,6 +60,8 @@ class SimulatedBase(Drawn):
         randomize: Whether the drive of each episode is a little off.
     """
 
+    mark_radius = 0.2
+
     def __init__(
         self,
         num_robots: int = 1,
@@ -79,13 +72,11 @@ class SimulatedBase(Drawn):
         randomize: bool = False,
     ) -> None:
         self.num_robots, self.room, self.randomize = num_robots, room, randomize
-        self.mark_radius = 0.2
         self.spec = base_spec(with_scans=with_scans)
         self.boxes: Array = np.tile(np.array(NOWHERE), (num_robots, boxes, 1))
         """x, y [m] and yaw [rad] of each box. Shape: (n, b, 3)."""
         self.pose: Array = np.zeros((num_robots, 3))
         """x, y [m] and yaw [rad]. Shape: (n, 3)."""
-        self._connected = False
         self._low, self._high = np.array(self.spec.command.low), np.array(self.spec.command.high)
         self._change = np.array(self.spec.command.max_rate) * self.spec.period
         self._velocity, self._command = np.zeros((num_robots, 2)), np.zeros((num_robots, 2))
@@ -94,10 +85,6 @@ class SimulatedBase(Drawn):
         self._seeds, self._scans = np.zeros(num_robots, np.uint64), np.zeros(num_robots, np.uint64)
         self._scanners = (LaserScanner(FRONT_MOUNT, FRONT_MASKED), LaserScanner(BACK_MOUNT, BACK_MASKED))
         self._seen = np.zeros((num_robots, FRONT_RAYS + BACK_RAYS if with_scans else 0))
-
-    def connect(self) -> None:
-        """There is nothing to connect to; commands are taken from now on."""
-        self._connected = True
 
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
         """Put these environments at rest at ``base_pose`` (k, 3), and their boxes at ``obstacle_pose`` (k, b, 3).
@@ -131,12 +118,8 @@ class SimulatedBase(Drawn):
         self._scan(env_ids)
         return self._state()
 
-    def step(self, command: Array) -> RobotState:
-        """Drive with `command` (n, 2), forward [m/s] and turning anticlockwise [rad/s]; one period later, measure."""
-        return next(self.slices(command, 1))
-
     def slices(self, command: Array, parts: int) -> Iterator[RobotState]:
-        """Send `command` (n, 2), and give the state after each of `parts` equal parts of the period."""
+        """Send `command` (n, 2), forward [m/s] and turning [rad/s], and give the state after each of `parts` parts."""
         self._require_link()
         self._command = checked_command(command, (self.num_robots, 2))
         target = np.clip(self._command, self._low, self._high) * self._gain
@@ -184,19 +167,9 @@ class SimulatedBase(Drawn):
         truth: dict[str, Any] = {"collision": self._collision, "obstacle_pose": self.boxes}
         return RobotState(signals, self._stamp, self._command, truth)
 
-    def _require_link(self) -> None:
-        if not self._connected:
-            raise ResetNeeded("The simulated base is not connected. Call connect() first.")
-
     def halt(self) -> None:
         """Stand still."""
         self._velocity, self._command = np.zeros_like(self._velocity), np.zeros_like(self._command)
-
-    def close(self) -> None:
-        """Halt; no command is taken until `connect`."""
-        self.halt()
-        self.close_picture()
-        self._connected = False
 
     def picture(self) -> tuple[list[Shape], View]:
         """The base of environment 0, its room and boxes, and what its lasers see.
@@ -267,3 +240,7 @@ def scan_shapes(pose: Array, front: Array, back: Array) -> list[Shape]:
         for x, y in eye + far * np.stack([np.cos(heading), np.sin(heading)], axis=1):
             dots.append(Shape("sphere", np.array([x, y, _LASER_HEIGHT]), (0.03,), RED))
     return dots
+
+
+open_floor = partial(SimulatedBase, room=None, with_scans=False)
+lab = partial(SimulatedBase, boxes=3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -249,11 +250,5 @@ class SimulatedArm:
         return self._measure(self._all[:0])
 
 
-def cube_scene(num_robots: int = 1, *, randomize: bool = False) -> SimulatedArm:
-    """The arm with a cube in front of it."""
-    return SimulatedArm(num_robots, with_object=True, randomize=randomize)
-
-
-def arm_scene(num_robots: int = 1, *, randomize: bool = False) -> SimulatedArm:
-    """The arm alone."""
-    return SimulatedArm(num_robots, with_object=False, randomize=randomize)
+cube_scene = partial(SimulatedArm, with_object=True)
+arm_scene = partial(SimulatedArm, with_object=False)

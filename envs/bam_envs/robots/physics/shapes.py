@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from bam_envs.core.errors import ResetNeeded
+from bam_envs.core.robot import RobotState
 
 if TYPE_CHECKING:
     from bam_envs.robots.physics.rendering import ShapeRenderer
@@ -58,13 +61,44 @@ def marked(marks: Sequence[tuple[Array, Colour]], radius: float = 0.02) -> list[
 
 
 class Drawn:
-    """A simulated robot that says what it looks like, and so has pictures; a subclass defines `picture`."""
+    """A robot simulated in NumPy, which says what it looks like, and so has pictures.
+
+    A subclass defines `slices`, `halt` and `picture`.
+    """
 
     floor: float = 0.0
     """Height of the floor [m]."""
     mark_radius: float = 0.02
     """Radius of the task's marks [m]."""
     _renderer: ShapeRenderer | None = None
+    _connected = False
+
+    def connect(self) -> None:
+        """There is nothing to connect to; commands are taken from now on."""
+        self._connected = True
+
+    def _require_link(self) -> None:
+        if not self._connected:
+            raise ResetNeeded("The simulated robot is not connected. Call reset() first.")
+
+    def slices(self, command: Array, parts: int) -> Iterator[RobotState]:
+        """Send `command` (n, m), and give the state after each of `parts` equal parts of the period."""
+        raise NotImplementedError
+
+    def step(self, command: Array) -> RobotState:
+        """Send `command` (n, m), in the units of the spec; one period later, measure."""
+        return next(self.slices(command, 1))
+
+    def halt(self) -> None:
+        """Hold where it is."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Halt, and close the window; no command is taken until `connect`."""
+        self.halt()
+        if self._renderer is not None:
+            self._renderer.close()
+        self._renderer, self._connected = None, False
 
     def picture(self) -> tuple[list[Shape], View]:
         """What environment 0 looks like, and from where."""
@@ -83,12 +117,6 @@ class Drawn:
             self._renderer = ShapeRenderer(mode, self.floor)
         shapes, view = self.picture()
         return self._renderer.render([*marked(marks, self.mark_radius), *shapes], view)
-
-    def close_picture(self) -> None:
-        """Close the window, or free what pictures needed."""
-        if self._renderer is not None:
-            self._renderer.close()
-        self._renderer = None
 
 
 def turned(yaw: float) -> Array:

@@ -5,7 +5,7 @@ import pytest
 
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot import Initial, Robot
-from bam_envs.robots.physics.kinematic_arm import KinematicArm, empty_arm, isaac_arm, obstacle_arm, reach_arm
+from bam_envs.robots.physics.kinematic_arm import empty_arm, isaac_arm, obstacle_arm, reach_arm
 from bam_envs.robots.ur import START, UR_MODELS
 from bam_envs.testing import RobotContract
 from bam_envs.testing.assertions import assert_same_state, assert_same_tree
@@ -162,15 +162,3 @@ def test_it_sees_its_obstacle():
     flange = UR_MODELS["ur5"].geometry.tool_position(signals["joint_position"])
     signals["obstacle_position"][1] = flange[1]
     assert robot.reset(ROWS, Initial(signals, ROWS)).truth["collision"].tolist() == [False, True]
-
-
-def test_kinematics_are_computed_once_a_step(monkeypatch):
-    calls = []
-    geometry = type(UR_MODELS["ur5"].geometry)
-    original = geometry.link_poses
-    monkeypatch.setattr(geometry, "link_poses", lambda self, q: calls.append(len(q)) or original(self, q))
-    robot = KinematicArm(64, UR_MODELS["ur5"], 0.1)
-    state = started(robot)
-    calls.clear()
-    robot.step(state.command)
-    assert calls == [64]

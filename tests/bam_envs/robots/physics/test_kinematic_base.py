@@ -178,7 +178,7 @@ def test_a_halt_between_two_parts_holds():
 def test_not_connected():
     with pytest.raises(ResetNeeded) as caught:
         SimulatedBase().step(np.zeros((1, 2)))
-    assert str(caught.value) == "The simulated base is not connected. Call connect() first."
+    assert str(caught.value) == "The simulated robot is not connected. Call reset() first."
 
 
 @pytest.mark.parametrize("make", [lab, open_floor])
