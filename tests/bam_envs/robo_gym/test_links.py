@@ -41,19 +41,12 @@ def test_rob_is_sim_on_a_robot(stem, options, tolerance):
             live.close()
 
 
-def test_an_environment_elsewhere():
-    with TcpServer(EnvServer(make("EmptyEnvironmentURSim-v0"))) as server:
-        env = make("EmptyEnvironmentURSim-v0", transport=server.url)
-        here = make("EmptyEnvironmentURSim-v0")
+@pytest.mark.parametrize("made", [gym.make, lambda name, **options: gym.make_vec(name, num_envs=2, **options)])
+def test_environments_elsewhere(made):
+    with TcpServer(EnvServer(made("EmptyEnvironmentURSim-v0"))) as server:
+        env, here = made("EmptyEnvironmentURSim-v0", transport=server.url), made("EmptyEnvironmentURSim-v0")
         np.testing.assert_array_equal(env.reset(seed=1)[0], here.reset(seed=1)[0])
         env.close()
-
-
-def test_rows_elsewhere():
-    with TcpServer(EnvServer(gym.make_vec("EmptyEnvironmentURSim-v0", num_envs=2))) as server:
-        rows = gym.make_vec("EmptyEnvironmentURSim-v0", num_envs=2, transport=server.url)
-        assert rows.reset(seed=1)[0].shape == (2, 12)
-        rows.close()
 
 
 def test_options_of_an_environment_elsewhere_are_its_own():

@@ -73,15 +73,6 @@ def test_wire_states(name):
         assert (same.keys(), same.get("rs_state")) == (info.keys(), info.get("rs_state"))
 
 
-def test_the_wire_state_after_the_end():
-    env = make("EmptyEnvironmentURSim-v0", parity=True)
-    env.reset(seed=0)
-    terminated = False
-    while not terminated:
-        _, _, terminated, _, info = env.step(np.zeros(5, dtype=np.float32))
-    assert env.unwrapped.get_rs_state() == info["rs_state"]
-
-
 @pytest.mark.parametrize("name", ["NoObstacleNavigationMir100Sim-v0", "EmptyEnvironmentURSim-v0"])
 def test_killing_and_restarting(name):
     env = make(name)

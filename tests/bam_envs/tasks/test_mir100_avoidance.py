@@ -1,14 +1,12 @@
 """Driving round boxes: ranges, collisions, rewards and samples, in numbers."""
 
-import copy
 import math
-import pickle
 
 import numpy as np
 import pytest
 
 import bam_envs  # noqa: F401 - registers the environments
-from bam_envs.core.errors import InvalidValue, ProtocolError
+from bam_envs.core.errors import ProtocolError
 from bam_envs.core.robot import RobotState
 from bam_envs.robo_gym.parity import BEAMS
 from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS
@@ -147,19 +145,19 @@ def test_a_live_robot_collides_by_its_rays_alone_and_in_parity_not_at_all():
         assert task.score(at(0.0, -2.5, scan=near(3, 0.1)), STILL).terminated.item() == (not parity)
 
 
-def test_arriving_and_colliding_at_once():
-    arrived = at(0.0, 2.4, touching=True)
-    for parity, reward, status in ((False, -2.0, "collision"), (True, 100.0, "success")):
-        score = begun(parity=parity).score(arrived, STILL)
-        assert (score.reward.item(), score.info["final_status"].item()) == (reward, status)
-        assert score.success.item() == parity
-
-
-@pytest.mark.parametrize(("parity", "reward"), [(False, 2.0), (True, 100.0)])
-def test_success(parity, reward):
-    score = begun(parity=parity).score(at(0.1, 2.4, touching=False), STILL)
-    assert (score.reward.item(), score.terminated.item(), score.success.item()) == (reward, True, True)
-    assert score.info["final_status"].item() == "success"
+@pytest.mark.parametrize(
+    ("parity", "touching", "reward", "status"),
+    [
+        (False, False, 2.0, "success"),
+        (True, False, 100.0, "success"),
+        (False, True, -2.0, "collision"),
+        (True, True, 100.0, "success"),
+    ],
+)
+def test_arriving_and_colliding_at_once(parity, touching, reward, status):
+    score = begun(parity=parity).score(at(0.1, 2.4, touching=touching), STILL)
+    assert (score.reward.item(), score.info["final_status"].item()) == (reward, status)
+    assert (score.terminated.item(), score.success.item()) == (True, status == "success")
 
 
 def test_samples():
@@ -191,24 +189,6 @@ def test_the_target_is_across_from_where_a_live_base_stands(y, low, high):
         assert low <= task.target[0, 1] <= high
 
 
-def test_driving_into_a_box_ends_the_episode(make):
-    for parity in (False, True):
-        env = make(ENV, parity=parity)
-        env.reset(seed=1, options={"start_pose": [0.0, -2.5, math.pi / 2], "target_pose": [0.0, 2.5, 0.0]})
-        for _ in range(100):
-            _, reward, terminated, _, info = env.step(np.float32([1.0, 0.0]))
-            if terminated:
-                break
-        assert info["final_status"] == "collision"
-        assert reward == (-200.0 if parity else -2.0)
-        assert env.unwrapped.state is None
-
-
-def test_a_start_in_a_wall(make):
-    with pytest.raises(InvalidValue, match=r"The base cannot start at \[2.8, 0.0, 0.0\]"):
-        make(ENV).reset(options={"start_pose": [2.8, 0.0, 0.0]})
-
-
 def test_boxes_make_way_for_a_start_that_is_asked_for(make, make_rows):
     env, envs, places = make(ENV), make_rows(ENV, 3), []
     options = {"start_pose": [0.0, 0.0, 0.0]}
@@ -235,4 +215,3 @@ def test_the_state_of_robo_gyms_server(make, parity):
     assert sent[509:1020] == state.signals["b_scan"][0].tolist()
     assert sent[1020] == 0.0
     assert sent[1021:] == ([0.0] * 9 if parity else env.unwrapped.task.obstacles.ravel().tolist())
-    assert pickle.loads(pickle.dumps(sent)) == copy.deepcopy(sent) == sent

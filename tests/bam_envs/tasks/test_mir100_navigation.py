@@ -2,7 +2,6 @@
 
 import copy
 import math
-import pickle
 
 import numpy as np
 import pytest
@@ -47,12 +46,6 @@ def test_the_bearing_is_from_minus_pi_to_pi():
     task = begun(target=(-1.0, 0.0, 0.0), parity=True)
     for yaw, bearing in ((0.0, -math.pi), (0.1, math.pi - 0.1), (-0.1, -math.pi + 0.1), (-3.0, -math.pi + 3.0)):
         assert task.observe(at(0.0, 0.0, yaw))[0, 1] == np.float32(bearing)
-
-
-def test_bounds_of_robo_gym():
-    space = make_task("bam/mir100-navigation-v0", parity=True).observation_space
-    np.testing.assert_array_equal(space.low, np.float32([-np.inf, -math.pi, -1.1, -1.6]))
-    np.testing.assert_array_equal(space.high, np.float32([np.inf, math.pi, 1.1, 1.6]))
 
 
 def test_actions_are_speeds():
@@ -146,14 +139,6 @@ def test_samples():
     assert 1.0 <= task.distance(state).min() < 1.01
 
 
-def test_the_target_is_far_from_where_a_live_base_stands():
-    task = make_task("bam/mir100-navigation-v0")
-    for seed in range(50):
-        task.sample_initial(ROW, [np.random.default_rng(seed)])
-        task.on_reset(ROW, at(0.9, -0.9))
-        assert task.distance(at(0.9, -0.9))[0] >= 1.0
-
-
 @pytest.mark.parametrize("kind", [list, tuple, np.array, np.float32])
 def test_options(make, make_rows, kind):
     env = make(ENV, parity=True)
@@ -209,13 +194,13 @@ def test_a_robot_that_stays_where_it_is_is_not_started_elsewhere():
 
 
 def test_the_state_of_robo_gyms_server(make):
+    space = make_task("bam/mir100-navigation-v0", parity=True).observation_space
+    np.testing.assert_array_equal(space.low, np.float32([-np.inf, -math.pi, -1.1, -1.6]))
+    np.testing.assert_array_equal(space.high, np.float32([np.inf, math.pi, 1.1, 1.6]))
     env = make(ENV, parity=True, rs_state_to_info=True)
     env.reset(options={"start_pose": [1.0, -1.0, 0.5], "target_pose": [0.0, 1.0, 0.0]})
     sent = env.step(np.float32([0.2, 0.0]))[4]["rs_state"]
-    assert isinstance(sent, list)
-    assert {type(number) for number in sent} == {float}
     assert len(sent) == 1030
     np.testing.assert_allclose(sent[:8], [0, 1, 0, 1 + 0.01 * math.cos(0.5), -1 + 0.01 * math.sin(0.5), 0.5, 0.1, 0])
     assert sent[8:1020] == [29.0] * 1012
     assert sent[1020:] == [0.0] * 10
-    assert pickle.loads(pickle.dumps(sent)) == copy.deepcopy(sent) == sent

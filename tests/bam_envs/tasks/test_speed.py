@@ -52,7 +52,7 @@ def test_no_robot_is_faster_than_its_task_lets_it_be(make_rows, env_id, randomiz
 @pytest.mark.parametrize("randomize", [False, True])
 @pytest.mark.parametrize("actions", ["random", "scripted"])
 def test_measured_speeds(make_rows, env_id, randomize, actions):
-    envs = make_rows(env_id, 32, randomize=randomize)
+    envs = make_rows(env_id, 16, randomize=randomize)
     observation, _ = envs.reset(seed=0)
     envs.action_space.seed(0)
     policy = scripted_policy(env_id)
@@ -73,10 +73,10 @@ def test_measured_speeds(make_rows, env_id, randomize, actions):
 @pytest.mark.parametrize("env_id", SCRIPTED)
 def test_commanded_speeds_whatever_the_actions(make_rows, env_id):
     """To the limit for half a second each way, into the table and into the cube."""
-    envs = make_rows(env_id, 32)
+    envs = make_rows(env_id, 16)
     envs.reset(seed=0)
     rng = np.random.default_rng(0)
-    for step in range(300):
+    for step in range(200):
         if step % 10 == 0:
             action = np.sign(rng.uniform(-1, 1, envs.action_space.shape)).astype(np.float32)
         before = envs.unwrapped.state.command[:, :6]

@@ -48,23 +48,6 @@ def test_where_it_starts():
     assert "obstacle_wave" not in initial.signals
 
 
-def test_how_the_obstacle_is_drawn():
-    task = make_task("bam/ur-avoidance-v0", 200)
-    initial = task.sample_initial(np.arange(200), [np.random.default_rng(seed) for seed in range(200)])
-    amplitude, frequency = initial.signals["obstacle_wave"].T
-    middle = initial.signals["obstacle_position"]
-    assert (frequency == 0.125).all()
-    assert (middle[:, :2] == [0.12, 0.34]).all()
-    for values, low, high in ((amplitude, 0.09, 0.35), (middle[:, 2], 0.2, 0.6)):
-        assert low <= values.min() < low + 0.02
-        assert high - 0.02 < values.max() <= high
-
-
-def test_at_the_pose_without_an_action():
-    task, _ = began()
-    assert scored(task, state(POSE)) == (pytest.approx(0.002, abs=1e-15), False, "")
-
-
 def test_actions_cost_and_so_do_jumps():
     task, _ = began()
     assert scored(task, state(POSE), [1, 0.5, 0, 0, 0])[0] == pytest.approx(0.001 + (1 - 1.25 / 6 - 0.2) / 1000)
@@ -176,14 +159,6 @@ def test_commands_are_radians_beside_the_pose():
     np.testing.assert_allclose(command[0] - where, [0.02, -0.01, 0, 0, 0.03, 0], atol=1e-8)
     command = task.command(np.array([[1.0, -0.5, 0.0, 0.0, 0.0]], np.float32), state(where))
     np.testing.assert_allclose(command[0] - where, [math.pi / 100, -math.pi / 200, 0, 0, 0, 0], atol=1e-8)
-
-
-def test_fixed_joints_go_back_to_the_pose():
-    task, _ = began(fix_base=True, fix_elbow=True)
-    assert task.action_space.shape == (3,)
-    assert [label.name for label in task.action_labels] == ["shoulder_lift_joint", "wrist_1_joint", "wrist_2_joint"]
-    command = task.command(np.array([[0.1, 0.1, 0.1]], np.float32), state(np.array(POSE) + 0.1))
-    np.testing.assert_allclose(command[0] - np.array(POSE) - 0.1, [-0.01, 0, -0.01, 0, 0, -0.01], atol=1e-8)
 
 
 def test_options():

@@ -85,14 +85,6 @@ def test_the_observation_otherwise(make):
     np.testing.assert_allclose(observation[18:21], position[0] / 0.75, rtol=1e-6)
 
 
-def test_actions_are_places_of_joints():
-    task = begun()
-    command = task.command(np.array([[1, 0, 0, 0, 0]], np.float32), state_at(START))
-    way = np.array([1, 0, 0, wrist_1(0) / (2 * np.pi), 0, 0]) * LIMITS - START
-    way[5] = 0.0
-    np.testing.assert_allclose(command[0], START + way * 0.1 * 0.1 * np.pi / np.abs(way).max(), rtol=1e-12)
-
-
 @pytest.mark.parametrize(("action", "joint"), [(-1.0, -3.48), (1.0, 0.31), (0.0, -1.585)])
 def test_wrist_1_is_restricted(action, joint):
     start = [0.0, -2.5, 1.5, joint + 0.1, -1.4, 0.0]
@@ -139,12 +131,6 @@ def test_a_collision_replaces_even_success(parity):
     score = task.score(state_at(START, collision=True), ONES[None])
     assert (score.reward[0], score.terminated[0], score.success[0]) == (-1.0, True, False)
     assert score.info["final_status"][0] == "collision"
-
-
-def test_a_live_arm_never_collides():
-    task, state = begun(target=FLANGE), state_at(START)
-    state.truth.clear()
-    assert task.score(state, ONES[None]).success[0]
 
 
 def test_a_success_in_the_last_step_is_told_as_robo_gym_tells_it():
@@ -241,9 +227,9 @@ def test_options_that_do_not_fit(make):
         make("bam/ur-reach-v0", ur_model="panda")
 
 
-@pytest.mark.parametrize("name", UR_MODELS)
+@pytest.mark.parametrize("name", ["ur3", "ur10e"])
 def test_the_joints_of_a_place_bring_the_flange_there(make_rows, name):
-    """Twenty places: an action that never changes is a success, with every model."""
+    """Twenty places: an action that never changes is a success."""
     model, rng = UR_MODELS[name], np.random.default_rng(1)
     goals = START + rng.uniform(-0.8, 0.8, (20, 6)) * [1.5, 0.25, 0.5, 1.0, 0.4, 0.0]
     envs = make_rows("bam/ur-reach-v0", 20, ur_model=name)
@@ -281,26 +267,19 @@ def test_modular_observations_end_with_the_last_action_of_the_joints_that_move(m
     assert env.observation_space.high[21:].tolist() == [1.0] * 4
 
 
-def test_wrist_1_of_the_modular_environment():
-    """Of robo-gym's it starts at 0, and an action reaches the whole of its range."""
-    for parity, start, end in ((False, START, -3.48), (True, STRAIGHT, -2 * np.pi)):
-        task = make_task("bam/ur-reach-v0", modular=True, parity=parity)
-        begun = task.sample_initial(np.arange(1), [np.random.default_rng(0)]).signals["joint_position"]
-        np.testing.assert_array_equal(begun, [start])
-        near = end + 0.01
-        command = task.command(np.array([[0, 0, 0, -1, 0]], np.float32), state_at([0, 0, 0, near, 0, 0]))
-        assert command[0, 3] - near == pytest.approx(-0.01 / 5)  # a fifth of the way in a step
-
-
-def test_modular_targets_are_the_origin_in_parity():
-    task = make_task("bam/ur-reach-v0", modular=True, parity=True)
-    task.sample_initial(np.arange(1), [np.random.default_rng(0)])
-    assert task.target.tolist() == [[0.0, 0.0, 0.0]]
+@pytest.mark.parametrize(("parity", "start", "end"), [(False, START, -3.48), (True, STRAIGHT, -2 * np.pi)])
+def test_wrist_1_and_targets_of_the_modular_environment(parity, start, end):
+    """Wrist 1 of robo-gym's starts at 0, and an action reaches the whole of its range; its targets are the origin."""
+    task = make_task("bam/ur-reach-v0", modular=True, parity=parity)
+    begun = task.sample_initial(np.arange(1), [np.random.default_rng(0)]).signals["joint_position"]
+    np.testing.assert_array_equal(begun, [start])
+    drawn = np.zeros(3) if parity else workspace_point(UR5, np.random.default_rng(0))
+    np.testing.assert_array_equal(task.target[0], drawn)
+    near = end + 0.01
+    command = task.command(np.array([[0, 0, 0, -1, 0]], np.float32), state_at([0, 0, 0, near, 0, 0]))
+    assert command[0, 3] - near == pytest.approx(-0.01 / 5)  # a fifth of the way in a step
     task.sample_initial(np.arange(1), [np.random.default_rng(0)], {"ee_target_pose": far_pose()})
     np.testing.assert_array_equal(task.target[0], far_pose()[:3])
-    task = make_task("bam/ur-reach-v0", modular=True)
-    task.sample_initial(np.arange(1), [np.random.default_rng(0)])
-    np.testing.assert_array_equal(task.target[0], workspace_point(UR5, np.random.default_rng(0)))
 
 
 def test_reset_options_may_stand():

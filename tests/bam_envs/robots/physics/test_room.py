@@ -8,8 +8,6 @@ import pytest
 from bam_envs.robots.mir100 import BACK_MASKED, BACK_MOUNT, BACK_RAYS, FRONT_MASKED, FRONT_MOUNT, FRONT_RAYS
 from bam_envs.robots.physics.room import LAB, NOISE, NOWHERE, LaserScanner, Room, measured, mixed, noise, touches
 
-NO_BOXES = np.zeros((1, 0, 3))
-
 
 def touching(pose, room=None, boxes=()):
     return bool(touches(np.array([pose], dtype=float), room, np.array([boxes], dtype=float).reshape(1, -1, 3))[0])
@@ -63,12 +61,6 @@ def test_corner_to_corner_is_separated_by_an_axis_of_the_box():
         assert touching((0, 0, 0), None, [(*middle, math.pi / 4)]) == (gap < 0)
 
 
-def test_nothing_there():
-    assert not touching((0, 0, 0), LAB)
-    np.testing.assert_array_equal(touches(np.zeros((1, 3)), None, NO_BOXES), [False])
-    assert not touching((500, 500, 0), None, [NOWHERE])
-
-
 FRONT, BACK = LaserScanner(FRONT_MOUNT, FRONT_MASKED), LaserScanner(BACK_MOUNT, BACK_MASKED)
 FORWARDS = 150  # -135 + (30 + 150) / 2 = -45 degrees in a scanner that looks to +45
 LEFTWARDS = 330  # +45 degrees there
@@ -79,10 +71,6 @@ RIGHTWARDS = 350  # +45 degrees there
 def cast(scanner, pose, room=LAB, boxes=()):
     boxes = np.array([boxes], dtype=float).reshape(1, -1, 3)
     return scanner.cast(np.array([pose], dtype=float), room, boxes)[0]
-
-
-def test_rays():
-    assert (FRONT.rays, BACK.rays) == (FRONT_RAYS, BACK_RAYS) == (501, 511)
 
 
 def test_walls_from_both_corners():
@@ -119,17 +107,17 @@ def test_a_box_behind_is_seen_by_the_back_scanner_alone():
     assert np.isinf(cast(FRONT, (0, 0, 0), None, box)[FORWARDS])
 
 
+def test_nothing_near_and_nothing_but_near():
+    assert (FRONT.rays, BACK.rays) == (FRONT_RAYS, BACK_RAYS) == (501, 511)
+    assert np.isinf(cast(FRONT, (1.0, 2.0, 0.3), None)).all()
+    assert (cast(FRONT, (0, 0, 0), LAB, [(0.4288, 0.2358, 0.3)]) == 0).all()  # from inside a box
+    assert not touching((0, 0, 0), LAB)
+    assert not touching((500, 500, 0), None, [NOWHERE])
+
+
 def test_the_nearer_of_two_boxes_hides_the_other():
     boxes = [(2.0, 0.2358, 0.0), (1.2, 0.2358, 0.0)]
     assert cast(FRONT, (0, 0, 0), LAB, boxes)[FORWARDS] == pytest.approx(1.2 - 0.25 - 0.4288, abs=1e-6)
-
-
-def test_from_inside_a_box_everything_is_near():
-    assert (cast(FRONT, (0, 0, 0), LAB, [(0.4288, 0.2358, 0.3)]) == 0).all()
-
-
-def test_without_walls_nothing_is_in_sight():
-    assert np.isinf(cast(FRONT, (1.0, 2.0, 0.3), None)).all()
 
 
 def test_as_a_plain_search_finds_it():
