@@ -81,11 +81,7 @@ class RobotInfo:
 
 
 def read_info(text: object, where: str) -> RobotInfo:
-    """The `RobotInfo` that `text` is; keys of a newer version are left out.
-
-    Raises:
-        ProtocolError: It is something else. Any text is true in Python, and what is simulated may be moved unasked.
-    """
+    """The `RobotInfo` that `text` is, without keys of a newer version; `ProtocolError` for anything else."""
     try:
         data = json.loads(text) if isinstance(text, str) else None
     except ValueError:
@@ -97,11 +93,7 @@ def read_info(text: object, where: str) -> RobotInfo:
 
 
 def decode_source(source: Source, message: object, size: int) -> Array:
-    """The `size` numbers [SI] of one signal. Shape: (size,).
-
-    Raises:
-        ProtocolError: The message is not what the profile says; it names topic, field or joint, expected and found.
-    """
+    """The `size` numbers [SI] of one signal, shape (size,). `ProtocolError` names topic, field or joint, and value."""
     where = source.topic
     content = require_message(message, where)
     if source.fields:
@@ -277,11 +269,7 @@ class Decoded(NamedTuple):
 
 
 def decode_command(profile: RobotProfile, spec: RobotSpec, topic: str, message: object) -> Decoded:
-    """What a message on `topic` commands.
-
-    Raises:
-        ProtocolError: The message is not what the profile says, or no command comes on `topic`.
-    """
+    """What a message on `topic` commands; `ProtocolError` if it is not what the profile says."""
     sink = profile.sinks_by_topic.get(topic)
     if sink is None:
         raise ProtocolError(f"{topic}: no command of {profile.name} comes here.")

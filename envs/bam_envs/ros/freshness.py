@@ -91,13 +91,7 @@ def new_session() -> str:
 
 
 class Tagger:
-    """Makes the tags of one session.
-
-    Args:
-        clock: Steady clock [s]: a step of the wall clock must not make commands old.
-        session: Its name; None: a new one.
-        key: What its messages are signed with; empty: they are not signed.
-    """
+    """Makes the tags of one session, on a steady clock [s]; with a `key` it also signs messages."""
 
     def __init__(
         self, clock: Callable[[], float] = time.monotonic, *, session: str | None = None, key: bytes = b""
@@ -142,21 +136,14 @@ class ClockOffset:
 
 
 class Freshness:
-    """Decides which messages of one session are fresh, whatever a bridge kept in its queues. Thread-safe.
-
-    Its clock is steady [s]: a step of the wall clock must not make commands old.
-    """
+    """Decides which messages of one session are fresh, whatever a bridge kept. Thread-safe; steady clock [s]."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._offset, self._lock = clock, ClockOffset(), threading.Lock()
         self._latest: dict[str, tuple[int, int]] = {}
 
     def require(self, tag: Tag, channel: str = "") -> None:
-        """Take note of a message of `channel`.
-
-        Raises:
-            RemoteError: It is of an old connection, not newer than one before it, or too late.
-        """
+        """Take note of a message of `channel`; `RemoteError` if its connection or number is old, or it is too late."""
         with self._lock:
             epoch, sequence = self._latest.get(channel, (0, 0))
             late = self._offset.age(tag.sent, self._clock()) - (tag.deadline - tag.sent)

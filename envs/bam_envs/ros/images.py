@@ -126,11 +126,7 @@ def read_depth_message(message: Mapping[str, Any]) -> NDArray[np.float32] | None
 
 
 def message_bytes(message: Mapping[str, Any]) -> bytes:
-    """The data of an image message, which a JSON bridge makes base64 text.
-
-    Raises:
-        ProtocolError: It is neither text nor bytes, or not base64.
-    """
+    """The data of an image message, which a JSON bridge makes base64 text; `ProtocolError` if it is neither."""
     data = message.get("data", b"")
     if isinstance(data, (bytes, bytearray, memoryview)):
         return bytes(data)

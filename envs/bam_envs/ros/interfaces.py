@@ -69,11 +69,7 @@ class Field:
 
 
 def normal_name(kind: str) -> str:
-    """``pkg/msg/Type`` and ``pkg/srv/Type`` as ``pkg/Type``, which is left as it is.
-
-    Raises:
-        InvalidValue: It is not the name of a type.
-    """
+    """``pkg/Type`` of ``pkg/Type``, ``pkg/msg/Type`` or ``pkg/srv/Type``; `InvalidValue` for what is no such name."""
     if not isinstance(kind, str) or len(kind) > 256 or not _PLAIN_NAME.fullmatch(kind):
         raise InvalidValue(f"Type: expected a name such as 'std_msgs/String', found {brief(kind)}.")
     return kind.replace("/msg/", "/").replace("/srv/", "/")
@@ -262,10 +258,7 @@ def _array(kind: str, one: Check, size: int | None) -> Check:
 
 
 def _usual(kind: str, values: Sequence[Any]) -> list[Any] | None:
-    """A checked copy of numbers or texts by a few passes in C; None where an item needs a look of its own.
-
-    One pass in Python would hold up everybody for the time of a large list.
-    """
+    """A checked copy of many numbers or texts, by a few passes in C; None where items need a closer look."""
     kinds = set(map(type, values))
     if kind in FLOATS and kinds and kinds <= {float, int}:
         try:

@@ -206,11 +206,7 @@ class RobotProfile:
         return next(signal for signal in self.signals if signal.name == name)
 
     def camera(self, name: str) -> CameraSource:
-        """The camera called `name`.
-
-        Raises:
-            UnknownName: There is none of that name.
-        """
+        """The camera called `name`; `UnknownName` if there is none."""
         cameras = {camera.name: camera for camera in self.cameras}
         if name not in cameras:
             raise UnknownName(f"camera of {self.name}", name, cameras)
@@ -221,11 +217,7 @@ class RobotProfile:
         return self.max_age if source.max_age is None else source.max_age
 
     def sinks(self, mode: str | None = None) -> tuple[Sink, ...]:
-        """Where the parts of a command go; `mode` None is the default one.
-
-        Raises:
-            UnknownName: There is no such mode.
-        """
+        """Where the parts of a command go; `mode` None is the default one. `UnknownName` if there is no such mode."""
         if mode is None:
             return next(iter(self.commands.values()))
         if mode not in self.commands:

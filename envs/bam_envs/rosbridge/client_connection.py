@@ -171,12 +171,7 @@ class Connection:
         return self.error is None and self._socket is not None and self._socket.state is State.OPEN
 
     def send(self, *frames: str) -> None:
-        """Write frames to the socket now, all of them or none.
-
-        Raises:
-            LinkLost: The connection has ended, or the server does not read.
-            InvalidValue: A frame is larger than allowed.
-        """
+        """Write frames to the socket now, all or none; `LinkLost` if it cannot, `InvalidValue` for one too large."""
         socket = self._socket
         if socket is None or self.error is not None:
             why = "not open" if self.error is None else bare_reason(self.url, self.error)

@@ -48,10 +48,7 @@ class Declarations:
     def subscribe(
         self, topic: str, kind: str, listener: Listener, throttle_ms: int, queue_length: int, compression: str
     ) -> tuple[object, dict[str, Any]]:
-        """`listener` wants `topic`. Returns a key to remove it by, too.
-
-        The lowest throttle of all listeners of a topic counts, for the server sends one stream.
-        """
+        """`listener` wants `topic`; also returns a key to remove it by. The lowest throttle of a topic counts."""
         wish = {"throttle_rate": throttle_ms, "queue_length": queue_length}
         for name, value in (("throttle_ms", throttle_ms), ("queue_length", queue_length)):
             # The Python servers drop a subscription without a word for anything but an integer.

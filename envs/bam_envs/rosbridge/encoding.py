@@ -82,21 +82,13 @@ def decode_frame(data: str | bytes) -> dict[str, Any]:
 
 
 def decode_server_frame(data: bytes) -> dict[str, Any]:
-    """The message in a frame of a server, in JSON or CBOR; NaN and Infinity, which are not JSON but sent, are None.
-
-    Raises:
-        ProtocolError: As `decode_frame`, or of `decode_cbor`.
-    """
+    """The message in a frame of a server, in JSON or CBOR; NaN and Infinity, which are not JSON but sent, are None."""
     # No text in UTF-8 begins with a byte from 0x80 to 0xbf, and an object in CBOR does.
     return decode_cbor(data) if b"\x80" <= data[:1] <= b"\xbf" else _object(data, MOST_ITEMS_OF_A_SERVER, _PATIENT)
 
 
 def load_json(text: object, what: str, most_items: int = MOST_ITEMS_OF_A_SERVER) -> dict[str, Any]:
-    """The object that `text` is in JSON, with finite numbers and at most `most_items` values in it.
-
-    Raises:
-        ProtocolError: It is something else; `what` names it.
-    """
+    """The object that `text` is in JSON, with finite numbers and at most `most_items` values; errors name it `what`."""
     if not isinstance(text, str):
         raise ProtocolError(f"{what} must be a string with a JSON object, not {type(text).__name__}.")
     try:
@@ -139,11 +131,7 @@ def _is_deep(data: bytes) -> bool:
 
 
 def decode_cbor(frame: bytes) -> dict[str, Any]:
-    """A message in CBOR; typed arrays in it become read-only arrays, shape (n,), in the byte order of this machine.
-
-    Raises:
-        ProtocolError: It is not CBOR, not an object, or has a tag that is no typed array.
-    """
+    """A message in CBOR; typed arrays become read-only arrays, shape (n,), in the byte order of this machine."""
     try:
         # cbor2 5 and 6 give a tag hook different arguments, so the tags are replaced afterwards.
         message = _untag(cbor2.loads(frame))
@@ -176,11 +164,7 @@ def _untag(value: Any) -> Any:
 
 
 def dump_json(value: Any, what: str = "message") -> str:
-    """`value` as JSON in ASCII; `bytes` in it become base64.
-
-    Raises:
-        InvalidValue: A number in it is not finite, or something is not plain: names the place in `what`.
-    """
+    """`value` as JSON in ASCII, `bytes` as base64; `InvalidValue` names what is not finite or plain in `what`."""
     try:
         return _ENCODER.encode(value)
     except (TypeError, ValueError, RecursionError) as error:

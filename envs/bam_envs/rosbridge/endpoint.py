@@ -82,11 +82,7 @@ class Endpoint:
         connect_timeout: float = 3.0,
         timeout: float | None = None,
     ) -> Endpoint:
-        """The endpoint whose token is in `token_file`, as commands and ``gym.make`` take it.
-
-        Raises:
-            InvalidValue: As the class; or the file cannot be read.
-        """
+        """The endpoint whose token is in `token_file`, as commands and ``gym.make`` take it. Raises as the class."""
         token = None if token_file is None else read_token(token_file)
         return cls(url, None if ca_file is None else str(ca_file), token, connect_timeout, timeout)
 
@@ -97,11 +93,7 @@ class Endpoint:
 
     @cached_property
     def address(self) -> Address:
-        """The parts of `url`; the port is rosbridge's 9090 where it is left out.
-
-        Raises:
-            InvalidValue: It is not the address of a rosbridge server.
-        """
+        """The parts of `url`, with rosbridge's port 9090 where it is left out; `InvalidValue` for a wrong one."""
         url = self.url
         try:
             parts = urlsplit(url)
@@ -136,11 +128,7 @@ class Endpoint:
         return {"Authorization": f"Bearer {self.token}"} if self.token else {}
 
     def tls_context(self) -> ssl.SSLContext | None:
-        """TLS settings that check certificate and host name; None without TLS.
-
-        Raises:
-            InvalidValue: The CA file cannot be read.
-        """
+        """TLS settings that check certificate and host name; None without TLS. `InvalidValue` for a bad CA file."""
         if not self.address.secure:
             return None
         try:

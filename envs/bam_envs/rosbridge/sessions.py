@@ -37,12 +37,7 @@ class _Session:
 
 
 class Sessions:
-    """The robot's side: every open session. Thread-safe.
-
-    Args:
-        is_driving: Whether the session of that name is in command: it is never closed for a new one.
-        clock: Steady clock [s].
-    """
+    """The robot's side: every open session; one that `is_driving` is never closed for a new one. Thread-safe."""
 
     def __init__(
         self, is_driving: Callable[[str], bool] = lambda name: False, clock: Callable[[], float] = time.monotonic
@@ -107,11 +102,7 @@ def is_over(error: RemoteError) -> bool:
 
 
 def read_session(response: Mapping[str, Any], where: str) -> Tagger:
-    """The tagger, with its key, of the session that `response` of `SESSION_SERVICE` opened.
-
-    Raises:
-        ProtocolError: It is something else.
-    """
+    """The tagger, with its key, of the session that `response` of `SESSION_SERVICE` opened, or `ProtocolError`."""
     try:
         said = json.loads(response["message"])
         name, key = said["session"], bytes.fromhex(said["key"])

@@ -63,11 +63,7 @@ class LoopThread:
         return True
 
     def do(self, work: Callable[[], T]) -> T:
-        """Run `work` in the thread and return its result; in the caller's thread where the loop does not run.
-
-        Raises:
-            LinkLost: The loop ended meanwhile.
-        """
+        """Run `work` in the thread, in the caller's where the loop does not run, and return its result."""
         done: Future[T] = Future()
 
         def settle() -> None:

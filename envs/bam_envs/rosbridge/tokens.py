@@ -24,11 +24,7 @@ _MOST_ADDRESSES = 4096
 
 
 def read_token(path: str | Path, *, private: bool = False) -> str:
-    """The secret in a file, without the white space around it.
-
-    Raises:
-        InvalidValue: The file cannot be read or is empty; if `private`, also: others may read it (POSIX only).
-    """
+    """The secret in a file, without white space around it; with `private`, of a file that nobody else may read."""
     try:
         if private and os.name == "posix" and os.stat(path).st_mode & (stat.S_IRWXG | stat.S_IRWXO):
             raise InvalidValue(f"The token file {path} is open to other users of this computer. Run: chmod 600 {path}")
@@ -42,11 +38,7 @@ def read_token(path: str | Path, *, private: bool = False) -> str:
 
 
 class Tokens:
-    """The secrets of one server: what clients must show, and operators, who may take command from others; or None.
-
-    Raises:
-        InvalidValue: One is empty, or both are the same.
-    """
+    """The secrets of one server: what clients must show, and operators, who may take command from others; or None."""
 
     def __init__(self, client: str | None = None, operator: str | None = None) -> None:
         if "" in (client, operator):

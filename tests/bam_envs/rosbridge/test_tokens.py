@@ -89,3 +89,9 @@ def test_few_guesses_a_second_from_all_and_no_address_is_kept_out_by_others():
         assert guesses.may_try("10.1.0.1")
     now[0] += 100.0
     assert guesses.may_try("10.0.0.1")
+
+
+def test_addresses_are_forgotten_in_the_end():
+    guesses = Guesses(lambda: 0.0)
+    tries(guesses, [f"10.{k // 250}.{k % 250}.1" for k in range(6000)])
+    assert [guesses.may_try(address) for address in ("10.0.0.1", "10.23.249.1")] == [True, False]

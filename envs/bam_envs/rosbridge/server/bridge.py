@@ -42,6 +42,11 @@ T = TypeVar("T")
 _logger = logging.getLogger(__name__)
 _PROCESS = Caller("this process")
 _LONGEST_QUEUE = 100
+_OPERATIONS = (
+    *("advertise", "unadvertise", "publish", "subscribe", "unsubscribe", "call_service", "advertise_service"),
+    *("unadvertise_service", "service_response", "set_level", "send_action_goal"),
+)
+"""What clients may say; each has a method of its name with an underscore."""
 _NO_ACTIONS = "Actions are not supported by this server; use a service, or a pair of topics."
 _NO_AUTH = "The op auth is for the first message of a web page; this client has been let in already."
 
@@ -51,22 +56,16 @@ class Incoming:
     """A frame of a client, read; what it carries (a message, arguments, a response) is checked."""
 
     message: Mapping[str, Any]
-    """What it says."""
     error: ProtocolError | None = None
     """Why it says nothing."""
     kind: str = ""
     """The type that its content was checked for; empty where there was nothing to check."""
     content: Any = None
-    """What came of that."""
     wrong: BamEnvsError | None = None
-    """Why nothing came of that."""
+    """Why there is no content."""
 
     def content_of(self, kind: str) -> Any:
-        """The content.
-
-        Raises:
-            BamEnvsError: It does not fit, or should be of another type by now.
-        """
+        """The content, or the error that it does not fit, or should be of another type by now."""
         if self.kind != kind:
             raise ProtocolError(f"Expected a {kind}, found a {self.kind}: the type was another one a moment ago.")
         if self.wrong is not None:
@@ -75,12 +74,7 @@ class Incoming:
 
 
 class Bridge:
-    """All clients, topics and services of one server.
-
-    Args:
-        options: What one client may use.
-        clock: Wall clock [s], for ``/rosapi/get_time``.
-    """
+    """All clients, topics and services of one server. `clock` is the wall clock [s], for ``/rosapi/get_time``."""
 
     def __init__(self, options: ServerOptions | None = None, clock: Callable[[], float] = time.time) -> None:
         self.options = options or ServerOptions()
@@ -89,19 +83,6 @@ class Bridge:
         self.services = Services(self._events.append)
         self._fragmented: set[Session] = set()
         self._leave: list[Callable[[Caller], None]] = []
-        self._operations: dict[str, Callable[[Session, Incoming, float], None]] = {
-            "advertise": self._advertise,
-            "unadvertise": self._unadvertise,
-            "publish": self._publish,
-            "subscribe": self._subscribe,
-            "unsubscribe": self._unsubscribe,
-            "call_service": self._call_service,
-            "advertise_service": self._advertise_service,
-            "unadvertise_service": self._unadvertise_service,
-            "service_response": self._service_response,
-            "set_level": self._set_level,
-            "send_action_goal": self._send_action_goal,
-        }
         for name, (kind, handler) in self._rosapi(clock).items():
             self.services.offer(Service(name, kind, name, handler=handler, inline=True))
 
@@ -127,10 +108,9 @@ class Bridge:
                 raise ProtocolError("A fragment must not hold fragments.")
         except ProtocolError as error:
             return Incoming({}, error)
-        try:
+        found = None
+        with contextlib.suppress(ProtocolError):  # it has no such name, as `take` will say
             found = self._content(message)
-        except ProtocolError:  # it has no such name, as `take` will say
-            found = None
         if found is None:
             return Incoming(message)
         kind, check = found
@@ -144,7 +124,7 @@ class Bridge:
         operation = message.get("op")
         if operation == "publish":
             topic = self.topics.get(read_name(message, "topic"))
-            if topic is not None and not topic.is_ours:
+            if topic is not None and None not in topic.publishers:
                 return topic.kind, lambda: _publication(topic, message.get("msg"))
         elif operation == "call_service":
             service = self.services.get(read_name(message, "service"))
@@ -158,11 +138,7 @@ class Bridge:
         return None
 
     def take(self, session: Session, incoming: Incoming, now: float) -> str | None:
-        """Do what a frame of a client says. Never raises about what the frame holds. `now` is any steady clock [s].
-
-        Returns:
-            The text of a message whose last fragment it was, to be read in turn.
-        """
+        """Do what a frame says, at `now` [s, steady]; returns the text of a message whose last fragment it was."""
         message = incoming.message
         try:
             if incoming.error is not None:
@@ -171,10 +147,10 @@ class Bridge:
                 return self._add_fragment(session, message, now)
             else:
                 name = read_text(message, "op")
-                if name not in self._operations:
-                    unknown = f"Unknown op {name!r:.40}; expected one of {', '.join(self._operations)}, fragment."
+                if name not in _OPERATIONS:
+                    unknown = f"Unknown op {name!r:.40}; expected one of {', '.join(_OPERATIONS)}, fragment."
                     raise ProtocolError(_NO_ACTIONS if "action" in name else _NO_AUTH if name == "auth" else unknown)
-                self._operations[name](session, incoming, now)
+                getattr(self, f"_{name}")(session, incoming, now)
         except BamEnvsError as error:
             number: Id = None
             with contextlib.suppress(ProtocolError):
@@ -425,7 +401,11 @@ class Bridge:
             self._status(publisher, text)
 
     def _status(self, session: Session, text: str, name: Id = None) -> None:
-        self._events.extend(session.status(text, name))
+        """Tell a client an error, unless it does not want to hear of errors."""
+        if session.level != "none":
+            message = {"op": "status", "level": "error", "msg": text}
+            packet = pack(message if name is None else {**message, "id": name}, stream="status")
+            self._events.append(Send(session, packet))
 
 
 def _publication(topic: Topic, content: Any) -> Publication:
@@ -437,7 +417,8 @@ def _publication(topic: Topic, content: Any) -> Publication:
 
 
 def _require_not_ours(topic: Topic) -> None:
-    if topic.is_ours:
+    # Where this process publishes, no client may: it could say where the robot is.
+    if None in topic.publishers:
         raise ProtocolError(f"Topic {topic.name} is published by this server alone; its clients may subscribe.")
 
 

@@ -107,12 +107,7 @@ class BridgeServer:
         return sum(one.unfinished for one in sockets), sum(one.outbox.size for one in sockets)
 
     def start(self) -> BridgeServer:
-        """Listen; returns when clients can connect.
-
-        Raises:
-            InvalidValue: The port is in use, the address is not of this computer, the certificate is not usable, or
-                the server was started before.
-        """
+        """Listen; returns when clients can connect. `InvalidValue` if port, address or certificate cannot be used."""
         if self._thread.was_started:
             raise InvalidValue("A server starts once; make a new one.")
         tls = tls_context(self._cert, self._key) if self._cert else None

@@ -165,7 +165,6 @@ class Session:
     streams: dict[str, Stream] = field(default_factory=dict)
     """What it has subscribed, by topic."""
     services: set[str] = field(default_factory=set)
-    """What it offers."""
     calls: set[int] = field(default_factory=set)
     """Numbers of its unanswered calls."""
     running: int = 0
@@ -175,13 +174,6 @@ class Session:
 
     def __post_init__(self) -> None:
         self.fragments = Fragments(self.options.max_incoming, self.options.fragment_lifetime)
-
-    def status(self, text: str, name: Id = None) -> list[Send]:
-        """What tells it an error: nothing if it does not want to hear of errors."""
-        if self.level == "none":
-            return []
-        message = {"op": "status", "level": "error", "msg": text}
-        return [Send(self, pack(message if name is None else {**message, "id": name}, stream="status"))]
 
 
 @lru_cache(maxsize=1024)

@@ -42,10 +42,7 @@ class Outbox:
         return len(self._packets)
 
     def add(self, packet: Packet, keep: int = 0) -> bool:
-        """Queue a packet; False if there is no room for one that must arrive.
-
-        Of its stream at most `keep` packets wait; 0 for the usual number.
-        """
+        """Queue a packet, at most `keep` of its stream (0: the usual); False if one that must arrive has no room."""
         if packet.stream is not None:
             most = min(keep or self._most_of_a_stream, self._most_of_a_stream)
             while self._waiting[packet.stream] >= most and self._drop(packet.stream):
@@ -82,14 +79,7 @@ class Outbox:
 
 
 class BridgeConnection(ServerConnection):
-    """A connection that knows when its socket takes more, and how much of what came is not a message yet.
-
-    Args:
-        *args: Of `websockets`, as are `options`.
-        sockets: Every open socket of the server; this one is added and removed.
-        limits: How much may wait, in both directions.
-        **options: See `args`.
-    """
+    """A connection with an `Outbox`, that knows what it holds and is one of `sockets`, all open ones of the server."""
 
     def __init__(self, *args: Any, sockets: set[BridgeConnection], limits: ServerOptions, **options: Any) -> None:
         super().__init__(*args, **options)
@@ -112,10 +102,7 @@ class BridgeConnection(ServerConnection):
     # ---- outgoing
 
     def put(self, packet: Packet, keep: int) -> None:
-        """Send `packet` at the next `flush`, or when the socket takes more.
-
-        A client that must get it and does not read is closed.
-        """
+        """Send `packet` at the next `flush`, or when the socket takes more; close it if that must arrive and cannot."""
         if self.state is not State.OPEN or self.transport.is_closing():
             return
         if self._takes_more and not self.outbox:

@@ -121,11 +121,7 @@ class Services(dict[str, Service]):
             self.withdraw(self[name])
 
     def call(self, service: Service, request: Request, values: Mapping[str, Any], now: float) -> None:
-        """Pass a request with complete `values` on to who offers `service`.
-
-        Raises:
-            ProtocolError: The client has too many unanswered calls.
-        """
+        """Pass a request with complete `values` on to who offers `service`; a client may have so many unanswered."""
         session, options = request.session, request.session.options
         if max(len(session.calls), len(session.waiting)) >= options.calls:
             raise ProtocolError(f"At most {options.calls} calls may be unanswered; wait for an answer first.")
@@ -186,11 +182,7 @@ class Services(dict[str, Service]):
         return self._calls.get(int(str(name))) if known else None
 
     def respond(self, provider: Session, message: Mapping[str, Any], values: Callable[[str], Any]) -> None:
-        """Pass on what a client answers to a call of its service; `values` gives its content, complete for a type.
-
-        Raises:
-            ProtocolError: Nobody waits for it, or it does not fit.
-        """
+        """Pass on what a client answers to a call of its service; `values` gives its content, complete for a type."""
         call = self.call_named(message.get("id"))
         if call is None or call.service.provider is not provider:
             raise ProtocolError(f"Nobody waits for a response with the id {brief(message.get('id'))}.")
@@ -239,11 +231,7 @@ def packed_response(request: Request, values: Any, result: bool) -> Packet:
 
 
 def checked(kind: str, part: Callable[[str], str], values: Any) -> dict[str, Any]:
-    """A request or a response (`part`) of a service of type `kind`, complete; a request may be a list of its fields.
-
-    Raises:
-        BamEnvsError: They do not fit.
-    """
+    """A request or a response (`part`) of a service of type `kind`, complete; a request may be a list of its fields."""
     name = part(kind)
     if isinstance(values, list) and part is request_type:
         fields = variants(name)

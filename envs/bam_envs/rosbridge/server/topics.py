@@ -24,14 +24,10 @@ class Wish:
     queue_length: int = 0
     """How many messages may wait; 0: no limit of its own."""
     wire: Wire = field(default_factory=Wire)
-    """How they are packed."""
 
 
 class Stream:
-    """All subscriptions of one client to one topic: it gets each message once, as the most demanding of them wants it.
-
-    `name` is the topic as the client spells it.
-    """
+    """All subscriptions of one client to one topic, which it calls `name`: it gets each message once."""
 
     def __init__(self, session: Session, topic: str, name: str) -> None:
         self.session, self.topic, self.name = session, topic, name
@@ -99,17 +95,9 @@ class Topic:
     latched: tuple[Session | None, Publication] | None = None
     """That message, and whose it is."""
 
-    @property
-    def is_ours(self) -> bool:
-        """Whether this process publishes it: then no client may, or it could say where the robot is."""
-        return None in self.publishers
-
 
 class Topics(dict[str, Topic]):
-    """Every topic of a server by name. A topic has the type of its first user, and ends with its last one.
-
-    `emit` takes what is to be sent.
-    """
+    """Every topic of a server by name. A topic has the type of its first user, and ends with its last one."""
 
     def __init__(self, emit: Callable[[Send], None]) -> None:
         super().__init__()
@@ -117,11 +105,7 @@ class Topics(dict[str, Topic]):
         self._delayed: set[Stream] = set()
 
     def require(self, name: str, kind: str | None) -> Topic:
-        """The topic `name`; a new one if there is none.
-
-        Raises:
-            ProtocolError: It has another type, or is not there and no type was given.
-        """
+        """The topic `name`; a new one if there is none. `ProtocolError` if it has another type, or needs one."""
         topic = self.get(name)
         if topic is None and kind is None:
             raise ProtocolError(f"Topic {name} does not exist yet; its type is needed.")
