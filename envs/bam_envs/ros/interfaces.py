@@ -140,6 +140,15 @@ def require_plain(value: object, place: str = "value") -> None:
 
 @cache
 def _table() -> dict[str, tuple[tuple[Field, ...], ...]]:
+    def field(text: str, package: str) -> Field:
+        kind, name = text.split()
+        name, _, value = name.partition("=")
+        kind, bracket, size = kind.partition("[")
+        kind = _SHORT.get(kind, kind)
+        primitive = kind in INTEGERS or kind in FLOATS or kind in ("bool", "string", "any")
+        full = kind if primitive or "/" in kind else f"{package}/{kind}"
+        return Field(name, full, size.removesuffix("]") if bracket else None, float(value or 0))
+
     table = {}
     for line in filter(None, DEFINITIONS.splitlines()):
         name, body = line.split(":", 1)
@@ -147,21 +156,9 @@ def _table() -> dict[str, tuple[tuple[Field, ...], ...]]:
         request, arrow, response = body.partition("->")
         parts = {name + "Request": request, name + "Response": response} if arrow else {name: body}
         for part, text in parts.items():
-            table[part] = tuple(
-                tuple(_field(one, package) for one in spelling.split(";") if one.strip())
-                for spelling in text.split("|")
-            )
+            spellings = [[one for one in spelling.split(";") if one.strip()] for spelling in text.split("|")]
+            table[part] = tuple(tuple(field(one, package) for one in fields) for fields in spellings)
     return table
-
-
-def _field(text: str, package: str) -> Field:
-    kind, name = text.split()
-    name, _, value = name.partition("=")
-    kind, bracket, size = kind.partition("[")
-    kind = _SHORT.get(kind, kind)
-    primitive = kind in INTEGERS or kind in FLOATS or kind in ("bool", "string", "any")
-    full = kind if primitive or "/" in kind else f"{package}/{kind}"
-    return Field(name, full, size.removesuffix("]") if bracket else None, float(value or 0))
 
 
 # ---- the check of each type, made once
@@ -191,7 +188,10 @@ def _message(kind: str) -> Check:
         if value is _MISSING:
             return left_out
         given = _object(value)
-        plan = usual if given.keys() <= usual.keys() else _fitting(plans, given)
+        plan = next((one for one in plans if given.keys() <= one.keys()), None)
+        if plan is None:
+            extra = next(name for name in given if name not in usual)
+            raise _Misfit(f"only the fields {', '.join(usual)}" if usual else "no fields", extra)
         checked, name = {}, ""
         try:  # one for all fields, and no function for each: this runs for every part of every message
             for name, one in plan.items():
@@ -201,15 +201,6 @@ def _message(kind: str) -> Check:
         return checked
 
     return check
-
-
-def _fitting(plans: Sequence[Mapping[str, Check]], given: Mapping[str, Any]) -> Mapping[str, Check]:
-    """The first spelling that has all the fields of `given`."""
-    for plan in plans:
-        if given.keys() <= plan.keys():
-            return plan
-    extra = next(name for name in given if name not in plans[0])
-    raise _Misfit(f"only the fields {', '.join(plans[0])}" if plans[0] else "no fields", extra)
 
 
 def _number(kind: str, first: float) -> Check:
@@ -343,7 +334,9 @@ def _plain(value: Any, depth: int, *, null: bool) -> None:
                 raise _Misfit("texts as names", name)
             _plain_item(f".{_string(name, 0)}", item, depth, null=null)
     elif kind is list or kind is tuple:
-        if not _all_plain_numbers(value):
+        kinds = set(map(type, value))
+        whole = kinds == {int} and min(value) >= -(2**63) and max(value) < 2**64
+        if not whole and not (kinds <= {float} and math.isfinite(sum(value))):
             for place, item in enumerate(value):
                 _plain_item(f"[{place}]", item, depth, null=null)
     elif isinstance(value, str):
@@ -355,13 +348,6 @@ def _plain(value: Any, depth: int, *, null: bool) -> None:
             raise _Misfit("a number of 64 bits", value)
         if isinstance(value, float) and not math.isfinite(value):
             raise _Misfit("a finite number", value)
-
-
-def _all_plain_numbers(values: Sequence[Any]) -> bool:
-    kinds = set(map(type, values))
-    if kinds == {int}:
-        return bool(min(values) >= -(2**63) and max(values) < 2**64)
-    return kinds <= {float} and math.isfinite(sum(values))
 
 
 def _plain_item(step: str, item: Any, depth: int, *, null: bool) -> None:

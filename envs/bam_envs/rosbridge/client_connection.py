@@ -136,11 +136,13 @@ class Connection:
         for probe in range(_CLOCK_PROBES):
             asked = time.time()
             found = await self._ask_time(f"ready:{self.epoch}:{probe}")
-            answered = time.time()
+            trip = time.time() - asked
             if found is None:
                 break
-            if answered - asked < best_trip:
-                best_trip, best = answered - asked, _read_clock(found, (asked + answered) / 2)
+            for ros, seconds, nanoseconds in (("ros2", "sec", "nanosec"), ("ros1", "secs", "nsecs")):
+                whole, rest = found.get(seconds), found.get(nanoseconds)
+                if isinstance(whole, int) and isinstance(rest, int) and trip < best_trip:
+                    best_trip, best = trip, ServerClock(ros, asked + trip / 2 - whole - rest * 1e-9)
         return best
 
     async def _ask_time(self, identity: str) -> Mapping[str, Any] | None:
@@ -318,13 +320,6 @@ class Connection:
             answer.set_exception(outcome)
         else:
             answer.set_result(outcome)
-
-
-def _read_clock(found: Mapping[str, Any], now: float) -> ServerClock:
-    for ros, seconds, nanoseconds in (("ros2", "sec", "nanosec"), ("ros1", "secs", "nsecs")):
-        if isinstance(found.get(seconds), int) and isinstance(found.get(nanoseconds), int):
-            return ServerClock(ros, now - found[seconds] - found[nanoseconds] * 1e-9)
-    return ServerClock()
 
 
 # ---- the socket, and in words why it could not be opened

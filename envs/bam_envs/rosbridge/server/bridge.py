@@ -42,11 +42,6 @@ T = TypeVar("T")
 _logger = logging.getLogger(__name__)
 _PROCESS = Caller("this process")
 _LONGEST_QUEUE = 100
-_OPERATIONS = (
-    *("advertise", "unadvertise", "publish", "subscribe", "unsubscribe", "call_service", "advertise_service"),
-    *("unadvertise_service", "service_response", "set_level", "send_action_goal"),
-)
-"""What clients may say; each has a method of its name with an underscore."""
 _NO_ACTIONS = "Actions are not supported by this server; use a service, or a pair of topics."
 _NO_AUTH = "The op auth is for the first message of a web page; this client has been let in already."
 
@@ -83,6 +78,21 @@ class Bridge:
         self.services = Services(self._events.append)
         self._fragmented: set[Session] = set()
         self._leave: list[Callable[[Caller], None]] = []
+        self._operations: dict[str, Callable[[Session, Incoming, float], None]] = {
+            "advertise": self._advertise,
+            "unadvertise": self._unadvertise,
+            "publish": self._publish,
+            "subscribe": self._subscribe,
+            "unsubscribe": self._unsubscribe,
+            "call_service": self._call_service,
+            "advertise_service": self._advertise_service,
+            "unadvertise_service": self._unadvertise_service,
+            "service_response": lambda session, said, now: self.services.respond(
+                session, said.message, said.content_of
+            ),
+            "set_level": self._set_level,
+            "send_action_goal": self._send_action_goal,
+        }
         for name, (kind, handler) in self._rosapi(clock).items():
             self.services.offer(Service(name, kind, name, handler=handler, inline=True))
 
@@ -147,10 +157,10 @@ class Bridge:
                 return self._add_fragment(session, message, now)
             else:
                 name = read_text(message, "op")
-                if name not in _OPERATIONS:
-                    unknown = f"Unknown op {name!r:.40}; expected one of {', '.join(_OPERATIONS)}, fragment."
+                if name not in self._operations:
+                    unknown = f"Unknown op {name!r:.40}; expected one of {', '.join(self._operations)}, fragment."
                     raise ProtocolError(_NO_ACTIONS if "action" in name else _NO_AUTH if name == "auth" else unknown)
-                getattr(self, f"_{name}")(session, incoming, now)
+                self._operations[name](session, incoming, now)
         except BamEnvsError as error:
             number: Id = None
             with contextlib.suppress(ProtocolError):
@@ -322,9 +332,6 @@ class Bridge:
         if service is None or service.provider is not session:
             raise ProtocolError(f"Service {name} is not offered by this client.")
         self.services.withdraw(service)
-
-    def _service_response(self, session: Session, incoming: Incoming, now: float) -> None:
-        self.services.respond(session, incoming.message, incoming.content_of)
 
     def _set_level(self, session: Session, incoming: Incoming, now: float) -> None:
         level = incoming.message.get("level")
