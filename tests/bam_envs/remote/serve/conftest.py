@@ -2,9 +2,13 @@
 
 import threading
 
+import gymnasium as gym
 import pytest
 
+import bam_envs  # noqa: F401 - registers the environments
 from bam_envs.core.errors import BamEnvsError
+from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_envs.ros.freshness import Tagger
 from bam_envs.rosbridge.bus import Caller
 
@@ -73,6 +77,23 @@ class MemoryBus:
 @pytest.fixture
 def bus():
     return MemoryBus()
+
+
+@pytest.fixture
+def serve_env():
+    """Start a `ServedEnvironment`; what it told is in its ``lines``."""
+    served = []
+
+    def start(env_id="bam/pick-v0", env=None, **options):
+        env, lines = env or gym.make(env_id, disable_env_checker=True), []
+        served.append(ServedEnvironment(env, ServeOptions(**{"port": 0, **options}), lines.append))
+        served[-1].lines = lines
+        return served[-1].__enter__()
+
+    yield start
+    for one in served:
+        one.close()
+        one.close()
 
 
 @pytest.fixture

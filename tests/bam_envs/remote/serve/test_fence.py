@@ -3,13 +3,10 @@
 import threading
 from dataclasses import replace
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
 from bam_envs.core.errors import RemoteError
-from bam_envs.remote.serve.serve_options import ServeOptions
-from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_envs.robots.profiles.profile import load_profile
 from bam_envs.ros.codec import encode_command
 from bam_envs.ros.freshness import Tagger, read_echo, read_tag
@@ -18,21 +15,6 @@ from bam_envs.rosbridge.client import RosbridgeLink
 
 UR5E = load_profile("ur5e")
 ACTION = np.array([0.3, -0.4, 0.4, 0.1, -0.2], np.float32)
-
-
-@pytest.fixture
-def serve():
-    """Start a `ServedEnvironment`."""
-    served = []
-
-    def start(env_id="bam/pick-v0", **options):
-        env = gym.make(env_id, disable_env_checker=True)
-        served.append(ServedEnvironment(env, ServeOptions(**{"port": 0, **options})))
-        return served[-1].__enter__()
-
-    yield start
-    for one in served:
-        one.close()
 
 
 class Watcher:
@@ -75,8 +57,8 @@ def watcher():
 
 
 @pytest.mark.parametrize("pace", ["fast", "realtime"])
-def test_a_watcher_takes_no_robot_over_from_a_running_policy(serve, watcher, make, pace):
-    url = serve(**{pace: True}).bus.url
+def test_a_watcher_takes_no_robot_over_from_a_running_policy(serve_env, watcher, make, pace):
+    url = serve_env(**{pace: True}).bus.url
     live = make("bam/pick-v0", robot=url)
     live.reset(seed=1)
     live.step(ACTION)
@@ -103,8 +85,8 @@ def test_a_watcher_takes_no_robot_over_from_a_running_policy(serve, watcher, mak
         assert np.abs(live.unwrapped.state.signals["joint_position"][0] - heard["data"]).max() < 0.5
 
 
-def test_a_reset_opens_a_session_where_the_old_one_is_not_known_any_more(serve, make):
-    served = serve(fast=True)
+def test_a_reset_opens_a_session_where_the_old_one_is_not_known_any_more(serve_env, make):
+    served = serve_env(fast=True)
     live = make("bam/pick-v0", robot=served.bus.url)
     live.reset(seed=1)
     live.step(ACTION)
@@ -116,8 +98,8 @@ def test_a_reset_opens_a_session_where_the_old_one_is_not_known_any_more(serve, 
     live.step(ACTION)
 
 
-def test_who_leaves_lets_the_next_one_drive_at_once(serve, make):
-    url = serve(fast=True).bus.url
+def test_who_leaves_lets_the_next_one_drive_at_once(serve_env, make):
+    url = serve_env(fast=True).bus.url
     for _ in range(2):
         live = make("bam/pick-v0", robot=url)
         live.reset(seed=1)

@@ -2,13 +2,10 @@
 
 import math
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue, SafetyStop
-from bam_envs.remote.serve.serve_options import ServeOptions
-from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_envs.remote.serve.served_robot import ServedRobot
 
 NAVIGATION, AVOIDANCE = "bam/mir100-navigation-v0", "bam/mir100-avoidance-v0"
@@ -16,21 +13,16 @@ FORWARD = np.array([1.0, 0.0], np.float32)
 
 
 @pytest.fixture
-def serve():
+def serve(serve_env):
     """Serve an environment whose base was put somewhere: ``serve(id, pose, **options)``."""
-    served = []
 
     def start(env_id, pose, **options):
-        env = gym.make(env_id, disable_env_checker=True)
-        served.append(ServedEnvironment(env, ServeOptions(port=0, **options)).__enter__())
-        robot = env.unwrapped.robot
-        assert isinstance(robot, ServedRobot)
-        env.reset(seed=3, options={"start_pose": pose})
-        return served[-1]
+        served = serve_env(env_id, **options)
+        assert isinstance(served.env.unwrapped.robot, ServedRobot)
+        served.env.reset(seed=3, options={"start_pose": pose})
+        return served
 
-    yield start
-    for one in served:
-        one.close()
+    return start
 
 
 def live(make, served, env_id, **options):

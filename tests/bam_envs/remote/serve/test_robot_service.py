@@ -589,13 +589,6 @@ def test_a_base_stands_still_half_a_second_after_the_last_command(base, bus):
     assert odometry["twist"]["twist"]["linear"]["x"] == 0.1
 
 
-def test_a_base_is_told_no_speed_that_it_has_not(base, bus):
-    assert bus.say("/cmd_vel", drive(1.5)) == (
-        "ProtocolError: /cmd_vel: linear_velocity must be -1 to 1 m/s, not 1.5 m/s."
-    )
-    assert base(5).tolist() == [0.0, 0.0]
-
-
 def test_messages_of_one_command_come_together_and_the_newest_wins():
     slot = CommandSlot()
     slot.put("b", [1], [0.08], complete=True, tag="of another client, which is forgotten")

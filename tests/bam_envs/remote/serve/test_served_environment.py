@@ -8,7 +8,6 @@ from bam_envs.core.errors import InvalidValue, NoServer, NotInCommand, RemoteErr
 from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.remote.rosbridge_transport import RosbridgeTransport
 from bam_envs.remote.serve.serve_options import ServeOptions
-from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_envs.remote.serve.served_robot import ServedRobot
 from bam_envs.remote.tcp_transport import TcpTransport
 from bam_envs.robots.profiles.profile import load_profile
@@ -22,25 +21,6 @@ from bam_envs.testing.transports import assert_same_value
 UR5E = load_profile("ur5e")
 ARM = arm_spec("ur5e", with_object=True)
 RISE = np.array([0.0, 0.0, 0.5, 0.0, 0.0], dtype=np.float32)
-
-
-@pytest.fixture
-def serve():
-    """Start a `ServedEnvironment`; what it told is in its ``lines``."""
-    served = []
-
-    def start(env_id="bam/pick-v0", num_envs=1, env=None, **options):
-        if env is None:
-            env = gym.make_vec(env_id, num_envs) if num_envs > 1 else gym.make(env_id, disable_env_checker=True)
-        lines = []
-        served.append(ServedEnvironment(env, ServeOptions(**{"port": 0, **options}), lines.append))
-        served[-1].lines = lines
-        return served[-1].__enter__()
-
-    yield start
-    for one in served:
-        one.close()
-        one.close()
 
 
 @pytest.fixture
@@ -89,23 +69,23 @@ def wait_for(condition, bus, timeout=10.0):
     pytest.fail("it never became true")
 
 
-def test_an_environment_with_its_robot(serve):
-    served = serve(tcp=0)
+def test_an_environment_with_its_robot(serve_env):
+    served = serve_env(tcp=0)
     rosbridge, tcp = served.endpoints
     assert rosbridge == f"bam/pick-v0 on {served.bus.url}, real time: /gym_env/gym_api_request and a ur5e's topics"
     assert tcp == f"bam/pick-v0 on {served.tcp.url}, the environment alone"
     served.require_running()
 
 
-def test_fast_in_a_namespace(serve):
-    served = serve(fast=True, namespace="bam_001")
+def test_fast_in_a_namespace(serve_env):
+    served = serve_env(fast=True, namespace="bam_001")
     assert served.endpoints == [
         f"bam/pick-v0 on {served.bus.url}, fast: /bam_001/gym_env/gym_api_request and a ur5e's topics under /bam_001"
     ]
 
 
-def test_an_environment_without_a_robot_has_no_topics(serve, transport):
-    served = serve("CartPole-v1")
+def test_an_environment_without_a_robot_has_no_topics(serve_env, transport):
+    served = serve_env("CartPole-v1")
     assert served.endpoints == [f"CartPole-v1 on {served.bus.url}, fast: /gym_env/gym_api_request"]
     observation, _ = transport(RosbridgeTransport, served.bus.url).reset(3)
     np.testing.assert_array_equal(observation, gym.make("CartPole-v1").reset(seed=3)[0])
@@ -113,10 +93,10 @@ def test_an_environment_without_a_robot_has_no_topics(serve, transport):
 
 @pytest.mark.parametrize("kind", [RosbridgeTransport, TcpTransport])
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
-def test_the_environment_is_the_one_in_process_bit_for_bit(serve, transport, make, actions_of, env_id, kind):
+def test_the_environment_is_the_one_in_process_bit_for_bit(serve_env, transport, make, actions_of, env_id, kind):
     options = {"rs_state_to_info": True} if ENVIRONMENTS[env_id].variants else {}
     local = make(env_id, **options)
-    served = serve(env=gym.make(env_id, disable_env_checker=True, **options), fast=True, tcp=0)
+    served = serve_env(env=gym.make(env_id, disable_env_checker=True, **options), fast=True, tcp=0)
     remote = transport(kind, served.bus.url if kind is RosbridgeTransport else served.tcp.url)
     assert_same_value(remote.reset(5), local.reset(seed=5), "reset")
     for action in actions_of(0, 20, local.action_space.shape[0]):
@@ -126,8 +106,8 @@ def test_the_environment_is_the_one_in_process_bit_for_bit(serve, transport, mak
             break
 
 
-def test_in_real_time_a_step_is_a_period(serve, transport):
-    served = serve(tcp=0)
+def test_in_real_time_a_step_is_a_period(serve_env, transport):
+    served = serve_env(tcp=0)
     remote = transport(TcpTransport, served.tcp.url)
     remote.reset(5)
     robot = served.env.unwrapped.robot
@@ -138,8 +118,8 @@ def test_in_real_time_a_step_is_a_period(serve, transport):
     assert robot.state.stamp[0] - before >= 0.15 - 1e-9
 
 
-def test_it_ends_at_once_while_a_client_steps(serve, transport):
-    served = serve()
+def test_it_ends_at_once_while_a_client_steps(serve_env, transport):
+    served = serve_env()
     remote, several, failed = transport(RosbridgeTransport, served.bus.url), threading.Event(), []
 
     def play():
@@ -180,8 +160,8 @@ class Timeless(gym.Env):
         self.closed += 1
 
 
-def test_topics_and_environment_are_one_robot_with_one_client_in_command(serve, link, transport):
-    served = serve(fast=True, tcp=0)
+def test_topics_and_environment_are_one_robot_with_one_client_in_command(serve_env, link, transport):
+    served = serve_env(fast=True, tcp=0)
     client, remote = link(served.bus.url), transport(TcpTransport, served.tcp.url)
     robot = served.env.unwrapped.robot
     start = robot.state.signals["joint_position"][0].copy()
@@ -202,9 +182,9 @@ def test_topics_and_environment_are_one_robot_with_one_client_in_command(serve, 
     assert [line.rpartition(" is ")[2] for line in served.lines] == ["in command", "no longer in command", "in command"]
 
 
-def test_through_somebody_elses_server(serve, link, transport):
+def test_through_somebody_elses_server(serve_env, link, transport):
     with BridgeServer(port=0) as theirs:
-        served = serve(fast=True, via=f"{theirs.url}/lab")
+        served = serve_env(fast=True, via=f"{theirs.url}/lab")
         assert served.endpoints == [
             f"bam/pick-v0 on {served.bus.url}, fast: /lab/gym_env/gym_api_request and a ur5e's topics under /lab"
         ]
@@ -221,56 +201,56 @@ def test_through_somebody_elses_server(serve, link, transport):
     assert any("It is tried again until it is back; the robot rests meanwhile." in line for line in served.lines)
 
 
-def test_a_robot_that_is_there_already_is_not_doubled(serve):
+def test_a_robot_that_is_there_already_is_not_doubled(serve_env):
     with BridgeServer(port=0) as theirs:
-        serve(fast=True, via=theirs.url)
+        serve_env(fast=True, via=theirs.url)
         env = gym.make("bam/pick-v0", disable_env_checker=True)
         with pytest.raises(InvalidValue) as caught:
-            serve(env=env, fast=True, via=theirs.url)
+            serve_env(env=env, fast=True, via=theirs.url)
         assert str(caught.value) == (
             f"{theirs.url}: /bam/robot answers there already, so another robot has these names. "
             "Give this one names of its own: --namespace NAME."
         )
-        serve(fast=True, via=theirs.url, namespace="cell_2")
+        serve_env(fast=True, via=theirs.url, namespace="cell_2")
         with pytest.raises(InvalidValue, match="/cell_2/bam/robot answers there already"):
-            serve(fast=True, via=theirs.url, namespace="cell_2")
+            serve_env(fast=True, via=theirs.url, namespace="cell_2")
 
 
-def test_what_stands_open_is_told(serve, monkeypatch):
+def test_what_stands_open_is_told(serve_env, monkeypatch):
     monkeypatch.setattr(ServeOptions, "warning", "it stands open")
-    assert serve("CartPole-v1").lines == ["it stands open"]
+    assert serve_env("CartPole-v1").lines == ["it stands open"]
 
 
-def test_nobody_at_the_address_of_the_other_server(serve):
+def test_nobody_at_the_address_of_the_other_server(serve_env):
     env = Timeless()
     with pytest.raises(NoServer, match=r"^ws://127\.0\.0\.1:1: refused"):
-        serve(env=env, via="ws://127.0.0.1:1")
+        serve_env(env=env, via="ws://127.0.0.1:1")
     assert env.closed > 0
 
 
-def test_what_was_started_ends_if_the_rest_cannot_start(serve):
+def test_what_was_started_ends_if_the_rest_cannot_start(serve_env):
     env = Timeless()
     with BridgeServer(port=0) as theirs:
         with pytest.raises(InvalidValue, match=f"Port {theirs.port} on 127.0.0.1 is in use"):
-            serve(env=env, port=theirs.port)
+            serve_env(env=env, port=theirs.port)
         assert env.closed > 0
         with pytest.raises(InvalidValue, match=f"Cannot listen on 127.0.0.1 port {theirs.port}"):
-            serve(tcp=theirs.port)
+            serve_env(tcp=theirs.port)
 
 
-def test_a_token(serve, link, transport, tmp_path):
+def test_a_token(serve_env, link, transport, tmp_path):
     path = tmp_path / "token"
     path.write_text(" secret \n")
     path.chmod(0o600)
-    served = serve("CartPole-v1", token_file=str(path), tcp=0)
+    served = serve_env("CartPole-v1", token_file=str(path), tcp=0)
     with pytest.raises(NoServer, match="token"):
         link(served.bus.url)
     link(served.bus.url, token="secret")
     transport(TcpTransport, served.tcp.url, token="secret")
 
 
-def test_a_clock_that_ended_is_noticed(serve):
-    served = serve()
+def test_a_clock_that_ended_is_noticed(serve_env):
+    served = serve_env()
     served._robot_service.clock.stop()
     with pytest.raises(RemoteError, match=r"The clock of the robot stands still\."):
         served.require_running()

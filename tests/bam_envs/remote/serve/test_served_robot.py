@@ -1,4 +1,5 @@
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -51,8 +52,8 @@ def hands():
 def serve(hands):
     served = []
 
-    def make(robot, **options):
-        served.append(ServedRobot(robot, command_timeout=0.1, now=hands, **options))
+    def make(robot, now=hands, **options):
+        served.append(ServedRobot(robot, command_timeout=0.1, now=now, **options))
         served[-1].connect()
         served[-1].reset(ROWS, initial())
         return served[-1]
@@ -194,22 +195,17 @@ def test_a_robot_that_says_no_set_point_rests_where_it_was_measured(serve, hands
     np.testing.assert_array_equal(served.target(), measured)
 
 
-def test_a_step_in_real_time_waits_for_the_clock():
-    served = ServedRobot(SimulatedArm(1), command_timeout=0.1, realtime=True)
-    served.connect()
-    served.reset(ROWS, initial())
+def test_a_step_in_real_time_waits_for_the_clock(serve):
+    served = serve(SimulatedArm(1), time.monotonic, realtime=True)
     clock = Ticker(served.tick, 0.001)
     clock.start()
     stamps = [served.step(command(0.01 * i)).stamp[0] for i in range(1, 4)]
     clock.stop()
-    served.close()
     assert np.diff(stamps).min() >= 0.05 - 1e-9
 
 
-def test_a_halt_ends_a_step_that_is_waited_for_in_time():
-    served = ServedRobot(SimulatedArm(1), command_timeout=0.1, realtime=True)
-    served.connect()
-    served.reset(ROWS, initial())
+def test_a_halt_ends_a_step_that_is_waited_for_in_time(serve):
+    served = serve(SimulatedArm(1), time.monotonic, realtime=True)
     states = []
     thread = threading.Thread(target=lambda: states.append(served.step(command(0.1))))
     thread.start()
@@ -220,7 +216,6 @@ def test_a_halt_ends_a_step_that_is_waited_for_in_time():
         served.tick()
     thread.join(10)
     assert states == [served.state]
-    served.close()
 
 
 def test_a_clock_that_stands_still_is_an_error(serve):
@@ -252,16 +247,13 @@ def test_a_fault_stays_until_a_reset(serve, realtime):
     assert served.fault is None
 
 
-def test_a_fault_reaches_the_step_that_waits():
-    served = ServedRobot(Failing(1), command_timeout=0.1, realtime=True)
-    served.connect()
-    served.reset(ROWS, initial())
+def test_a_fault_reaches_the_step_that_waits(serve):
+    served = serve(Failing(1), time.monotonic, realtime=True)
     clock = Ticker(served.tick, 0.001)
     clock.start()
     with pytest.raises(PhysicsDiverged, match="not finite"):
         served.step(command())
     clock.stop()
-    served.close()
 
 
 def test_wrong_commands_are_refused(serve):
@@ -306,17 +298,14 @@ def test_time_stands_still_before_the_first_reset_and_after_the_end(hands):
     assert served.state is None
 
 
-def test_a_step_that_waits_is_told_of_the_end():
-    served = ServedRobot(SimulatedArm(1), command_timeout=0.1, realtime=True)
-    served.connect()
-    served.reset(ROWS, initial())
+def test_a_step_that_waits_is_told_of_the_end(serve):
+    served = serve(SimulatedArm(1), time.monotonic, realtime=True)
     failures = []
 
     def step():
-        try:
+        with pytest.raises(ResetNeeded, match=r"^The served robot was closed\.$"):
             served.step(command())
-        except ResetNeeded as error:
-            failures.append(str(error))
+        failures.append(True)
 
     thread = threading.Thread(target=step)
     thread.start()
@@ -324,4 +313,4 @@ def test_a_step_that_waits_is_told_of_the_end():
         served.tick()
     served.close()
     thread.join(10)
-    assert failures == ["The served robot was closed."]
+    assert failures == [True]

@@ -272,9 +272,7 @@ def test_strangers_are_told_what_is_wrong(stranger, sent, told):
         one.frames.receive(time.monotonic() + PATIENCE)
 
 
-@pytest.mark.parametrize(
-    "tree", [[], 7, ["step"], ["step", 3], ["walk", ["s", 1, 1, 0.0, 1.0]], ["step", ["s", 1, 1, 0.0, 1.0]], {"a": 1}]
-)
+@pytest.mark.parametrize("tree", [7, ["step", ["s", 1, 1, 0.0, 1.0]]])
 def test_what_is_no_request_ends_its_connection_alone(stranger, client, tree):
     one, two = stranger(), client()
     two.connect()
