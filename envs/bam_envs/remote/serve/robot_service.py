@@ -1,8 +1,7 @@
 """The topics of a served robot: states out, commands in from one client at a time; halt, scene, and its description.
 
 Commands are checked in the thread of the network, where they arrive, and their sender is told what is refused. An
-accepted command goes into one slot; the clock's thread takes it from there, moves the robot and publishes. In lockstep
-a quick robot is moved where its command arrives: handing it to another thread costs more than its step.
+accepted command goes into one slot; the clock's thread takes it from there, moves the robot and publishes.
 
 Everything that moves the robot, or keeps it from moving, is in this file, so that one can see that a halt wins over
 each of them.
@@ -11,7 +10,6 @@ each of them.
 from __future__ import annotations
 
 import logging
-import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -44,8 +42,6 @@ _log = logging.getLogger(__name__)
 
 IDLE_PERIOD = 0.05
 """Time between two states when time goes on only with commands, and none come [s]."""
-QUICK = 2e-4
-"""Longest time that moving the robot may hold up the thread of the network [s]."""
 _ROUNDING = 1e-9
 """How far beyond a limit a number may be that went through text and other units."""
 
@@ -96,8 +92,6 @@ class RobotService:
         lease: Who is in command; shared with everything else that moves the robot.
         namespace: Before every topic, such as ``/cell_1``; or nothing.
         simulated: Whether nothing real moves; then a scene can be set.
-        quick: In lockstep, a robot whose last period took no longer than this to compute [s] is moved in the thread of
-            the network.
         clock: Wall clock [s], for stamps.
     """
 
@@ -110,7 +104,6 @@ class RobotService:
         *,
         namespace: str = "",
         simulated: bool = True,
-        quick: float = QUICK,
         clock: Callable[[], float] = time.time,
     ) -> None:
         profile = profile.narrowed(robot.spec.command.labels)
@@ -129,12 +122,10 @@ class RobotService:
         self._answered = ""  # `Tag.echo` of the last command that was executed
         self._connected = True
         self._moving = threading.Lock()  # an order that was taken is begun before a halt, or not at all
-        self._ticking, self._took = threading.Lock(), math.inf  # how long the last period took to compute [s]
         self._unsubscribe: list[Callable[[], None]] = []
         self._scene = (
             StringRpcService(bus, namespace + SCENE_TOPIC, self._set_scene, self._sessions) if simulated else None
         )
-        self._quick = quick
         self.clock = Ticker(self.tick, IDLE_PERIOD if lockstep else robot.tick_period)
         """Moves the robot and publishes."""
 
@@ -185,16 +176,8 @@ class RobotService:
         self._lease.take(caller.client, shown=caller.shown, silence=caller.silence)
         echo, complete = "" if tag is None else tag.echo, topic in self._completing
         self._slot.put(caller.client, places, told, complete=complete, tag=echo)
-        if not (complete and self.info.lockstep):
-            return
-        # A period in this thread, if it is short and nobody is at it, or in the clock's.
-        if self._took > self._quick or not self._ticking.acquire(blocking=False):
+        if complete and self.info.lockstep:
             self.clock.wake()
-            return
-        try:
-            self._pass_period()
-        finally:
-            self._ticking.release()
 
     def _on_lease(self, message: Message, caller: Caller) -> None:
         """The client in command says that it is there, or leaves, over any of its connections."""
@@ -254,37 +237,24 @@ class RobotService:
 
     def tick(self) -> None:
         """Let time pass, as the clock does: in lockstep a period if a command is complete, else a part of one."""
-        if self.info.lockstep:
-            with self._ticking:
-                self._pass_period()
-            return
+        lockstep = self.info.lockstep
         with self._moving:
-            order = self._slot.take()
+            order = self._slot.take(complete=lockstep)
             if order.values and order.client == self._lease.holder:  # it may have changed since
-                self._robot.follow(self._merged(order), at_once=order.complete)
-                self._answered = order.tag
-        self._robot.tick()
-        self._publish()
-
-    def _pass_period(self) -> None:
-        """A whole period, if a command is there; else the state that has not changed."""
-        with self._moving:
-            order = self._slot.take(complete=True)
-            if order.values and order.client == self._lease.holder:
-                began = time.perf_counter()
+                command = self._robot.target()
+                command[0, list(order.values)] = list(order.values.values())
+                command = np.minimum(np.maximum(command, self._low), self._high)  # np.clip takes three times as long
                 try:
-                    self._robot.step(self._merged(order))
+                    if lockstep:
+                        self._robot.step(command)
+                    else:
+                        self._robot.follow(command, at_once=order.complete)
                     self._answered = order.tag
                 except RobotFault as fault:
                     _log.warning("%s: %s", self._profile.name, fault)
-                self._took = time.perf_counter() - began
+        if not lockstep:
+            self._robot.tick()
         self._publish()
-
-    def _merged(self, order: Order) -> Any:
-        command = self._robot.target()
-        for place, value in order.values.items():
-            command[0, place] = value
-        return np.minimum(np.maximum(command, self._low), self._high)  # as np.clip, in a third of the time
 
     def _publish(self) -> None:
         state = self._robot.state

@@ -202,7 +202,6 @@ class _Connection:
         self.host, self.client, self.session = host, f"{host}:{port}", ""
         self.caller: Caller | None = None  # known when it is let in
         self._owner, self._frames = owner, FrameSocket(sock)
-        self._answered: tuple[tuple[str, int, int], list[bytes | memoryview]] | None = None
         self.thread = threading.Thread(target=self._run, name=f"bam-tcp {self.client}", daemon=True)
 
     def drop(self) -> None:
@@ -231,18 +230,13 @@ class _Connection:
         self._frames.send(parts, time.monotonic() + self._owner.patience)
 
     def _answer(self, request: Request) -> list[bytes | memoryview]:
-        """The frame that answers `request`; one that came before gets the answer of before, and nothing moves."""
+        """The frame that answers `request`."""
         tag = request.tag
-        number = (tag.session, tag.epoch, tag.sequence)
-        if self._answered is not None and self._answered[0] == number:
-            return self._answered[1]
         try:
             self._owner.freshness.require(Tag(tag.session, tag.epoch, tag.sequence, tag.sent, tag.deadline))
-            parts = encode([tag.sequence, "ok", self._do(request)])
+            return encode([tag.sequence, "ok", self._do(request)])
         except BamEnvsError as error:
-            parts = encode(refusal(tag.sequence, error))
-        self._answered = (number, parts)
-        return parts
+            return encode(refusal(tag.sequence, error))
 
     def _do(self, request: Request) -> Tree:
         server, deadline = self._owner.server, time.monotonic() + request.tag.lifetime

@@ -159,61 +159,6 @@ def test_in_lockstep_nothing_goes_on_before_a_command_is_complete(serve, bus):
     np.testing.assert_allclose(service.robot.target(), [command(0.01, 0.04)])
 
 
-CLOCK, HERE = "bam-ticker", threading.current_thread().name
-
-
-class Watched(FakeRobot):
-    """Keeps in which threads it is stepped."""
-
-    def __init__(self):
-        super().__init__(1)
-        self.threads = []
-
-    def step(self, command):
-        self.threads.append(threading.current_thread().name)
-        return super().step(command)
-
-
-def stepped(service, number):
-    """Send one more command, and wait for the answer."""
-    assert service.send(command(0.001 * number)) is None
-    service.joints(lambda message: message["position"][0] == 0.001 * number)
-
-
-@pytest.mark.parametrize(("quick", "threads"), [(1e6, [CLOCK, HERE, HERE]), (0.0, [CLOCK] * 3)])
-def test_a_quick_robot_is_moved_where_its_command_arrives_and_a_slow_one_by_the_clock(serve, quick, threads):
-    robot = Watched()
-    service = serve(robot, quick=quick)
-    for number in range(1, 4):  # how quick it is turns out at the first
-        stepped(service, number)
-    assert robot.threads == threads
-
-
-class Slow(Watched):
-    """A step of it ends when it may."""
-
-    def __init__(self):
-        super().__init__()
-        self.may, self.begun = threading.Event(), threading.Event()
-
-    def step(self, command):
-        self.begun.set()
-        self.may.wait(10.0)
-        return super().step(command)
-
-
-def test_while_the_clock_is_at_it_a_command_waits_for_it(serve):
-    robot = Slow()
-    service = serve(robot, quick=1e6)
-    assert service.send(command(0.001)) is None
-    assert robot.begun.wait(10.0)
-    assert service.send(command(0.002)) is None
-    assert robot.threads == []
-    robot.may.set()
-    service.joints(lambda message: message["position"][0] == 0.002)
-    assert set(robot.threads) == {CLOCK}
-
-
 def test_in_real_time_states_come_with_or_without_commands(serve, bus):
     service = serve(SimulatedArm(1), realtime=True)
     for number in range(1, 11):
