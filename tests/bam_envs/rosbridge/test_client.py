@@ -265,17 +265,3 @@ def test_a_listener_may_not_wait_for_the_network(scripted, link, heard):
         "Hand the work to another thread."
         for method in ("call", "connect", "wait_up")
     ]
-
-
-def test_several_links_in_one_process_do_not_touch_each_other(scripted, new_scripted, new_link, new_heard):
-    other = new_scripted()
-    links = [new_link(scripted), new_link(other), new_link(other)]
-    listeners = [new_heard() for _ in links]
-    for link, listener in zip(links, listeners, strict=True):
-        link.subscribe("/pong", STRING, listener)
-    scripted.wait_for("subscribe"), other.wait_for("subscribe", 2)
-    links[1].close()
-    other.wait_connected(1)
-    scripted.send({"op": "publish", "topic": "/pong", "msg": {"data": "1"}})
-    other.send({"op": "publish", "topic": "/pong", "msg": {"data": "2"}})
-    assert (listeners[0].wait(), listeners[2].wait(), listeners[1].messages) == ([{"data": "1"}], [{"data": "2"}], [])

@@ -179,11 +179,6 @@ def test_a_goal_of_an_action_is_answered_as_one(peers):
     assert peers.say(peers.client(), op="send_action_goal", action="/a", action_type="x/Y", id="g") == [answer]
 
 
-def test_json_in_a_binary_frame_is_done(peers):
-    frame = json.dumps({"op": "call_service", "service": "/no", "id": 5}).encode()
-    assert peers.say(peers.client(), frame) == response("Service /no does not exist", False, "/no", id=5)
-
-
 def test_a_wrong_type_harms_nobody_else(peers):
     first, second, third = (peers.client(name) for name in "abc")
     peers.say(first, op="subscribe", topic="/t", type=TEXT)
@@ -302,17 +297,6 @@ def test_a_latched_message_waits_for_newcomers_as_long_as_its_publisher(peers):
     assert heard == [(text("new"), "a")]
     peers.bridge.lost(first)
     assert peers.say(third, op="subscribe", topic="/t", type=TEXT) == []
-
-
-def test_bytes_travel_as_base64_and_as_bytes(peers):
-    plain, cbor = peers.client("a"), peers.client("b")
-    kind = "sensor_msgs/CompressedImage"
-    peers.say(plain, op="subscribe", topic="/i", type=kind)
-    peers.say(cbor, op="subscribe", topic="/i", type=kind, compression="cbor")
-    peers.bridge.advertise("/i", kind)
-    peers.bridge.publish(peers.bridge.publication("/i", {"data": b"\x00\xff"}), 0.0)
-    assert peers.take(plain)[0]["msg"]["data"] == "AP8="
-    assert peers.take(cbor)[0]["msg"]["data"] == b"\x00\xff"
 
 
 # This process.

@@ -93,11 +93,12 @@ def threads():
 
 
 def test_it_ends_with_a_goodbye_and_leaves_no_thread(threads):
-    with BridgeServer(port=0) as server:
+    server = BridgeServer(port=0)
+    server.serve("/s", TRIGGER, lambda request, caller: {"message": caller.name})  # there after the start
+    with server:
         assert server.url == f"ws://127.0.0.1:{server.port}"
         client = Client(server.url)
-        server.serve("/s", TRIGGER, lambda request, caller: {})
-        assert client.call("/s")["result"]
+        assert client.call("/s")["values"]["message"] == "client1"
         assert server.clients == 1
         server.close()
         with pytest.raises(ConnectionClosed) as end:
@@ -146,23 +147,12 @@ def test_wrong_options_are_refused_at_once(options, text):
 def test_nothing_is_kept_while_it_does_not_run():
     server = BridgeServer(port=0)
     server.advertise("/t", TEXT)
-    for _ in range(2):
-        with pytest.raises(LinkLost, match=r"^/t: the server is not running; nothing was sent\.$"):
-            server.publish("/t", {"data": "x"})
-        server.start() if server.port == 0 else None
-        server.close()
-
-
-def test_what_is_set_up_before_the_start_is_there_after_it():
-    server, heard = BridgeServer(port=0), threading.Event()
-    server.serve("/s", TRIGGER, lambda request, caller: {"message": caller.name})
-    server.subscribe("/t", TEXT, lambda message, caller: heard.set())
+    with pytest.raises(LinkLost, match=r"^/t: the server is not running; nothing was sent\.$"):
+        server.publish("/t", {"data": "x"})
     with server:
-        client = Client(server.url)
-        assert client.call("/s")["values"]["message"] == "client1"
-        client.send(op="publish", topic="/t", msg={"data": "x"})
-        assert heard.wait(DEADLINE)
-        client.close()
+        server.publish("/t", {"data": "x"})
+    with pytest.raises(LinkLost, match=r"^/t: the server is not running; nothing was sent\.$"):
+        server.publish("/t", {"data": "x"})
 
 
 def test_topics_both_ways(server, new_client, heard):
@@ -237,41 +227,52 @@ def test_a_service_of_a_client_that_is_cut_off(server, new_client):
 # Who may come in.
 
 
+def refused(url, **options):
+    """The HTTP status and text of a refusal."""
+    with pytest.raises(InvalidStatus) as caught:
+        connect(url, **options)
+    response = caught.value.response
+    assert (response.headers.get("WWW-Authenticate") == "Bearer") == (response.status_code == 401)
+    return response.status_code, response.body.decode()
+
+
+def bearer(token):
+    return {"additional_headers": {"Authorization": f"Bearer {token}"}}
+
+
+NEEDED = (
+    401,
+    "This server needs its token: send the header 'Authorization: Bearer TOKEN', or open the URL with ?token=TOKEN.\n",
+)
+
+
 def test_the_token(new_server, new_client):
     url = new_server(token="secret").url
-    for wrong in [
-        {},
-        {"additional_headers": {"Authorization": "Bearer Secret"}},
-        {"additional_headers": {"Authorization": "secret"}},
-    ]:
-        with pytest.raises(InvalidStatus) as caught:
-            new_client(url, **wrong)
-        assert caught.value.response.status_code == 401
-        assert caught.value.response.headers["WWW-Authenticate"] == "Bearer"
-        assert caught.value.response.body.startswith(b"This server needs its token: send the header ")
-    with pytest.raises(InvalidStatus):
-        new_client(url + "/?token=wrong")
+    for wrong in ({}, bearer("Secret"), {"additional_headers": {"Authorization": "secret"}}):
+        assert refused(url, **wrong) == NEEDED
+    assert refused(url + "/?token=wrong") == NEEDED
     new_client(url, additional_headers={"Authorization": "bearer secret"}).sync()
     new_client(url + "/?token=secret").sync()
 
 
+@pytest.mark.parametrize("more", [bearer("first"), {}])
+def test_one_request_is_one_guess(new_server, new_client, more):
+    url = new_server(token="secret").url
+    assert refused(f"{url}/?token=second&token=secret", **more) == NEEDED
+    new_client(f"{url}/?token=secret", **bearer("secret")).sync()
+
+
 def test_a_web_page_comes_in_only_with_the_token(new_server, new_client, caplog):
     page = {"additional_headers": {"Origin": "https://evil.example"}}
-    with pytest.raises(InvalidStatus) as caught:
-        new_client(new_server().url, **page)
-    assert caught.value.response.status_code == 403
-    assert caught.value.response.body == (
-        b"A web page comes in only with the token of this server, and it was started without one.\n"
-    )
+    text = "A web page comes in only with the token of this server, and it was started without one.\n"
+    assert refused(new_server().url, **page) == (403, text)
     assert [record.getMessage() for record in caplog.records] == [
         "The web page 'https://evil.example' was refused: a browser comes in only with a token. "
         'To let it in, start the server with one, and send it as the first message: {"op": "auth", "token": TOKEN}.'
     ]
     url = new_server(token="secret").url
     new_client(url + "/?token=secret", **page).sync()
-    with pytest.raises(InvalidStatus) as caught:
-        new_client(url + "/?token=wrong", **page)
-    assert caught.value.response.status_code == 401
+    assert refused(url + "/?token=wrong", **page) == NEEDED
 
 
 def ending(client):
@@ -304,41 +305,23 @@ def test_an_operator_is_known_by_another_token(new_server, new_client):
     server, callers = new_server(token="secret", operator_token="mine"), []
     server.subscribe("/who", TEXT, lambda message, caller: callers.append(caller))
     for token in ("secret", "mine"):
-        client = new_client(server.url, additional_headers={"Authorization": f"Bearer {token}"})
+        client = new_client(server.url, **bearer(token))
         client.send(op="publish", topic="/who", msg={"data": token})
         client.sync()
     assert [caller.operator for caller in callers] == [False, True]
     assert all(0.0 <= caller.silence() < DEADLINE for caller in callers)
 
 
-def guess(place):
-    """The HTTP status of a wrong token."""
-    options = {"sock": socket.create_connection(place), "additional_headers": {"Authorization": "Bearer guess"}}
-    with pytest.raises(InvalidStatus) as caught:
-        connect("ws://127.0.0.1/", **options)
-    return caught.value.response.status_code
-
-
 def test_guessing_tokens_is_slow_and_keeps_no_other_address_out(new_server, new_client):
     server = new_server(token="secret")
-    place = ("127.0.0.1", server.port)
-    statuses = [guess(place) for _ in range(20)]
+    statuses = [refused(server.url, **bearer("guess"))[0] for _ in range(20)]
     assert statuses[:4] == [401] * 4
     assert 429 in statuses
     try:
-        elsewhere = socket.create_connection(place, source_address=("127.0.0.2", 0))
+        elsewhere = socket.create_connection(("127.0.0.1", server.port), source_address=("127.0.0.2", 0))
     except OSError:
         pytest.skip("this system has one loopback address")
-    new_client(server.url, sock=elsewhere, additional_headers={"Authorization": "Bearer secret"}).sync()
-
-
-@pytest.mark.parametrize("headers", [{"Authorization": "Bearer first"}, {}])
-def test_one_request_is_one_guess(new_server, new_client, headers):
-    url = new_server(token="secret").url
-    with pytest.raises(InvalidStatus) as caught:
-        new_client(f"{url}/?token=second&token=secret", additional_headers=headers)
-    assert caught.value.response.status_code == 401
-    new_client(f"{url}/?token=secret", additional_headers={"Authorization": "Bearer secret"}).sync()
+    new_client(server.url, sock=elsewhere, **bearer("secret")).sync()
 
 
 def test_tls(new_server, new_client, certificates):
@@ -350,32 +333,25 @@ def test_tls(new_server, new_client, certificates):
 
 def test_certificates_that_are_none(certificates, tmp_path, threads):
     cert, _ = certificates("127.0.0.1")
-    with pytest.raises(
-        InvalidValue, match=r"^Certificate: .*nowhere\.pem cannot be read: No such file or directory\.$"
+    (tmp_path / "other.pem").write_text("no PEM at all")
+    nowhere, other = str(tmp_path / "nowhere.pem"), str(tmp_path / "other.pem")
+    for options, text in (
+        ({"cert": nowhere}, f"{nowhere} cannot be read: No such file or directory."),
+        ({"cert": cert, "key": cert}, f"{cert} and {cert} are not a certificate with its key in PEM: "),
+        ({"cert": cert}, f"{cert} holds no key; give the file with its key too (--key)."),
+        ({"cert": other}, f"{other} is not a certificate with its key in PEM: not PEM."),
     ):
-        BridgeServer(port=0, cert=str(tmp_path / "nowhere.pem")).start()
-    with pytest.raises(InvalidValue, match=r"^Certificate: .* are not a certificate with its key in PEM: "):
-        BridgeServer(port=0, cert=cert, key=cert).start()
-    with pytest.raises(InvalidValue) as caught:
-        BridgeServer(port=0, cert=cert).start()
-    assert str(caught.value) == f"Certificate: {cert} holds no key; give the file with its key too (--key)."
-    other = tmp_path / "other.pem"
-    other.write_text("no PEM at all")
-    with pytest.raises(InvalidValue) as caught:
-        BridgeServer(port=0, cert=str(other)).start()
-    assert str(caught.value) == f"Certificate: {other} is not a certificate with its key in PEM: not PEM."
+        with pytest.raises(InvalidValue) as caught:
+            BridgeServer(port=0, **options).start()
+        assert str(caught.value).startswith(f"Certificate: {text}")
     assert threads() == set()
 
 
 def test_there_is_room_for_so_many(new_server, new_client):
     url = new_server(options=ServerOptions(max_clients=2)).url
-    first, second = new_client(url), new_client(url)
-    first.sync()
-    second.sync()
-    with pytest.raises(InvalidStatus) as caught:
-        new_client(url)
-    assert caught.value.response.status_code == 503
-    assert caught.value.response.body == b"There are 2 clients, and no room for more.\n"
+    for client in (new_client(url), new_client(url)):
+        client.sync()
+    assert refused(url) == (503, "There are 2 clients, and no room for more.\n")
 
 
 # Bad company.
