@@ -178,12 +178,3 @@ def test_a_copy_made_during_a_call_is_free(kind):
     thread.start()
     thread.join(30)
     kind.check(ws["y"], [[1.0]])
-
-
-def test_a_hand_made_loop_without_a_temporal_agent(kind):
-    ws, actor, actions = Workspace(), Times(), []
-    for t, observation in enumerate([kind([0.5]), kind([1.5]), kind([2.5])]):
-        ws.set("x", t, observation)
-        actor(ws, t=t)
-        actions.append(ws.get("y", t)[0].item())
-    assert actions == [1.0, 3.0, 5.0]

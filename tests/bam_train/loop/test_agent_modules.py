@@ -89,15 +89,6 @@ def test_children_are_a_module_list_that_can_be_assigned_into():
     assert ws["again"][4].tolist() == [[5.0]]
 
 
-def test_a_wrapped_agent_can_be_exchanged():
-    agent = loop()
-    agent.agent = Observing()
-    ws = Workspace()
-    agent(ws, n_steps=2)
-    assert list(ws.keys()) == ["obs"]
-    assert list(agent.parameters()) == []
-
-
 def test_train_eval_and_conversion_reach_every_agent():
     agent = loop()
     assert agent.eval() is agent

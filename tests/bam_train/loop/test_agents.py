@@ -91,11 +91,6 @@ def test_keywords_of_a_wrapper(ws, kind):
     kind.check(ws["x"], [[-329.0]])
 
 
-def test_a_wrapper_round_a_container(ws, kind):
-    KWAgentWrapper(Agents(Add(1), Add(2)), sign=-1)(ws, t=0)
-    kind.check(ws["x"], [[-12.0]])
-
-
 def test_copying_a_variable(ws, kind):
     copier = CopyTAgent("x", "y", name="copier")
     ws.set("x", 1, kind([5.0]))

@@ -183,12 +183,6 @@ def test_a_table(ws):
     assert table.loc[(2, 1), "step"] == 7
 
 
-def test_chosen_variables_of_a_table(ws):
-    assert list(ws.to_dataframe("step", "obs").columns) == ["step", "obs[0]", "obs[1]"]
-    with pytest.raises(UnknownVariable):
-        ws.to_dataframe("rewrd")
-
-
 def test_shorter_variables_leave_holes(ws, kind):
     ws.set("value", 0, kind([1.0, 2.0]))
     ws.set("count", 1, kind([3, 4], "int64"))

@@ -114,15 +114,6 @@ def test_a_display_of_its_own_on_a_terminal(clock, terminal):
     assert text.endswith("\x1b[?25h")  # the cursor is back
 
 
-def test_a_display_of_its_own_ends_with_the_exception(clock, terminal):
-    with pytest.raises(ValueError):  # noqa: PT011 - raised here
-        fail(ValueError, True, 1000, 5, "rollout")
-    text = terminal()
-    assert last_line(text).startswith("rollout from t=5 ")
-    assert " 40/1000 " in last_line(text)
-    assert text.endswith("\x1b[?25h")
-
-
 def test_speed():
     column, task = StepsPerSecond(), types.SimpleNamespace(finished_speed=None, speed=None)
     assert column.render(task).plain == ""

@@ -133,20 +133,6 @@ def test_reading_the_time_before_the_first_gives_the_last(kind):
     kind.check(ws["before"], [[2.0], [0.0], [1.0]])
 
 
-def test_writing_at_the_next_time(kind):
-    class Fibonacci(Agent):
-        def forward(self, t, **kwargs):
-            if t == 0:
-                self.set(("x", 0), kind([0], "int64"))
-                self.set(("x", 1), kind([1], "int64"))
-            else:
-                self.set(("x", t + 1), self.get(("x", t)) + self.get(("x", t - 1)))
-
-    ws = Workspace()
-    TemporalAgent(Fibonacci())(ws, t=0, n_steps=8)
-    assert ws["x"].flatten().tolist() == [0, 1, 1, 2, 3, 5, 8, 13, 21]
-
-
 class Later(Agent):
     def __init__(self):
         super().__init__()

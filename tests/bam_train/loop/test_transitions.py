@@ -16,22 +16,6 @@ def ws(kind):
     return workspace
 
 
-def test_pairs_are_time_major_and_stop_at_the_end_of_an_episode(ws, kind):
-    pairs = ws.get_transitions()
-    kind.check(pairs["x"], [[0, 1, 10, 20, 21], [10, 11, 20, 30, 31]], "int64")
-    kind.check(pairs["env/done"], [[False] * 5, [False, True, False, False, False]], "bool")
-    kind.check(pairs["v"][0], [[0.0, 0.5], [1.0, 0.5], [10.0, 0.5], [20.0, 0.5], [21.0, 0.5]])
-    assert (pairs.time_size(), pairs.batch_size()) == (2, 5)
-    assert list(pairs.keys()) == ["x", "v", "env/done"]
-
-
-def test_no_final_state_drops_nothing_and_needs_no_flag(ws, kind):
-    pairs = ws.get_transitions(no_final_state=True)
-    kind.check(pairs["x"], [[0, 1, 10, 11, 20, 21], [10, 11, 20, 21, 30, 31]], "int64")
-    ws.remove_variable("env/done")
-    kind.check(ws.get_transitions(no_final_state=True)["x"][1], [10, 11, 20, 21, 30, 31], "int64")
-
-
 @pytest.mark.parametrize(("dtype", "ends"), [("int64", [0, 2]), ("float32", [0.0, 0.5]), ("bool", [False, True])])
 def test_another_flag_of_any_number(ws, kind, dtype, ends):
     for t in range(4):

@@ -115,18 +115,6 @@ def test_a_variable_that_begins_late(kind):
     assert set(map(tuple, sink.times["late"][:-50])) <= {(0,)}
 
 
-def test_a_first_write_far_ahead(kind):
-    ws = Workspace(window=2)
-    for t in range(10):
-        ws.set("x", t, kind([t], "int64"))
-    ws.set("far", 500, kind([1], "int64"))
-    assert ws.first_time == 499
-    assert ws["far"].flatten().tolist() == [0, 1]
-    ws.set("x", 500, kind([7], "int64"))
-    assert ws["x"].flatten().tolist() == [0, 7]
-    assert ws.time_size() == 501
-
-
 def test_a_variable_written_once(kind):
     """Such as an advantage at t = 0: it goes to the sink with its piece."""
     sink = Sink()

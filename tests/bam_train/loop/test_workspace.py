@@ -75,30 +75,6 @@ def test_the_first_write_fixes_the_dtype(kind, dtype):
     kind.check(ws["x"], [[[1, 0]], [[0, 1]]], dtype)
 
 
-def test_set_full(kind):
-    ws = Workspace()
-    ws.set_full("x", kind.column(1.0, 2.0, 3.0))
-    kind.check(ws["x"], [[1.0], [2.0], [3.0]])
-    kind.check(ws.get("x", 1), [2.0])
-    kind.check(ws.get("x", -1), [3.0])
-
-
-def test_set_full_over_single_times_leaves_a_longer_tail(kind):
-    ws = counted(kind, "x")
-    ws.set_full("x", kind([[7.0, 7.0], [8.0, 8.0]]))
-    kind.check(ws["x"], [[7.0, 7.0], [8.0, 8.0], [20.0, 21.0]])
-    ws.set_full("x", kind([[1.0, 1.0]] * 4))
-    kind.check(ws["x"], [[1.0, 1.0]] * 4)
-
-
-def test_set_after_set_full(kind):
-    ws = Workspace()
-    ws.set_full("x", kind.column(1.0, 2.0))
-    ws.set("x", 0, kind([5.0]))
-    ws.set("x", 3, kind([6.0]))
-    kind.check(ws["x"], [[5.0], [2.0], [0.0], [6.0]])
-
-
 def test_sizes(kind):
     ws = Workspace()
     assert ws.time_size() is None

@@ -41,18 +41,18 @@ operations = st.lists(
 
 
 class Values:
-    """The same fresh tensors for both sides: numbers counted up, flags now and then true."""
+    """The same fresh values for both sides: numbers counted up, flags now and then true."""
 
-    def __init__(self, weight):
-        self.weight, self.count = weight, 0
+    def __init__(self, weight, kind="torch"):
+        self.weight, self.kind, self.count = weight, kind, 0
 
     def __call__(self, name, *front):
         shape = (*front, *SHAPES[name])
         numbers = torch.arange(self.count, self.count + int(np.prod(shape))).reshape(shape)
         self.count += numbers.numel()
-        if name == "env/done":
-            return numbers % 5 == 0
-        return numbers * self.weight if self.count % 2 else numbers.float()
+        value = numbers * self.weight if self.count % 2 else numbers.float()
+        value = numbers % 5 == 0 if name == "env/done" else value
+        return value if self.kind == "torch" else value.detach().numpy()
 
 
 def sliced(workspace):
@@ -121,6 +121,8 @@ def size(method):
 
 
 def same(ours, theirs):
+    if isinstance(ours, np.ndarray):
+        ours, theirs = torch.from_numpy(ours), theirs.detach()
     assert type(ours) is type(theirs)
     assert (ours.dtype, ours.shape, ours.requires_grad) == (theirs.dtype, theirs.shape, theirs.requires_grad)
     assert torch.equal(ours, theirs)
@@ -133,11 +135,12 @@ def gradient(weight, tensors):
     return torch.autograd.grad(sum(chosen), weight, retain_graph=True)[0].item()
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@pytest.mark.parametrize("kind", ["torch", "numpy"])
+@settings(max_examples=150, deadline=None, derandomize=True)
 @given(st.sampled_from([[], FILLED]), operations)
-def test_any_sequence_of_operations(filled, sequence):
+def test_any_sequence_of_operations(kind, filled, sequence):
     weights = [torch.tensor(2.0, requires_grad=True) for _ in range(2)]
-    makers = [Values(weight) for weight in weights]
+    makers = [Values(weights[0], kind), Values(weights[1])]
     ours, theirs = Workspace(), bbrl_workspace.Workspace()
     for operation in filled + sequence:
         if is_told_apart(theirs, operation):
@@ -160,25 +163,27 @@ def test_any_sequence_of_operations(filled, sequence):
         for name in read:
             same(read[name], bbrl_read[name])
         assert (sizes_, text) == (bbrl_sizes, bbrl_text)
-        assert gradient(weights[0], read.values()) == gradient(weights[1], bbrl_read.values())
+        if kind == "torch":
+            assert gradient(weights[0], read.values()) == gradient(weights[1], bbrl_read.values())
 
 
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.integers(1, 7), st.integers(1, 4), st.booleans(), st.booleans(), st.integers(0, 2**32 - 1))
 def test_transitions(length, columns, no_final_state, compact, seed):
     generator = torch.Generator().manual_seed(seed)
-    spaces = [Workspace(), bbrl_workspace.Workspace()]
+    theirs, *spaces = bbrl_workspace.Workspace(), Workspace(), Workspace()
     for t in range(length):
         x, done = torch.randn(columns, 2, generator=generator), torch.rand(columns, generator=generator) < 0.3
-        for workspace in spaces:
-            workspace.set("x", t, x)
-            workspace.set("env/done", t, done)
-    ours, theirs = (
-        (workspace.contiguous() if compact else workspace).get_transitions(no_final_state=no_final_state)
-        for workspace in spaces
-    )
-    for name in ("x", "env/done"):
-        same(ours[name], theirs[name])
+        for name, value in (("x", x), ("env/done", done)):
+            theirs.set(name, t, value)
+            spaces[0].set(name, t, value)
+            spaces[1].set(name, t, value.numpy())
+    theirs = (theirs.contiguous() if compact else theirs).get_transitions(no_final_state=no_final_state)
+    for ours in spaces:
+        pairs = (ours.contiguous() if compact else ours).get_transitions(no_final_state=no_final_state)
+        assert list(pairs.keys()) == ["x", "env/done"]
+        for name in pairs:
+            same(pairs[name], theirs[name])
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -17,23 +17,10 @@ def ws(kind):
     return workspace
 
 
-def test_copy_time(ws, kind):
-    ws.copy_time(2, 0, 2)
-    kind.check(ws["x"], [[20.0, 21.0, 22.0], [30.0, 31.0, 32.0], [20.0, 21.0, 22.0], [30.0, 31.0, 32.0]])
-    kind.check(ws["y"], [[-20.0, -21.0, -22.0], [-30.0, -31.0, -32.0], [-20.0, -21.0, -22.0], [-30.0, -31.0, -32.0]])
-
-
 def test_copy_time_of_some_variables(ws, kind):
     ws.copy_time(3, 0, 1, var_names=["y"])
     kind.check(ws.get("x", 0), [0.0, 1.0, 2.0])
     kind.check(ws.get("y", 0), [-30.0, -31.0, -32.0])
-
-
-def test_copy_n_last_steps_keeps_the_length(ws, kind):
-    assert ws.copy_n_last_steps(1) is None
-    kind.check(ws["x"], [[30.0, 31.0, 32.0], [10.0, 11.0, 12.0], [20.0, 21.0, 22.0], [30.0, 31.0, 32.0]])
-    kind.check(ws.get("y", 0), [-30.0, -31.0, -32.0])
-    assert ws.time_size() == 4
 
 
 def test_copy_n_last_steps_of_some_variables_copies_these_only(ws, kind):
@@ -42,32 +29,6 @@ def test_copy_n_last_steps_of_some_variables_copies_these_only(ws, kind):
     kind.check(ws.get("x", 0), [30.0, 31.0, 32.0])
     kind.check(ws.get("y", 0), [0.0, -1.0, -2.0])
     kind.check(ws.get("other", 0), [5.0, 5.0, 5.0])
-
-
-@pytest.mark.parametrize(("begin", "end", "times"), [(2, 99, [2, 3]), (-2, 4, [2, 3]), (0, -1, [0, 1, 2])])
-def test_subtime_follows_the_rules_of_slices(ws, begin, end, times):
-    for name, sign in (("x", 1), ("y", -1)):
-        assert ws.subtime(begin, end)[name][:, 1].tolist() == [sign * (10.0 * t + 1) for t in times]
-
-
-def test_get_time_truncated(ws, kind):
-    kind.check(ws.get_time_truncated("x", 1, 3), [[10.0, 11.0, 12.0], [20.0, 21.0, 22.0]])
-    kind.check(ws.get_time_truncated("x", 3, 9), [[30.0, 31.0, 32.0]])
-    kind.check(ws.get_time_truncated("y", 3, 9), [[-30.0, -31.0, -32.0]])
-
-
-def test_get_time_truncated_workspace_of_different_lengths(ws, kind):
-    ws.set("z", 0, kind([1.0, 2.0, 3.0]))
-    piece = ws.get_time_truncated_workspace(0, 2)
-    kind.check(piece["x"], [[0.0, 1.0, 2.0], [10.0, 11.0, 12.0]])
-    kind.check(piece["z"], [[1.0, 2.0, 3.0]])
-
-
-def test_select_batch_keeps_order_and_repeats(ws, kind):
-    chosen = ws.select_batch(kind([2, 0, 2], "int64"))
-    kind.check(chosen.get("x", 1), [12.0, 10.0, 12.0])
-    kind.check(chosen.get("y", 1), [-12.0, -10.0, -12.0])
-    assert (chosen.time_size(), chosen.batch_size()) == (4, 3)
 
 
 def test_select_batch_by_a_mask(ws, kind):
@@ -93,12 +54,6 @@ def test_select_batch_n_draws_with_replacement(ws):
     assert set(x[1].tolist()) == {10.0, 11.0, 12.0}
     assert (x == -y).all()
     assert ((x[1:] - x[:-1]) == 10.0).all()
-
-
-def test_select_subtime(ws, kind):
-    piece = ws.select_subtime(kind([0, 2, 1], "int64"), 2)
-    kind.check(piece["x"], [[0.0, 21.0, 12.0], [10.0, 31.0, 22.0]])
-    kind.check(piece["y"], [[0.0, -21.0, -12.0], [-10.0, -31.0, -22.0]])
 
 
 @pytest.mark.parametrize("n_times", [1, 3])

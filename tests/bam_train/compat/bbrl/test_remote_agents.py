@@ -129,44 +129,29 @@ def test_a_process_goes_on_where_it_was(started):
     assert agent.agent.agent[0].calls == 0
 
 
-def test_unseeded_processes_differ(created):
-    remote, workspace = created(Walker(), t=0)
-    remote(workspace, t=0)
-    assert workspace["x"][0, :, 0].tolist() == [0, 0, 1, 1]
-    assert workspace["x"][0, 0, 4] != workspace["x"][0, 2, 4]
+def test_seeds_modes_and_weights_reach_running_processes(created):
+    remote, workspace = created(Agents(Walker(name="policy")), t=0)
 
+    def written():
+        remote(workspace, t=0)
+        return workspace["x"][0, ::2].clone()
 
-def test_seeds_after_the_start(created):
-    agent = loop(Walker())
-    remote, workspace = created(agent)
-    remote(workspace, **STEPS)
+    first = written()
+    assert first[:, 0].tolist() == [0, 1]  # unseeded, their noise differs
+    assert first[0, 4] != first[1, 4]
     remote.seed(10, inc=5)
-    remote(workspace, t=0, n_steps=1)
-    assert workspace["x"][0, :, 0].tolist() == [10, 10, 15, 15]
+    seeded = written()
+    assert seeded[:, 0].tolist() == [10, 15]
     with torch.random.fork_rng():
         torch.manual_seed(15)
-        assert torch.equal(workspace["x"][0, 2:, 4:5], torch.rand(2, 1))
-
-
-def test_modes(created):
-    remote, workspace = created(Walker(), t=0)
-    modes = []
-    for change in (lambda: None, remote.eval, remote.train):
+        assert seeded[1, 4] == torch.rand(2, 1)[0]
+    for change, mode in ((remote.eval, 0), (remote.train, 1)):
         change()
-        remote(workspace, t=0)
-        modes.append((remote.training, workspace["x"][0, 0, 2].item(), workspace["x"][0, 2, 2].item()))
-    assert modes == [(True, 1, 1), (False, 0, 0), (True, 1, 1)]
-
-
-def test_weights_are_shared(created):
-    remote, workspace = created(Agents(Walker(name="policy")), t=0)
-    remote(workspace, t=0)
-    assert workspace["x"][0, :, 5].tolist() == [0, 0, 0, 0]
-    state = {"weight": torch.tensor([2.5])}
+        assert written()[:, 2].tolist() == [mode, mode]
+        assert remote.training == bool(mode)
     for policy in remote.get_by_name("policy"):
-        policy.load_state_dict(state)
-    remote(workspace, t=0)
-    assert workspace["x"][0, :, 5].tolist() == [2.5] * 4
+        policy.load_state_dict({"weight": torch.tensor([2.5])})
+    assert written()[:, 5].tolist() == [2.5, 2.5]
 
 
 def test_one_call_at_a_time(started):
@@ -237,15 +222,6 @@ def test_workspaces_that_do_not_fit(created, started):
     ):
         started(name="far")[0](narrow, t=0)
     assert multiprocessing.active_children() == []
-
-
-def test_names(created):
-    remote, _ = created(Walker(name="walker"), t=0)
-    remote.agents[0].set_name("first")
-    remote.set_name("all")
-    assert remote.get_by_name("all") == [remote]
-    assert remote.get_by_name("first") == [remote.agents[0]]
-    assert remote.get_by_name("walker") == [agent.agent for agent in remote.agents]
 
 
 # -- failures ----------------------------------------------------------------------------------------------------------
@@ -396,6 +372,18 @@ def test_the_last_reference_ends_the_process():
     copied.close()
 
 
+def run_program(*arguments):
+    """Another Python; waits until the last of its processes has closed the output."""
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    return subprocess.run(
+        [sys.executable, "-W", "ignore::DeprecationWarning", *arguments],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
 SCRIPT = """
 import os, signal
 from remote_test_agents import Trouble
@@ -414,15 +402,7 @@ if __name__ == "__main__":
 
 @pytest.mark.parametrize(("killed", "code"), [(True, -signal.SIGKILL), (False, 0)])
 def test_processes_end_with_their_parent(killed, code):
-    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-    # Waits until the last process has closed its end of the pipe.
-    run = subprocess.run(
-        [sys.executable, "-W", "ignore::DeprecationWarning", "-c", SCRIPT.format(killed=killed)],
-        env={**os.environ, "PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    run = run_program("-c", SCRIPT.format(killed=killed))
     assert (run.returncode, run.stdout, run.stderr) == (code, "True\n", "")
 
 
@@ -448,14 +428,7 @@ finally:
 
 
 def test_a_process_that_is_closed_while_it_forks_does_not_run_the_program_again():
-    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-    run = subprocess.run(
-        [sys.executable, "-W", "ignore::DeprecationWarning", "-c", HANDLER],
-        env={**os.environ, "PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    run = run_program("-c", HANDLER)
     assert (run.returncode, run.stdout, run.stderr) == (0, "the end of the program\n", "")
 
 
@@ -467,13 +440,6 @@ def test_a_script_without_main_guard(tmp_path):
         "agent, workspace = NRemoteAgent.create(Walker(), 1, t=0)\n"
         "agent(workspace, t=0)\n"
     )
-    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-    run = subprocess.run(
-        [sys.executable, str(script)],
-        env={**os.environ, "PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    run = run_program(str(script))
     assert run.returncode == 1
     assert "ended with exit code 1 before it was ready; a script that starts processes needs `if __name__" in run.stderr

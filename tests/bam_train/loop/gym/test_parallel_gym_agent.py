@@ -48,15 +48,6 @@ def test_without_auto_reset_the_last_frame_is_repeated(toys):
     assert agent.include_last_state
 
 
-def test_a_new_call_at_0_resets_all(toys):
-    agent = ParallelGymAgent(toys.Counting, 1, include_last_state=False)
-    toys.run(agent, 6)
-    ws = toys.run(agent, 3)
-    assert toys.column(ws, "env/env_obs") == [[2, 0], [2, 1], [2, 2]]
-    assert toys.column(ws, "env/cumulated_reward") == [0, 21, 43]
-    assert toys.column(ws, "env/timestep") == [0, 1, 2]
-
-
 def test_auto_reset_with_the_last_state(toys):
     agent = ParallelGymAgent(lambda: Autoreset(toys.Counting(length=2)), 1)
     ws = toys.run(agent, 8)

@@ -140,23 +140,6 @@ def test_cartpole_is_parallels_bit_for_bit(toys, kind):
     assert_same({name: found[name] for name in found.variables}, {name: expected[name] for name in expected.variables})
 
 
-@pytest.mark.parametrize("mode", RESETTING)
-@pytest.mark.parametrize("kind", [SyncVectorEnv, AsyncVectorEnv])
-def test_first_episodes_are_the_same_in_every_mode(toys, mode, kind):
-    native = toys.run(VecGymAgent(partial(cartpole, AutoresetMode.NEXT_STEP, SyncVectorEnv)), 60, act=alternating(4))
-    agent = VecGymAgent(partial(cartpole, mode, kind))
-    found = toys.run(agent, 60, act=alternating(4))
-    agent.close()
-    for row in range(4):
-        end = native["env/done"][:, row].int().argmax() + 1
-        for name in found.variables:
-            assert torch.equal(found[name][:end, row], native[name][:end, row])
-        start = found["env/env_obs"][end, row]
-        assert start.abs().max() <= 0.05
-        assert not torch.equal(start, found["env/env_obs"][0, row])
-    assert torch.equal(found["env/reward"] == 0, found["env/timestep"] == 0)
-
-
 def test_gymnasiums_vectorised_cartpole(toys):
     make = partial(gym.make_vec, "CartPole-v1", num_envs=64, vectorization_mode="vector_entry_point")
     ws = toys.run(VecGymAgent(make), 80, act=alternating(64))

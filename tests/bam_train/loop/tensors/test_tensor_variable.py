@@ -60,11 +60,6 @@ def test_every_other_way_to_read(workspace, read):
     assert torch.equal(read(workspace), EXPECTED)
 
 
-def test_transitions(workspace):
-    pairs = workspace.get_transitions(no_final_state=True)["x"]
-    assert torch.equal(pairs, torch.stack([EXPECTED[:-1].reshape(-1), EXPECTED[1:].reshape(-1)]))
-
-
 def test_writing_over_them(workspace):
     workspace.set("x", 2, torch.tensor([7.0, 7.5]))
     assert workspace["x"][:, 0].tolist() == [0.0, 1.0, 7.0, 3.0]
