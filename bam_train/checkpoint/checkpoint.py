@@ -19,6 +19,7 @@ import json
 import math
 import os
 import zipfile
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,13 +33,11 @@ from bam_train.checkpoint.manifest import AGAIN, MANIFEST, Manifest, manifest_by
 from bam_train.checkpoint.zip_members import (
     CHUNK,
     RESUME,
-    digest,
+    chunks,
     list_members,
     most_bytes,
     open_zip,
-    require_digest,
     require_same_members,
-    unpack,
 )
 from bam_train.errors import AlteredCheckpoint, CheckpointError, CheckpointMismatch, FormatError, OutputError
 
@@ -70,11 +69,11 @@ class Checkpoint:
         path = Path(path).expanduser()
         with open_zip(path) as archive:
             infos = list_members(path, archive)
-            manifest = parse_manifest(path, unpack(path, archive, infos[MANIFEST]))
-            require_same_members(path, set(infos) - {MANIFEST}, set(manifest.sha256))
+            manifest = parse_manifest(path, b"".join(chunks(path, archive, infos[MANIFEST])))
+            require_same_members(path, set(infos), set(manifest.sha256))
             for name, expected in manifest.sha256.items():
                 if not name.startswith(RESUME):  # may have gigabytes, and is verified when it is read
-                    require_digest(path, name, expected, digest(path, archive, infos[name]))
+                    deque(chunks(path, archive, infos[name], expected), maxlen=0)
         return cls(path, manifest)
 
     def has(self, member: str) -> bool:
@@ -88,16 +87,14 @@ class Checkpoint:
             raise AlteredCheckpoint(self.path, member, f"has no {member}; it holds {found}. {AGAIN}")
         with open_zip(self.path) as archive:
             infos = list_members(self.path, archive)
-            require_same_members(self.path, set(infos) - {MANIFEST}, set(self.manifest.sha256))
+            require_same_members(self.path, set(infos), set(self.manifest.sha256))
             size, memory = infos[member].file_size, math.inf
             if hasattr(os, "sysconf"):
                 memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
             if size > memory / 2:
                 text = f"{member} has {size} bytes, more than half of this computer's memory ({memory})"
                 raise CheckpointError(self.path, f"{text}. Go on with it on a larger one")
-            data = unpack(self.path, archive, infos[member])
-        require_digest(self.path, member, self.manifest.sha256[member], hashlib.sha256(data).hexdigest())
-        return data
+            return b"".join(chunks(self.path, archive, infos[member], self.manifest.sha256[member]))
 
     def arrays(self, member: str) -> dict[str, np.ndarray]:
         """Return a safetensors member's arrays."""

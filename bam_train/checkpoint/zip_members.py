@@ -94,45 +94,31 @@ def list_members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipI
     return infos
 
 
-def unpack(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
-    """Return a member's bytes."""
-    return b"".join(_chunks(path, archive, info))
-
-
-def digest(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> str:
-    """Return a member's sha256 in hex, without holding the member in memory."""
-    sha256 = hashlib.sha256()
-    for chunk in _chunks(path, archive, info):
-        sha256.update(chunk)
-    return sha256.hexdigest()
-
-
-def require_digest(path: Path, member: str, expected: str, found: str) -> None:
-    """Refuse a member whose sha256 is not the manifest's."""
-    if found != expected:
-        text = f"{member} was altered: its sha256 is {found[:12]}..., expected {expected[:12]}.... {AGAIN}"
-        raise AlteredCheckpoint(path, member, text)
-
-
-def require_same_members(path: Path, found: set[str], expected: set[str]) -> None:
-    """Refuse a file that lacks a member of the manifest, or has one more."""
-    for name in sorted(expected - found):
-        raise AlteredCheckpoint(path, name, f"{name} is missing, although {MANIFEST} lists it. {AGAIN}")
-    for name in sorted(found - expected):
-        raise AlteredCheckpoint(path, name, f"{name} was added: {MANIFEST} does not list it. {AGAIN}")
-
-
-def _chunks(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Iterator[bytes]:
-    name, found = info.filename, 0
+def chunks(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, expected: str | None = None) -> Iterator[bytes]:
+    """A member's bytes, a part at a time; after the last, its sha256 in hex is compared with the expected one."""
+    name, found, sha256 = info.filename, 0, hashlib.sha256()
     try:
         with archive.open(info) as stream:
             while chunk := stream.read(CHUNK):
                 found += len(chunk)
+                sha256.update(chunk)
                 yield chunk
     except _DAMAGE as error:
         raise AlteredCheckpoint(path, name, f"{name} is damaged ({error}). {AGAIN}") from error
     if found != info.file_size:
         raise AlteredCheckpoint(path, name, f"{name} has {found} bytes, expected {info.file_size}. {AGAIN}")
+    if expected is not None and sha256.hexdigest() != expected:
+        text = f"{name} was altered: its sha256 is {sha256.hexdigest()[:12]}..., expected {expected[:12]}.... {AGAIN}"
+        raise AlteredCheckpoint(path, name, text)
+
+
+def require_same_members(path: Path, found: set[str], expected: set[str]) -> None:
+    """Refuse a file that lacks a member of the manifest, or has one more beside the manifest."""
+    found = found - {MANIFEST}
+    for name in sorted(expected - found):
+        raise AlteredCheckpoint(path, name, f"{name} is missing, although {MANIFEST} lists it. {AGAIN}")
+    for name in sorted(found - expected):
+        raise AlteredCheckpoint(path, name, f"{name} was added: {MANIFEST} does not list it. {AGAIN}")
 
 
 def most_bytes(name: str) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import pkgutil
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -42,7 +42,7 @@ class Algorithm:
 
     def load(self) -> Any:
         """The class; imports its library."""
-        return _resolve(self.reference)
+        return pkgutil.resolve_name(self.reference)
 
     def require_actions(self, env: str, kind: str) -> None:
         """Refuse `env` if this algorithm cannot learn on its `kind` of action space, such as ``Box``.
@@ -107,7 +107,7 @@ def load_trainer(name: str) -> type[Trainer]:
     if name not in TRAINERS:
         raise SettingsError(f"Unknown trainer {name!r}. {did_you_mean(name, TRAINERS)}")
     try:
-        trainer: type[Trainer] = _resolve(TRAINERS[name])
+        trainer: type[Trainer] = pkgutil.resolve_name(TRAINERS[name])
     except ModuleNotFoundError as error:
         raise MissingExtra(str(error.name).partition(".")[0], EXTRAS[name], f"The {name} trainer") from error
     return trainer
@@ -129,8 +129,3 @@ def require_algorithm(trainer: str, algorithm: str) -> None:
         else:
             hint = did_you_mean(algorithm, table)
         raise SettingsError(f"Unknown algorithm {algorithm!r}. {hint}")
-
-
-def _resolve(reference: str) -> Any:
-    module, _, name = reference.partition(":")
-    return getattr(importlib.import_module(module), name)

@@ -101,29 +101,40 @@ def starting_cell_fixture():
     return starting_cell
 
 
+FIELDS = {
+    "env": "test/Env-v0",
+    "env_kwargs": {},
+    "signals": {},
+    "period": None,
+    "algorithm": "ppo",
+    "trainer": "sb3",
+    "settings": {},
+    "steps": 2048,
+    "seed": 0,
+    "scores": {},
+    "versions": {},
+    "git_commit": None,
+    "created": "2026-01-01T00:00:00Z",
+}
+
+
 @pytest.fixture
-def corridor_checkpoint(corridor, tmp_path):
+def manifest_fields():
+    """Makes a manifest's fields of the spaces, and any others."""
+
+    def fields(observation_space, action_space, **others):
+        spaces = {"observation_space": space_to_json(observation_space), "action_space": space_to_json(action_space)}
+        return {**FIELDS, **spaces, **others}
+
+    return fields
+
+
+@pytest.fixture
+def corridor_checkpoint(corridor, tmp_path, manifest_fields):
     """Makes a checkpoint.zip whose frozen policy always goes right; fields of its manifest may be given."""
 
     def make(name="right.zip", **fields):
-        manifest = {
-            "env": corridor,
-            "env_kwargs": {},
-            "observation_space": space_to_json(Corridor.observation_space),
-            "action_space": space_to_json(Corridor.action_space),
-            "signals": {},
-            "period": None,
-            "algorithm": "ppo",
-            "trainer": "sb3",
-            "settings": {},
-            "steps": 2048,
-            "seed": 0,
-            "scores": {},
-            "versions": {},
-            "git_commit": None,
-            "created": "2026-01-01T00:00:00Z",
-            **fields,
-        }
+        manifest = manifest_fields(Corridor.observation_space, Corridor.action_space, **{"env": corridor, **fields})
         numbers = manifest["observation_space"]["shape"][0]
         golden = {"observation": np.ones((2, numbers), np.float32), "action": np.array([1, 1])}
         members = {POLICY: always_right(numbers), GOLDEN: safetensors_file.dump(golden)}

@@ -34,7 +34,6 @@ from bam_train.trainers.resolve_settings import own_settings
 from bam_train.trainers.sb3 import sb3_hyperparameters as hyperparameters
 from bam_train.trainers.sb3 import sb3_resume as resume
 from bam_train.trainers.sb3.sb3_freezing import freeze, golden
-from bam_train.trainers.sb3.sb3_model import make_model
 from bam_train.trainers.sb3.sb3_resume import all_finite, refused_distribution, undisturbed
 from bam_train.trainers.sb3.sb3_vec_env import BatchVecEnv, make_training_env, one_env
 
@@ -87,7 +86,7 @@ class SB3Trainer:
         """Set up a new run of complete settings."""
         torch.set_num_threads(settings.threads)
         venv = make_training_env(settings.env, settings.env_kwargs, settings.num_envs, settings.place)
-        model, notices = make_model(settings, venv)
+        model, notices = hyperparameters.make_model(settings, venv)
         model.set_logger(Logger(None, []))
         trainer = cls(settings, model, venv)
         trainer.notices += notices

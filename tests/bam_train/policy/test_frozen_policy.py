@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.spaces import Discrete
 from onnx import TensorProto, helper, numpy_helper
 
 from bam_train.checkpoint import safetensors_file, write_checkpoint
@@ -21,6 +22,7 @@ BOX3 = {"type": "Box", "shape": [3], "dtype": "float32", "low": "-inf", "high": 
 BOX2 = {"type": "Box", "shape": [2], "dtype": "float32", "low": -1.0, "high": 1.0}
 DISCRETE = {"type": "Discrete", "n": 4, "start": 1, "dtype": "int64"}
 WEIGHT = np.array([[1, 0], [0, 1], [0.5, 0.5]], np.float32)
+SEEN = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
 TYPES = {"float32": TensorProto.FLOAT, "int64": TensorProto.INT64, "uint8": TensorProto.UINT8}
 node = helper.make_node
 
@@ -255,39 +257,36 @@ def test_what_is_not_a_graph_is_refused():
 # From a checkpoint
 
 
-def save(path: Path, actions: np.ndarray | None = None, **members: bytes) -> Path:
-    observations = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
-    actions = np.clip(observations @ WEIGHT, -1, 1) if actions is None else actions
-    fields: dict[str, Any] = {
-        **{name: {} for name in ("env_kwargs", "signals", "settings", "scores", "versions")},
-        **dict.fromkeys(["env", "algorithm", "trainer", "created"], "x"),
-        **dict.fromkeys(["steps", "seed"], 0),
-        **dict.fromkeys(["period", "git_commit"]),
-    }
-    golden = safetensors_file.dump({"observation": observations, "action": actions})
-    spaces = {"observation_space": BOX3, "action_space": BOX2}
-    frozen = {"bam/policy.onnx": clipped(), "bam/golden.safetensors": golden}
-    return write_checkpoint(path, {**fields, **spaces}, {**frozen, **members}).path
+@pytest.fixture
+def save(tmp_path: Path, manifest_fields: Any) -> Any:
+    """Makes a checkpoint, whose golden actions and members may be given; its path."""
+
+    def save(actions: np.ndarray | None = None, **members: bytes) -> Path:
+        actions = np.clip(SEEN @ WEIGHT, -1, 1) if actions is None else actions
+        golden = safetensors_file.dump({"observation": SEEN, "action": actions})
+        fields = {**manifest_fields(Discrete(2), Discrete(2)), "observation_space": BOX3, "action_space": BOX2}
+        frozen = {"bam/policy.onnx": clipped(), "bam/golden.safetensors": golden}
+        return write_checkpoint(tmp_path / "a.zip", fields, {**frozen, **members}).path
+
+    return save
 
 
-def test_a_checkpoint_is_loaded_and_its_golden_actions_checked(tmp_path: Path):
-    policy = FrozenPolicy.load(str(save(tmp_path / "a.zip")))
+def test_a_checkpoint_is_loaded_and_its_golden_actions_checked(save: Any):
+    policy = FrozenPolicy.load(str(save()))
     np.testing.assert_array_equal(policy.act(np.zeros(3, np.float32)), [0, 0])
     assert (policy.observation_space, policy.action_space) == (BOX3, BOX2)
 
 
-def test_a_policy_that_does_not_act_as_the_trainer_did_is_refused(tmp_path: Path):
-    observations = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
+def test_a_policy_that_does_not_act_as_the_trainer_did_is_refused(save: Any):
     for row, change in ((3, 2e-5), (15, 0.5), (15, np.nan)):
-        actions = np.clip(observations @ WEIGHT, -1, 1)
+        actions = np.clip(SEEN @ WEIGHT, -1, 1)
         actions[row, 1] += change
-        path = save(tmp_path / "a.zip", actions)
         text = (
             rf"the frozen policy differs from the trainer's by {change:.2g}.* in row {row} of bam/golden\.safetensors"
         )
-        with pytest.raises(PolicyError, match=rf"a\.zip: {text}, expected at most 1e-05\. Save it again"):
-            FrozenPolicy.load(path)
-    FrozenPolicy.load(save(tmp_path / "a.zip", np.clip(observations @ WEIGHT, -1, 1) + np.float32(5e-6)))
+        with pytest.raises(PolicyError, match=rf"a\.zip: {text}\.safetensors, expected at most 1e-05\. Save it again"):
+            FrozenPolicy.load(save(actions))
+    FrozenPolicy.load(save(np.clip(SEEN @ WEIGHT, -1, 1) + np.float32(5e-6)))
 
 
 @pytest.mark.parametrize(
@@ -301,22 +300,20 @@ def test_a_policy_that_does_not_act_as_the_trainer_did_is_refused(tmp_path: Path
         {"observation": np.zeros((0, 3), np.float32), "action": np.zeros((0, 2))},
     ],
 )
-def test_golden_actions_that_do_not_fit_are_refused(tmp_path: Path, arrays: dict[str, np.ndarray]):
-    path = save(tmp_path / "a.zip", **{"bam/golden.safetensors": safetensors_file.dump(arrays)})
+def test_golden_actions_that_do_not_fit_are_refused(save: Any, arrays: dict[str, np.ndarray]):
+    path = save(**{"bam/golden.safetensors": safetensors_file.dump(arrays)})
     with pytest.raises(PolicyError, match=r"a\.zip: bam/golden\.safetensors does not fit the policy: "):
         FrozenPolicy.load(path)
 
 
-def test_nothing_is_unpickled(tmp_path: Path):
+def test_nothing_is_unpickled(save: Any, tmp_path: Path):
     """SB3's own `data` runs code when SB3 opens it; ours never looks at it."""
     cloudpickle = pytest.importorskip("cloudpickle")
     ppo = pytest.importorskip("stable_baselines3").PPO
     trace = tmp_path / "was-here"
     payload = cloudpickle.dumps(Touch(str(trace)))
     data = {"clip_range": {":type:": "x", ":serialized:": base64.b64encode(payload).decode()}}
-    path = save(
-        tmp_path / "a.zip", data=json.dumps(data).encode(), **{"policy.pth": payload, "vecnormalize.pkl": payload}
-    )
+    path = save(data=json.dumps(data).encode(), **{"policy.pth": payload, "vecnormalize.pkl": payload})
     FrozenPolicy.load(path).act(np.zeros(3, np.float32))
     assert not trace.exists()
     with pytest.raises(Exception, match=r".*"):
@@ -334,8 +331,8 @@ class Touch:
         return os.mkdir, (self.path,)
 
 
-def test_many_policies_may_run_in_many_threads(tmp_path: Path):
-    path = save(tmp_path / "a.zip")
+def test_many_policies_may_run_in_many_threads(save: Any):
+    path = save()
     worst: list[float] = []
 
     def work(seed: int) -> None:

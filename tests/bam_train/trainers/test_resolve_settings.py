@@ -102,30 +102,20 @@ def test_every_preset_is_complete_and_of_an_environment_of_ours(name):
     assert read_preset("CartPole-v1", "ppo") == {}
 
 
-def fields(settings, steps, **extra):
-    space = {"type": "Discrete", "n": 2, "start": 0, "dtype": "int64"}
-    base = {
-        "env": settings.env,
-        "env_kwargs": {},
-        "observation_space": space,
-        "action_space": space,
-        "signals": {},
-        "period": None,
-        "algorithm": settings.algo,
-        "trainer": "sb3",
-        "settings": settings.to_mapping(),
-        "steps": steps,
-        "seed": settings.seed,
-        "scores": {},
-        "versions": {},
-        "git_commit": None,
-        "created": "2025-01-01T00:00:00+00:00",
-    }
-    return {**base, **extra}
+@pytest.fixture
+def fields(manifest_fields):
+    """Makes a manifest's fields of settings."""
+
+    def fields(settings, steps, **extra):
+        what = {"env": settings.env, "algorithm": settings.algo, "settings": settings.to_mapping()}
+        two = gym.spaces.Discrete(2)
+        return manifest_fields(two, two, **what, steps=steps, seed=settings.seed, **extra)
+
+    return fields
 
 
 @pytest.fixture
-def saved(tmp_path):
+def saved(tmp_path, fields):
     """A checkpoint that trained 3000 of 6000 steps, and a function that writes more like it."""
     settings = resolve({"env": "CartPole-v1", "algo": "ppo", "steps": 6000, "normalize": True, "seed": 3})
 
@@ -154,7 +144,7 @@ def test_a_run_that_was_elsewhere_goes_on_here(saved, tmp_path):
     )
 
 
-def test_where_a_run_computes_is_not_read_from_a_file(saved, tmp_path):
+def test_where_a_run_computes_is_not_read_from_a_file(saved, fields, tmp_path):
     elsewhere = {"token_file": "/etc/passwd", "ca_file": "a.pem"}
     manifest = fields(saved.settings, 3000)
     manifest["settings"] |= elsewhere
@@ -183,7 +173,7 @@ def test_where_a_run_computes_is_not_read_from_a_file(saved, tmp_path):
         ("device", 7, "device: expected text, found 7"),
     ],
 )
-def test_settings_that_no_run_has_are_refused(saved, tmp_path, name, value, message):
+def test_settings_that_no_run_has_are_refused(saved, fields, tmp_path, name, value, message):
     manifest = fields(saved.settings, 3000)
     manifest["settings"][name] = value
     with pytest.raises(SettingsError) as caught:
@@ -375,7 +365,7 @@ def test_a_best_checkpoint_goes_on_in_its_own_place(saved, here):
         ),
     ],
 )
-def test_notes_of_another_form_are_refused(saved, here, notes, message):
+def test_notes_of_another_form_are_refused(saved, fields, here, notes, message):
     members = {"bam/resume/notes.json": json.dumps(notes).encode()}
     resumed = write_checkpoint(here / "odd.zip", fields(saved.settings, 3000), members)
     with pytest.raises(AlteredCheckpoint) as caught:

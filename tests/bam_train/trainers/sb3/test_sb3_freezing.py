@@ -351,7 +351,7 @@ def test_unknown_policies_and_lstms_are_refused():
     ],
 )
 def test_golden_actions_are_the_trainers(
-    algorithm: type[BaseAlgorithm], observation_space: Any, action_space: Any, rows: int, tmp_path: Path
+    algorithm: type[BaseAlgorithm], observation_space: Any, action_space: Any, rows: int, save: Any
 ):
     model, normaliser = make(algorithm, observation_space, action_space)
     arrays = safetensors_file.parse(golden(model, normaliser, observation_space, action_space))
@@ -359,8 +359,7 @@ def test_golden_actions_are_the_trainers(
     assert action.shape == (rows, *action_space.shape)
     drawn = {name.removeprefix("observation").removeprefix("."): array for name, array in arrays.items()}
     np.testing.assert_array_equal(trainer_actions(model, None, observation_space, action_space, drawn), action)
-    path = save(tmp_path / "a.zip", model, normaliser, observation_space, action_space)
-    FrozenPolicy.load(path)
+    FrozenPolicy.load(save(model, normaliser, observation_space, action_space))
 
 
 def test_golden_choices_are_clear_ones():
@@ -373,35 +372,24 @@ def test_golden_choices_are_clear_ones():
     assert (best[:, 0] - best[:, 1]).min() > 0.01
 
 
-def save(path: Path, model: Any, normaliser: Any, observation_space: Any, action_space: Any, **members: bytes) -> Path:
-    fields = {
-        "env": "Blank-v0",
-        "env_kwargs": {},
-        "observation_space": space_to_json(observation_space),
-        "action_space": space_to_json(action_space),
-        "signals": {},
-        "period": None,
-        "algorithm": "ppo",
-        "trainer": "sb3",
-        "settings": {},
-        "steps": 0,
-        "seed": 0,
-        "scores": {},
-        "versions": {},
-        "git_commit": None,
-        "created": "",
-    }
-    frozen = {
-        "bam/policy.onnx": freeze(model, normaliser, observation_space, action_space),
-        "bam/golden.safetensors": golden(model, normaliser, observation_space, action_space),
-    }
-    return write_checkpoint(path, fields, {**frozen, **members}).path
+@pytest.fixture
+def save(tmp_path: Path, manifest_fields: Any) -> Any:
+    """Makes a checkpoint of a model; its path."""
+
+    def save(model: Any, normaliser: Any, *own_spaces: Any) -> Path:
+        frozen = {
+            "bam/policy.onnx": freeze(model, normaliser, *own_spaces),
+            "bam/golden.safetensors": golden(model, normaliser, *own_spaces),
+        }
+        return write_checkpoint(tmp_path / "a.zip", manifest_fields(*own_spaces), frozen).path
+
+    return save
 
 
-def test_weights_that_are_not_numbers_are_refused(tmp_path: Path):
+def test_weights_that_are_not_numbers_are_refused(save: Any):
     model, _ = make(TD3, VECTOR, ARM)
     next(model.policy.actor.parameters()).data[:] = float("nan")
-    path = save(tmp_path / "a.zip", model, None, VECTOR, model.action_space)
+    path = save(model, None, VECTOR, model.action_space)
     with pytest.raises(PolicyError, match="the frozen policy differs from the trainer's by nan in row 0"):
         FrozenPolicy.load(path)
 
@@ -421,9 +409,9 @@ print(policy.act(np.zeros({shape!r}, {dtype!r})).tolist())
 """
 
 
-def test_a_process_without_torch_runs_a_policy(tmp_path: Path):
+def test_a_process_without_torch_runs_a_policy(save: Any):
     model, _ = make(PPO, IMAGE, ARM, **copy.deepcopy(SMALL_CNN))
-    path = save(tmp_path / "a.zip", model, None, IMAGE, ARM)
+    path = save(model, None, IMAGE, ARM)
     blocked = ["torch", "gymnasium", "bam_envs", "onnx", "stable_baselines3", "cloudpickle", "tyro", "rich"]
     script = BLOCK.format(blocked=blocked, path=str(path), shape=IMAGE.shape, dtype=str(IMAGE.dtype))
     done = subprocess.run(
