@@ -134,7 +134,7 @@ def corridor_checkpoint(corridor, tmp_path, manifest_fields):
     """Makes a checkpoint.zip whose frozen policy always goes right; fields of its manifest may be given."""
 
     def make(name="right.zip", **fields):
-        manifest = manifest_fields(Corridor.observation_space, Corridor.action_space, **{"env": corridor, **fields})
+        manifest = manifest_fields(Corridor.observation_space, Corridor.action_space, env=corridor) | fields
         numbers = manifest["observation_space"]["shape"][0]
         golden = {"observation": np.ones((2, numbers), np.float32), "action": np.array([1, 1])}
         members = {POLICY: always_right(numbers), GOLDEN: safetensors_file.dump(golden)}
