@@ -28,7 +28,7 @@ class Always:
 
     def act_batch(self, observations):
         self.batches.append(len(observations))
-        return np.full(len(observations), self.action)
+        return np.stack([self.action] * len(observations))
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_episode_k_has_seed_plus_k_and_exact_figures(corridor, starting_cell):
 
 
 @pytest.mark.parametrize("num_envs", [1, 3, 10, 16, None])
-def test_numbers_do_not_depend_on_the_rows(corridor, num_envs):
+def test_numbers_do_not_depend_on_how_many_run_side_by_side(corridor, num_envs):
     assert evaluate(Always(0), corridor, episodes=10, seed=3, num_envs=num_envs) == evaluate(
         Always(0), corridor, episodes=10, seed=3, num_envs=2
     )
@@ -76,13 +76,6 @@ def test_no_success_where_the_environment_has_none(corridor):
     report = evaluate(Always(), corridor, {"says_success": False}, episodes=3, seed=0)
     assert (report.success_rate, report.success_interval, report.successes) == (None, None, None)
     assert json.loads(json.dumps(report.to_json(), allow_nan=False))["success_rate"] is None
-
-
-def test_json_is_plain(corridor):
-    values = evaluate(Always(), corridor, episodes=2, seed=5).to_json()
-    assert json.loads(json.dumps(values)) == values
-    assert values["env"] == corridor
-    assert values["episodes"] == 2
 
 
 def test_recurrent_state_is_forgotten_at_the_start_of_every_wave(corridor, starting_cell):
@@ -124,7 +117,6 @@ def test_progress_after_every_wave(corridor):
     ("arguments", "message"),
     [
         ({"episodes": 0}, "episodes: expected a whole number of at least 1, found 0"),
-        ({"episodes": -3}, "episodes: expected a whole number of at least 1, found -3"),
         ({"seed": -1}, "seed: expected a whole number of at least 0, found -1"),
         ({"num_envs": 0}, "num_envs: expected a whole number of at least 1, found 0"),
     ],
@@ -135,16 +127,15 @@ def test_out_of_range(corridor, arguments, message):
     assert str(caught.value) == message
 
 
-def test_an_action_that_is_not_finite_is_refused():
-    class Broken(Always):
-        def act_batch(self, observations):
-            return np.full((len(observations), 1), np.nan, np.float32)
-
+def test_an_action_that_is_not_finite_is_refused_and_a_given_environment_left_open():
+    envs = make_vector_env("Pendulum-v1", None, 2)
     with pytest.raises(PolicyError) as caught:
-        evaluate(Broken(), "Pendulum-v1", episodes=2, seed=4)
+        evaluate(Always(np.full(1, np.nan, np.float32)), "Pendulum-v1", episodes=2, seed=4, env=envs)
     assert str(caught.value) == (
         "action[0, 0] is nan at step 0 of the episodes from seed 4 on; expected finite numbers: the policy is broken"
     )
+    assert not envs.closed
+    envs.close()
 
 
 def test_returns_that_are_not_finite_are_none():
@@ -160,14 +151,6 @@ def test_returns_that_are_not_finite_are_none():
 )
 def test_rows_share_the_episodes_evenly(env_id, episodes, rows):
     assert default_num_envs(env_id, episodes) == rows
-
-
-def test_same_seeds_same_numbers_on_gymnasium():
-    one, two = (evaluate(Always(1), "CartPole-v1", episodes=20, seed=11) for _ in range(2))
-    assert one == two
-    assert one.success_rate is None
-    assert 8 <= one.length_mean <= 11
-    assert one.return_mean == one.length_mean
 
 
 class Steady:
@@ -193,15 +176,3 @@ def test_an_episode_depends_on_its_seed_and_on_no_other_episode(env_id):
     assert together.length_mean > 1
     assert together == evaluate(policy, env_id, options, episodes=4, seed=3, num_envs=1)
     assert together == evaluate(policy, env_id, options, episodes=4, seed=3, num_envs=3)
-
-
-def test_given_rows_are_left_open_after_an_exception():
-    class Broken(Always):
-        def act_batch(self, observations):
-            return np.full((len(observations), 1), np.nan, np.float32)
-
-    rows = make_vector_env("Pendulum-v1", None, 2)
-    with pytest.raises(PolicyError):
-        evaluate(Broken(), "Pendulum-v1", episodes=2, env=rows)
-    assert not rows.closed
-    rows.close()

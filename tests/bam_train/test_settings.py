@@ -12,17 +12,11 @@ from bam_train.settings import TrainSettings, differences, file_stem, merge, rea
 BASE = {"env": "bam/pick-v0", "algo": "ppo"}
 
 
-def test_round_trip_through_json():
-    settings = TrainSettings.from_mapping(
-        {**BASE, "steps": 1e6, "hyperparameters": {"policy_kwargs": {"net_arch": [64]}}}
-    )
+def test_settings_survive_json_and_share_nothing_with_what_they_are_made_from():
+    given = {**BASE, "steps": 1e6, "hyperparameters": {"policy_kwargs": {"net_arch": [64]}}}
+    settings = TrainSettings.from_mapping(given)
     assert settings.steps == 1_000_000
     assert TrainSettings.from_mapping(json.loads(json.dumps(settings.to_mapping()))) == settings
-
-
-def test_settings_share_nothing_with_what_they_are_made_from():
-    given = {**BASE, "hyperparameters": {"policy_kwargs": {"net_arch": [64]}}}
-    settings = TrainSettings.from_mapping(given)
     settings.hyperparameters["policy_kwargs"]["net_arch"].append(1)
     assert given["hyperparameters"]["policy_kwargs"]["net_arch"] == [64]
 
@@ -33,8 +27,6 @@ def test_settings_share_nothing_with_what_they_are_made_from():
         ({"stps": 3}, "settings: unknown setting 'stps'. Did you mean 'steps'?"),
         ({"steps": "many"}, "steps: expected a whole number from 1 to 1000000000000000, found 'many'"),
         ({"steps": 0}, "steps: expected a whole number from 1 to 1000000000000000, found 0"),
-        ({"num_envs": 0}, "num_envs: expected a whole number from 1 to 100000, found 0"),
-        ({"seed": -1}, "seed: expected a whole number from 0 to 1000000000000000, found -1"),
         ({"until_success": 1.5}, "until_success: expected a share above 0 and at most 1, such as 0.99, found 1.5"),
         ({"normalize": 3}, "normalize: expected true or false or a table of named values, found 3"),
         ({"env_kwargs": {"value": float("nan")}}, "env_kwargs.value: expected a finite number, found nan"),
@@ -57,12 +49,20 @@ def test_typed_values(text, value):
     assert read_assignments([f"policy_kwargs.x={text}"]) == {"hyperparameters": {"policy_kwargs": {"x": value}}}
 
 
-@pytest.mark.parametrize("text", ["gamma", "=3", "a..b=3", "gamma 0.9"])
-def test_what_is_no_assignment_is_refused(text):
-    message = f"--set {text}: expected name=value, such as --set learning_rate=3e-4, found {text!r}"
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        *(
+            (text, f"expected name=value, such as --set learning_rate=3e-4, found {text!r}")
+            for text in ("=3", "a..b=3")
+        ),
+        ("steps.x=3", "steps is not a table; expected steps=value"),
+    ],
+)
+def test_what_is_no_assignment_is_refused(text, message):
     with pytest.raises(SettingsError) as caught:
         read_assignments([text])
-    assert str(caught.value) == message
+    assert str(caught.value) == f"--set {text}: {message}"
 
 
 def test_merge_merges_tables_and_changes_no_layer():
@@ -81,11 +81,6 @@ def test_assignments_go_to_settings_or_to_the_algorithm():
     }
 
 
-def test_an_assignment_into_something_that_is_no_table():
-    with pytest.raises(SettingsError, match=r"^--set steps\.x=3: steps is not a table; expected steps=value$"):
-        read_assignments(["steps.x=3"])
-
-
 def test_config_files_in_both_formats(tmp_path):
     (tmp_path / "a.toml").write_text('env = "bam/pick-v0"\n[hyperparameters]\ngamma = 0.9\n')
     (tmp_path / "a.json").write_text('{"env": "bam/pick-v0", "hyperparameters": {"gamma": 0.9}}')
@@ -102,22 +97,17 @@ def test_config_files_in_both_formats(tmp_path):
         ("a.json", "[1]", "a.json: expected a table of settings, found a list"),
         ("a.toml", "stps = 3", "a.toml: unknown setting 'stps'. Did you mean 'steps'?"),
         ("a.yaml", "", "a.yaml: expected a .toml or .json file, found .yaml"),
+        ("a.json", b"\xff\xfe", "a.json: is not text (invalid start byte at byte 0)"),
+        ("a.json", None, "a.json: no such file. Check the name after --config, or make one with --print-config"),
     ],
 )
 def test_bad_config_files(tmp_path, name, text, message):
-    (tmp_path / name).write_text(text)
+    if text is not None:
+        (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(SettingsError) as caught:
         read_config(tmp_path / name)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_a_config_file_that_is_not_there_or_not_text(tmp_path):
-    with pytest.raises(SettingsError, match=r"a\.json: no such file\. Check the name after --config, or make one"):
-        read_config(tmp_path / "a.json")
-    (tmp_path / "b.json").write_bytes(b"\xff\xfe")
-    with pytest.raises(SettingsError, match=r"b\.json: is not text"):
-        read_config(tmp_path / "b.json")
 
 
 def test_differences_look_into_tables_and_tell_true_from_one():

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from bam_train.signals import SignalMemory, Terminated, handled, interrupt, waiting
+from bam_train.signals import SignalMemory, Terminated, at_quit, before_quitting, handled, interrupt, waiting
 
 
 def test_each_signal_reaches_the_handler_and_afterwards_the_one_before():
@@ -57,14 +57,9 @@ def test_another_thread_handles_nothing():
 
 def test_signals_can_wait():
     done = []
-
-    def run():
-        with waiting():
-            signal.raise_signal(signal.SIGINT)
-            done.append(True)
-
-    with pytest.raises(KeyboardInterrupt):
-        run()
+    with pytest.raises(KeyboardInterrupt), waiting():
+        signal.raise_signal(signal.SIGINT)
+        done.append(True)
     assert done == [True]
 
 
@@ -86,3 +81,19 @@ def test_an_interruption_can_travel():
     with pytest.raises(Terminated) as caught:
         interrupt(signal.SIGTERM)
     assert copy.copy(caught.value).signal == signal.SIGTERM
+
+
+def test_before_a_program_quits_at_once_the_latest_call_comes_first():
+    """One that fails holds up no other, and all are gone after their block, also after an error."""
+    called = []
+
+    def fail():
+        raise OSError("the disk is gone")
+
+    with at_quit(lambda: called.append("outer")), at_quit(fail), at_quit(lambda: called.append("inner")):
+        before_quitting()
+    assert called == ["inner", "outer"]
+    with pytest.raises(KeyboardInterrupt), at_quit(lambda: called.append("never")):
+        raise KeyboardInterrupt
+    before_quitting()
+    assert len(called) == 2

@@ -20,30 +20,20 @@ class Right:
         return 1
 
 
-def test_every_picture_of_every_episode(corridor, starting_cell):
-    env = gym.make(corridor, render_mode="rgb_array")
-    pictures = []
-    count = record_video(env, Right(), pictures.append, episodes=2, seed=7)
-    env.close()
-    assert count == len(pictures)
-    cells = [cell for seed in (7, 8) for cell in range(starting_cell(seed), 5)]
-    assert [int(picture[0, :, 0].argmax()) // 8 for picture in pictures] == cells
-
-
-def test_gif(corridor, tmp_path):
+def test_gif(corridor, tmp_path, starting_cell):
+    """Every picture of every episode."""
     env = gym.make(corridor, render_mode="rgb_array")
     path = tmp_path / "film.gif"
     with open_video(path, rate=20) as add:
         count = record_video(env, Right(), add, episodes=2, seed=7)
     env.close()
+    cells = [cell for seed in (7, 8) for cell in range(starting_cell(seed), 5)]
     with Image.open(path) as film:
-        assert film.n_frames == count
-        assert film.info["duration"] == 50
-        assert film.info["loop"] == 0
-        assert film.size == (40, 8)
-        assert film.convert("RGB").getpixel((39, 0)) == (0, 0, 0)
-        film.seek(count - 1)
-        assert film.convert("RGB").getpixel((39, 0)) == (255, 200, 0)
+        assert film.n_frames == count == len(cells)
+        assert (film.info["duration"], film.info["loop"], film.size) == (50, 0, (40, 8))
+        for k, cell in enumerate(cells):
+            film.seek(k)
+            assert film.convert("RGB").getpixel((8 * cell, 0)) == (255, 200, 0)
     assert [one.name for one in tmp_path.iterdir()] == ["film.gif"]
 
 
@@ -61,41 +51,34 @@ def test_mp4(tmp_path):
 
 
 def test_nothing_is_left_of_a_film_that_failed(tmp_path):
-    def broken():
-        with open_video(tmp_path / "film.gif", rate=20) as add:
-            add(np.zeros((8, 8, 3), np.uint8))
-            raise ValueError("no more")
-
-    with pytest.raises(ValueError, match="no more"):
-        broken()
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_film_needs_a_picture(tmp_path):
     path = tmp_path / "film.gif"
+    with pytest.raises(ValueError, match="no more"), open_video(path, rate=20) as add:
+        add(np.zeros((8, 8, 3), np.uint8))
+        raise ValueError("no more")
     with pytest.raises(SettingsError) as caught, open_video(path, rate=20):
         pass
     assert str(caught.value) == f"{path}: a video needs at least one frame"
     assert list(tmp_path.iterdir()) == []
 
 
-def test_paths_are_refused_before_the_work(tmp_path):
-    with pytest.raises(SettingsError) as suffix:
-        require_video_path(tmp_path / "film.avi")
-    assert str(suffix.value) == f"{tmp_path}/film.avi: expected a video that ends in .gif or .mp4, found '.avi'"
-    with pytest.raises(OutputError) as folder:
-        require_video_path(tmp_path / "films" / "film.gif")
-    assert str(folder.value) == f"{tmp_path}/films/film.gif: there is no folder {tmp_path}/films; make it first"
+@pytest.mark.parametrize(
+    ("name", "error", "text"),
+    [
+        ("film.avi", SettingsError, "{}/film.avi: expected a video that ends in .gif or .mp4, found '.avi'"),
+        ("films/film.gif", OutputError, "{0}/films/film.gif: there is no folder {0}/films; make it first"),
+        ("folder.gif", OutputError, "{}/folder.gif: cannot be written: it is a folder; choose another file"),
+    ],
+)
+def test_paths_are_refused_before_the_work(tmp_path, name, error, text):
     (tmp_path / "folder.gif").mkdir()
-    with pytest.raises(OutputError) as taken:
-        require_video_path(tmp_path / "folder.gif")
-    assert str(taken.value) == f"{tmp_path}/folder.gif: cannot be written: it is a folder; choose another file"
-    assert require_video_path(tmp_path / "ok.GIF") == tmp_path / "ok.GIF"
+    with pytest.raises(error) as caught:
+        require_video_path(tmp_path / name)
+    assert str(caught.value) == text.format(tmp_path)
 
 
 def test_home_is_expanded(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert require_video_path(Path("~/film.gif")) == tmp_path / "film.gif"
+    assert require_video_path(Path("~/film.GIF")) == tmp_path / "film.GIF"
 
 
 def test_a_missing_writer_is_named(tmp_path, monkeypatch):

@@ -203,17 +203,20 @@ def test_a_closed_pipe_is_quiet(cartpole_checkpoint):
     assert err.startswith("episode 1/1 (seed 1000000): terminated after ")
 
 
-def test_no_torch_and_no_simulator_of_ours(cartpole_checkpoint):
-    code = """
+@pytest.mark.parametrize(
+    ("program", "flags"), [("deploy", ["--fast", "--episodes", "1"]), ("eval", ["--episodes", "2"])]
+)
+def test_no_torch_and_no_simulator_of_ours(cartpole_checkpoint, program, flags):
+    code = f"""
 import sys
-from bam_train.cli.deploy import main
+from bam_train.cli.{program} import main
 try:
     main()
 except SystemExit as done:
-    heavy = {"torch", "stable_baselines3", "mujoco", "rich", "roslibpy", "onnx", "PIL"}
+    heavy = {{"torch", "stable_baselines3", "mujoco", "rich", "roslibpy", "onnx", "PIL"}}
     print(done.code, sorted(heavy & set(sys.modules)))
 """
-    command = [sys.executable, "-c", code, str(cartpole_checkpoint), "--fast", "--episodes", "1"]
+    command = [sys.executable, "-c", code, str(cartpole_checkpoint), *flags]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "0 []"
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bam_envs.core.errors import LinkLost
+from bam_envs.core.errors import InvalidValue, LinkLost
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.experiment import ScriptParser, environment_of, open_env, require_place, signals_ask, whole
 from bam_train.errors import SettingsError
@@ -27,11 +27,6 @@ def parser():
     return made
 
 
-def test_what_is_given_is_read(parser):
-    assert vars(parser.parse_args(["--steps", "1_000"])) == {"steps": 1000, "stop_reward": None}
-    assert parser.parse_args([]).steps == 7
-
-
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
@@ -44,6 +39,7 @@ def test_what_is_given_is_read(parser):
     ],
 )
 def test_what_cannot_be_is_one_line(parser, capsys, arguments, text):
+    assert vars(parser.parse_args(["--steps", "1_000"])) == {"steps": 1000, "stop_reward": None}
     with pytest.raises(SystemExit) as caught:
         parser.parse_args(arguments)
     assert caught.value.code == 2
@@ -133,13 +129,10 @@ def test_the_environment_of_a_checkpoint_is_closed_at_the_end():
         robot.step(robot.setpoint)
 
 
-def test_an_address_that_does_not_answer():
-    with pytest.raises(LinkLost), open_env(Checkpoint.open(PICK), "ws://127.0.0.1:1", who="try", episodes=1):
-        pass
-
-
-def test_an_address_that_is_none():
-    with pytest.raises(Exception, match="nonsense"), open_env(Checkpoint.open(PICK), "nonsense", who="try", episodes=1):
+@pytest.mark.parametrize("address", ["ws://127.0.0.1:1", "nonsense"])
+def test_an_address_that_does_not_answer_or_is_none(address):
+    opening = open_env(Checkpoint.open(PICK), address, who="try", episodes=1)
+    with pytest.raises((LinkLost, InvalidValue), match=address), opening:
         pass
 
 
