@@ -67,12 +67,6 @@ def test_ctrl_c_is_one_line():
     assert process.returncode in (130, -signal.SIGINT)
 
 
-def test_help():
-    done = run(SCRIPT, "--help")
-    assert done.returncode == 0
-    assert "python scripts/interaction_loop.py" in done.stdout
-
-
 def test_the_notebook_is_the_script_executed(make_notebook):
     pytest.importorskip("nbformat")
     assert make_notebook.is_current(SCRIPT, SCRIPT.with_suffix(".ipynb")), "run: python scripts/make_notebook.py"
@@ -97,13 +91,9 @@ def test_a_changed_script_is_found(make_notebook, tmp_path):
     notebook = script.with_suffix(".ipynb")
     assert not make_notebook.is_current(script, notebook)
     notebook.write_text(SCRIPT.with_suffix(".ipynb").read_text())
-    assert not make_notebook.is_current(script, notebook)
-    done = run(SCRIPTS / "make_notebook.py", script, "--check")
-    assert done.returncode == 1
-    assert done.stdout == f"{notebook}: not current; run python scripts/make_notebook.py\n"
-
-
-def test_no_such_script(tmp_path):
-    done = run(SCRIPTS / "make_notebook.py", tmp_path / "none.py")
-    assert done.returncode == 1
-    assert done.stderr == f"make_notebook: there is no file {tmp_path}/none.py\n"
+    for path, text in (
+        (script, f"{notebook}: not current; run python scripts/make_notebook.py\n"),
+        (tmp_path / "none.py", f"make_notebook: there is no file {tmp_path}/none.py\n"),
+    ):
+        done = run(SCRIPTS / "make_notebook.py", path, "--check")
+        assert (done.returncode, done.stdout + done.stderr) == (1, text)

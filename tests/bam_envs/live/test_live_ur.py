@@ -1,6 +1,5 @@
 """UR arms behind the embedded rosbridge server: the same environments, with the shipped profile."""
 
-
 import gymnasium as gym
 import numpy as np
 import pytest
