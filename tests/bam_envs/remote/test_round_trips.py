@@ -7,15 +7,18 @@ from typing import Any
 import numpy as np
 from gymnasium import Space, spaces
 from gymnasium.vector.utils import concatenate, create_empty_array
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
+from bam_envs.remote.gymapi.gymapi_codec import EnvCodec
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.remote.tcp_transport import TcpTransport
+from bam_envs.remote.transport import EnvSpecMessage
 from bam_envs.remote.values import exact, pack, tree_from_json, tree_to_json
 from bam_envs.testing.transports import MirrorEnv, assert_same_value
+from tests.bam_envs.remote.gymapi.test_codec import action_there, result_back
 
 DTYPES = ("float16", "float32", "float64", "uint8", "int8", "int32", "int64", "uint64")
 
@@ -44,8 +47,14 @@ def texts(draw: st.DrawFn) -> spaces.Text:
     return spaces.Text(draw(st.integers(1, 9)), min_length=0, charset=charset)
 
 
+IMAGES = st.sampled_from([(8, 9), (9, 8, 1), (8, 8, 3), (8, 10, 4)]).map(lambda s: spaces.Box(0, 255, s, np.uint8))
+POSES = st.sampled_from([("position", "orientation"), ("position", "orientation", "gripper_width")]).map(
+    lambda keys: spaces.Dict({k: spaces.Box(-9, 9, {"position": (3,), "orientation": (4,)}.get(k, ())) for k in keys})
+)
 LEAVES = st.one_of(
     boxes(),
+    IMAGES,
+    POSES,
     st.builds(lambda n, start: spaces.Discrete(n, start=start), st.integers(1, 99), st.integers(-9, 9)),
     multi_discretes(),
     st.builds(spaces.MultiBinary, st.one_of(st.integers(1, 9), st.lists(st.integers(1, 4), min_size=2, max_size=3))),
@@ -77,6 +86,8 @@ def values(space: Space[Any]) -> st.SearchStrategy[Any]:
 
 def _box_values(space: spaces.Box) -> st.SearchStrategy[Any]:
     dtype = space.dtype
+    if np.prod(space.shape) > 64:
+        return st.integers(0, 2**32).map(lambda seed: _sample(space, seed))
     if dtype.kind != "f":
         return arrays(dtype, space.shape, elements=st.integers(int(np.iinfo(dtype).min), int(np.iinfo(dtype).max)))
     low, high = (float(bound.flat[0]) for bound in (space.low, space.high))
@@ -134,6 +145,16 @@ def test_tcp(case):
     env = MirrorEnv(space)
     with TcpServer(EnvServer(env)) as server, closing(TcpTransport(server.url)) as transport:
         there_and_back(transport, env, values)
+
+
+@settings(suppress_health_check=[HealthCheck.too_slow])
+@given(cases())
+def test_gymapi(case):
+    space, values = case
+    codec = EnvCodec(EnvSpecMessage("x", space, space))
+    for value in values:
+        assert_same_value(action_there(codec, value), value, "action")
+        assert_same_value(result_back(codec, (value, 0.1, True, False, {}))[0], value, "observation")
 
 
 @given(cases())

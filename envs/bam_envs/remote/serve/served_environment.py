@@ -83,11 +83,7 @@ class ServedEnvironment:
         self._stack.close()
 
     def require_running(self) -> None:
-        """Check that everything that it needs still runs.
-
-        Raises:
-            RemoteError: The robot's clock stands still.
-        """
+        """Check that everything that it needs still runs. Raises RemoteError: the robot's clock stands still."""
         if self._robot_service is not None and not self._robot_service.clock.running:
             raise RemoteError("The clock of the robot stands still.")
 

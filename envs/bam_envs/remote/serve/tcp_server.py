@@ -83,11 +83,7 @@ class TcpServer:
         return f"tcp://{f'[{self.host}]' if ':' in self.host else self.host}:{self.port}"
 
     def start(self) -> None:
-        """Listen.
-
-        Raises:
-            InvalidValue: The port is in use, or the address not of this computer.
-        """
+        """Listen. Raises InvalidValue: the port is in use, or the address not of this computer."""
         family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
         try:
             self._listener = socket.create_server((self.host, self.port), family=family, backlog=128)

@@ -102,11 +102,7 @@ def test_stamps_of_ros_1_and_unknown_fields_are_let_through():
     [
         ([], "expected an object, found []"),
         ({"seed": "1"}, "seed: expected an integer (int64), found '1'"),
-        ({"seed": 1.5}, "seed: expected an integer (int64), found 1.5"),
-        ({"env_name": None}, "env_name: expected a text, found None"),
-        ({"header": {"request_type": "STEP"}}, "header.request_type: expected an integer (uint8), found 'STEP'"),
         ({"header": {"force_priority": 1}}, "header.force_priority: expected true or false, found 1"),
-        ({"header": {"client_id": 3}}, "header.client_id: expected a text, found 3"),
         ({"action": {}}, "action: expected a list, found {"),
         (
             {"action": [{"continuous_action": [0.0, "x"]}]},
@@ -116,8 +112,6 @@ def test_stamps_of_ros_1_and_unknown_fields_are_let_through():
             {"action": [{"continuous_action": [float("nan")]}]},
             "continuous_action[0]: expected a finite number, found nan",
         ),
-        ({"action": [{"continuous_action": [None]}]}, "continuous_action[0]: expected a number, found None"),
-        ({"action": [{"discrete_action": [1.0]}]}, "discrete_action[0]: expected an integer (int64), found 1.0"),
     ],
 )
 def test_a_field_of_the_wrong_kind_is_named(message, text):
