@@ -2,8 +2,8 @@
 
 What the lists of an action cannot hold exactly (Text, Sequence, images, infinities) is JSON in ``prefix``, marked by
 ``bam:``; what the fields of an observation cannot hold is JSON in ``info``, by the name of its leaf. Images go into
-``color_img``, all of them where that is a list and the first one where it is not; a depth image that was asked for goes
-into ``depth_img``.
+``color_img``, all of them where that is a list and the first one where it is not; depth images of other racks are read
+from ``depth_img``.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from bam_envs.remote.gymapi.leaves import (
 from bam_envs.remote.gymapi.versions import JUNE_22, Version
 from bam_envs.remote.transport import EnvSpecMessage, Info
 from bam_envs.remote.values import exact, pack, tree_from_json, tree_to_json
-from bam_envs.ros.images import FORMATS, color_message, depth_message, read_color_message, read_depth_message
+from bam_envs.ros.images import FORMATS, color_message, read_color_message, read_depth_message
 from bam_envs.rosbridge.encoding import dump_json, load_json
 
 Trees = dict[str, Any]
@@ -124,21 +124,14 @@ class ObservationCodec:
     Args:
         space: Of a single environment.
         image_format: ``"png"``, which keeps every bit, or ``"jpeg"``.
-        depth: Names of the leaves that are depth images [m], to be sent in whole millimetres; one at most.
-
-    Raises:
-        InvalidValue: Another format, or a name that is no leaf that may be a depth image.
     """
 
-    def __init__(self, space: Space[Any], image_format: str = "png", depth: Sequence[str] = ()) -> None:
-        self.space, self.image_format, self.depth = space, image_format, tuple(depth)
+    def __init__(self, space: Space[Any], image_format: str = "png") -> None:
+        self.space, self.image_format = space, image_format
         self._leaves = leaves_of(space, "observation")
         self._images = [leaf for leaf in self._leaves if leaf.kind == IMAGE]
         if image_format not in FORMATS:
             raise InvalidValue(f"The image format must be png or jpeg, not {image_format!r}.")
-        fitting = [leaf.name for leaf in self._leaves if is_depth(leaf.space)]
-        if not set(self.depth) <= set(fitting) or len(self.depth) > 1:
-            raise InvalidValue(f"depth must name one of the depth images ({', '.join(fitting)}), not {self.depth}.")
 
     def encode(
         self, observation: Any, stamp: Mapping[str, int] | None = None, version: Version = JUNE_22
@@ -155,10 +148,7 @@ class ObservationCodec:
         images = self._images if version.lists else self._images[:1]
         for leaf in self._leaves:
             part = leaf.of(value)
-            if leaf.name in self.depth:
-                image = depth_message(part, leaf.name, stamp)
-                fields["depth_img"] = [image] if version.lists else image
-            elif leaf in images:
+            if leaf in images:
                 image = color_message(part, self.image_format, leaf.name, stamp)
                 fields["color_img"] = [*fields.get("color_img", []), image] if version.lists else image
             elif not (leaf.kind in (NUMBERS, POSE) and _lists(leaf.kind).write(leaf, part, fields)):
@@ -243,7 +233,6 @@ class EnvCodec:
         foreign: Whether its server is not of bam-train.
         action_type: See `ActionCodec`.
         image_format: See `ObservationCodec`.
-        depth: See there, too.
     """
 
     def __init__(
@@ -253,11 +242,10 @@ class EnvCodec:
         foreign: bool = False,
         action_type: int = DEFAULT,
         image_format: str = "png",
-        depth: Sequence[str] = (),
     ) -> None:
         self.spec, self.foreign = spec, foreign
         self._actions = ActionCodec(spec.action_space, action_type)
-        self._observations = ObservationCodec(spec.observation_space, image_format, depth)
+        self._observations = ObservationCodec(spec.observation_space, image_format)
 
     def write_actions(self, action: Any) -> tuple[dict[str, Any], ...]:
         """The messages of an action. Raises InvalidValue if it does not fit."""

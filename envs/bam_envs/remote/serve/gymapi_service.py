@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NoAnswer  # not the builtin before Python 3.11
 from contextlib import suppress
@@ -61,12 +61,11 @@ class GymApiService:
         bus: Where.
         namespace: Put before every name.
         image_format: ``"png"``, which keeps every bit, or ``"jpeg"``.
-        depth: Name of the part of the observation that is a depth image, to be sent in whole millimetres; or nothing.
         version: Of the messages, such as ``"2025-06-17"``; None to find out.
         clock: Wall clock [s], for stamps.
 
     Raises:
-        InvalidValue: `image_format`, `depth` or `version` is not possible.
+        InvalidValue: `image_format` or `version` is not possible.
     """
 
     def __init__(
@@ -76,12 +75,11 @@ class GymApiService:
         namespace: str = "",
         *,
         image_format: str = "png",
-        depth: Sequence[str] = (),
         version: str | None = None,
         clock: Callable[[], float] = time.time,
     ) -> None:
         self.env, self.bus, self.namespace = env, bus, namespace
-        self._codec = EnvCodec(env.spec(), image_format=image_format, depth=depth)
+        self._codec = EnvCodec(env.spec(), image_format=image_format)
         self._clock = clock
         self._version = None if version is None else version_named(version)
         self._freshness, self._answers = FreshnessCheck(), RecentAnswers[Feedback](_ANSWERS)
