@@ -34,15 +34,18 @@ class FakeRobot:
         """Every command since the robot was made, as it was given. Shape: (n, 7) each."""
         self.halts = 0
         """How often `halt` was called."""
-        self._with_object = with_object
         self._connected = False
         self._low, self._high = np.array(self.spec.command.low), np.array(self.spec.command.high)
         self._reach = np.array(self.spec.command.max_rate) * self.spec.period
-        self._position = np.tile([0.0] * 6 + [GRIPPER_OPEN], (num_robots, 1))
-        self._velocity = np.zeros((num_robots, 6))
-        self._object = np.tile([0.5, 0.0, OBJECT_HEIGHT, 1.0, 0.0, 0.0, 0.0], (num_robots, 1))
-        self._stamp = np.zeros(num_robots)
-        self._command = self._position
+        position = np.tile([0.0] * 6 + [GRIPPER_OPEN], (num_robots, 1))
+        # Every array is replaced, never changed: states that were handed out keep theirs.
+        self._now = {
+            "position": position,
+            "velocity": np.zeros((num_robots, 6)),
+            "object": np.tile([0.5, 0.0, OBJECT_HEIGHT, 1.0, 0.0, 0.0, 0.0], (num_robots, 1)),
+            "stamp": np.zeros(num_robots),
+            "command": position,
+        }
 
     def connect(self) -> None:
         """Take commands from now on."""
@@ -51,20 +54,23 @@ class FakeRobot:
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
         """Set these environments to the initial joint positions and object pose, at rest, the gripper open."""
         self._require_link()
-        self._position, self._object = self._position.copy(), self._object.copy()
-        self._velocity, self._stamp = self._velocity.copy(), self._stamp.copy()
-        self._position[env_ids, :6], self._position[env_ids, 6] = initial.signals["joint_position"], GRIPPER_OPEN
-        self._velocity[env_ids], self._stamp[env_ids] = 0.0, 0.0
-        self._command = self._command.copy()
-        self._command[env_ids] = self._position[env_ids]
-        if "object_pose" in initial.signals:
-            self._place_object(env_ids, initial.signals["object_pose"])
-        return self._measure()
+        self._now = now = self.state_dict()
+        now["position"][env_ids, :6], now["position"][env_ids, 6] = initial.signals["joint_position"], GRIPPER_OPEN
+        now["velocity"][env_ids], now["stamp"][env_ids] = 0.0, 0.0
+        now["command"][env_ids] = now["position"][env_ids]
+        return self._place(env_ids, initial.signals.get("object_pose"))
 
-    def _place_object(self, env_ids: EnvIds, pose: Array) -> None:
-        """Put the object at x, y [m] and yaw [rad] of `pose` (k, 3)."""
-        self._object[env_ids, :2], self._object[env_ids, 2] = pose[:, :2], OBJECT_HEIGHT
-        self._object[env_ids, 3], self._object[env_ids, 6] = np.cos(pose[:, 2] / 2), np.sin(pose[:, 2] / 2)
+    def place_object(self, pose: Array | None, seeds: NDArray[np.int64]) -> RobotState:
+        """Put the object at x, y [m] and yaw [rad] of `pose` (n, 3), or leave it; nothing is drawn from `seeds`."""
+        self._require_link()
+        return self._place(np.arange(self.num_robots), pose)
+
+    def _place(self, env_ids: EnvIds, pose: Array | None) -> RobotState:
+        if pose is not None:
+            self._now["object"] = placed = self._now["object"].copy()
+            placed[env_ids, :2], placed[env_ids, 2] = pose[:, :2], OBJECT_HEIGHT
+            placed[env_ids, 3], placed[env_ids, 6] = np.cos(pose[:, 2] / 2), np.sin(pose[:, 2] / 2)
+        return self.measure()
 
     def step(self, command: Array) -> RobotState:
         """Send `command` (n, 7): six joint positions [rad] and the gripper's width [m]; one period later, measure."""
@@ -73,41 +79,39 @@ class FakeRobot:
     def slices(self, command: Array, parts: int) -> Iterator[RobotState]:
         """Send `command` (n, 7), and give the state after each of `parts` equal parts of the period."""
         self._require_link()
-        self._command = checked_command(command, (self.num_robots, 7))
-        self.sent.append(self._command.copy())
-        return self._slices(np.clip(self._command, self._low, self._high), parts)
+        self._now["command"] = checked_command(command, (self.num_robots, 7))
+        self.sent.append(self._now["command"].copy())
+        return self._slices(np.clip(self._now["command"], self._low, self._high), parts)
 
     def _slices(self, target: Array, parts: int) -> Iterator[RobotState]:
-        start, began, halts = self._position, self._stamp, self.halts
+        start, began, halts = self._now["position"], self._now["stamp"], self.halts
         near = np.abs(target - start) <= self._reach
         travel = np.clip(target - start, -self._reach, self._reach)
         for part in range(1, parts + 1):
             if self.halts == halts:
-                last = part == parts
-                self._position = np.where(near & last, target, start + travel * (part / parts))
-                self._velocity = travel[:, :6] / self.spec.period
+                self._now["position"] = np.where(near & (part == parts), target, start + travel * (part / parts))
+                self._now["velocity"] = travel[:, :6] / self.spec.period
             else:
-                self._velocity = np.zeros_like(self._velocity)
-            self._stamp = began + self.spec.period * part / parts
-            yield self._measure()
+                self._now["velocity"] = np.zeros_like(self._now["velocity"])
+            self._now["stamp"] = began + self.spec.period * part / parts
+            yield self.measure()
 
-    def place_object(self, pose: Array | None, seeds: NDArray[np.int64]) -> RobotState:
-        """Put the object at x, y [m] and yaw [rad] of `pose` (n, 3), or leave it; nothing is drawn from `seeds`."""
+    def measure(self) -> RobotState:
+        """The state now.
+
+        Raises:
+            ResetNeeded: Not connected.
+        """
         self._require_link()
-        if pose is not None:
-            self._object = self._object.copy()
-            self._place_object(np.arange(self.num_robots), pose)
-        return self._measure()
-
-    def _measure(self) -> RobotState:
-        signals = {
-            "joint_position": self._position[:, :6],
-            "joint_velocity": self._velocity,
-            "gripper_width": self._position[:, 6:],
+        position, place = self._now["position"], self._now["object"]
+        signals = {"joint_position": position[:, :6], "joint_velocity": self._now["velocity"]}
+        signals |= {
+            "gripper_width": position[:, 6:],
+            "object_position": place[:, :3],
+            "object_quaternion": place[:, 3:],
         }
-        if self._with_object:
-            signals |= {"object_position": self._object[:, :3], "object_quaternion": self._object[:, 3:]}
-        return RobotState(signals, self._stamp, self._command)
+        measured = {signal.name: signals[signal.name] for signal in self.spec.signals}
+        return RobotState(measured, self._now["stamp"], self._now["command"])
 
     def _require_link(self) -> None:
         if not self._connected:
@@ -124,14 +128,10 @@ class FakeRobot:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the future of the robots depends on."""
-        arrays = (self._position, self._velocity, self._object, self._stamp, self._command)
-        names = ("position", "velocity", "object", "stamp", "command")
-        return {name: array.copy() for name, array in zip(names, arrays, strict=True)}
+        return {name: array.copy() for name, array in self._now.items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> RobotState:
         """Go to what `state_dict` returned; the state there."""
         self.connect()
-        self._position, self._velocity = np.array(state["position"]), np.array(state["velocity"])
-        self._object, self._stamp = np.array(state["object"]), np.array(state["stamp"])
-        self._command = np.array(state["command"])
-        return self._measure()
+        self._now = {name: np.array(state[name]) for name in self._now}
+        return self.measure()
