@@ -30,7 +30,7 @@ from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.robot_env import RobotEnv
 from bam_envs.robots.physics.mujoco_arm import PHYSICS_STEPS, SimulatedArm
-from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.robots.profile import load_profile
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.tasks.pick import PickTask
 

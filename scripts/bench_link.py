@@ -78,7 +78,7 @@ def serve_robot() -> None:
     from bam_envs.remote.serve.robot_service import RobotService
     from bam_envs.remote.serve.served_robot import ServedRobot
     from bam_envs.robots.fake import FakeRobot
-    from bam_envs.robots.profiles.profile import load_profile
+    from bam_envs.robots.profile import load_profile
     from bam_envs.rosbridge.server import BridgeServer
 
     robot = ServedRobot(FakeRobot(1), command_timeout=0.1)

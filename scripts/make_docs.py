@@ -171,7 +171,7 @@ def _default(value: object) -> str:
 def guards() -> str:
     """The guards of an arm and of a base, with their limits."""
     from bam_envs.live.building import profile_limits
-    from bam_envs.robots.profiles.profile import load_profile
+    from bam_envs.robots.profile import load_profile
     from bam_envs.safety.guards import default_guards
 
     robots: dict[tuple[str, ...], list[str]] = {}
@@ -187,7 +187,7 @@ def guards() -> str:
 
 def topics_of(name: str) -> str:
     """The topics of a shipped profile: what a robot publishes, and what it is told."""
-    from bam_envs.robots.profiles import load_profile
+    from bam_envs.robots.profile import load_profile
 
     profile = load_profile(name)
     published: dict[tuple[str, str], list[str]] = {}

@@ -9,7 +9,7 @@ import pytest
 from bam_envs.core.errors import LinkLost, NoServer, NotReady, SafetyStop, StaleState
 from bam_envs.core.robot import Initial
 from bam_envs.live.building import live_robot, profile_limits
-from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import arm_spec
 
 ROW = np.zeros(1, np.int64)

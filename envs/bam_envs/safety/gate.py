@@ -14,7 +14,7 @@ import time
 import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NoReturn, Protocol, cast, final
+from typing import Any, NoReturn, cast, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +37,7 @@ from bam_envs.safety.guard import (
 )
 from bam_envs.safety.guards import LATE, Freshness, Shape, default_guards
 
-__all__ = ["ClearedCommand", "Limits", "LiveRobot", "SafeRobot"]
+__all__ = ["ClearedCommand", "Limits", "SafeRobot"]
 
 Array = NDArray[np.float64]
 GRIPPER_TIME = 1.0
@@ -107,31 +107,15 @@ def _clear(robot: object, command: Array) -> ClearedCommand:
     return cleared
 
 
-class LiveRobot(Robot, Protocol):
-    """A `Robot` that takes cleared commands only, and whose `reset` moves nothing: it measures.
-
-    One that answers commands also has ``waiting() -> float``: how long it has owed the answer to one [s].
-    """
-
-    needs_clearance: bool
-    """True."""
-
-    def step(self, command: Array | ClearedCommand) -> RobotState:
-        """Send `command`, and return the state one period later; any but a cleared one is refused."""
-
-    def measure(self) -> RobotState:
-        """The newest state."""
-
-    def age(self) -> float:
-        """Age of the newest state [s]."""
-
-
 @final
 class SafeRobot(metaclass=Sealed):
     """One robot behind guards: a `Robot` around a `Robot`.
 
-    A live robot (one with ``needs_clearance``) is handed a `ClearedCommand`, any other a plain array. The guards are
-    those of `default_guards`, always; no attribute changes them.
+    A live robot (one whose ``needs_clearance`` is true) is handed a `ClearedCommand`, any other a plain array. It has
+    ``measure()``, the newest state; ``age()``, the age of that state [s]; and, if it answers commands, ``waiting()``,
+    how long it has owed the answer to one [s]. Its ``reset`` moves nothing: it measures.
+
+    The guards are those of `default_guards`, always; no attribute changes them.
 
     Args:
         robot: One robot, simulated or live.
@@ -173,7 +157,7 @@ class SafeRobot(metaclass=Sealed):
 
     def __init__(
         self,
-        robot: Robot | LiveRobot,
+        robot: Robot,
         guards: Sequence[Guard] = (),
         *,
         limits: Limits | None = None,
@@ -191,7 +175,12 @@ class SafeRobot(metaclass=Sealed):
         self._guards = tuple(default_guards(robot.spec, self._limits, tool_position=tool_position))
         self._robot: Any = robot
         self._clock = clock
-        self._is_base, self._places = is_base(robot.spec), _required_places(robot.spec)
+        self._is_base, self._places = is_base(robot.spec), measured_places(robot.spec, robot.spec.command.units)
+        unmeasured = {*range(len(robot.spec.command.labels))} - {place for place, _, _ in self._places}
+        missing = [robot.spec.command.labels[at] for at in sorted(unmeasured) if robot.spec.command.units[at] == "rad"]
+        if missing:  # the guards could not know where the arm is
+            names = ", ".join(missing)
+            raise InvalidValue(f"The guards need {names} of {robot.spec.name} measured in rad; no signal has it.")
         self._speeds = measured_places(robot.spec, [f"{unit}/s" for unit in robot.spec.command.units])
         every = (*self._further, *self._guards)
         self._counts = {guard.name: {"altered": 0, "held": 0, "stopped": 0} for guard in every}
@@ -199,8 +188,11 @@ class SafeRobot(metaclass=Sealed):
         self._bad, self._halts, self._status = 0, 0, ""
         self._sent_at: float | None = None
         self._forget()
-        if self._live is not None:
-            self._claim()
+        if self._live is not None:  # a second gate would let a whole step through, as the first one does
+            other = _GUARDED.get(robot)
+            if other is not None and other() is not None:
+                raise InvalidValue(f"{self.spec.name} stands behind a SafeRobot already; command it through that one.")
+            _GUARDED[robot] = weakref.ref(self)
 
     def __init_subclass__(cls) -> None:
         raise InvalidValue("A SafeRobot has no other kind: it keeps a robot safe. Give it further guards with guards=.")
@@ -210,13 +202,6 @@ class SafeRobot(metaclass=Sealed):
             f"The SafeRobot of {self.spec.name} cannot be copied: a robot has one gate. Build another SafeRobot for "
             "another robot."
         )
-
-    def _claim(self) -> None:
-        """Refuse a second gate to one robot: each of them would let a whole step through."""
-        other = _GUARDED.get(self._live)
-        if other is not None and other() is not None:
-            raise InvalidValue(f"{self.spec.name} stands behind a SafeRobot already; command it through that one.")
-        _GUARDED[self._live] = weakref.ref(self)
 
     def _forget(self) -> None:
         """Nothing is known of the robot."""
@@ -342,26 +327,20 @@ class SafeRobot(metaclass=Sealed):
         goes_on = self._sent_at is not None or self._live is None or self._in_lockstep()
         if self._last is not None and goes_on and pause <= LATE * self.spec.period:
             return self._last
-        self._last = last = self._measured_anew()
-        self._speed, self._before = np.zeros_like(last), None
-        self._restart_guards()
-        return last
-
-    def _measured_anew(self) -> Array:
-        """The measured pose as a command; a gripper goes on holding, or is open if it is not measured. Shape: (m,)."""
         if self._live is not None and self._state is not None:
             self._state = self._fresh_state()
-        measured = self._measured()
+        measured, command = self._measured(), self.spec.command
         if self._is_base:
-            return np.zeros_like(measured)
-        if self._sent is None:  # fingers may be measured a little beyond their range, which no robot takes as a command
-            known = np.where(np.isfinite(measured), measured, self.spec.command.high)
-            inside: Array = np.clip(known, self.spec.command.low, self.spec.command.high)
-            return inside
-        begin: Array = self._sent.copy()
-        joints = joint_columns(self.spec)
-        begin[joints] = measured[joints]
-        return begin
+            last = np.zeros_like(measured)
+        elif self._sent is None:
+            # A gripper that is not measured is taken as open; fingers may be measured a little beyond their range.
+            last = np.clip(np.where(np.isfinite(measured), measured, command.high), command.low, command.high)
+        else:  # the gripper goes on holding
+            last, joints = self._sent.copy(), joint_columns(self.spec)
+            last[joints] = measured[joints]
+        self._last, self._speed, self._before = last, np.zeros_like(last), None
+        self._restart_guards()
+        return last
 
     def _measured(self) -> Array:
         """The measured value of each number of the command; NaN where nothing is measured. Shape: (m,)."""
@@ -588,18 +567,3 @@ def _copied(state: RobotState) -> RobotState:
 def _copy(tick: Tick) -> Tick:
     """The tick for a user's guard: only what the guard does to the command is taken over."""
     return replace(tick, **{name: value.copy() for name, value in vars(tick).items() if isinstance(value, np.ndarray)})
-
-
-def _required_places(spec: RobotSpec) -> list[tuple[int, str, int]]:
-    """Place in the command, signal and column of what is measured of a command.
-
-    Raises:
-        InvalidValue: A joint is not measured: the guards could not know where the arm is.
-    """
-    places = measured_places(spec, spec.command.units)
-    known = {place for place, _, _ in places}
-    numbers = enumerate(zip(spec.command.labels, spec.command.units, strict=True))
-    missing = [label for place, (label, unit) in numbers if unit == "rad" and place not in known]
-    if missing:
-        raise InvalidValue(f"The guards need {', '.join(missing)} of {spec.name} measured in rad; no signal has it.")
-    return places

@@ -14,7 +14,7 @@ from websockets.exceptions import ConnectionClosed
 
 from bam_envs.core.errors import LinkLost
 from bam_envs.core.robot import Initial, RobotState
-from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.robots.profile import load_profile
 from bam_envs.ros.codec import HALT_TOPIC, INFO_SERVICE, RobotInfo, decode_command, encode_state
 from bam_envs.ros.messages import write_stamp
 from bam_envs.rosbridge.bus import Caller

@@ -13,7 +13,7 @@ from bam_envs.remote.serve.served_robot import ServedRobot
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.physics.kinematic_base import SimulatedBase
-from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import JOINTS, arm_spec
 from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.safety.gate import SafeRobot

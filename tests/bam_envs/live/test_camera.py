@@ -9,7 +9,7 @@ import pytest
 
 from bam_envs.core.errors import InvalidValue, MissingExtra, ProtocolError, ResetNeeded, StaleState, UnknownName
 from bam_envs.live.camera import LiveCamera, decode_pixels
-from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.robots.profile import load_profile
 from bam_envs.ros.images import color_message
 from bam_envs.ros.profile_tables import CameraSource
 from bam_envs.rosbridge.endpoint import Endpoint

@@ -6,7 +6,7 @@ import pytest
 
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
-from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur import UR_MODELS
 from bam_envs.safety.arm_guards import ToolSpeed
 

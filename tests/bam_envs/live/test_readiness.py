@@ -8,7 +8,7 @@ import pytest
 from bam_envs.core.errors import NotReady, SafetyStop
 from bam_envs.core.timing import Deadline
 from bam_envs.live.building import live_robot
-from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.robots.profile import load_profile
 from bam_envs.ros.codec import RobotInfo
 
 ROW = np.zeros(1, np.int64)

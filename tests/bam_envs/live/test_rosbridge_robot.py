@@ -24,7 +24,7 @@ from bam_envs.core.robot import Initial
 from bam_envs.core.timing import Deadline
 from bam_envs.live.rosbridge_robot import RosbridgeRobot
 from bam_envs.robots.fake import FakeRobot
-from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import JOINTS
 from bam_envs.ros.codec import HALT_TOPIC, SCENE_TOPIC, RobotInfo
 from bam_envs.ros.freshness import read_tag

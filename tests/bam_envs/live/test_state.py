@@ -8,7 +8,7 @@ import pytest
 
 from bam_envs.core.errors import ProtocolError, StaleState
 from bam_envs.live.state import LiveState, Mailbox
-from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import JOINTS, arm_spec
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER
 

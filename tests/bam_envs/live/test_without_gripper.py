@@ -15,7 +15,7 @@ from bam_envs.remote.serve.robot_service import RobotService
 from bam_envs.remote.serve.served_robot import ServedRobot
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.physics.kinematic_arm import empty_arm
-from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur import START as EMPTY_START
 from bam_envs.robots.ur import ur_model, ur_spec
 from bam_envs.rosbridge.endpoint import Endpoint

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import UnknownName
-from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur import DEFAULT_MODEL, UR_MODELS, ur_model, ur_spec
 from bam_envs.robots.ur5e import COMMAND, JOINTS
 

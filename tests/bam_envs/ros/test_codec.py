@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.core.robot import RobotState
-from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import JOINTS
 from bam_envs.ros.codec import (
     RobotInfo,

@@ -19,7 +19,7 @@ from bam_envs.core.robot import Initial
 from bam_envs.live.building import live_robot
 from bam_envs.live.rosbridge_robot import RosbridgeRobot
 from bam_envs.robots.physics.mujoco_arm import SimulatedArm
-from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.robots.profile import load_profile
 from bam_envs.safety.gate import ClearedCommand, SafeRobot
 from bam_envs.safety.guard import BOUNDS, Limits
 from bam_envs.testing import ARM_HOME, DrivenRobot

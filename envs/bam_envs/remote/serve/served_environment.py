@@ -18,7 +18,7 @@ from bam_envs.remote.serve.robot_service import RobotService
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_robot import ServedRobot
 from bam_envs.remote.serve.tcp_server import TcpServer
-from bam_envs.robots.profiles.profile import profile_for
+from bam_envs.robots.profile import profile_for
 from bam_envs.ros.codec import INFO_SERVICE
 from bam_envs.ros.profile_tables import RobotProfile
 from bam_envs.rosbridge.bus import Bus

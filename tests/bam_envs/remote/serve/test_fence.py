@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import RemoteError
-from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.robots.profile import load_profile
 from bam_envs.ros.codec import encode_command
 from bam_envs.ros.freshness import Tagger, read_echo, read_tag
 from bam_envs.ros.messages import tag_text

@@ -15,7 +15,7 @@ from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.physics.kinematic_arm import reach_arm
 from bam_envs.robots.physics.kinematic_base import SimulatedBase
 from bam_envs.robots.physics.mujoco_arm import SimulatedArm
-from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.robots.profile import load_profile
 from bam_envs.ros.codec import RobotInfo, encode_command, read_info
 from bam_envs.ros.freshness import Tagger, read_echo
 from bam_envs.rosbridge.bus import Caller

@@ -10,7 +10,7 @@ from bam_envs.remote.rosbridge_transport import RosbridgeTransport
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_robot import ServedRobot
 from bam_envs.remote.tcp_transport import TcpTransport
-from bam_envs.robots.profiles.profile import load_profile
+from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import arm_spec
 from bam_envs.ros.codec import encode_command
 from bam_envs.rosbridge.client import RosbridgeLink

@@ -1,8 +1,8 @@
 """Reads robot profiles: which topics a live robot has, in which order and unit its numbers come, how old they may be.
 
-A profile is one TOML or YAML file; ``ur5e.toml`` and ``mir100.toml`` in this folder are shipped and show every table. A
-file may start from a shipped one (``extends = "ur5e"``), replace whole tables of it, rename topics (``[rename]``) and
-frames (``[frames]``); ``ignore`` at its top lists names that may come with every source of names.
+A profile is one TOML or YAML file; those in the folder ``profiles`` are shipped, and show every table. A file may start
+from a shipped one (``extends = "ur5e"``), replace whole tables of it, rename topics (``[rename]``) and frames
+(``[frames]``); ``ignore`` at its top lists names that may come with every source of names.
 
 The types of the keys are those of the dataclasses here and in `bam_envs.ros.profile_tables`; the functions below check
 what one key says against another.

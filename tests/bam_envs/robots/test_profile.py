@@ -8,7 +8,7 @@ import pytest
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.mir100 import base_spec
-from bam_envs.robots.profiles.profile import load_profile, profile_for, shipped_profiles
+from bam_envs.robots.profile import load_profile, profile_for, shipped_profiles
 from bam_envs.robots.ur import ur_model, ur_spec
 from bam_envs.robots.ur5e import JOINTS, arm_spec
 
