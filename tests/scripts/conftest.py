@@ -1,11 +1,17 @@
 """What tests of the experiment scripts share: running one as a user does, and a policy that one has trained."""
 
+import contextlib
+import io
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
+from unittest import mock
 
 import pytest
+
+from tests.one_ray import shared_ray_fixture  # noqa: F401
 
 ROOT = Path(__file__).parents[2]
 PATHS = [str(ROOT), str(ROOT / "envs")]
@@ -38,10 +44,33 @@ def run_script(environment):
 
 
 @pytest.fixture(scope="session")
-def trained(run_script, tmp_path_factory):
+def run_here(shared_ray):
+    """As `run_script`, in this process, which has imported much of what scripts import and runs Ray already."""
+
+    def run(name, *arguments, folder):
+        shared_ray.start()
+        script, out, err, status = ROOT / "scripts" / f"{name}.py", io.StringIO(), io.StringIO(), 0
+        with (
+            contextlib.chdir(folder),
+            mock.patch.object(sys, "argv", [str(script), *map(str, arguments)]),
+            mock.patch.object(sys, "path", [str(script.parent), *sys.path]),
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(err),
+        ):
+            try:
+                runpy.run_path(str(script), run_name="__main__")
+            except SystemExit as end:
+                status = end.code or 0
+        return subprocess.CompletedProcess(script, status, out.getvalue(), err.getvalue())
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def trained(run_here, tmp_path_factory):
     """A folder in which a MiR100 was trained for one iteration and explored for two episodes; and what was said."""
     folder = tmp_path_factory.mktemp("trained")
     options = ("--run", "PPO", "--stop-iters", 1, "--explore-during-inference", "--num-episodes-during-inference", 2)
-    done = run_script("training_inference_mir", *options, folder=folder)
+    done = run_here("training_inference_mir", *options, folder=folder)
     assert done.returncode == 0, done.stderr
     return folder, done

@@ -4,9 +4,7 @@ import pickle
 import re
 import runpy
 import shutil
-import sys
 import zipfile
-from dataclasses import replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -14,7 +12,6 @@ import numpy as np
 import pytest
 
 import bam_envs  # noqa: F401 - registers the environments
-from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
 
@@ -25,15 +22,12 @@ EPISODE = re.compile(r"episode \d+: return -?\d+\.\d\d, (?:no )?success, clipped
 
 
 @pytest.fixture
-def run(capsys, monkeypatch):
+def run(run_here, tmp_path):
     """Run it with these arguments; status, standard output, standard error."""
 
     def run_it(*arguments):
-        monkeypatch.setattr(sys, "argv", ["policy_from_cp_mir.py", *map(str, arguments)])
-        monkeypatch.syspath_prepend(SCRIPTS)
-        with pytest.raises(SystemExit) as end:
-            runpy.run_path(str(SCRIPTS / "policy_from_cp_mir.py"), run_name="__main__")
-        return end.value.code, *capsys.readouterr()
+        done = run_here("policy_from_cp_mir", *arguments, folder=tmp_path)
+        return done.returncode, done.stdout, done.stderr
 
     return run_it
 
@@ -68,20 +62,14 @@ def test_a_policy_of_another_robot_is_noted(run):
     assert out.splitlines()[-1].endswith(" of 1 episodes on bam/pick-v0")
 
 
-def test_a_directory_of_rllib_acts_the_same(run_script, run, checkpoint, directory, tmp_path):
-    """Of the whole algorithm, and of the policy alone, in a process of its own: RLlib's code is imported there."""
+def test_a_directory_of_rllib_acts_the_same(run, checkpoint, directory, tmp_path):
+    """Of the whole algorithm, and of the policy alone."""
     options = ("--num-episodes", 1, "--seed", 5)
     _, expected, _ = run(checkpoint, *options)
-    alone = tmp_path / "alone"
-    (directory / "learner_group" / "learner" / "rl_module" / "default_policy").rename(alone)
-    try:
-        done = run_script("policy_from_cp_mir", alone, *options, "--trust-pickle", folder=tmp_path)
-    finally:
-        alone.rename(directory / "learner_group" / "learner" / "rl_module" / "default_policy")
-    assert (done.returncode, done.stdout) == (0, expected), done.stderr
-    done = run_script("policy_from_cp_mir", directory, *options, "--trust-pickle", folder=tmp_path)
-    assert (done.returncode, done.stdout) == (0, expected), done.stderr
-    assert list(tmp_path.iterdir()) == []
+    alone = shutil.copytree(directory / "learner_group" / "learner" / "rl_module" / "default_policy", tmp_path / "a")
+    for given in (alone, directory):
+        status, out, err = run(given, *options, "--trust-pickle")
+        assert (status, out) == (0, expected), err
 
 
 def test_checkpoints_of_robo_gyms(run, tmp_path):
@@ -151,8 +139,7 @@ def test_clipped_actions_are_counted():
 
 def test_it_drives_a_robot_behind_rosbridge(run, checkpoint, monkeypatch):
     """In real time: a short episode."""
-    short = replace(ENVIRONMENTS["bam/mir100-navigation-v0"], max_episode_steps=10)
-    monkeypatch.setitem(ENVIRONMENTS, short.id, short)
+    monkeypatch.setattr(gym.spec("bam/mir100-navigation-v0"), "max_episode_steps", 10)
     with ServedEnvironment(gym.make("bam/mir100-navigation-v0"), ServeOptions(port=0, tcp=0)) as served:
         status, out, err = run(checkpoint, "--num-episodes", 1, "--robot", served.bus.url)
     assert (status, err) == (0, "")
