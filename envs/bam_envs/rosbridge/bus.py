@@ -74,21 +74,22 @@ def refusal_of(topic: str, reason: object) -> str:
 
 
 class Bus(Protocol):
-    """Publish, subscribe, serve. From any thread."""
+    """Publish, subscribe, serve, from any thread. A subclass inherits `publish`, and an `on_leave` that never calls."""
 
     def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
         """Say that `topic` of type `kind` will be published; a latched one repeats its last message to newcomers."""
 
     def publish(self, topic: str, message: Message) -> None:
-        """Send `message` now, or not at all.
-
-        Raises:
-            LinkLost: There is no link; nothing is kept.
-            InvalidValue: A number in it is not finite, or is not a plain number.
-        """
+        """Send `message` now, or not at all. Raises as `publish_all`."""
+        self.publish_all([(topic, message)])
 
     def publish_all(self, messages: Sequence[tuple[str, Message]]) -> None:
-        """Send several messages, each with its topic, in this order; quicker than one by one. Raises as `publish`."""
+        """Send several messages now, each on its topic, in this order: all of them or none.
+
+        Raises:
+            LinkLost: There is no link; nothing is sent later.
+            InvalidValue: A number in one is not finite or not plain, or a topic was not advertised.
+        """
 
     def subscribe(self, topic: str, kind: str, listener: Listener) -> Callable[[], None]:
         """Call `listener` for each message, until what is returned is called. Other listeners are not touched."""
@@ -98,6 +99,7 @@ class Bus(Protocol):
 
     def on_leave(self, callback: Callable[[Caller], None]) -> None:
         """Call `callback` when a caller's connection ends, where the bus knows; elsewhere never."""
+        return
 
     def close(self) -> None:
         """Stop serving and release everything. Idempotent."""

@@ -25,7 +25,7 @@ from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NoServer,
 from bam_envs.core.wording import brief
 from bam_envs.ros.interfaces import normal_name
 from bam_envs.ros.messages import write_stamp
-from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller, Handler, Listener, Message, tell
+from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Bus, Handler, Listener, Message, tell
 from bam_envs.rosbridge.client_connection import Connection, ServerClock, bare_reason
 from bam_envs.rosbridge.declarations import Declarations
 from bam_envs.rosbridge.encoding import dump_json
@@ -46,7 +46,7 @@ _ENDED = "Timeout exceeded"
 _NEARLY = 0.9
 
 
-class RosbridgeLink:
+class RosbridgeLink(Bus):
     """A client of a rosbridge server; a `Bus` that can also call services.
 
     Args:
@@ -175,17 +175,8 @@ class RosbridgeLink:
         """Say that `topic` of type `kind` will be published."""
         self._declare(lambda: self._declarations.advertise(topic, kind, latch))
 
-    def publish(self, topic: str, message: Message) -> None:
-        """Send `message` now, or not at all: on return it has been written to the socket.
-
-        Raises:
-            LinkLost: It was not sent, and is not kept.
-            InvalidValue: A number in it is not finite or not plain, or the topic was not advertised.
-        """
-        self.publish_all([(topic, message)])
-
     def publish_all(self, messages: Sequence[tuple[str, Message]]) -> None:
-        """Send several messages, each on its topic, in this order: all of them or none. Raises as `publish`."""
+        """Send several messages now or not at all: on return they have been written to the socket. See `Bus`."""
         connection = self._require_up()
         for topic, _ in messages:
             self._declarations.require_advertised(topic)
@@ -228,9 +219,6 @@ class RosbridgeLink:
     def on_status(self, callback: Callable[[Mapping[str, Any]], None]) -> None:
         """Call `callback` with each `status` message; on the network thread."""
         self._status_callbacks.append(callback)
-
-    def on_leave(self, callback: Callable[[Caller], None]) -> None:
-        """A rosbridge server does not say who sends a message, nor who left: `callback` is never called."""
 
     # ---- services
 

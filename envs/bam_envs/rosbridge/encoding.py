@@ -281,9 +281,9 @@ class Fragments:
         self._unfinished.clear()
 
     @property
-    def deadline(self) -> float | None:
-        """When the first unfinished message is given up [s], clock of the caller; None if there is none."""
-        return min((parts.deadline for parts in self._unfinished.values()), default=None)
+    def deadline(self) -> float:
+        """When the first unfinished message is given up [s], clock of the caller; infinite if there is none."""
+        return min((parts.deadline for parts in self._unfinished.values()), default=math.inf)
 
     def add(self, message: Mapping[str, Any], now: float) -> str | None:
         """Take a message ``fragment``; returns the whole text when it was the last one missing.

@@ -155,7 +155,7 @@ def test_fragments_come_in_any_order_and_twice():
     random.Random(0).shuffle(parts)
     fragments = Fragments(1000)
     assert [fragments.add(part, 0.0) for part in [parts[0], *parts]][-1] == "The quick brown fox"
-    assert fragments.deadline is None
+    assert fragments.deadline == math.inf
 
 
 def test_unfinished_messages_are_given_up():
@@ -164,7 +164,7 @@ def test_unfinished_messages_are_given_up():
     assert fragments.deadline == 6.0
     assert fragments.expire(5.9) == []
     assert fragments.expire(6.0) == ["a"]
-    assert fragments.deadline is None
+    assert fragments.deadline == math.inf
 
 
 GOOD = {"id": "a", "data": "x", "num": 0, "total": 2}

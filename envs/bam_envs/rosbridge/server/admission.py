@@ -12,7 +12,6 @@ from http import HTTPStatus
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
-from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
@@ -43,10 +42,8 @@ class Admission:
         self._tokens, self._guesses = tokens, Guesses()
         self._options, self._present = options, present
 
-    def check(self, connection: ServerConnection, request: Request) -> Response | None:
+    def check(self, connection: BridgeConnection, request: Request) -> Response | None:
         """The refusal of a request to open a WebSocket, or None; a page may show its token later (`greet`)."""
-        if not isinstance(connection, BridgeConnection):
-            raise TypeError(f"Expected a BridgeConnection, found {connection!r}.")
         headers, is_page = request.headers.get_all("Authorization"), "Origin" in request.headers
         shown = [text.partition(" ")[2].strip() for text in headers if text.lower().startswith("bearer ")]
         shown += parse_qs(urlsplit(request.path).query).get("token", [])

@@ -178,11 +178,10 @@ class Bridge:
             self._note_fragments(session)
 
     @property
-    def next_deadline(self) -> float | None:
-        """When `tick` is needed next [s], clock of `take`; None if nothing waits."""
-        times = [self.services.deadline, self.topics.deadline]
-        times += [session.fragments.deadline for session in self._fragmented]
-        return min((one for one in times if one is not None), default=None)
+    def next_deadline(self) -> float:
+        """When `tick` is needed next [s], clock of `take`; infinite if nothing waits."""
+        fragments = (session.fragments.deadline for session in self._fragmented)
+        return min(self.services.deadline, self.topics.deadline, *fragments)
 
     def events(self) -> list[Event]:
         """What is to be done, in this order; empties the list."""
@@ -387,10 +386,7 @@ class Bridge:
                 self._status(greatest, f"All unfinished fragments hold more than {self.options.unfinished} bytes.")
 
     def _note_fragments(self, session: Session) -> None:
-        if session.fragments.deadline is not None:
-            self._fragmented.add(session)
-        else:
-            self._fragmented.discard(session)
+        (self._fragmented.add if session.fragments.size else self._fragmented.discard)(session)
 
     def _deliver(self, listener: Listener, publication: Publication, publisher: Session | None) -> None:
         try:

@@ -11,19 +11,20 @@ import asyncio
 import functools
 import itertools
 import logging
+import math
 import ssl
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
-from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.asyncio.server import Server, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.protocol import State
 
 from bam_envs.core.errors import InvalidValue, LinkLost
-from bam_envs.rosbridge.bus import Caller, Handler, Listener, Message
+from bam_envs.rosbridge.bus import Bus, Caller, Handler, Listener, Message
 from bam_envs.rosbridge.server.admission import Admission, listening_error, tls_context
 from bam_envs.rosbridge.server.bridge import Bridge, Incoming
 from bam_envs.rosbridge.server.client_session import Invoke, Send, ServerOptions, Session
@@ -46,7 +47,7 @@ _quiet = logging.getLogger(f"{__name__}.websockets")
 _quiet.setLevel(logging.CRITICAL)
 
 
-class BridgeServer:
+class BridgeServer(Bus):
     """A rosbridge server, and in its own process a `Bus`.
 
     Args:
@@ -139,10 +140,6 @@ class BridgeServer:
         """Say that `topic` of type `kind` will be published."""
         self._do(lambda: self._bridge.advertise(topic, kind, latch=latch))
 
-    def publish(self, topic: str, message: Message) -> None:
-        """Send `message` now, or not at all."""
-        self.publish_all([(topic, message)])
-
     def publish_all(self, messages: Sequence[tuple[str, Message]]) -> None:
         """Send several messages, each with its topic, in this order."""
         publications = [self._bridge.publication(topic, message) for topic, message in messages]
@@ -174,13 +171,13 @@ class BridgeServer:
     async def _main(self, tls: ssl.SSLContext | None, listening: Future[None]) -> None:
         self._stop, options = asyncio.Event(), self.options
         extra: dict[str, Any] = {"ssl": tls, "ssl_handshake_timeout": options.open_timeout} if tls else {}
-        # What makes a connection: `websockets` calls it, and only says that it is a class.
-        connection: Any = functools.partial(BridgeConnection, sockets=self._sockets, limits=options)
+        # `websockets` does not know that what its handlers get is what this makes.
+        extra["create_connection"] = functools.partial(BridgeConnection, sockets=self._sockets, limits=options)
+        extra["process_request"], handler = self._admission.check, cast(Any, self._serve)
         server = await serve(
-            self._serve,
+            handler,
             self.host,
             self.port,
-            process_request=self._admission.check,
             compression=None,
             open_timeout=options.open_timeout,
             ping_interval=options.ping_interval,
@@ -189,7 +186,6 @@ class BridgeServer:
             max_size=options.max_incoming,
             max_queue=_QUEUE,
             logger=_quiet,
-            create_connection=connection,
             **extra,
         )
         self.port = server.sockets[0].getsockname()[1]
@@ -215,10 +211,8 @@ class BridgeServer:
             connection.transport.abort()
         await _turns()
 
-    async def _serve(self, connection: ServerConnection) -> None:
+    async def _serve(self, connection: BridgeConnection) -> None:
         """Read one client's frames until its connection ends."""
-        if not isinstance(connection, BridgeConnection):
-            raise TypeError(f"Expected a BridgeConnection, found {connection!r}.")
         try:
             await self._admission.greet(connection)
         except ConnectionClosed:
@@ -283,7 +277,7 @@ class BridgeServer:
         for connection in written:
             connection.flush()
         deadline = self._bridge.next_deadline
-        if deadline is None or (self._timer is not None and self._timer.when() <= deadline):
+        if deadline == math.inf or (self._timer is not None and self._timer.when() <= deadline):
             return
         if self._timer is not None:
             self._timer.cancel()

@@ -146,7 +146,6 @@ class Invoke:
     number: int
     handler: Handler
     request: Message
-    caller: Caller
 
 
 Event = Send | Invoke

@@ -78,21 +78,12 @@ class Services(dict[str, Service]):
         self._emit = emit
         self._calls: dict[int, Call] = {}
         self._numbers = itertools.count(1)
-        self._look = math.inf  # no call runs out of time before; one that was answered may have set it
-
-    @property
-    def deadline(self) -> float | None:
-        """When to call `expire` next [s]; None if there is no need."""
-        return None if self._look == math.inf else self._look
+        self.deadline = math.inf
+        """When to call `expire` next [s]; a call that was answered may have set it."""
 
     def offer(self, service: Service) -> Service | None:
-        """Add a service; returns the one of another client whose place it takes.
-
-        A client that comes back after a cut would otherwise wait until its old connection is noticed to be dead.
-
-        Raises:
-            ProtocolError: It is offered by this process.
-        """
+        """Add a service; returns the one of another client whose place it takes."""
+        # A client that comes back after a cut does not wait until its old connection is noticed to be dead.
         before = self.get(service.name)
         if before is not None:
             if before.provider is None:
@@ -130,12 +121,12 @@ class Services(dict[str, Service]):
         call = Call(next(self._numbers), service, request, timeout, now + timeout)
         self._calls[call.number] = call
         session.calls.add(call.number)
-        self._look = min(self._look, call.deadline)
+        self.deadline = min(self.deadline, call.deadline)
         if service.provider is not None:
             message = {"op": "call_service", "id": str(call.number), "service": service.spelling, "args": values}
             self._emit(Send(service.provider, pack(message)))
         elif service.handler is not None:
-            invoke = Invoke(session, call.number, service.handler, values, session.caller)
+            invoke = Invoke(session, call.number, service.handler, values)
             packet = self.packed_answer(invoke) if service.inline else None
             if packet is not None:
                 self._answer(call, packet)
@@ -156,7 +147,7 @@ class Services(dict[str, Service]):
         if call is None:
             return None
         try:
-            values = invoke.handler(invoke.request, invoke.caller)
+            values = invoke.handler(invoke.request, invoke.session.caller)
             if not call.service.inline:  # what /rosapi/get_time answers spells the time for ROS 1 and for ROS 2
                 values = checked(call.service.kind, response_type, values)
             return _packed(call, values, True)
@@ -200,11 +191,11 @@ class Services(dict[str, Service]):
 
     def expire(self, now: float) -> None:
         """Answer the calls whose time is over."""
-        if now < self._look:
+        if now < self.deadline:
             return
         for call in [one for one in self._calls.values() if one.deadline <= now]:
             self._fail(call, f"Timeout exceeded: service {call.service.name} did not answer in {call.timeout:g} s.")
-        self._look = min((one.deadline for one in self._calls.values()), default=math.inf)
+        self.deadline = min((one.deadline for one in self._calls.values()), default=math.inf)
 
     def _fail(self, call: Call, reason: str) -> None:
         self._answer(call, _packed(call, reason, False))

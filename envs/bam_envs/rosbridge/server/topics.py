@@ -54,9 +54,9 @@ class Stream:
             self._waiting = deque(self._waiting, maxlen=max(1, self.wish.queue_length))
 
     @property
-    def deadline(self) -> float | None:
-        """When a waiting message may go [s]; None if none waits."""
-        return self._next if self._waiting else None
+    def deadline(self) -> float:
+        """When a waiting message may go [s]; infinite if none waits."""
+        return self._next if self._waiting else math.inf
 
     def offer(self, publication: Publication, now: float) -> Send | None:
         """A new message: what to send now, if anything. What comes too early waits; the oldest is dropped."""
@@ -136,9 +136,9 @@ class Topics(dict[str, Topic]):
             self._note(stream, stream.offer(publication, now))
 
     @property
-    def deadline(self) -> float | None:
-        """When a message that came too early for a subscriber may go [s]; None if none waits."""
-        return min((one.deadline for one in self._delayed if one.deadline is not None), default=None)
+    def deadline(self) -> float:
+        """When a message that came too early for a subscriber may go [s]; infinite if none waits."""
+        return min((one.deadline for one in self._delayed), default=math.inf)
 
     def tick(self, now: float) -> None:
         """Send what waited long enough."""
@@ -169,7 +169,4 @@ class Topics(dict[str, Topic]):
     def _note(self, stream: Stream, event: Send | None) -> None:
         if event is not None:
             self._emit(event)
-        if stream.deadline is not None:
-            self._delayed.add(stream)
-        else:
-            self._delayed.discard(stream)
+        (self._delayed.add if stream.deadline < math.inf else self._delayed.discard)(stream)

@@ -143,8 +143,7 @@ class Fuzzed:
                     self.frames += len(event.packet.frames)
                 else:
                     self.bridge.services.finish(event, self.bridge.services.packed_answer(event))
-        deadline = self.bridge.next_deadline
-        if deadline is not None and deadline <= self.now:
+        if self.bridge.next_deadline <= self.now:
             self.bridge.tick(self.now)
 
     def require_service(self):
@@ -170,7 +169,7 @@ def test_nonsense_is_survived_and_forgotten(seed):
     fuzzed.leave()
     assert list(fuzzed.bridge.topics) == ["/command"]
     assert [name for name in fuzzed.bridge.services if not name.startswith("/rosapi/")] == ["/trigger"]
-    assert fuzzed.bridge.next_deadline is None
+    assert fuzzed.bridge.next_deadline == math.inf
 
 
 def test_nonsense_through_sockets():
