@@ -20,44 +20,27 @@ from bam_train.trainers.training_run import Best, TrainingRun
 STATISTICS = Statistics(episodes=3, return_mean=1.5, length_mean=4.0, success_rate=None, metrics={"train/loss": 0.25})
 
 
-def report(success, total=0.0, episodes=10, seed=0):
-    return EvaluationReport(
-        env="test/Count-v0",
-        episodes=episodes,
-        seed=seed,
-        successes=None if success is None else round(success * episodes),
-        success_rate=success,
-        success_interval=None if success is None else wilson_interval(round(success * episodes), episodes),
-        return_mean=total,
-        return_std=0.0,
-        return_min=total,
-        return_max=total,
-        length_mean=1.0,
-        length_std=0.0,
-    )
+def report(success, total=0.0, episodes=10):
+    successes = None if success is None else round(success * episodes)
+    interval = None if success is None else wilson_interval(successes, episodes)
+    found = (successes, success, interval, total, 0.0, total, total, 1.0, 0.0)
+    return EvaluationReport("test/Count-v0", episodes, 0, *found)
 
 
 class Counter:
-    """Trains by counting, ten steps an update; writes its steps into the files it saves."""
+    """Trains by counting, ten steps and a second an update; writes its steps into the files it saves."""
 
-    def __init__(self, settings, clock=None):
-        self.settings, self.steps, self.clock = settings, 0, clock
-        self.saved, self.refuse, self.fails_at, self.logged, self.notices = [], [], None, [], []
-        self.failure = TrainingFailed("train/loss is nan at step 10")
-        self.statistics = STATISTICS
-        self.rows = self.link = None
-        self.news = []
+    def __init__(self, settings, begin, save_takes):
+        self.settings, self.steps, self.save_takes, self.now = settings, begin, save_takes, 0.0
+        self.saved, self.refuse, self.logged, self.notices, self.news = [], [], [], [], []
+        self.fails_at, self.failure, self.statistics, self.rows = None, None, STATISTICS, None
 
     def train(self, steps, on_progress):
         while self.steps < steps:
-            self.steps += 10
-            if self.clock is not None:
-                self.clock.now += 1.0
-            if self.link is not None and self.steps >= 60:
-                raise self.link
+            self.steps, self.now = self.steps + 10, self.now + 1.0
             if self.steps == 20:
                 self.notices += self.news
-            if self.fails_at is not None and self.steps >= self.fails_at:
+            if self.steps == self.fails_at:
                 raise self.failure
             if not on_progress(Progress(self.steps, steps, lambda: self.statistics)):
                 return
@@ -66,8 +49,7 @@ class Counter:
         if path.name in self.refuse:
             no_space = OSError(28, "No space left on device")
             raise OutputError(f"{path}: cannot be written: No space left on device") from no_space
-        if self.clock is not None:
-            self.clock.now += self.clock.save_takes
+        self.now += self.save_takes
         path.write_text(str(self.steps))
         self.saved.append((path.name, self.steps, dict(scores), notes))
 
@@ -82,14 +64,6 @@ class Counter:
 
     def log(self, metrics):
         self.logged.append(dict(metrics))
-
-
-class Clock:
-    def __init__(self, save_takes=0.0):
-        self.now, self.save_takes = 0.0, save_takes
-
-    def __call__(self):
-        return self.now
 
 
 class Watcher:
@@ -110,9 +84,9 @@ class Watcher:
 def start(tmp_path, monkeypatch):
     """Makes a run whose evaluations are looked up by step; asks for seeds are in ``start.seeds``."""
 
-    def start(results, clock=None, best=None, copies=None, begin=0, **extra):
+    def start(results, best=None, copies=None, begin=0, save_takes=0.0, **extra):
         given = {"env": "test/Count-v0", "algo": "ppo", "steps": 100, "eval_every": 30, "eval_episodes": 10, "seed": 7}
-        settings = TrainSettings.from_mapping({**given, **extra})
+        trainer, watcher = Counter(TrainSettings.from_mapping({**given, **extra}), begin, save_takes), Watcher()
         start.seeds = []
 
         def evaluate(policy, env_id, env_kwargs, *, episodes, seed, env):
@@ -122,17 +96,21 @@ def start(tmp_path, monkeypatch):
             return found.pop(0) if isinstance(found, list) else found
 
         monkeypatch.setattr(run_module, "evaluate", evaluate)
-        trainer, watcher = Counter(settings, clock), Watcher()
-        trainer.steps = begin
         folder = RunFolder(tmp_path / "runs", "count-ppo")
-        run = TrainingRun(trainer, folder, tmp_path / "out.zip", watcher, best, clock or Clock(), copies)
+        run = TrainingRun(trainer, folder, tmp_path / "out.zip", watcher, best, lambda: trainer.now, copies)
         return run, trainer, watcher
 
     return start
 
 
+def at(*successes):
+    """Success rates of the evaluations at 30, 60, 90 and 100 steps."""
+    return dict(zip((30, 60, 90, 100), map(report, successes), strict=False))
+
+
 def test_evaluations_are_due_every_so_many_steps_and_at_the_end(start):
-    run, trainer, watcher = start({step: report(0.1) for step in (30, 60, 90, 100)})
+    run, trainer, watcher = start(at(0.1, 0.1, 0.1, 0.1))
+    trainer.rows = object()  # training lends its own environments; `evaluate` of the fixture looks at them
     outcome = run.run()
     assert [row[0] for row in watcher.evaluations] == [30, 60, 90, 100]
     assert start.seeds == [(step, 2_000_007, 10) for step in (30, 60, 90, 100)]
@@ -164,155 +142,10 @@ def test_the_best_is_by_success_then_by_return(start, results, best):
     assert outcome.best.steps == best
     assert outcome.checkpoint.read_text() == str(best)
     assert outcome.last.read_text() == "100"
-    assert trainer.saved[-1][0] == "last.zip"
-
-
-def test_scores_name_the_steps_at_which_they_were_found(start):
-    run, trainer, _ = start({30: report(0.5), 60: report(0.4), 90: report(0.4), 100: report(0.4)})
-    outcome = run.run()
-    assert (outcome.scores["success_rate"], outcome.scores["steps"]) == (0.5, 30)
-    name, steps, scores, notes = trainer.saved[-1]
-    assert (name, steps, scores["success_rate"], scores["steps"]) == ("last.zip", 100, 0.4, 100)
-    assert notes["best"] == {"steps": 30, "success_rate": 0.5, "return_mean": 0.0, "path": str(outcome.checkpoint)}
-
-
-def test_success_must_be_confirmed_by_fresh_episodes(start):
-    look, all_of_them = report(1.0, episodes=3), report(1.0)
-    lucky, lasting = [look, all_of_them, report(0.8)], [look, all_of_them, report(0.9)]
-    run, _, watcher = start({30: [report(0.0, episodes=3)], 60: lucky, 90: lasting}, until_success=0.9)
-    outcome = run.run()
-    quarter, whole, fresh = (2_000_007, 3), (2_000_007, 10), (2_000_017, 10)
-    assert start.seeds == [(30, *quarter)] + [(step, *asked) for step in (60, 90) for asked in (quarter, whole, fresh)]
-    assert [row[:2] for row in watcher.evaluations] == [(30, 0.0), (60, 0.8), (90, 0.9)]
-    assert (outcome.reason, outcome.steps, outcome.best.steps) == ("success", 90, 90)
-
-
-def test_a_quarter_with_few_failures_is_followed_by_the_rest(start):
-    look, rest = report(2 / 3, episodes=3), report(0.7)
-    results = {step: [look, rest] for step in (30, 60, 90)} | {100: rest}
-    run, _, watcher = start(results, until_success=0.9)
-    run.run()
-    assert [row[:2] for row in watcher.evaluations] == [(step, 0.7) for step in (30, 60, 90, 100)]
-
-
-def test_the_last_evaluation_is_a_whole_one(start):
-    look = report(0.0, episodes=3)
-    run, _, _ = start({30: [look], 60: [look], 90: [look], 100: report(0.1)}, until_success=0.9)
-    assert run.run().scores["episodes"] == 10
-
-
-@pytest.mark.parametrize(("share", "steps"), [(0.95, [10, 20, 30]), (0.9, [40, 80, 100])])
-def test_training_that_succeeds_is_evaluated_early(start, share, steps):
-    results = dict.fromkeys(range(10, 101, 10), report(0.9)) | {30: [report(1.0), report(1.0), report(1.0)]}
-    run, trainer, watcher = start(results, until_success=0.95, eval_every=40)
-    trainer.statistics = replace(STATISTICS, success_rate=share)
-    run.run()
-    assert [row[0] for row in watcher.evaluations] == steps
-
-
-def test_success_that_nobody_reports_never_ends_a_run(start):
-    run, _, watcher = start({step: report(None, 1.0) for step in (30, 60, 90, 100)}, until_success=0.9)
-    assert run.run().reason == "steps"
-    assert watcher.notes == ["test/Count-v0 reports no is_success, so --until-success has no effect"]
-
-
-def test_asked_to_stop_it_saves_and_ends_without_an_evaluation(start):
-    run, _, watcher = start({30: report(0.5)}, Clock())
-    watcher.training = lambda progress, *rest: run.stop() if progress.steps == 50 else None
-    outcome = run.run()
-    assert (outcome.reason, outcome.steps) == ("stopped", 50)
-    assert outcome.last.read_text() == "50"
-    assert outcome.best.steps == 30
-
-
-@pytest.mark.parametrize(("takes", "saves"), [(0.0, [30, 340, 650, 960, 1000]), (2.0, [30, 1000])])
-def test_it_saves_every_half_minute_without_evaluations_and_less_often_if_it_is_slow(start, takes, saves):
-    run, trainer, _ = start({1000: report(0.5)}, Clock(takes), steps=1000, eval_every=1000)
-    run.run()
-    assert [row[1] for row in trainer.saved if row[0] == "last.zip"] == [*saves, 1000]
-
-
-@pytest.mark.parametrize(
-    ("failure", "text"),
-    [
-        (TrainingFailed("train/loss is nan at step 60"), "train/loss is nan at step 60"),
-        (EnvironmentFailed("test/Count-v0: reward is inf"), "at step 60: test/Count-v0: reward is inf"),
-    ],
-)
-def test_a_nan_names_the_last_good_checkpoint(start, tmp_path, failure, text):
-    run, trainer, _ = start({30: report(0.5)})
-    trainer.fails_at, trainer.failure = 60, failure
-    with pytest.raises(TrainingFailed) as caught:
-        run.run()
-    last = tmp_path / "runs" / "count-ppo" / "last.zip"
-    assert str(caught.value) == f"{text}; the last good checkpoint is {last}"
-    assert last.read_text() == "30"
-
-
-def test_a_nan_before_anything_was_saved(start):
-    run, trainer, _ = start({})
-    trainer.fails_at = 10
-    with pytest.raises(TrainingFailed, match=r"; no checkpoint had been saved yet$"):
-        run.run()
-
-
-FULL = "cannot be written: No space left on device. Choose another place with"
-
-
-def test_a_full_disk_at_out_loses_nothing(start, tmp_path):
-    run, trainer, watcher = start({30: report(0.1), 60: report(0.9), 90: report(0.1), 100: report(0.1)})
-    trainer.refuse = ["out.zip"]
-    outcome = run.run()
-    assert str(outcome.failure) == f"{run.out}: {FULL} --out"
-    rescued = tmp_path / "runs" / "count-ppo" / "best.zip"
-    assert (outcome.checkpoint, rescued.read_text()) == (rescued, "60")
-    assert (tmp_path / "runs" / "count-ppo" / "last.zip").read_text() == "100"
-    assert watcher.notes[:2] == [
-        f"{run.out}: {FULL} --out. Training goes on",
-        f"the best policy is in {rescued} instead",
-    ]
-
-
-def test_a_full_disk_in_the_run_folder_does_not_end_training(start):
-    run, trainer, watcher = start({30: report(0.1), 60: report(0.9), 90: report(0.1), 100: report(0.1)})
-    trainer.refuse = ["last.zip"]
-    outcome = run.run()
-    last = run.folder.last
-    assert str(outcome.failure) == f"{last}: {FULL} --runs"
-    assert (trainer.steps, outcome.checkpoint, outcome.last) == (100, run.out, None)
-    assert run.out.read_text() == "60"
-    missing = f"{last} does not exist yet"
-    assert watcher.notes[:2] == [f"{last}: {FULL} --runs. Training goes on", missing]
-    assert watcher.notes[-2:] == [f"{last}: {FULL} --runs", missing]
-
-
-def test_a_disk_that_fills_up_later_leaves_an_older_state(start):
-    run, trainer, watcher = start({30: report(0.9), 60: report(0.1), 90: report(0.1), 100: report(0.1)})
-    watcher.evaluated = lambda steps, *rest: trainer.refuse.append("last.zip") if steps == 60 else None
-    outcome = run.run()
-    assert (outcome.last, outcome.last_steps, outcome.last.read_text()) == (run.folder.last, 30, "30")
-    assert watcher.notes[-1] == f"{run.folder.last} still has step 30, whole"
-
-
-def test_full_disks_everywhere_do_not_end_training_either(start):
-    run, trainer, watcher = start({30: report(0.1), 60: report(0.9), 90: report(0.1), 100: report(0.1)})
-    trainer.refuse = ["out.zip", "best.zip", "last.zip"]
-    trainer.train = lambda steps, on_progress, train=trainer.train: train(
-        steps, lambda progress: (trainer.refuse.clear() if progress.steps == 90 else None) or on_progress(progress)
-    )
-    outcome = run.run()
-    assert "the best policy could not be saved; no best policy is saved yet" in watcher.notes
-    assert run.out.read_text() == "90"
-    assert run.folder.last.read_text() == "100"
-    assert outcome.failure is None
-
-
-def test_records_that_cannot_be_written_do_not_end_training(start):
-    run, _, watcher = start({step: report(0.1) for step in (30, 60, 90, 100)})
-    (run.folder.path / "progress.jsonl").mkdir()
-    failure = str(run.run().failure)
-    assert failure.startswith(f"{run.folder.path / 'progress.jsonl'}: cannot be written: Is a directory. ")
-    assert watcher.notes == [f"{failure}. Training goes on, and some records are missing"]
+    name, at_steps, scores, notes = trainer.saved[-1]
+    assert (name, at_steps, scores["success_rate"], scores["steps"]) == ("last.zip", 100, results[-1][0], 100)
+    assert (notes["best"]["steps"], notes["best"]["path"]) == (best, str(outcome.checkpoint))
+    assert outcome.scores["steps"] == best
 
 
 def test_a_few_episodes_are_not_better_than_many(start):
@@ -327,16 +160,141 @@ def test_a_few_episodes_are_not_better_than_many(start):
 
 
 def test_a_resumed_run_keeps_a_better_best(start):
-    results = {60: report(0.5), 90: report(0.7), 100: report(0.6)}
-    run, _, _ = start(results, best=Best(20, 0.8, 3.0), begin=30)
+    run, _, _ = start({60: report(0.5), 90: report(0.7), 100: report(0.6)}, best=Best(20, 0.8, 3.0), begin=30)
     run.out.write_text("20")
     outcome = run.run()
     assert (outcome.best.steps, outcome.checkpoint.read_text()) == (20, "20")
 
 
+def test_success_must_be_confirmed_by_fresh_episodes(start):
+    look, all_of_them = report(1.0, episodes=3), report(1.0)
+    lucky, lasting = [look, all_of_them, report(0.8)], [look, all_of_them, report(0.9)]
+    run, _, watcher = start({30: [report(0.0, episodes=3)], 60: lucky, 90: lasting}, until_success=0.9)
+    outcome = run.run()
+    quarter, whole, fresh = (2_000_007, 3), (2_000_007, 10), (2_000_017, 10)
+    assert start.seeds == [(30, *quarter)] + [(step, *asked) for step in (60, 90) for asked in (quarter, whole, fresh)]
+    assert [row[:2] for row in watcher.evaluations] == [(30, 0.0), (60, 0.8), (90, 0.9)]
+    assert (outcome.reason, outcome.steps, outcome.best.steps) == ("success", 90, 90)
+
+
+def test_a_quarter_with_few_failures_is_followed_by_the_rest_and_the_last_evaluation_is_whole(start):
+    few, many = report(2 / 3, episodes=3), report(0.0, episodes=3)
+    run, _, watcher = start({30: [few, report(0.7)], 60: [many], 90: [many], 100: report(0.1)}, until_success=0.9)
+    run.run()
+    assert [row[1] for row in watcher.evaluations] == [0.7, 0.0, 0.0, 0.1]
+    assert [asked[2] for asked in start.seeds] == [3, 10, 3, 3, 10]
+
+
+@pytest.mark.parametrize(("share", "steps"), [(0.95, [10, 20, 30]), (0.9, [40, 80, 100])])
+def test_training_that_succeeds_is_evaluated_early(start, share, steps):
+    results = dict.fromkeys(range(10, 101, 10), report(0.9)) | {30: [report(1.0), report(1.0), report(1.0)]}
+    run, trainer, watcher = start(results, until_success=0.95, eval_every=40)
+    trainer.statistics = replace(STATISTICS, success_rate=share)
+    run.run()
+    assert [row[0] for row in watcher.evaluations] == steps
+
+
+def test_success_that_nobody_reports_never_ends_a_run(start):
+    run, _, watcher = start(at(None, None, None, None), until_success=0.9)
+    assert run.run().reason == "steps"
+    assert watcher.notes == ["test/Count-v0 reports no is_success, so --until-success has no effect"]
+
+
+def test_asked_to_stop_it_saves_and_ends_without_an_evaluation(start):
+    run, _, watcher = start(at(0.5))
+    watcher.training = lambda progress, *rest: run.stop() if progress.steps == 50 else None
+    outcome = run.run()
+    assert (outcome.reason, outcome.steps, outcome.best.steps) == ("stopped", 50, 30)
+    assert outcome.last.read_text() == "50"
+
+
+@pytest.mark.parametrize(("takes", "saves"), [(0.0, [30, 340, 650, 960, 1000]), (2.0, [30, 1000])])
+def test_it_saves_every_half_minute_without_evaluations_and_less_often_if_it_is_slow(start, takes, saves):
+    run, trainer, _ = start({1000: report(0.5)}, save_takes=takes, steps=1000, eval_every=1000)
+    run.run()
+    assert [row[1] for row in trainer.saved if row[0] == "last.zip"] == [*saves, 1000]
+
+
+KEPT = "What was learnt is kept: go on with --resume {last}"
+
+
+@pytest.mark.parametrize(
+    ("failure", "text", "kept"),
+    [
+        (TrainingFailed("loss is nan"), "loss is nan; the last good checkpoint is {last}", "30"),
+        (EnvironmentFailed("reward is inf"), "at step 60: reward is inf; the last good checkpoint is {last}", "30"),
+        (LinkLost("tcp://a:9: the link dropped."), f"at step 60: tcp://a:9: the link dropped. {KEPT}", "60"),
+        (ProcessesLost("env runner 2 died"), f"at step 60: env runner 2 died. {KEPT}", "60"),
+    ],
+)
+def test_a_failure_names_the_last_good_checkpoint(start, failure, text, kept):
+    run, trainer, _ = start(at(0.5))
+    trainer.fails_at, trainer.failure = 60, failure
+    with pytest.raises(TrainingFailed) as caught:
+        run.run()
+    assert str(caught.value) == text.format(last=run.folder.last)
+    assert run.folder.last.read_text() == kept
+
+
+def test_a_failure_before_anything_was_saved(start):
+    run, trainer, _ = start({})
+    trainer.fails_at, trainer.failure = 10, TrainingFailed("loss is nan")
+    with pytest.raises(TrainingFailed, match=r"^loss is nan; no checkpoint had been saved yet$"):
+        run.run()
+
+
+FULL = "cannot be written: No space left on device. Choose another place with"
+RISING = at(0.1, 0.9, 0.1, 0.1)
+
+
+def test_a_full_disk_at_out_loses_nothing(start):
+    run, trainer, watcher = start(RISING)
+    trainer.refuse = ["out.zip"]
+    outcome, rescued = run.run(), run.folder.path / "best.zip"
+    assert str(outcome.failure) == f"{run.out}: {FULL} --out"
+    assert (outcome.checkpoint, rescued.read_text(), run.folder.last.read_text()) == (rescued, "60", "100")
+    notes = [f"{run.out}: {FULL} --out. Training goes on", f"the best policy is in {rescued} instead"]
+    assert watcher.notes[:2] == notes
+
+
+def test_a_full_disk_in_the_run_folder_does_not_end_training(start):
+    run, trainer, watcher = start(RISING)
+    trainer.refuse = ["last.zip"]
+    outcome, last = run.run(), run.folder.last
+    assert str(outcome.failure) == f"{last}: {FULL} --runs"
+    assert (trainer.steps, outcome.checkpoint, outcome.last, run.out.read_text()) == (100, run.out, None, "60")
+    missing = f"{last} does not exist yet"
+    assert watcher.notes[:2] == [f"{last}: {FULL} --runs. Training goes on", missing]
+    assert watcher.notes[-2:] == [f"{last}: {FULL} --runs", missing]
+
+
+def test_a_disk_that_fills_up_later_leaves_an_older_state(start):
+    run, trainer, watcher = start(at(0.9, 0.1, 0.1, 0.1))
+    watcher.evaluated = lambda steps, *rest: trainer.refuse.append("last.zip") if steps == 60 else None
+    outcome = run.run()
+    assert (outcome.last, outcome.last_steps, outcome.last.read_text()) == (run.folder.last, 30, "30")
+    assert watcher.notes[-1] == f"{run.folder.last} still has step 30, whole"
+
+
+def test_full_disks_everywhere_do_not_end_training_either(start):
+    run, trainer, watcher = start(RISING)
+    trainer.refuse = ["out.zip", "best.zip", "last.zip"]
+    watcher.training = lambda progress, *rest: trainer.refuse.clear() if progress.steps == 90 else None
+    outcome = run.run()
+    assert "the best policy could not be saved; no best policy is saved yet" in watcher.notes
+    assert (run.out.read_text(), run.folder.last.read_text(), outcome.failure) == ("90", "100", None)
+
+
+def test_records_that_cannot_be_written_do_not_end_training(start):
+    run, _, watcher = start(RISING)
+    (run.folder.path / "progress.jsonl").mkdir()
+    failure = str(run.run().failure)
+    assert failure.startswith(f"{run.folder.path / 'progress.jsonl'}: cannot be written: Is a directory. ")
+    assert watcher.notes == [f"{failure}. Training goes on, and some records are missing"]
+
+
 def test_records(start):
-    clock = Clock()
-    run, _, watcher = start({step: report(0.5) for step in (30, 60, 90, 100)}, clock)
+    run, _, watcher = start(at(0.5, 0.5, 0.5, 0.5))
     run.run()
     records = run.folder.records()
     assert [record["steps"] for record in records if record["kind"] == "training"] == list(range(10, 101, 10))
@@ -351,28 +309,9 @@ def test_records(start):
         "success_rate": None,
         "train/loss": 0.25,
     }
-    assert records[3]["kind"] == "evaluation"
-    assert (records[3]["steps"], records[3]["success_rate"], records[3]["seconds"]) == (30, 0.5, 3.0)
+    assert (records[3]["kind"], records[3]["steps"]) == ("evaluation", 30)
+    assert (records[3]["success_rate"], records[3]["seconds"]) == (0.5, 3.0)
     assert watcher.rates[0] == (10, 10.0, 9.0)
-
-
-def test_where_there_are_no_other_environments_training_lends_its_own(start):
-    run, trainer, _ = start({100: report(0.5)}, eval_every=100)
-    trainer.rows = object()  # `evaluate` of the fixture looks at it
-    assert run.run().best.success_rate == 0.5
-
-
-@pytest.mark.parametrize(
-    "link", [LinkLost("tcp://a:9: the link dropped."), ProcessesLost("env runner 2 died 6 times within 20 updates")]
-)
-def test_a_lost_link_or_process_loses_nothing_that_was_learnt(start, link):
-    run, trainer, _ = start({30: report(0.5)})
-    trainer.link, last = link, run.folder.last
-    with pytest.raises(TrainingFailed) as caught:
-        run.run()
-    said = str(link).rstrip(".")
-    assert str(caught.value) == f"at step 60: {said}. What was learnt is kept: go on with --resume {last}"
-    assert last.read_text() == "60"
 
 
 def test_what_the_trainer_says_in_mid_run_is_passed_on_once(start):
@@ -380,6 +319,9 @@ def test_what_the_trainer_says_in_mid_run_is_passed_on_once(start):
     trainer.news = ["env runner 1 died", "env runner 1 is back"]
     run.run()
     assert watcher.notes == ["env runner 1 died", "env runner 1 is back"]
+
+
+SLOW = "s3://bucket/: out.zip could not be copied there: OSError: slow down"
 
 
 class Copying:
@@ -391,18 +333,18 @@ class Copying:
     def copy(self, checkpoint):
         if self.failures:
             self.failures -= 1
-            raise OutputError("s3://bucket/: out.zip could not be copied there: OSError: slow down")
+            raise OutputError(SLOW)
         self.copied.append(checkpoint.read_text())
 
 
-RISING = {30: report(0.1), 60: report(0.5), 90: report(0.4), 100: report(0.4)}
-
-
-def test_every_best_checkpoint_is_copied(start):
-    copies = Copying()
+@pytest.mark.parametrize(("failures", "copied"), [(0, ["30", "60"]), (2, ["60"]), (9, [])])
+def test_every_best_checkpoint_is_copied_and_a_copy_that_failed_is_made_up_for(start, failures, copied):
+    copies = Copying(failures)
     run, _, watcher = start(RISING, copies=copies)
-    assert run.run().failure is None
-    assert (copies.copied, watcher.notes) == (["30", "60"], [])
+    outcome = run.run()
+    assert (outcome.steps, copies.copied) == (100, copied)
+    assert str(outcome.failure) == ("None" if copied else SLOW)
+    assert watcher.notes == [f"{SLOW}. It is tried again at the next best policy"] * (failures > 0)
 
 
 def test_a_stopped_run_copies_its_newest_state_if_it_has_no_best(start):
@@ -412,21 +354,3 @@ def test_a_stopped_run_copies_its_newest_state_if_it_has_no_best(start):
     run.watcher.note = lambda text: run.stop()
     assert run.run().reason == "stopped"
     assert copies.copied == ["20"]
-
-
-def test_a_copy_that_failed_is_made_up_for(start):
-    copies = Copying(failures=2)
-    run, _, watcher = start(RISING, copies=copies)
-    assert run.run().failure is None
-    assert copies.copied == ["60"]
-    assert watcher.notes == [
-        "s3://bucket/: out.zip could not be copied there: OSError: slow down. It is tried again at the next best policy"
-    ]
-
-
-def test_a_last_copy_that_failed_fails_the_run(start):
-    run, _, watcher = start(RISING, copies=Copying(failures=9))
-    outcome = run.run()
-    assert (outcome.reason, outcome.steps) == ("steps", 100)
-    assert str(outcome.failure) == "s3://bucket/: out.zip could not be copied there: OSError: slow down"
-    assert len(watcher.notes) == 1
