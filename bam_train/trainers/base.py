@@ -78,11 +78,7 @@ class Trainer(Protocol):
 
     @classmethod
     def create(cls, settings: TrainSettings) -> Self:
-        """Set up a new run of complete settings.
-
-        Raises:
-            SettingsError: The library refuses the settings.
-        """
+        """Set up a new run of complete settings; raises SettingsError if the library refuses them."""
 
     @classmethod
     def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None) -> Self:
@@ -105,10 +101,7 @@ class Trainer(Protocol):
     def save(self, path: Path, scores: Mapping[str, Any], notes: Mapping[str, Any]) -> Checkpoint:
         """Write a checkpoint that can be resumed and deployed; training is not disturbed, not even its random numbers.
 
-        Args:
-            path: The file.
-            scores: What evaluation found, for the manifest.
-            notes: JSON values kept for `load`'s caller in ``bam/resume/notes.json``.
+        The scores are for the manifest, the notes JSON values in ``bam/resume/notes.json`` for who resumes.
         """
 
     def freeze(self) -> FrozenPolicy:

@@ -75,15 +75,9 @@ def _require_of_trainer(settings: TrainSettings) -> None:
 
 
 def own_settings(checkpoint: Checkpoint, env: str | None = None, *, elsewhere: bool = False) -> dict[str, Any]:
-    """Settings that a checkpoint's run had, but for where it computed, which no file says.
+    """Settings that a checkpoint's run had, but for where it computed, which no file says: it may be untrusted.
 
-    Args:
-        checkpoint: May be untrusted.
-        env: The environment, if somebody named it.
-        elsewhere: It runs on another computer.
-
-    Raises:
-        CheckpointMismatch: See `environment_of`.
+    The environment is `env` if somebody named it; if it runs `elsewhere`, it need not be installed here.
     """
     manifest = checkpoint.manifest
     module = manifest.env.rpartition(":")[0]

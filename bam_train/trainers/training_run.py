@@ -24,15 +24,12 @@ from bam_train.settings import TrainSettings
 from bam_train.trainers.base import Progress, Statistics, Trainer
 from bam_train.trainers.run_folder import Copies, RunFolder, unwritable
 
-SAVE_EVERY = 30.0
-"""Seconds between two saves at least, unless an evaluation comes first."""
-
 FIRST_SAVE = 2.0
 """Seconds until the first save: a run that is killed early has something to go on from."""
-
+SAVE_EVERY = 30.0
+"""Seconds between two saves at least, unless an evaluation comes first."""
 SAVE_SHARE = 0.02
 """Share of the time that saving may take: a large replay buffer is saved less often."""
-
 RECORD_EVERY = 0.1
 """Seconds between two training records at least."""
 
@@ -68,12 +65,10 @@ class Best:
     def rank(self) -> tuple[float, float]:
         """Larger is better: success first, then return; what is unknown ranks last.
 
-        Success is what is sure of it, the low end of its interval: 1 of 5 is less than 4 of 20. Over the same number
-        of episodes this is the order of the success rates.
+        Success is the low end of its interval: 1 of 5 is less than 4 of 20.
         """
-        lowest = float("-inf")
         sure = self.success_rate if self.success_interval is None else self.success_interval[0]
-        return tuple(lowest if value is None else value for value in (sure, self.return_mean))  # type: ignore[return-value]
+        return (-math.inf if sure is None else sure), (-math.inf if self.return_mean is None else self.return_mean)
 
 
 @dataclass(frozen=True)
@@ -338,16 +333,11 @@ def evaluate_for_success(
     last: bool = False,
     envs: VectorEnv[Any, Any, Any] | None = None,
 ) -> tuple[EvaluationReport, bool]:
-    """Evaluate a policy; towards ``until_success`` in up to three parts.
+    """Evaluate a policy; towards ``until_success`` in up to three parts. Episode k has EVALUATION_SEED + seed + k.
 
     First a quarter of the episodes, which spares early, hopeless policies a long evaluation; then all, if that may
-    reach it; then, if it did, as many fresh ones, which must reach it too.
-
-    Args:
-        policy: What acts.
-        settings: Of the run; episode k is seeded EVALUATION_SEED + seed + k.
-        last: Whether this is the run's last evaluation, which is never cut short.
-        envs: Environments to evaluate on, left open; by default some are made.
+    reach it; then, if it did, as many fresh ones, which must reach it too. The last evaluation of a run is never cut
+    short. Environments that are given stay open; by default some are made.
 
     Returns:
         The report (the worse of two), and whether ``until_success`` was reached.

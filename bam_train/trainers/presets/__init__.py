@@ -11,11 +11,6 @@ from typing import Any
 from bam_train.settings import file_stem, parse_config
 
 
-def preset_name(env: str, algo: str, trainer: str = "sb3") -> str:
-    """File name of a preset: ``bam/pick-v0`` and ppo make ``pick-ppo.toml``, and for rllib ``pick-rllib-ppo.toml``."""
-    return f"{file_stem(env, algo, trainer)}.toml"
-
-
 def list_presets() -> list[str]:
     """File names of all presets, sorted."""
     names = (entry.name for entry in resources.files(__name__).iterdir())
@@ -28,7 +23,7 @@ def read_preset(env: str, algo: str, trainer: str = "sb3") -> dict[str, Any]:
     Raises:
         SettingsError: The file is not as it should be.
     """
-    name = preset_name(env, algo, trainer)
+    name = f"{file_stem(env, algo, trainer)}.toml"
     if name not in list_presets():
         return {}
     return parse_config(name, resources.files(__name__).joinpath(name).read_text(encoding="utf-8"))

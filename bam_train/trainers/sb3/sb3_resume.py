@@ -18,13 +18,12 @@ import numpy as np
 import torch
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.save_util import recursive_getattr
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecNormalize
 
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.safetensors_file import pack, unpack
 from bam_train.errors import AlteredCheckpoint, FormatError
 from bam_train.trainers.sb3.sb3_freezing import leaves
-from bam_train.trainers.sb3.sb3_vec_env import BatchVecEnv
 
 MODEL, STATE, REPLAY, NOTES = "bam/resume/model", "bam/resume/state", "bam/resume/replay", "bam/resume/notes.json"
 _SUFFIXES = (".json", ".safetensors")
@@ -58,7 +57,7 @@ class Waiting:
 
 
 def members(
-    model: Any, venv: VecEnv, normaliser: VecNormalize | None, waiting: Waiting | None, notes: Mapping[str, Any]
+    model: Any, venv: Any, normaliser: VecNormalize | None, waiting: Waiting | None, notes: Mapping[str, Any]
 ) -> dict[str, bytes]:
     """Everything that the run needs to go on, by name in its checkpoint.
 
@@ -74,7 +73,7 @@ def members(
     tree = {
         "counters": _counters(model),
         "normaliser": _statistics(normaliser),
-        "env": venv.state_dict() if _saves_episodes(venv) and model._last_obs is not None else None,
+        "env": venv.state_dict() if getattr(venv, "can_be_saved", False) and model._last_obs is not None else None,
         "random": waiting.random if waiting else random_states(model),
         "noise": waiting.noise if waiting else [one.noise_prev for one in _correlated_noises(model)],
     }
@@ -96,7 +95,7 @@ def members(
     return written
 
 
-def load(checkpoint: Checkpoint, model: Any, venv: VecEnv, normaliser: VecNormalize | None) -> Waiting:
+def load(checkpoint: Checkpoint, model: Any, venv: Any, normaliser: VecNormalize | None) -> Waiting:
     """Put a checkpoint's state into a new model of the same settings; what is left is returned.
 
     Raises:
@@ -113,7 +112,7 @@ def load(checkpoint: Checkpoint, model: Any, venv: VecEnv, normaliser: VecNormal
         _load_counters(model, tree["counters"])
         if normaliser is not None:
             _load_statistics(normaliser, tree["normaliser"])
-        same = _saves_episodes(venv) and tree["env"] is not None
+        same = getattr(venv, "can_be_saved", False) and tree["env"] is not None
         if same:
             venv.load_state_dict(tree["env"])
         else:  # `learn` begins new episodes, seeded by how far the run is
@@ -151,10 +150,6 @@ def _read(checkpoint: Checkpoint, name: str) -> Any:
         return unpack(skeleton, arrays, torch.from_numpy)
     except FormatError as error:
         raise AlteredCheckpoint(checkpoint.path, name, str(error)) from error
-
-
-def _saves_episodes(venv: VecEnv) -> bool:
-    return isinstance(venv, BatchVecEnv) and venv.can_be_saved
 
 
 def _counters(model: Any) -> dict[str, Any]:

@@ -100,9 +100,8 @@ class SB3Trainer:
         require_fit(checkpoint, one_env(trainer.venv), settings.place)
         trainer._waiting = resume.load(checkpoint, trainer.model, trainer.venv, trainer._normaliser)
         if not trainer._waiting.same_episodes:
-            trainer.notices.append(
-                f"{settings.env} cannot save running episodes: new ones begin, so the rest differs from an unbroken run"
-            )
+            text = "cannot save running episodes: new ones begin, so the rest differs from an unbroken run"
+            trainer.notices.append(f"{settings.env} {text}")
         before = checkpoint.manifest.settings.get("steps", settings.steps)
         courses = hyperparameters.over_the_whole_run(settings.hyperparameters)
         if courses and before != settings.steps:
@@ -143,9 +142,8 @@ class SB3Trainer:
         except (ValueError, RuntimeError) as error:
             if all_finite(self.model) and not refused_distribution(error):
                 raise
-            raise TrainingFailed(
-                f"the policy's weights or actions are NaN or infinite after step {self.steps}; {_FINITE}"
-            ) from error
+            text = f"the policy's weights or actions are NaN or infinite after step {self.steps}; {_FINITE}"
+            raise TrainingFailed(text) from error
 
     def _roll_out(self, collect: Any, *arguments: Any, **named: Any) -> Any:
         """Stands before the algorithm's own `collect_rollouts`, where nothing is half done."""

@@ -15,10 +15,11 @@ from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_train.checkpoint import write_checkpoint
 from bam_train.errors import AlteredCheckpoint, CheckpointMismatch, OutputError, SettingsError
+from bam_train.settings import file_stem
 from bam_train.trainers import load_trainer, require_algorithm
 from bam_train.trainers.algorithms import ALGORITHMS
 from bam_train.trainers.best_checkpoint import choose_output
-from bam_train.trainers.presets import list_presets, preset_name, read_preset
+from bam_train.trainers.presets import list_presets, read_preset
 from bam_train.trainers.resolve_settings import resolve, resolve_resumed
 from bam_train.trainers.training_run import Best
 
@@ -94,7 +95,7 @@ def test_the_table_of_trainers():
 @pytest.mark.parametrize("name", list_presets())
 def test_every_preset_is_complete_and_of_an_environment_of_ours(name):
     runs = [(trainer, algo) for trainer, table in ALGORITHMS.items() for algo in table]
-    found = [(env, *run) for env in ENVIRONMENTS for run in runs if preset_name(env, run[1], run[0]) == name]
+    found = [(env, *run) for env in ENVIRONMENTS for run in runs if f"{file_stem(env, run[1], run[0])}.toml" == name]
     assert len(found) == 1
     env, trainer, algo = found[0]
     assert read_preset(env, algo, trainer)
