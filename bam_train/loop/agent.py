@@ -202,11 +202,10 @@ class Agent(_Base):  # type: ignore[misc]
         """The agent in a file of `save_model`. It is a pickle and runs what is in it: read only files you trust."""
         return import_torch("Agent.load_model()").load(filename, weights_only=False)
 
-    def _workspace(self) -> Workspace:
+    def _workspace(self) -> Any:
         if self.workspace is None:
             raise LoopError(f"{agent_name(self)} has no workspace outside a call; call it: agent(workspace, t=0).")
-        workspace: Workspace = self.workspace
-        return workspace
+        return self.workspace
 
 
 def import_torch(purpose: str) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from bam_train.loop.variables import to_array
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from pandas import DataFrame, Series
+    from pandas import DataFrame
 
     from bam_train.loop.workspace import Workspace
 
@@ -38,7 +38,6 @@ def plot(workspace: Workspace, *names: str, batch: int | Sequence[int] | None = 
         batch: The batch column or columns to draw; None draws all.
 
     Raises:
-        UnknownVariable: A name is not in the workspace.
         WorkspaceError: There is nothing to draw, a variable holds images, or it does not have these batch columns.
         MissingExtra: matplotlib is not installed.
     """
@@ -52,7 +51,12 @@ def plot(workspace: Workspace, *names: str, batch: int | Sequence[int] | None = 
     rows = figure.subplots(len(arrays), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (name, array) in zip(rows, arrays.items(), strict=True):
         times = workspace.first_time + np.arange(len(array))
-        _draw(axes, times, name, array, _columns(name, array.shape[1], batch))
+        columns = range(array.shape[1]) if batch is None else [int(column) for column in np.atleast_1d(batch)]
+        for column in columns:
+            if not 0 <= column < array.shape[1]:
+                last = array.shape[1] - 1
+                raise WorkspaceError(f"{name!r} has no batch column {column}; it has columns 0 to {last}.")
+        _draw(axes, times, name, array, columns)
     rows[-1].set_xlabel("t")
     return figure
 
@@ -69,7 +73,6 @@ def to_dataframe(workspace: Workspace, *names: str) -> DataFrame:
         *names: The variables, in this order; without names all, but for images.
 
     Raises:
-        UnknownVariable: A name is not in the workspace.
         WorkspaceError: There is nothing to put into the table, or a variable holds images.
         MissingExtra: pandas is not installed.
     """
@@ -86,17 +89,10 @@ def to_dataframe(workspace: Workspace, *names: str) -> DataFrame:
         own = pandas.MultiIndex.from_product([range(first, first + len(array)), range(array.shape[1])])
         flat = array.reshape(own.size, -1)
         for label, values in zip(_labels(array.shape[2:]), flat.T, strict=True):
-            columns[name + label] = _column(values, own, rows)
+            if not own.equals(rows) and values.dtype.kind != "f":
+                values = pandas.array(values)  # such as Int64 and boolean, which know NA
+            columns[name + label] = pandas.Series(values, index=own).reindex(rows)
     return pandas.DataFrame(columns, index=rows)
-
-
-def _column(values: np.ndarray, own: Any, rows: Any) -> Series:
-    import pandas
-
-    if own.equals(rows):
-        return pandas.Series(values, index=rows)
-    exact = values if values.dtype.kind == "f" else pandas.array(values)  # such as Int64 and boolean, which know NA
-    return pandas.Series(exact, index=own).reindex(rows)
 
 
 def _arrays(workspace: Workspace, names: tuple[str, ...], purpose: str) -> dict[str, np.ndarray]:
@@ -117,23 +113,13 @@ def _arrays(workspace: Workspace, names: tuple[str, ...], purpose: str) -> dict[
     return {name: array for name, array in arrays.items() if name not in images}
 
 
-def _columns(name: str, width: int, batch: int | Sequence[int] | None) -> list[int]:
-    if batch is None:
-        return list(range(width))
-    chosen = [int(column) for column in np.atleast_1d(np.asarray(batch))]
-    for column in chosen:
-        if not 0 <= column < width:
-            raise WorkspaceError(f"{name!r} has no batch column {column}; it has columns 0 to {width - 1}.")
-    return chosen
-
-
 def _labels(shape: tuple[int, ...]) -> Iterator[str]:
     """``""`` for a scalar; ``[0]``, ``[1]``, … for a vector; ``[0,0]``, … for a matrix, in C order."""
     for index in np.ndindex(shape):
         yield f"[{','.join(map(str, index))}]" if index else ""
 
 
-def _draw(axes: Axes, times: np.ndarray, name: str, array: np.ndarray, columns: list[int]) -> None:
+def _draw(axes: Axes, times: np.ndarray, name: str, array: np.ndarray, columns: Sequence[int]) -> None:
     labels = list(_labels(array.shape[2:]))
     values = array.reshape(*array.shape[:2], len(labels))
     lines = [(column, component) for column in columns for component in range(len(labels))]

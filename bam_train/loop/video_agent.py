@@ -17,11 +17,7 @@ from bam_train.video import Frame, open_video, picture, require_video_path
 
 
 class VideoAgent(Agent):
-    """Adds what an environment shows to a video. Stands behind the environment's agent.
-
-    Args:
-        env: Made with ``render_mode="rgb_array"``.
-        add: Takes a picture, such as what `bam_train.video.open_video` gives.
+    """Gives pictures of an environment, which renders ``"rgb_array"``, to `add`; stands behind the environment's agent.
 
     Attributes:
         count: The number of pictures taken.
@@ -41,7 +37,7 @@ class VideoAgent(Agent):
 
 
 def record_video(env: gym.Env[Any, Any], policy: Agent, path: str | Path, *, arrays: str = "torch") -> Path:
-    """Record one episode; the environment is closed at the end.
+    """Record one episode in a file, whose path is returned; the environment is closed at the end.
 
     BBRL writes ``<path without suffix>/rl-video-episode-0.mp4``; this writes `path` itself.
 
@@ -51,9 +47,6 @@ def record_video(env: gym.Env[Any, Any], policy: Agent, path: str | Path, *, arr
             finds what `ParallelGymAgent` writes.
         path: Ends in ``.mp4`` or ``.gif``; without a suffix it is an ``.mp4``. Its folder is made.
         arrays: What the policy reads and writes: ``"torch"``, without gradients, or ``"numpy"``.
-
-    Returns:
-        The file.
 
     Raises:
         SettingsError: Another suffix, or the environment gives no picture.

@@ -287,33 +287,28 @@ class AsynchronousAgent(_ProcessAgent):
     def __init__(self, agent: Agent, verbose: bool = False, *, start_method: str = "spawn") -> None:
         super().__init__(agent, verbose=verbose, start_method=start_method)
         self._last: Workspace | None = None
-        self._expected = False
 
     def __call__(self, **kwargs: Any) -> None:  # type: ignore[override]  # it has its own workspace
         """Start the agent on a new workspace with these keywords, without waiting; refused while one is running."""
         if self.is_running():
             raise _still_running(self)
         self._running_worker().send("run_alone", kwargs)
-        self._last, self._expected = None, True
+        self._last = None
 
     def is_running(self) -> bool:
         """Whether the last call is still under way; a failure is raised here."""
         if super().is_running():
             return True
-        if self._expected and self._worker is not None:
-            self._expected, self._last = False, Workspace()
+        if self._worker is not None and self._worker.result is not None:
+            self._last = Workspace()
             for name, value in pickle.loads(self._worker.result).items():
                 self._last.set_full(name, value)
+            self._worker.result = None
         return False
 
     def get_workspace(self) -> Workspace | None:
         """The workspace of the last call; None while it is under way, and before the first."""
         return None if self.is_running() else self._last
-
-    def close(self) -> None:
-        """End the process; at any time, and idempotent. The last workspace stays."""
-        super().close()
-        self._expected = False
 
 
 def _still_running(agent: Agent) -> LoopError:

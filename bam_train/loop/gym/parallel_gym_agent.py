@@ -2,10 +2,10 @@
 
 Differences from bbrl 1.0.1:
 
-- A missing action, one for another number of environments, of another shape than the action space or out of a Discrete
-  space's range, and an observation that is no array, number or dict of them, are exceptions that name the variable.
-- What environments give is written in the dtype of the table below, whatever its Python type: NumPy integers as int64
-  (BBRL: float32), float16 as float32 (BBRL: int64), flags as bool (BBRL: int64 where an environment gives 0 and 1).
+- An action that is missing or does not fit the action space, and an observation that is no array, number or dict of
+  them, are exceptions that name the variable.
+- What environments give is written in the dtype of the table below, whatever its Python type; BBRL writes NumPy
+  integers as float32, float16 as int64, and flags 0 and 1 as int64.
 - `seed` in the call, `info_keys`, `arrays="numpy"`, `close`.
 - With `reward_at_t` the cumulated reward at two times is two tensors, not one.
 

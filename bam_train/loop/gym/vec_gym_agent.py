@@ -1,9 +1,7 @@
 """A Gymnasium vector environment as an agent.
 
-Differences from bbrl 1.0.1's `VecGymAgent`, which fails with more than one environment and never restarts
-cumulated_reward: any number of environments, timestep, dict observations and actions, variables that mean what
-`ParallelGymAgent`'s do in every autoreset mode, and its seeds: environment k is reset with
-num_envs * r * seed + k + 1 (BBRL's VecGymAgent: r * seed + k). Rewards are summed in float64.
+Unlike bbrl 1.0.1's `VecGymAgent`, which fails with more than one environment and never restarts cumulated_reward, it
+has the variables and the seeds of `ParallelGymAgent` in every autoreset mode. Rewards are summed in float64.
 
 With `include_last_state` the time at which an episode ends has the last observation, and the next time is a first
 observation with reward 0:

@@ -29,9 +29,8 @@ def gae(
         delta[t]     = reward[t] + discount_factor * must_bootstrap[t] * next_critic[t] - critic[t]
         advantage[t] = delta[t] + discount_factor * gae_coef * must_bootstrap[t] * advantage[t + 1]
 
-    The sum ends where `must_bootstrap` is False and at the last time. The first axis is time: give T x B. A flat batch
-    of N transitions (`get_transitions` of one environment) is right as well; of several environments it is not, because
-    neighbours in such a batch belong to different environments (except with ``gae_coef=0``).
+    The sum ends where `must_bootstrap` is False and at the last time. The first axis is time: give T x B, or N of the
+    transitions of one environment. Neighbours in a flat batch of several environments do not belong together.
 
     Args:
         reward: Reward of each transition, T x B or N, float.

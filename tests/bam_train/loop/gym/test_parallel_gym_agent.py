@@ -13,24 +13,6 @@ from bam_train.errors import LoopError, SettingsError
 from bam_train.loop import ParallelGymAgent, VecGymAgent, Workspace
 
 
-def test_variables_are_those_of_bbrl(toys):
-    agent = ParallelGymAgent(toys.Counting, 2)
-    workspace = Workspace()
-    agent(workspace, t=0)
-    found = {name: (workspace[name].dtype, tuple(workspace[name].shape)) for name in workspace.variables}
-    assert list(found.items()) == [
-        ("env/env_obs", (torch.float32, (1, 2, 2))),
-        ("env/terminated", (torch.bool, (1, 2))),
-        ("env/truncated", (torch.bool, (1, 2))),
-        ("env/done", (torch.bool, (1, 2))),
-        ("env/reward", (torch.float32, (1, 2))),
-        ("env/cumulated_reward", (torch.float32, (1, 2))),
-        ("env/timestep", (torch.int64, (1, 2))),
-    ]
-    assert agent.writes == tuple(found)
-    assert agent.reads is None
-
-
 def test_without_auto_reset_the_last_frame_is_repeated(toys):
     agent = ParallelGymAgent(toys.Counting, 2, {"length": 3})
     agent.envs[1].length = 4
@@ -58,20 +40,6 @@ def test_auto_reset_with_the_last_state(toys):
     assert toys.column(ws, "env/done") == [False, False, True, False, False, True, False, False]
     assert agent.envs[0].unwrapped.actions == [1, 2, 4, 5, 7]
     assert ws["env/cumulated_reward"][ws["env/done"]].tolist() == [23, 43]
-
-
-@pytest.mark.parametrize("wrap", [lambda env: env, gym.wrappers.RecordEpisodeStatistics])
-def test_time_limits(toys, wrap):
-    """The same whether `Autoreset`, `TimeLimit` and `OrderEnforcing` are outermost or not."""
-
-    def make():
-        return wrap(Autoreset(gym.wrappers.TimeLimit(gym.wrappers.OrderEnforcing(toys.Counting(length=5)), 2)))
-
-    ws = toys.run(ParallelGymAgent(make, 2), 8)
-    for row in (0, 1):
-        assert toys.column(ws, "env/truncated", row) == [False, False, True, False, False, True, False, False]
-        assert toys.column(ws, "env/timestep", row) == [0, 1, 2, 0, 1, 2, 0, 1]
-    assert not ws["env/terminated"].any()
 
 
 def test_reward_at_t(toys):
@@ -106,6 +74,7 @@ def test_numpy_arrays(toys):
     }
     assert toys.column(ws, "env/reward") == [0, 11, 12]
     assert agent.ghost_params is None
+    assert (agent.reads, set(agent.writes)) == (None, set(ws.variables) - {"action"})
 
 
 def test_infos(toys):

@@ -45,58 +45,34 @@ def assert_same(found, expected):
         assert torch.equal(found[name], one), name
 
 
-class Plain:
-    """Rewards that do not depend on the number of the episode."""
-
-    @staticmethod
-    def of(counting):
-        class Rewarding(counting):
-            def step(self, action):
-                observation, _, *rest = super().step(action)
-                return observation, float(self.count), *rest
-
-        return Rewarding
-
-
 @pytest.fixture
 def plain(toys):
     """`toys`, with rewards that do not count episodes."""
-    toys.Counting = Plain.of(toys.Counting)
+
+    class Rewarding(toys.Counting):
+        def step(self, action):
+            observation, _, *rest = super().step(action)
+            return observation, float(self.count), *rest
+
+    toys.Counting = Rewarding
     return toys
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_rows_with_the_last_state(plain, mode):
-    keys = ("is_success", "odd", "length")
-    found = plain.run(VecGymAgent(vector_of(plain, mode), info_keys=keys), 14)
-    expected = plain.run(parallel_of(plain, info_keys=keys), 14)
-    assert_same(without_episode(found), without_episode(expected))
-
-
-@pytest.mark.parametrize("mode", RESETTING)
-def test_rows_without_the_last_state(toys, mode):
-    keys = ("is_success", "odd", "length")
-    found = toys.run(VecGymAgent(vector_of(toys, mode), include_last_state=False, info_keys=keys), 14)
-    expected = toys.run(parallel_of(toys, include_last_state=False, info_keys=keys), 14)
-    assert_same({name: found[name] for name in found.variables}, {name: expected[name] for name in expected.variables})
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_rows_without_auto_reset(toys, mode):
-    keys = ("is_success", "odd", "length")
-    agent = VecGymAgent(vector_of(toys, mode), auto_reset=False, info_keys=keys)
-    found = toys.run(agent, 7)
-    expected = toys.run(parallel_of(toys, autoreset=False, info_keys=keys), 7)
-    assert_same({name: found[name] for name in found.variables}, {name: expected[name] for name in expected.variables})
-    again = toys.run(agent, 7)  # a new call at t = 0 resets all
-    for name in ("env/done", "env/timestep", "env/info/odd"):
-        assert torch.equal(again[name], found[name])
-
-
-def test_without_auto_reset_the_last_state_is_always_there(toys):
-    agent = VecGymAgent(vector_of(toys, AutoresetMode.SAME_STEP, (2,)), auto_reset=False, include_last_state=False)
-    assert agent.include_last_state
-    assert toys.column(toys.run(agent, 4), "env/env_obs") == [[1, 0], [1, 1], [1, 2], [1, 2]]
+@pytest.mark.parametrize(
+    ("mode", "kwargs"),
+    [
+        *((mode, {}) for mode in MODES),
+        *((mode, {"include_last_state": False}) for mode in RESETTING),
+        *((mode, {"auto_reset": False}) for mode in MODES),
+        *((mode, {"auto_reset": False, "include_last_state": False}) for mode in MODES),  # it is always there
+    ],
+)
+def test_variables_are_those_of_single_environments(plain, mode, kwargs):
+    keys, options = ("is_success", "odd", "length"), dict(kwargs)
+    vector = VecGymAgent(vector_of(plain, mode), info_keys=keys, **kwargs)
+    single = parallel_of(plain, autoreset=options.pop("auto_reset", True), info_keys=keys, **options)
+    for _ in range(2):  # t = 0 resets all
+        assert_same(without_episode(plain.run(vector, 14)), without_episode(plain.run(single, 14)))
 
 
 def test_what_is_given_away_may_be_changed(toys):
