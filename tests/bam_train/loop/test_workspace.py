@@ -19,12 +19,6 @@ def counted(kind, *names, times=3):
     return ws
 
 
-def test_all_times(kind):
-    ws = counted(kind, "x")
-    kind.check(ws.get_full("x"), [[0.0, 1.0], [10.0, 11.0], [20.0, 21.0]])
-    kind.check(ws["x"], [[0.0, 1.0], [10.0, 11.0], [20.0, 21.0]])
-
-
 def test_several_names_at_once(kind):
     ws = counted(kind, "x", "y", times=1)
     y, x = ws["y", "x"]
@@ -32,13 +26,6 @@ def test_several_names_at_once(kind):
     kind.check(x, [[0.0, 1.0]])
     (again,) = ws[["y"]]
     kind.check(again, [[100.0, 101.0]])
-
-
-def test_minus_one_is_the_last_time(kind):
-    ws = counted(kind, "x")
-    kind.check(ws.get("x", -1), [20.0, 21.0])
-    ws.set("x", -1, kind([7.0, 8.0]))
-    kind.check(ws["x"], [[0.0, 1.0], [10.0, 11.0], [7.0, 8.0]])
 
 
 def test_what_was_read_does_not_change_with_later_writes(kind):
@@ -65,14 +52,6 @@ def test_missing_earlier_times_are_zeros(kind, dtype, zero, one):
     kind.check(ws["x"], [[[zero, zero]], [[zero, zero]], [[one, one]]], dtype)
     ws.set("x", 4, kind([[one, zero]], dtype))
     kind.check(ws["x"][2:], [[[one, one]], [[zero, zero]], [[one, zero]]], dtype)
-
-
-@pytest.mark.parametrize("dtype", ["float16", "float64", "int32", "uint8", "bool"])
-def test_the_first_write_fixes_the_dtype(kind, dtype):
-    ws = Workspace()
-    ws.set("x", 0, kind([[1, 0]], dtype))
-    ws.set("x", 1, kind([[0, 1]], dtype))
-    kind.check(ws["x"], [[[1, 0]], [[0, 1]]], dtype)
 
 
 def test_sizes(kind):

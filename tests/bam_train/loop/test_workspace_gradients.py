@@ -35,16 +35,6 @@ def test_a_value_is_the_object_that_was_set(weight):
     assert ws["y"].data_ptr() == value.data_ptr()
 
 
-def test_reading_all_and_going_on_writing(ws, weight):
-    early = ws["x"].sum()
-    ws.set("x", 3, 3 * weight)
-    late = ws["x"].sum()
-    ws.set("x", 3, 5 * weight)
-    assert gradient(weight, early) == [3.0, 3.0]
-    assert late.item() == 6 * 5.0
-    assert gradient(weight, ws["x"].sum()) == [8.0, 8.0]
-
-
 def test_what_t_wrote_is_differentiated_through_at_the_next_t(weight):
     ws = Workspace()
     ws.set("h", 0, torch.ones(2))
@@ -52,16 +42,6 @@ def test_what_t_wrote_is_differentiated_through_at_the_next_t(weight):
         ws.set("h", t, ws.get("h", t - 1) * weight)
     assert ws["h"][-1].tolist() == [8.0, 27.0]
     assert gradient(weight, ws["h"][-1].sum()) == [12.0, 27.0]
-
-
-def test_values_with_and_without_gradient_in_one_variable(weight):
-    ws = Workspace()
-    ws.set("x", 0, torch.zeros(2))
-    ws.set("x", 1, 4 * weight)
-    ws.set("x", 3, weight.detach())
-    assert ws["x"].requires_grad
-    assert ws["x"].tolist() == [[0.0, 0.0], [8.0, 12.0], [0.0, 0.0], [2.0, 3.0]]
-    assert gradient(weight, ws["x"].sum()) == [4.0, 4.0]
 
 
 def test_a_stored_value_may_be_changed_in_place(weight):
@@ -78,28 +58,14 @@ def test_a_stored_value_may_be_changed_in_place(weight):
 @pytest.mark.parametrize(
     ("operation", "expected"),
     [
-        (lambda ws: ws, [3.0, 3.0]),
-        (lambda ws: ws.subtime(1, 3), [3.0, 3.0]),
-        (lambda ws: ws.get_time_truncated_workspace(2, 3), [2.0, 2.0]),
-        (lambda ws: ws.contiguous(), [3.0, 3.0]),
-        (lambda ws: ws.select_batch(torch.tensor([1, 1])), [0.0, 6.0]),
         (lambda ws: ws.select_batch(torch.tensor([True, False])), [3.0, 0.0]),
-        (lambda ws: ws.select_subtime(torch.tensor([0, 1]), 2), [1.0, 3.0]),
         (lambda ws: ws.get_transitions(no_final_state=True), [4.0, 4.0]),
         (lambda ws: ws.get_transitions(), [4.0, 3.0]),
-        (lambda ws: ws.cat_batch([ws, ws]), [6.0, 6.0]),
         (lambda ws: ws.sample_subworkspace(1, 2, 3), [3.0, 3.0]),
     ],
 )
 def test_pieces_keep_the_graph(ws, weight, operation, expected):
     assert gradient(weight, operation(ws)["x"].sum()) == expected
-
-
-def test_copy_time_keeps_the_graph(ws, weight):
-    ws.copy_time(2, 0, 1)
-    assert gradient(weight, ws["x"].sum()) == [5.0, 5.0]
-    ws.copy_n_last_steps(2)  # 1, 2, 2
-    assert gradient(weight, ws["x"].sum()) == [5.0, 5.0]
 
 
 def test_zero_grad_detaches_and_keeps_the_values(ws, weight):

@@ -1,10 +1,10 @@
-"""Pieces of a workspace: times, batch columns, windows, several workspaces side by side."""
+"""Pieces of a workspace: times, batch columns, windows, pairs of times."""
 
 import numpy as np
 import pytest
 import torch
 
-from bam_train.loop import Workspace
+from bam_train.loop import Agent, TemporalAgent, Workspace
 
 
 @pytest.fixture
@@ -69,14 +69,6 @@ def test_sample_subworkspace(ws, n_times):
         assert {value // 10 for value in columns} <= {0.0, 1.0}
 
 
-@pytest.mark.parametrize("through", [Workspace, Workspace()])
-def test_cat_batch(ws, kind, through):
-    both = through.cat_batch([ws, ws.select_batch(kind([1], "int64"))])
-    kind.check(both.get("x", 1), [10.0, 11.0, 12.0, 11.0])
-    kind.check(both.get("y", 3), [-30.0, -31.0, -32.0, -31.0])
-    assert (both.time_size(), both.batch_size()) == (4, 4)
-
-
 def test_to_a_device(ws, kind):
     moved = ws.to("cpu")
     assert moved is not ws
@@ -93,3 +85,41 @@ def test_to_another_device():
     moved = ws.to(torch.device("meta"))
     assert [str(moved[name].device) for name in ("x", "y")] == ["meta", "meta"]
     assert [str(ws[name].device) for name in ("x", "y")] == ["cpu", "cpu"]
+
+
+@pytest.fixture
+def episodes(kind):
+    """Two columns over four times; column 1 ends its episode at t=1."""
+    workspace = Workspace()
+    for t in range(4):
+        workspace.set("x", t, kind([10 * t, 10 * t + 1], "int64"))
+        workspace.set("v", t, kind([[10.0 * t, 0.5], [10.0 * t + 1, 0.5]]))
+        workspace.set("env/done", t, kind([False, t == 1], "bool"))
+    return workspace
+
+
+@pytest.mark.parametrize(("dtype", "ends"), [("int64", [0, 2]), ("float32", [0.0, 0.5]), ("bool", [False, True])])
+def test_another_flag_of_any_number(episodes, kind, dtype, ends):
+    for t in range(4):
+        episodes.set("over", t, kind(ends if t == 0 else [0, 0], dtype))
+    pairs = episodes.get_transitions(filter_key="over")
+    kind.check(pairs["x"], [[0, 10, 11, 20, 21], [10, 20, 21, 30, 31]], "int64")
+
+
+@pytest.mark.parametrize("no_final_state", [False, True])
+def test_one_time_gives_no_transition(episodes, kind, no_final_state):
+    pairs = episodes.subtime(0, 1).get_transitions(no_final_state=no_final_state)
+    assert tuple(pairs["x"].shape) == (2, 0)
+    assert tuple(pairs["v"].shape) == (2, 0, 2)
+    assert (pairs.time_size(), pairs.batch_size()) == (2, 0)
+
+
+def test_agents_run_on_transitions(episodes, kind):
+    class Twice(Agent):
+        def forward(self, t, **kwargs):
+            self.set(("twice", t), 2 * self.get(("x", t)))
+
+    pairs = episodes.get_transitions()
+    TemporalAgent(Twice())(pairs, t=0, n_steps=2)
+    kind.check(pairs["twice"], [[0, 2, 20, 40, 42], [20, 22, 40, 60, 62]], "int64")
+    kind.check(pairs.select_batch(kind([4, 0], "int64"))["twice"], [[42, 0], [62, 20]], "int64")

@@ -79,16 +79,6 @@ def test_while_it_is_running(started):
     assert multiprocessing.active_children() == []
 
 
-def test_modes_and_seeds_do_not_hide_the_result(started):
-    agent = started(Walker())
-    agent(t=0, n_steps=2)
-    agent.eval()
-    agent.seed(3)
-    assert result(agent)["x"].shape[0] == 2
-    agent(t=0, n_steps=1)
-    assert result(agent)["x"][0, 0, [0, 2]].tolist() == [3, 0]
-
-
 @pytest.mark.parametrize("what", ["fail", "die"])
 def test_failures(started, what):
     agent = started(Trouble())

@@ -73,15 +73,6 @@ def test_set_full_writes_into_the_memory(array):
     assert memory.tolist() == [[7, 7], [6, 6], [6, 6]]
 
 
-def test_times_are_copied_in_place(array):
-    shared = shared_workspace(written(array))
-    memory = shared.variables["x"].memory
-    shared.copy_time(0, 1, 2)
-    assert memory.tolist() == [[0.5, 1.5]] * 2 + [[1.5, 2.5]] if array is torch.tensor else True
-    shared.copy_n_last_steps(1)
-    assert memory[0].tolist() == memory[2].tolist()
-
-
 def test_a_split_is_a_part_of_the_memory(array):
     shared = shared_workspace(written(array), n_repeat=3)
     part = shared.columns(2, 4)

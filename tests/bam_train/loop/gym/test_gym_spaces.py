@@ -141,23 +141,6 @@ def test_rows_become_arrays(toys, space, action, dtype):
     assert action.tolist()[0] != [0, 0]
 
 
-def test_dict_actions(toys):
-    space = spaces.Dict(arm=spaces.Dict(move=BOX, grip=spaces.Discrete(2)), stop=spaces.Discrete(2))
-    given = step_with(
-        toys,
-        space,
-        {
-            "action/arm/move": torch.tensor([[1.0, 2], [3, 4]]),
-            "action/arm/grip": torch.tensor([0, 1]),
-            "action/stop": torch.tensor([1, 0]),
-        },
-    )
-    assert given[0]["arm"]["move"].tolist() == [1, 2]
-    assert given[1]["arm"]["move"].tolist() == [3, 4]
-    assert [one["arm"]["grip"] for one in given] == [0, 1]
-    assert [one["stop"] for one in given] == [1, 0]
-
-
 def test_a_missing_action(toys):
     agent = ParallelGymAgent(toys.Counting, 2)
     ws = Workspace()

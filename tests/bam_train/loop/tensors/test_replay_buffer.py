@@ -48,13 +48,6 @@ def test_of_too_many_rows_the_newest_are_kept(count):
     assert buffer.is_full
 
 
-def test_a_batch_is_a_copy():
-    buffer = ReplayBuffer(2)
-    buffer.put(rows(0, 2))
-    buffer.get_shuffled(3)["x"].zero_()
-    assert column(buffer) == [0, 1]
-
-
 def test_values_are_copied_and_detached():
     buffer = ReplayBuffer(2)
     value = torch.ones(2, 1, requires_grad=True)
