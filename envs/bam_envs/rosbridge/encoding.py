@@ -6,9 +6,7 @@ import base64
 import json
 import math
 import struct
-import sys
 import zlib
-from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -29,7 +27,6 @@ MOST_ITEMS_OF_A_SERVER = 4_000_000
 """The same for messages of a server: an image may come as a list of numbers."""
 _NOT_BRACKETS = bytes(set(range(256)) - set(b'"[]{}'))
 _ONE_KIND = bytes.maketrans(b"{}", b"[]")
-
 _LONGEST_ID = 256
 """Most characters of an id: it is kept, and repeated, for as long as what it names is unfinished."""
 _LARGEST_ID = 2**53
@@ -38,23 +35,18 @@ _MOST_FRAGMENTS = 10_000
 """Of one outgoing message: a smaller fragment size would cost more than it carries."""
 _EMPTY = 100
 """About what a fragment without any text costs [bytes]."""
-
 _MOST_UNFINISHED = 16
 """Messages of one connection of which fragments may be missing at the same time."""
 Id = str | int | None
 """What a client calls an interaction; None if it does not."""
 
-# Tags of typed arrays by type, little-endian, with the type code of `array`.
+# Tags of typed arrays by type, and what they hold: little-endian numbers.
 _TYPED = {
-    "int8": (72, "b"),
-    "int16": (77, "h"),
-    "int32": (78, "i"),
-    "int64": (79, "q"),
-    "uint16": (69, "H"),
-    "uint32": (70, "I"),
-    "uint64": (71, "Q"),
-    "float32": (85, "f"),
-    "float64": (86, "d"),
+    kind: (tag, np.dtype(kind).newbyteorder("<"))
+    for kind, tag in (
+        *(("int8", 72), ("int16", 77), ("int32", 78), ("int64", 79), ("uint16", 69), ("uint32", 70), ("uint64", 71)),
+        *(("float32", 85), ("float64", 86)),
+    )
 }
 # All tags: 64-71 unsigned, 72-79 signed, 80-86 floating point; of each first the big-endian ones, by size. 68 is
 # "clamped" bytes, 76 is reserved, and 83 and 87 are quadruple precision, which NumPy does not have everywhere.
@@ -74,9 +66,6 @@ def decode_frame(data: str | bytes) -> dict[str, Any]:
     """The message in a frame of a client: one JSON object, alone and bounded. A binary frame holds the same in UTF-8.
 
     NaN and infinities are read, so that what refuses them can say in which message and field they were.
-
-    Raises:
-        ProtocolError: Not one JSON object, too many values, too deeply nested.
     """
     return _object(data, MOST_ITEMS, _STRICT)
 
@@ -202,11 +191,8 @@ def _typed(kind: str, message: Mapping[str, Any]) -> dict[str, Any]:
 
 def _typed_field(one: Field, value: Any) -> Any:
     if isinstance(value, list) and one.type in _TYPED:
-        tag, code = _TYPED[one.type]
-        numbers = array(code, value)
-        if sys.byteorder == "big":
-            numbers.byteswap()
-        return cbor2.CBORTag(tag, numbers.tobytes())
+        tag, dtype = _TYPED[one.type]
+        return cbor2.CBORTag(tag, np.array(value, dtype).tobytes())
     if isinstance(value, list):
         return [_typed(one.type, item) if isinstance(item, dict) else item for item in value]
     return _typed(one.type, value) if isinstance(value, dict) else value

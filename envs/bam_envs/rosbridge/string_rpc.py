@@ -21,6 +21,7 @@ from typing import Any, Generic, TypeVar
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, ProtocolError, RemoteError
 from bam_envs.ros.freshness import FreshnessCheck, Tagger, read_tag
 from bam_envs.rosbridge.bus import Bus, Caller, Handler, Message
+from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.encoding import MOST_ITEMS, dump_json, load_json
 from bam_envs.rosbridge.sessions import Sessions
 
@@ -58,17 +59,18 @@ class StringRpc:
     """Calls what a `StringRpcService` of the same name answers. Any thread; the first call opens the topics.
 
     Args:
-        bus: Carries the topics. If it knows when its link drops (`on_down`), calls under way fail at once.
+        link: Carries the topics; when it drops, calls under way fail at once.
         name: Such as ``/bam/scene``.
         tagger: Of the session to ask for; None: of none.
     """
 
-    def __init__(self, bus: Bus, name: str, tagger: Tagger | None = None) -> None:
+    def __init__(self, link: RosbridgeLink, name: str, tagger: Tagger | None = None) -> None:
         self.name = name
-        self._bus, self._tagger, self._lock = bus, tagger or Tagger(), threading.Lock()
+        self._link, self._tagger, self._lock = link, tagger or Tagger(), threading.Lock()
         self._pending: dict[str, Future[dict[str, Any]]] = {}
         self._unsubscribe: Callable[[], None] | None = None
-        self._watched, self._answered = False, -1
+        self._answered = -1  # the connection on which a reply came last
+        link.on_down(lambda *_: self._fail(f"the link dropped while {name} was to answer"))
 
     def call(self, payload: dict[str, Any], timeout: float) -> dict[str, Any]:
         """Send `payload` and wait at most `timeout` [s] for the reply.
@@ -78,18 +80,20 @@ class StringRpc:
             LinkLost: The link is down or dropped, or there was no reply in time: whether it was executed is unknown.
             RemoteError: The other end refused or failed; `NotInCommand` if somebody else is in command there.
         """
-        deadline = time.monotonic() + timeout
-        tag = self._tagger.next(self._epoch(), timeout)
+        deadline, epoch = time.monotonic() + timeout, self._link.epoch
+        tag = self._tagger.next(epoch, timeout)
         identity = f"{tag.session}-{tag.sequence}"
-        content = _content(identity, payload, f"A request to {self.name}")
+        content = dump_json({"id": identity, "payload": payload}, f"A request to {self.name}")
         signed = dump_json({"tag": self._tagger.sign(tag, self.name, content.encode())}, self.name)
         text = f"{signed[:-1]},{content[1:]}"
-        self._open()
+        with self._lock:
+            if self._unsubscribe is None:
+                self._link.advertise(f"{self.name}/request", _STRING)
+                self._unsubscribe = self._link.subscribe(f"{self.name}/reply", _STRING, self._on_reply)
         future = self._pending[identity] = Future()
-        epoch = self._epoch()
         try:
             while (left := deadline - time.monotonic()) > 0:
-                self._bus.publish(f"{self.name}/request", {"data": text})
+                self._link.publish(f"{self.name}/request", {"data": text})
                 try:
                     reply = future.result(left if self._answered == epoch else min(left, _RESEND))
                 except NoAnswer:
@@ -107,18 +111,6 @@ class StringRpc:
         if unsubscribe is not None:
             unsubscribe()
         self._fail(f"the calls to {self.name} were closed")
-
-    def _open(self) -> None:
-        with self._lock:
-            if self._unsubscribe is None:
-                self._bus.advertise(f"{self.name}/request", _STRING)
-                self._unsubscribe = self._bus.subscribe(f"{self.name}/reply", _STRING, self._on_reply)
-            if not self._watched and (on_down := getattr(self._bus, "on_down", None)) is not None:
-                on_down(lambda *_: self._fail(f"the link dropped while {self.name} was to answer"))
-            self._watched = True
-
-    def _epoch(self) -> int:
-        return int(getattr(self._bus, "epoch", 1))
 
     def _on_reply(self, message: Message, _caller: Caller) -> None:
         reply = load_json(message.get("data"), f"{self.name}/reply")
@@ -139,11 +131,6 @@ class StringRpc:
             future = self._pending.pop(identity, None)
             if future is not None:
                 future.set_exception(LinkLost(f"No reply: {reason}. Whether it did what was asked is unknown."))
-
-
-def _content(identity: str, payload: object, what: str) -> str:
-    """What the tag of a request signs."""
-    return dump_json({"id": identity, "payload": payload}, what)
 
 
 class StringRpcService:
@@ -200,7 +187,7 @@ class StringRpcService:
             if self._sessions is None or not tag.mac:
                 self._freshness.require(tag, self.name)
                 return caller, ""
-            content = _content(identity, request.get("payload"), self.name).encode()
+            content = dump_json({"id": identity, "payload": request.get("payload")}, self.name).encode()
             fresh = self._sessions.prove(tag, self.name, content, caller)
             caller = replace(caller, session=tag.session)
             fresh.require(tag, self.name)
