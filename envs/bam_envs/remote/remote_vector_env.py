@@ -97,7 +97,7 @@ class Rack:
 
 
 class Described:
-    """What a remote environment tells of the other end, from the description that comes when it connects."""
+    """Properties of the environment at the other end, from the description that the server sends on connecting."""
 
     @property
     def _there(self) -> EnvSpecMessage:
@@ -110,7 +110,7 @@ class Described:
 
     @property
     def period(self) -> float | None:
-        """Time between two actions [s]; None if the other end does not say."""
+        """Time between two actions [s]; None if the server does not report it."""
         return self._there.period
 
     @property
@@ -119,7 +119,7 @@ class Described:
         return self._there.max_episode_steps
 
     def describe(self) -> dict[str, Any]:
-        """What every number of observation, action, state and command means; empty if the other end does not say."""
+        """What every number of observation, action, state and command means; empty if not reported."""
         return dict(self._there.signals)
 
 
@@ -210,8 +210,8 @@ class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
         """Begin an episode in every environment, or in those of ``options["reset_mask"]`` (n,) bool.
 
         Args:
-            seed: Environment i is seeded with ``seed + i``, or with ``seed[i]``; a rack that is not ours is told that
-                of its first arm.
+            seed: Environment i is seeded with ``seed + i``, or with ``seed[i]``; a rack that is not ours gets
+                that of its first arm.
             options: ``reset_mask``, and what the other ends take.
         """
         if seed is None or isinstance(seed, (int, np.integer)):

@@ -35,7 +35,7 @@ _INSTALL = "pip install 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-std-msgs ros-jazzy
 class RclpyBus:
     """Topics and services of one ROS 2 node.
 
-    ROS does not say who sent a message, nor when somebody leaves: callers are unknown, and `on_leave` never calls.
+    ROS reports neither who sent a message nor who leaves: callers are unknown, and `on_leave` never calls.
 
     Args:
         name: Of the node.
@@ -123,10 +123,10 @@ class RclpyBus:
 
     def subscribe(self, topic: str, kind: str, listener: Listener) -> Callable[[], None]:
         """Call `listener` for each message, until what is returned is called."""
-        said = ""  # a refusal is logged once, however often it comes in a row: ROS cannot tell the sender
+        logged = ""  # a refusal is logged once, however often it comes in a row: ROS cannot tell the sender
 
         def receive(message: Any) -> None:
-            nonlocal said
+            nonlocal logged
             refusal = ""
             try:
                 listener(to_dict(message), UNKNOWN_CALLER)
@@ -135,9 +135,9 @@ class RclpyBus:
             except Exception as error:  # it must not end the thread of every topic, among them the one that halts
                 _log.exception("a listener failed")
                 refusal = f"{type(error).__name__}: {error}"
-            if refusal and refusal != said:
+            if refusal and refusal != logged:
                 _log.warning("%s", refusal_of(topic, refusal))
-            said = refusal
+            logged = refusal
 
         def stop() -> None:
             with self._lock:
@@ -217,7 +217,7 @@ class RclpyBus:
         return bool(self._require_node().count_subscribers(topic))
 
     def on_leave(self, callback: Callable[[Caller], None]) -> None:
-        """ROS does not say who leaves."""
+        """Do nothing: ROS does not report who leaves."""
 
     def _require_node(self) -> Any:
         if self._node is None:

@@ -47,7 +47,7 @@ class RosbridgeTransport:
     """Carries an environment through rosbridge. One request at a time; `close` may be called from any thread.
 
     A server of bam-train describes its environment. Another rack does not: then the spaces must be given, and it is
-    asked nothing that it may not know.
+    sent only what racks understand.
 
     Args:
         url: ``ws://host:port/namespace`` or ``wss://…``; the namespace may be left out.
@@ -56,7 +56,7 @@ class RosbridgeTransport:
             which is several times faster through a real rosbridge.
         timeout: Longest time for a request [s]; a rack's pick takes seconds.
         connect_timeout: Longest time to connect [s].
-        name: The name of this client that others are told; computer and process by default.
+        name: The name of this client, shown to others; computer and process by default.
         ca_file: PEM file of the authorities to trust instead of the system's.
         token: The server's shared secret, if it has one.
         take: Take command from the client that has it.
@@ -265,7 +265,7 @@ class RosbridgeTransport:
     def _foreign(self, reason: str) -> EnvCodec:
         namespace = f" --namespace {self._link.namespace.strip('/')}" if self._link.namespace else ""
         remedy = f"Start one: bam-serve --env {self.env_id or 'bam/pick'}{namespace}"
-        if "does not exist" in reason:  # the words of every bridge but one, whose text does not say
+        if "does not exist" in reason:  # the text of every bridge but one
             elsewhere = namespaces_with(self._link, "services", service_name(""))
             raise NoServer(self.url, f"{reason}.{elsewhere} {remedy}")
         try:

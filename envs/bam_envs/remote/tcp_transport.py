@@ -44,7 +44,7 @@ class TcpTransport:
         timeout: Longest time for a request [s].
         connect_timeout: Longest time to connect [s].
         token: The server's shared secret, if it has one. Nothing is encrypted.
-        name: The name of this client that others are told; computer and process by default.
+        name: The name of this client, shown to others; computer and process by default.
         take: Take command from the client that has it.
 
     Raises:

@@ -71,7 +71,7 @@ class Hello(msgspec.Struct, frozen=True):
     epoch: int
     """Counts its connections."""
     name: str
-    """What other clients are told of it."""
+    """Its name, shown to other clients."""
     token: str
     """The shared secret, or ""."""
     env_id: str
@@ -81,7 +81,7 @@ class Hello(msgspec.Struct, frozen=True):
 
 
 class TagMessage(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """A `Tag` without a signature: who sent a request when, and for how long it means anything."""
+    """A `Tag` without a signature: who sent a request, when, and how long it is valid."""
 
     session: str
     epoch: int
@@ -100,7 +100,7 @@ class TagMessage(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fi
 
 
 class Reset(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="reset"):
-    """Begin an episode."""
+    """Request: begin an episode."""
 
     tag: TagMessage
     seed: Any
@@ -110,14 +110,14 @@ class Reset(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
 
 
 class Step(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="step"):
-    """Do an action."""
+    """Request: perform an action."""
 
     tag: TagMessage
     action: Any
 
 
 class Leave(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="leave"):
-    """Release the environment."""
+    """Request: release the environment."""
 
     tag: TagMessage
 
@@ -206,7 +206,7 @@ def read_result(spec: EnvSpecMessage, tree: Tree, size: int) -> tuple[Any, ...]:
 
 
 class ForeignPeer(ProtocolError):  # noqa: N818 - reads as what was found
-    """The other end speaks something else; the text says what, as far as one can tell."""
+    """The other end speaks another protocol; the text names it where it can be recognised."""
 
 
 def encode(message: Tree) -> list[bytes | memoryview]:
@@ -292,7 +292,7 @@ class FrameSocket:
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         for name, value in _KEEPALIVE.items():
-            if hasattr(socket, name):  # not every system lets one say how soon
+            if hasattr(socket, name):  # not every system has this setting
                 sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
         self._socket = sock
 

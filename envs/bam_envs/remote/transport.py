@@ -37,11 +37,11 @@ class EnvSpecMessage:
     autoreset: bool = True
     """With `vector`, whether an environment whose episode ends is reset in the same step; always so on our servers."""
     period: float | None = None
-    """Time between two actions [s]; None if the other end does not say."""
+    """Time between two actions [s]; None if the server does not report it."""
     max_episode_steps: int | None = None
     """The time limit there; `truncated` comes from there."""
     signals: Mapping[str, Any] = field(default_factory=dict)
-    """What `describe()` of the environment there returns; empty if the other end does not say."""
+    """What `describe()` of the environment there returns; empty if the server does not report it."""
 
     def each(self, action: Any) -> list[Any]:
         """The action of each environment. Raises InvalidValue if there are too many or too few."""
@@ -68,7 +68,7 @@ def plain_seed(seed: Any, largest: float = math.inf) -> Seed:
 
 
 def spec_to_json(spec: EnvSpecMessage) -> dict[str, Any]:
-    """What a server says of its environment, as strict JSON values."""
+    """The description that a server sends of its environment, as strict JSON values."""
     return {
         "env_id": spec.env_id,
         "observation_space": space_to_json(spec.observation_space),

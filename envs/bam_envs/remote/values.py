@@ -187,7 +187,7 @@ def _unstacked(feature: Space[Any], value: Any, name: str) -> list[Any]:
 def plain_info(value: Any) -> Tree:
     """An info as a tree: tuples and sets become lists, keys and other objects their text.
 
-    Numbers keep their values, and those of NumPy their dtypes. NaN is let through: an info is for people.
+    Numbers keep their values, and those of NumPy their dtypes. NaN is let through: nothing learns from an info.
     """
     if isinstance(value, str):  # first: NumPy's texts would be taken for numbers
         return value.encode(errors="replace").decode()  # halves of surrogate pairs cannot be sent

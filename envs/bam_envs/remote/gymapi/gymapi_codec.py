@@ -276,12 +276,12 @@ class EnvCodec:
         if self.spec.vector:
             each = zip(observation, *(ends or [[0.0] * size, [False] * size, [False] * size]), info, strict=True)
         feedback = []
-        for observed, reward, terminated, truncated, told in each:
-            if self.spec.vector and "final_obs" in told:
-                told = {**told, "final_obs": pack(space, told["final_obs"], "final_obs")}
+        for observed, reward, terminated, truncated, one in each:
+            if self.spec.vector and "final_obs" in one:
+                one = {**one, "final_obs": pack(space, one["final_obs"], "final_obs")}
             fields, trees = self._observations.encode(observed, stamp, version)
             flags = (reward, terminated, truncated)
-            feedback.append(write_feedback(fields, trees, flags, told, version, executed=executed))
+            feedback.append(write_feedback(fields, trees, flags, one, version, executed=executed))
         return feedback
 
     def read_result(self, response: GymResponse) -> tuple[Any, Any, Any, Any, Any]:

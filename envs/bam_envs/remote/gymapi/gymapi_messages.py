@@ -54,7 +54,7 @@ class RequestType(IntEnum):
 
 
 class ErrorCode(IntEnum):
-    """How a request went."""
+    """The outcome of a request."""
 
     UNDEFINED = 0
     SUCCESS = 1
@@ -69,7 +69,7 @@ class GymRequest:
     type: RequestType
     """What is asked for."""
     client_id: str = ""
-    """Who asks, for people."""
+    """Name of the client, to be shown."""
     env_name: str = ""
     """The environment that is meant; empty for the one that is there."""
     actions: tuple[Message, ...] = ()
@@ -79,7 +79,7 @@ class GymRequest:
     options: Info | None = None
     """Of a reset, as Gymnasium's."""
     tag: Tag | None = None
-    """When it was sent and until when it counts; None from clients that say nothing."""
+    """When it was sent and how long it is valid; None from clients that send none."""
     take: bool = False
     """Take command from the client that has it."""
 
@@ -223,7 +223,7 @@ def write_feedback(
 def write_response(
     feedback: Sequence[Message], duration: float, stamp: Message, version: Version = JUNE_22
 ) -> dict[str, Any]:
-    """The message of a success that took `duration` [s] and is sent at `stamp`, in the words of `version`."""
+    """The message of a success that took `duration` [s] and is sent at `stamp`, with the fields of `version`."""
     code = {"value": int(ErrorCode.SUCCESS)}
     # How long it travels (transport_duration) only the client can tell.
     times = {"process_duration": duration, "response_stamp": dict(stamp)} if version.june else {"duration": duration}
@@ -241,9 +241,9 @@ def write_failure(error: BamEnvsError, duration: float, stamp: Message, version:
 
 def read_response(message: object) -> GymResponse:
     """The answer in `message`, of any server. Raises ProtocolError if a field is of the wrong kind."""
-    told = message.get("feedback") if isinstance(message, Mapping) else None
-    told = told if isinstance(told, (list, tuple)) else ()
-    given = {**message, "feedback": [_without_nulls(one) for one in told]} if told else message  # type: ignore[dict-item]
+    received = message.get("feedback") if isinstance(message, Mapping) else None
+    received = received if isinstance(received, (list, tuple)) else ()
+    given = {**message, "feedback": [_without_nulls(one) for one in received]} if received else message  # type: ignore[dict-item]
     try:
         whole = complete_known(response_type(KIND), given)
     except InvalidValue as error:
@@ -251,7 +251,7 @@ def read_response(message: object) -> GymResponse:
     # NaN in place of each null: no space takes that.
     feedback = [
         {**checked, **_filled(checked, one, math.nan, _NOWHERE)}
-        for checked, one in zip(whole["feedback"], told, strict=True)
+        for checked, one in zip(whole["feedback"], received, strict=True)
     ]
     read = [read_info(one["info"]) for one in feedback]
     infos, ours = tuple(info for info, _ in read), tuple(bam for _, bam in read)
@@ -280,11 +280,11 @@ def _without_nulls(feedback: Any) -> Any:
     return {**kept, **_filled(feedback, feedback, 0.0, {})}
 
 
-def _filled(values: Message, told: Message, number: float, pose: Message) -> dict[str, Any]:
-    """The lists of `values` with a number or pose in place of each entry that was told as null, or holds one."""
+def _filled(values: Message, received: Message, number: float, pose: Message) -> dict[str, Any]:
+    """The lists of `values` with a number or pose in place of each entry that was received as null, or holds one."""
     filled: dict[str, Any] = {}
     for field, unknown in (("observation", number), ("pose", pose)):
-        entries = told.get(field)
+        entries = received.get(field)
         gaps = [_has_null(one) for one in entries] if isinstance(entries, list) else []
         if any(gaps):
             filled[field] = [unknown if gap else value for value, gap in zip(values[field], gaps, strict=True)]
@@ -299,7 +299,7 @@ def _has_null(value: Any, depth: int = 3) -> bool:
 
 
 def _source(feedback: Sequence[Message], at: int) -> int:
-    """The place of the observation of the entry at `at`, which names it, or says that it is in its ``ns``."""
+    """The place of the observation of the entry at `at`, which may be that of another entry."""
     one, path = feedback[at], [at]
     while one["duplicate_obs"]:
         place = one["duplicate_index"]
@@ -344,7 +344,7 @@ def _for_people(value: Any) -> Any:
 
 
 def read_info(text: str) -> tuple[Info, Info]:
-    """An info and what it holds under ``bam``. Other people's text that is no JSON object is ``{"text": …}``."""
+    """An info and what it holds under ``bam``. Text that is no JSON object is ``{"text": …}``."""
     try:
         words = json.loads(text) if text else {}
     except (ValueError, RecursionError):

@@ -33,7 +33,7 @@ NUMBERS, POSE, IMAGE, EXACT = "numbers", "pose", "image", "exact"
 GRIPPER_WIDTH = "gripper_width"
 _MOST_NUMBERS = 4096
 _SMALLEST_IMAGE = 8
-"""Fewer pixels a side are a table of numbers, which people want to read."""
+"""With fewer pixels a side it is sent as numbers, which can be read in a log."""
 _WHOLE = 2**53
 """Every integer up to this is itself as a float64."""
 _CHANNELS = ((), (1,), (3,), (4,))
@@ -160,7 +160,7 @@ class Lists:
     def in_order(self, values: Sequence[Any], names: Sequence[str], field: str = "") -> Sequence[Any]:
         """`values` in the order of the leaves: by their `names` if there are any, else as they come.
 
-        Names of somebody else's own, none of which is expected, are no names: then only the number of values counts.
+        Names none of which is expected are ignored: then only the number of values counts.
         Errors call the values `field`, by default the field of the values.
         """
         field = field or self.values

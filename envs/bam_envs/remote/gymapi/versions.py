@@ -49,7 +49,7 @@ class Version:
 
     @property
     def no_images(self) -> dict[str, Any]:
-        """What an entry says where there is no image; the default of a single one needs no words."""
+        """The fields of an entry without images; where there is room for one image, the defaults do."""
         return {"color_img": [], "depth_img": [], "camera_info": []} if self.lists else {}
 
 
@@ -85,7 +85,7 @@ def _header(message: object) -> Mapping[str, Any]:
 
 
 def version_of_bus(bus: Bus) -> Version | None:
-    """The version of the types that `bus` was compiled with; None where it has none, or does not say."""
+    """The version of the types that `bus` was compiled with; None where it has none or does not report it."""
     fields: Mapping[str, bool] = {}  # of GymFeedback; to each, whether it is a list
     if hasattr(bus, "fields"):  # a ROS 2 node
         fields = bus.fields(_FEEDBACK)

@@ -1,4 +1,4 @@
-"""Who is in command: one client at a time; the others are told who."""
+"""Which client is in command: one at a time; the others see its name."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bam_envs.core.errors import NotInCommand
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER
 
 Change = Callable[[str | None, str | None], None]
-"""Called with who was in command and who is, as others are told; None is nobody."""
+"""Called with the names, as others see them, of the client that was in command and of the one that is, or None."""
 LEASE_SECONDS = 2.0
 """Usual time without a sign of life after which another client may take command [s]."""
 
@@ -20,7 +20,7 @@ class CommandLease:
     """Command of one robot or environment. The first to ask has it, until it leaves or another one may take it.
 
     A client without a sign of life for longer than `seconds` keeps command until another one asks. A sign of life is a
-    request, a word that says so (`renew`), or what the connection shows by itself. Safe to call from any thread.
+    request, an explicit `renew`, or what the connection shows by itself. Safe to call from any thread.
 
     Args:
         seconds: Time without a sign of life after which another client may take command [s].
@@ -58,7 +58,7 @@ class CommandLease:
         Args:
             client: Its name.
             force: Take it from the client that has it.
-            shown: What the others are told instead of its name, where that is a secret.
+            shown: What other clients see instead of its name, where that is a secret.
             silence: How long its connection has given no sign of life [s].
 
         Raises:

@@ -105,7 +105,7 @@ class EnvServer:
         sleep: Waits [s].
 
     Raises:
-        InvalidValue: `env` resets in another step, or `realtime` and it does not say its period.
+        InvalidValue: `env` resets in another step, or `realtime` and it has no period.
     """
 
     def __init__(
@@ -166,7 +166,7 @@ class EnvServer:
             take: Take command from the client that has it, which only an operator may.
             deadline: When it is too late to begin [s], on the clock of this server.
             caller: The connection on which it asks.
-            shown: What the others are told instead of its name, where that is a secret.
+            shown: What other clients see instead of its name, where that is a secret.
 
         Raises:
             NotInCommand: Another client is in command.
@@ -272,9 +272,9 @@ class EnvServer:
             return exact(space, observation, "observation"), plain_info(info)
         each = enumerate(iterate(self.env.observation_space, observation))
         infos = []
-        for i, told in enumerate(split_infos(info, self._spec.num_envs)):
-            last = told.pop("final_obs", None)
-            infos.append(plain_info(told))
+        for i, reported in enumerate(split_infos(info, self._spec.num_envs)):
+            last = reported.pop("final_obs", None)
+            infos.append(plain_info(reported))
             if last is not None:
                 infos[i]["final_obs"] = exact(space, last, f"final_obs of environment {i}")
         return [exact(space, one, f"observation of environment {i}") for i, one in each], infos
@@ -283,11 +283,11 @@ class EnvServer:
         self, observation: Any, reward: Any, terminated: Any, truncated: Any, info: Any
     ) -> tuple[Any, Any, Any, Any, Any]:
         """The result of a step, checked and with lists in place of batches."""
-        seen, told = self._begun(observation, info)
+        seen, infos = self._begun(observation, info)
         if not self._spec.vector:
-            return seen, _reward(reward), bool(terminated), bool(truncated), told
+            return seen, _reward(reward), bool(terminated), bool(truncated), infos
         rewards = [_reward(one, f"reward of environment {i}") for i, one in enumerate(reward)]
-        return seen, rewards, [bool(one) for one in terminated], [bool(one) for one in truncated], told
+        return seen, rewards, [bool(one) for one in terminated], [bool(one) for one in truncated], infos
 
     def _end_episode(self, before: str | None, after: str | None) -> None:
         self._episode = self._over = None

@@ -43,7 +43,7 @@ _PATIENCE = 60.0
 """Longest wait for the answer to a request that came twice while the first one is executed [s]."""
 _MOST_CLIENTS = 1024
 _LONGEST_NAME = 100
-"""Characters of a client's name that are kept, and told to others."""
+"""Characters of a client's name that are kept and shown to others."""
 
 
 class GymApiService:
@@ -144,7 +144,7 @@ class GymApiService:
         self.env.require_name(request.env_name)
         name = request.client_id[:_LONGEST_NAME] or "somebody"
         # The same client when it comes back on another connection: the session in the tag of a service call is known to
-        # nobody else, so others are never told of it.
+        # nobody else, so it is never shown to others.
         mark = (caller.session or caller.name) if published or request.tag is None else request.tag.session
         client = f"{name}#{mark}" if mark else name
         shown = f"{name} ({caller.address})" if caller.address else name

@@ -17,7 +17,7 @@ from bam_envs.remote.transport import EnvSpecMessage, Info, Seed
 
 
 class LocalTransport:
-    """Carries nothing anywhere. Results are those of the other transports bit for bit.
+    """An environment in this process, without a network. Results are those of the other transports bit for bit.
 
     Args:
         env: A Gymnasium environment, a vector environment (see `EnvServer`), or a server, which others may share.
@@ -105,7 +105,7 @@ class FakeEnv(gym.Env[Any, Any]):
 
 
 class FakeTransport(LocalTransport):
-    """Records its calls, and fails when it is told to.
+    """Records its calls, and raises the faults that a test queues.
 
     ::
 

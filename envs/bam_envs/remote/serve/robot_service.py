@@ -1,6 +1,6 @@
 """The topics of a served robot: states out, commands in from one client at a time; halt, scene, and its description.
 
-Commands are checked in the thread of the network, where they arrive, and their sender is told what is refused. An
+Commands are checked in the thread of the network, where they arrive, and refusals go back to their sender. An
 accepted command goes into one slot; the clock's thread takes it from there, moves the robot and publishes.
 
 Everything that moves the robot, or keeps it from moving, is in this file, so that one can see that a halt wins over
@@ -162,8 +162,8 @@ class RobotService:
     def _on_command(self, topic: str, message: Message, caller: Caller) -> None:
         command = self._robot.spec.command
         places, values, tag, content = decode_command(self._profile, self._robot.spec, topic, message)
-        told = values.tolist()
-        for place, value in zip(places, told, strict=True):  # how fast the robot goes there is its own affair
+        received = values.tolist()
+        for place, value in zip(places, received, strict=True):  # the robot limits its speed itself
             low, high = command.low[place], command.high[place]
             if not low - _ROUNDING <= value <= high + _ROUNDING:
                 label, unit = command.labels[place], command.units[place]
@@ -175,12 +175,12 @@ class RobotService:
             caller = replace(caller, session=tag.session)
         self._lease.take(caller.client, shown=caller.shown, silence=caller.silence)
         echo, complete = "" if tag is None else tag.echo, topic in self._completing
-        self._slot.put(caller.client, places, told, complete=complete, tag=echo)
+        self._slot.put(caller.client, places, received, complete=complete, tag=echo)
         if complete and self.info.lockstep:
             self.clock.wake()
 
     def _on_lease(self, message: Message, caller: Caller) -> None:
-        """The client in command says that it is there, or leaves, over any of its connections."""
+        """The client in command renews its lease, or leaves, over any of its connections."""
         word, _, text = str(message.get("data")).partition(" ")
         tag = read_tag(text)
         if tag is None or word not in (RENEW, LEAVE):

@@ -103,7 +103,7 @@ class ServeOptions:
 
     @property
     def warning(self) -> str | None:
-        """What people should know of where it listens, in one line; None if there is nothing."""
+        """A warning about an address that other computers reach, in one line; None if there is no reason for one."""
         if not self._is_open or self.cert:
             return None
         if self.no_token:

@@ -40,7 +40,7 @@ class ServedEnvironment:
     Args:
         env: The environment; it is closed at the end.
         options: Where and how.
-        tell: Called with a line for people when command changes hands, and when a link is lost.
+        tell: Called with one line of text when another client takes command, and when a link is lost.
 
     Raises:
         InvalidValue: Options that exclude each other.
@@ -159,7 +159,7 @@ class ServedEnvironment:
         return server.start()
 
     def _require_own_names(self, link: RosbridgeLink) -> None:
-        """Refuse names that another robot has: both would do what a client tells one of them."""
+        """Refuse names that another robot has: both would execute the commands for one of them."""
         service = self.prefix + INFO_SERVICE
         try:
             link.call(service, "", {}, _LOOK)
@@ -171,15 +171,15 @@ class ServedEnvironment:
         )
 
     def _keep_refusal(self, status: Mapping[str, Any]) -> None:
-        """Keep what a server says in a `status` message of a declaration that it does not carry."""
+        """Record the reason, from a `status` message, why the server does not carry a declaration."""
         if status.get("level") == "error":
             self._refusals[str(status.get("id"))] = str(status.get("msg"))
 
     def _not_offered(self) -> set[str]:
-        """Names that the server of ``--via``, or ROS 2 here, does not carry; people are told why and what helps.
+        """Names that the server of ``--via``, or ROS 2 here, does not carry; reports the reasons and remedies.
 
-        One kind of rosbridge server says so in `status` messages. The other kinds say nothing, and what they carry is
-        what rosapi lists.
+        One kind of rosbridge server reports them in `status` messages. The others report nothing; there, what rosapi
+        does not list is not carried.
         """
         bus = self.bus
         if isinstance(bus, RclpyBus):
@@ -207,7 +207,7 @@ class ServedEnvironment:
         return set(refused)
 
     def _offered(self, profile: RobotProfile | None, refused: set[str]) -> str:
-        """What is offered, without what is `refused`, in words.
+        """A line of text about what is offered, without the names in `refused`.
 
         Raises:
             RemoteError: Nothing, and it is served nowhere else.

@@ -137,7 +137,7 @@ class ServedRobot:
                 self._drop_parts()
 
     def target(self) -> Array:
-        """A copy of what the robot is told to do now. Shape: (n, m)."""
+        """A copy of the command that the robot executes now. Shape: (n, m)."""
         with self._changed:
             return self._target + 0.0
 
@@ -213,7 +213,7 @@ class ServedRobot:
         if self._zero_rests:
             return np.zeros_like(self._target)
         setpoint: Array | None = getattr(self._robot, "setpoint", None)  # where its controllers pull now
-        if setpoint is not None:  # it also says how hard a gripper holds
+        if setpoint is not None:  # it includes how hard a gripper holds
             return setpoint
         # What is measured, in place of what was commanded.
         measured = {

@@ -37,7 +37,7 @@ _LOG = logging.getLogger(__name__)
 _POLL = 0.2  # seconds between two looks at whether the server is closing
 _HELLO_TIMEOUT, _HELLO_LIMIT = 5.0, 65536  # [s], [bytes]: all that a stranger gets
 _STRANGERS, _STRANGERS_OF_ONE = 64, 16
-"""Connections that said no hello yet: of all, and of one address. The oldest gives way."""
+"""Most connections without a hello yet: in all, and of one address. The oldest is dropped for a new one."""
 _ROOM = 2**20
 """What a request may hold beside an action [bytes]."""
 
@@ -49,7 +49,7 @@ class TcpServer:
         server: What is served.
         host: The interface; 127.0.0.1 is this computer alone.
         port: 0 for any that is free.
-        token: A secret that clients must know. Nothing is encrypted: it keeps strangers out, not those who listen in.
+        token: A secret that clients must know. Nothing is encrypted: whoever reads the network learns it.
         operator_token: Who shows this one instead may take command from others.
         max_clients: How many may be connected.
         patience: Longest time for the rest of a message, and for a client to take its answer [s].
@@ -142,7 +142,7 @@ class TcpServer:
             self._connections[connection] = None
             strangers = [one for one in self._connections if one.caller is None]
             mine = [one for one in strangers if one.host == connection.host]
-        # Connections that say nothing keep nobody out: a new one is always accepted.
+        # Silent connections must not keep others out: a new one is always accepted.
         if len(mine) > _STRANGERS_OF_ONE:
             mine[0].drop()
         elif len(strangers) > _STRANGERS:
@@ -214,7 +214,7 @@ class _Connection:
                 request = self._frames.receive(limit=self._owner.most, patience=self._owner.patience, kind=Request)
                 self._send(self._answer(request))
         except (ProtocolError, RemoteError) as error:
-            with suppress(LinkLost):  # it is told why the connection ends
+            with suppress(LinkLost):  # the client learns why the connection ends
                 self._frames.send(encode(refusal(0, RemoteError(str(error)))), time.monotonic() + _POLL)
         except LinkLost:
             pass  # it went away
