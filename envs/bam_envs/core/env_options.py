@@ -12,6 +12,7 @@ from numbers import Real
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, UnknownName
 
@@ -57,3 +58,18 @@ def require_kinds(env_id: str, options: Mapping[str, Any], given: Mapping[str, A
             raise InvalidValue(f"{name}= of {env_id} must be True or False, not {value!r}.")
         if isinstance(default, float) and (not isinstance(value, Real) or isinstance(value, bool)):
             raise InvalidValue(f"{name}= of {env_id} must be a number, not {value!r}.")
+
+
+def finite_numbers(value: Any, size: int, name: str) -> NDArray[np.float64]:
+    """`value`, an option called `name` in errors, as an array. Shape: (size,).
+
+    Raises:
+        InvalidValue: It is not `size` finite numbers.
+    """
+    try:
+        numbers = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.array(np.nan)
+    if numbers.shape != (size,) or not np.isfinite(numbers).all():
+        raise InvalidValue(f"{name} must be {size} finite numbers, not {value!r}.")
+    return numbers

@@ -10,7 +10,6 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds, Initial, RobotState
 
 Array = NDArray[np.float64]
@@ -122,18 +121,3 @@ def as_objects(values: Sequence[Any]) -> NDArray[Any]:
     objects = np.empty(len(values), dtype=object)
     objects[:] = values
     return objects
-
-
-def finite_numbers(value: Any, size: int, name: str) -> Array:
-    """`value`, an option called `name` in errors, as an array. Shape: (size,).
-
-    Raises:
-        InvalidValue: It is not `size` finite numbers.
-    """
-    try:
-        numbers = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        numbers = np.array(np.nan)
-    if numbers.shape != (size,) or not np.isfinite(numbers).all():
-        raise InvalidValue(f"{name} must be {size} finite numbers, not {value!r}.")
-    return numbers

@@ -7,14 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Any
 
 from bam_envs.core.registry import ENVIRONMENTS, Alias, register_alias
 
-NOTHING: Mapping[str, Any] = MappingProxyType({})
-_UR = MappingProxyType({"ur_model": "ur5", "rs_state_to_info": True})
-_UR_MODULAR = MappingProxyType({"ur_model": "ur5", "rs_state_to_info": False})
+_UR = {"ur_model": "ur5", "rs_state_to_info": True}
+_UR_MODULAR = {"ur_model": "ur5", "rs_state_to_info": False}
 
 
 @dataclass(frozen=True)
@@ -47,16 +45,16 @@ class RoboGymId:
 
 
 _STEMS: tuple[tuple[str, str, Mapping[str, Any]], ...] = (
-    ("NoObstacleNavigationMir100", "bam/mir100-navigation-v0", NOTHING),
-    ("ObstacleAvoidanceMir100", "bam/mir100-avoidance-v0", NOTHING),
+    ("NoObstacleNavigationMir100", "bam/mir100-navigation-v0", {}),
+    ("ObstacleAvoidanceMir100", "bam/mir100-avoidance-v0", {}),
     ("EmptyEnvironmentUR", "bam/ur-empty-v0", _UR),
     ("EndEffectorPositioningUR", "bam/ur-reach-v0", _UR),
     ("BasicAvoidanceUR", "bam/ur-avoidance-v0", _UR),
     ("AvoidanceRaad2022UR", "bam/ur-track-v0", _UR),
-    ("AvoidanceRaad2022TestUR", "bam/ur-track-v0", MappingProxyType({**_UR, "fixed_paths": True})),
+    ("AvoidanceRaad2022TestUR", "bam/ur-track-v0", {**_UR, "fixed_paths": True}),
     ("EmptyEnvironment2UR", "bam/ur-empty-v0", _UR_MODULAR),
-    ("EndEffectorPositioning2UR", "bam/ur-reach-v0", MappingProxyType({**_UR_MODULAR, "modular": True})),
-    ("IsaacReachUR", "bam/isaac-reach-v0", MappingProxyType({"rs_state_to_info": False})),
+    ("EndEffectorPositioning2UR", "bam/ur-reach-v0", {**_UR_MODULAR, "modular": True}),
+    ("IsaacReachUR", "bam/isaac-reach-v0", {"rs_state_to_info": False}),
 )
 ROBO_GYM: dict[str, RoboGymId] = {
     entry.id: entry

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from bam_envs.core.env_options import finite_numbers
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.kinematics import angle_between, from_angles, quaternions
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import Array, Flags, Floats, Label, Score, finite_numbers
+from bam_envs.core.task import Array, Flags, Floats, Label, Score
 from bam_envs.core.validation import Positive, check
 from bam_envs.tasks.ur_arm import AboveZero, UrTask, collisions, frame_keys, joint_labels, joint_option, wire_states
 

@@ -12,20 +12,10 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from bam_envs.core.env_options import finite_numbers
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import (
-    Array,
-    Flags,
-    Floats,
-    Label,
-    Score,
-    TaskMemory,
-    as_objects,
-    draw_seeds,
-    finite_numbers,
-    labelled_box,
-)
+from bam_envs.core.task import Array, Flags, Floats, Label, Score, TaskMemory, as_objects, draw_seeds, labelled_box
 from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS, SCAN_RANGE
 
 FASTEST = np.array([0.5, 0.7])

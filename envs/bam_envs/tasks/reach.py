@@ -101,7 +101,18 @@ class ReachTask(TaskMemory):
         measured, sent = state.signals["joint_position"], state.command[:, :6]
         wanted = sent + np.clip(action, -1.0, 1.0).astype(np.float64) * JOINT_STEP
         wanted = np.clip(np.clip(wanted, measured - LEASH, measured + LEASH), _LOW, -_LOW)
-        return np.concatenate([slow_step(sent, wanted), np.full((self.num_envs, 1), GRIPPER_OPEN)], axis=1)
+        travel = wanted - sent
+        travel *= np.minimum(1.0, 0.999 * JOINT_STEP / np.maximum(np.abs(travel).max(axis=1), 1e-9))[:, None]
+        tool = GEOMETRY.tool_position(sent)
+        for _ in range(3):
+            step = GEOMETRY.tool_position(sent + travel) - tool
+            length = np.sqrt(np.einsum("ij,ij->i", step, step))
+            if length.max() <= TOOL_STEP:
+                break
+            travel *= np.where(length > TOOL_STEP, 0.99 * TOOL_STEP / np.maximum(length, 1e-9), 1.0)[:, None]
+        sinks = (tool[:, 2] + step[:, 2] < LOWEST_TOOL) & (step[:, 2] < 0)
+        joints = sent + np.where(sinks[:, None], 0.0, travel)
+        return np.concatenate([joints, np.full((self.num_envs, 1), GRIPPER_OPEN)], axis=1)
 
     def score(self, state: RobotState, action: Floats) -> Score:
         """Nearer is better; arriving is worth staying there."""
@@ -114,26 +125,3 @@ class ReachTask(TaskMemory):
     def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
         """The goal."""
         return [(self.goal[0], (0.1, 0.7, 0.3, 0.6))]
-
-
-def slow_step(joints: Array, wanted: Array) -> Array:
-    """As far from `joints` towards `wanted` as a robot near people may go in a period, and never below `LOWEST_TOOL`.
-
-    Args:
-        joints: Joint positions that were commanded last [rad]. Shape: (n, 6).
-        wanted: Joint positions to go to [rad]. Shape: (n, 6).
-
-    Returns:
-        Shape: (n, 6).
-    """
-    travel = wanted - joints
-    travel *= np.minimum(1.0, 0.999 * JOINT_STEP / np.maximum(np.abs(travel).max(axis=1), 1e-9))[:, None]
-    tool = GEOMETRY.tool_position(joints)
-    for _ in range(3):
-        step = GEOMETRY.tool_position(joints + travel) - tool
-        length = np.sqrt(np.einsum("ij,ij->i", step, step))
-        if length.max() <= TOOL_STEP:
-            break
-        travel *= np.where(length > TOOL_STEP, 0.99 * TOOL_STEP / np.maximum(length, 1e-9), 1.0)[:, None]
-    sinks = (tool[:, 2] + step[:, 2] < LOWEST_TOOL) & (step[:, 2] < 0)
-    return joints + np.where(sinks[:, None], 0.0, travel)

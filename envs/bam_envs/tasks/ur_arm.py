@@ -16,20 +16,11 @@ import numpy as np
 from gymnasium import spaces
 from msgspec import Meta
 
+from bam_envs.core.env_options import finite_numbers
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.kinematics import LINKS, quaternions
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import (
-    Array,
-    Flags,
-    Floats,
-    Label,
-    TaskMemory,
-    as_objects,
-    draw_seeds,
-    finite_numbers,
-    labelled_box,
-)
+from bam_envs.core.task import Array, Flags, Floats, Label, TaskMemory, as_objects, draw_seeds, labelled_box
 from bam_envs.robots.ur import DEFAULT_MODEL, JOINTS, UrModel
 from bam_envs.robots.ur import ur_model as model_called
 

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from bam_envs.core.env_options import finite_numbers
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import Array, Flags, Floats, Label, Score, finite_numbers
+from bam_envs.core.task import Array, Flags, Floats, Label, Score
 from bam_envs.robots.physics.obstacles import wave_signals
 from bam_envs.tasks.ur_arm import (
     FOREARM,

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from bam_envs.core.env_options import finite_numbers
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import Array, Flags, Floats, Label, Score, finite_numbers
+from bam_envs.core.task import Array, Flags, Floats, Label, Score
 from bam_envs.core.validation import check
 from bam_envs.robots.ur import UrModel
 from bam_envs.tasks.ur_arm import (

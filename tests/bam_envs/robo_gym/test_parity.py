@@ -139,25 +139,18 @@ def test_bases_with_random_actions(stem):
     assert sum(steps for steps, _ in ends) > 300
 
 
-def test_a_base_succeeds():
-    ends = [Both("NoObstacleNavigationMir100").play(seed, to_target) for seed in range(3)]
-    assert [info["final_status"] for _, info in ends] == ["success"] * 3
-
-
-def test_a_base_leaves_the_box():
+@pytest.mark.parametrize(
+    ("start", "within", "status"),
+    [
+        ([9.5, 0.0, 0.0], 20, "out of boundary"),
+        ([0.0, 9.5, np.pi / 2], 20, "out of boundary"),
+        ([0.0, -9.5, -np.pi / 2], 500, "max_steps_exceeded"),  # robo-gym's misplaced parenthesis
+    ],
+)
+def test_a_base_leaves_the_box(start, within, status):
     both = Both("NoObstacleNavigationMir100")
-    steps, info = both.play(0, always(1, 0), start_pose=[9.5, 0.0, 0.0], target_pose=[0.0, 0.0, 0.0])
-    assert (info["final_status"], steps < 20) == ("out of boundary", True)
-    steps, info = both.play(0, always(1, 0), start_pose=[0.0, 9.5, np.pi / 2], target_pose=[0.0, 0.0, 0.0])
-    assert (info["final_status"], steps < 20) == ("out of boundary", True)
-
-
-def test_a_base_is_not_seen_to_leave_the_box_on_one_side():
-    """robo-gym's misplaced parenthesis."""
-    both = Both("NoObstacleNavigationMir100")
-    start = [0.0, -9.5, -np.pi / 2]
     steps, info = both.play(0, always(1, 0), start_pose=start, target_pose=[0.0, 0.0, 0.0])
-    assert (steps, info["final_status"]) == (500, "max_steps_exceeded")
+    assert (info["final_status"], steps <= within) == (status, True)
 
 
 @pytest.mark.parametrize("stem", ["NoObstacleNavigationMir100", "ObstacleAvoidanceMir100"])
@@ -166,10 +159,12 @@ def test_a_base_that_stands_still(stem):
     assert (steps, info["final_status"]) == (500, "max_steps_exceeded")
 
 
-def test_a_base_among_boxes():
+def test_a_base_with_and_without_boxes():
     both = Both("ObstacleAvoidanceMir100")
     ends = [both.play(seed, to_target)[1]["final_status"] for seed in range(20)]
     assert {"collision", "success"} <= set(ends)
+    ends = [Both("NoObstacleNavigationMir100").play(seed, to_target) for seed in range(3)]
+    assert [info["final_status"] for _, info in ends] == ["success"] * 3
 
 
 @pytest.mark.parametrize("stem", UR)
@@ -205,35 +200,21 @@ def holding(both):
 JOINTS = ["base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3"]
 
 
-@pytest.mark.parametrize("stem", UR)
-@pytest.mark.parametrize(
-    "fixed",
-    [{"fix_base": True}, {"fix_wrist_3": False}, {"fix_shoulder": True, "fix_elbow": True}, {"fix_wrist_1": True}],
-    ids=str,
-)
-def test_arms_with_fixed_joints(stem, fixed):
-    both = Both(stem, **fixed)
-    assert sum(both.play(seed, randomly(seed, scale=0.3), steps=100)[0] for seed in range(2)) > 20
+FIXED = [{"fix_base": True}, {"fix_wrist_3": False}, {"fix_shoulder": True, "fix_elbow": True}, {"fix_wrist_1": True}]
+MODELS = ("ur3", "ur3e", "ur5e", "ur10", "ur10e", "ur16e")
+OPTIONS = [
+    *((stem, fixed, 0.3, 1, 100) for stem in UR for fixed in FIXED),
+    *((stem, {"ur_model": model}, 0.3, 5, 100) for stem in UR[:3] for model in MODELS),
+    *(("EndEffectorPositioningUR", {"restrict_wrist_1": one}, 1.0, 10, 150) for one in (True, False)),
+    *((stem, {"include_polar_to_elbow": one}, 0.1, 1, 200) for stem in UR[2:] for one in (True, False)),
+    ("AvoidanceRaad2022TestUR", {}, 0.1, 1, 100),
+]
 
 
-@pytest.mark.parametrize("model", ["ur3", "ur3e", "ur5e", "ur10", "ur10e", "ur16e"])
-@pytest.mark.parametrize("stem", UR[:3])
-def test_arms_of_all_sizes(stem, model):
-    both = Both(stem, ur_model=model)
-    assert sum(both.play(seed, randomly(seed, scale=0.3, hold=5), steps=100)[0] for seed in range(2)) > 20
-
-
-@pytest.mark.parametrize("restrict", [True, False])
-def test_the_first_wrist(restrict):
-    both = Both("EndEffectorPositioningUR", restrict_wrist_1=restrict)
-    assert sum(both.play(seed, randomly(seed, hold=10), steps=150)[0] for seed in range(3)) > 50
-
-
-@pytest.mark.parametrize("stem", ["BasicAvoidanceUR", "AvoidanceRaad2022UR"])
-@pytest.mark.parametrize("include", [True, False])
-def test_the_obstacle_seen_from_the_elbow(stem, include):
-    both = Both(stem, include_polar_to_elbow=include)
-    assert both.play(5, randomly(5, scale=0.1), steps=200)[0] > 20
+@pytest.mark.parametrize(("stem", "options", "scale", "hold", "steps"), OPTIONS)
+def test_options_of_arms(stem, options, scale, hold, steps):
+    both = Both(stem, **options)
+    assert sum(both.play(seed, randomly(seed, scale, hold), steps=steps)[0] for seed in range(2)) > 20
 
 
 def test_the_flange_reaches_its_target():
@@ -331,8 +312,3 @@ def test_our_trajectory_is_another():
     assert lengths.tolist() == [len(segment) for segment in theirs]
     apart = [np.abs(waypoints[i, : len(one)] - one).max() for i, one in enumerate(theirs)]
     assert 0.6 < max(apart) < 0.7
-
-
-def test_the_obstacles_that_are_always_the_same():
-    both = Both("AvoidanceRaad2022TestUR")
-    assert both.play(0, randomly(0, scale=0.1), steps=100)[0] > 20

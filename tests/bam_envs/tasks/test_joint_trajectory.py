@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue
-from bam_envs.robots.physics.contacts import ArmContacts
+from bam_envs.robots.physics.kinematic_arm import ArmContacts
 from bam_envs.robots.ur import UR_MODELS, ur_model
 from bam_envs.tasks.ur_track import load_trajectory
 

@@ -99,7 +99,12 @@ class Obstacles:
         """Where the obstacles are `time` seconds after their episode began. Shape: (n,) -> (n, 3)."""
         sample = np.floor(time * UPDATE_RATE + 1e-6)
         place: Array = self._place.copy()
-        place[:, 2] += self._wave[:, 0] * _triangle(sample, self._wave[:, 1])
+        # A triangle from -1 to 1; both ends of its period are samples: it stays at the bottom for two of them.
+        amplitude, frequency = self._wave.T
+        still = frequency <= 0
+        count = np.floor(UPDATE_RATE / np.where(still, UPDATE_RATE / 2, frequency))
+        triangle = np.where(still, 0.0, 1.0 - np.abs(4 * (sample % count / (count - 1)) - 2))
+        place[:, 2] += amplitude * triangle
         follows = self._samples > 0
         if follows.any():
             path = Splines(self._knots[follows], self._coefficients[follows])
@@ -123,14 +128,3 @@ class Obstacles:
         env_ids = np.flatnonzero(self._samples)
         if len(env_ids):
             self._follow(env_ids, self._points[env_ids], self._samples[env_ids].astype(np.float64))
-
-
-def _triangle(sample: Array, frequency: Array) -> Array:
-    """-1 at the bottom, +1 at the top, of a wave sampled at `UPDATE_RATE` over one period. Shape: (n,).
-
-    Both ends of the period are samples: it stays at the bottom for two of them.
-    """
-    still = frequency <= 0
-    count = np.floor(UPDATE_RATE / np.where(still, UPDATE_RATE / 2, frequency))
-    phase = sample % count / (count - 1)
-    return np.where(still, 0.0, 1.0 - np.abs(4 * phase - 2))

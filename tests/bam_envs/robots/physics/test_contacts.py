@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bam_envs.robots.physics.contacts import TABLE, ArmContacts, Capsules, box_distance2, segment_distance2
+from bam_envs.robots.physics.kinematic_arm import TABLE, ArmContacts, Capsules, box_distance2, segment_distance2
 from bam_envs.robots.ur import UR_MODELS
 
 STARTS = {

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import Initial, Robot
 from bam_envs.robots.physics.kinematic_arm import empty_arm, isaac_arm, obstacle_arm, reach_arm
 from bam_envs.robots.ur import START, UR_MODELS
@@ -38,15 +38,6 @@ def started(robot, joints=START):
     robot.connect()
     rows = np.arange(robot.num_robots)
     return robot.reset(rows, Initial({"joint_position": np.tile(joints, (len(rows), 1))}, rows + 5))
-
-
-def test_factories():
-    made = [factory(2) for factory in (reach_arm, empty_arm, obstacle_arm, isaac_arm)]
-    assert [robot.spec.name for robot in made] == ["ur5", "ur5", "ur5", "ur10"]
-    assert [robot.spec.period for robot in made] == [0.1, 0.05, 0.05, 1 / 30]
-    assert [len(robot.spec.signals) for robot in made] == [2, 2, 4, 2]
-    with pytest.raises(UnknownName):
-        reach_arm(ur_model="ur7")
 
 
 def test_it_is_at_its_set_point_one_period_later():
@@ -114,10 +105,6 @@ def test_a_collision_is_told_until_the_next_reset():
     assert told[-1] is True
     state = robot.reset(np.array([1]), Initial({"joint_position": np.array([START])}, np.zeros(1, np.int64)))
     assert state.truth["collision"].tolist() == [False, False]
-
-
-def test_an_arm_may_start_in_a_collision():
-    assert started(reach_arm(2), DOWN).truth["collision"].tolist() == [True, True]
 
 
 def test_arms_that_differ_lag_by_a_share_of_the_way():

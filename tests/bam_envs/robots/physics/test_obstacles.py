@@ -25,12 +25,6 @@ def at(obstacles, time):
     return obstacles.position(np.full(obstacles.num_envs, float(time)))
 
 
-def test_one_that_stays():
-    obstacles = begun({"obstacle_position": np.array([[0.3, -0.2, 0.5]])})
-    for time in (0.0, 0.05, 17.3):
-        np.testing.assert_array_equal(at(obstacles, time), [[0.3, -0.2, 0.5]])
-
-
 def test_up_and_down():
     """800 samples a period of 8 s, both ends of which are samples; robo-gym's sawtooth of the width 0.5."""
     obstacles = begun(
@@ -93,10 +87,6 @@ def test_rows_move_each_its_own_way():
     np.testing.assert_array_equal(positions[2], [1.0, 0.0, 0.5])
     obstacles.begin(np.array([1]), {"obstacle_position": np.array([[0.0, 1.0, 0.5]])}, SEED)
     np.testing.assert_array_equal(obstacles.position(np.full(3, 9.0))[1], [0.0, 1.0, 0.5])
-
-
-def test_before_an_episode_it_is_out_of_the_way():
-    np.testing.assert_array_equal(Obstacles(2).position(np.zeros(2)), [[0.0, 0.0, 1.9]] * 2)
 
 
 def test_saved_and_restored():
