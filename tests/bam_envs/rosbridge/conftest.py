@@ -23,10 +23,7 @@ DEADLINE = 10.0
 class ScriptedServer:
     """Keeps every frame it gets; answers requests from a table; misbehaves on request.
 
-    Args:
-        context: TLS settings.
-        status: HTTP status with which it refuses each connection, if any.
-        port: Where it listens; 0: anywhere.
+    It has TLS with a `context`, and refuses each connection with the HTTP `status`, if any.
     """
 
     def __init__(self, context=None, status=None, port=0):

@@ -1,4 +1,4 @@
-"""`RosbridgeLink` in forked and spawned processes, beside Twisted, and at the end of a program."""
+"""`RosbridgeLink` in forked and spawned processes, and at the end of a program."""
 
 import json
 import os
@@ -84,8 +84,8 @@ def test_workers_each_connect_on_their_own(scripted, tmp_path, method):
                 return answer
 
             if __name__ == "__main__":
-                with multiprocessing.get_context({method!r}).Pool(3) as pool:
-                    print(pool.map(work, range(6), chunksize=1))
+                with multiprocessing.get_context({method!r}).Pool(2) as pool:
+                    print(pool.map(work, range(4), chunksize=1))
             """
         )
     )
@@ -94,35 +94,7 @@ def test_workers_each_connect_on_their_own(scripted, tmp_path, method):
     result = subprocess.run(
         [sys.executable, str(program)], env=environment, capture_output=True, text=True, timeout=60, check=False
     )
-    assert (result.stdout.strip(), result.returncode) == ("[0, 1, 4, 9, 16, 25]", 0), result.stderr
-
-
-@pytest.mark.parametrize("transport", ["twisted", "asyncio"])
-def test_roslibpy_beside_it_may_come_and_go(python, scripted, transport):
-    _run(
-        python,
-        scripted,
-        f"""
-        import os, warnings
-        warnings.simplefilter("ignore")
-        import roslibpy
-        from bam_envs.rosbridge.client import RosbridgeLink
-
-        url = os.environ["BAM_TEST_URL"]
-        ros = roslibpy.Ros("127.0.0.1", int(url.rsplit(":", 1)[1]), transport="{transport}")
-        ros.run()
-        link = RosbridgeLink(url)
-        link.connect()
-        link.advertise("/cmd", "std_msgs/String")
-        link.publish("/cmd", {{"data": "before"}})
-        ros.terminate()
-        link.publish("/cmd", {{"data": "after"}})
-        assert link.epoch == 1
-        link.close()
-        print(0)
-        """,
-    )
-    assert [frame["msg"]["data"] for frame in scripted.of("publish")] == ["before", "after"]
+    assert (result.stdout.strip(), result.returncode) == ("[0, 1, 4, 9]", 0), result.stderr
 
 
 def test_a_program_that_forgets_to_close_ends(python, scripted):

@@ -26,17 +26,9 @@ def running():
     assert not thread.post(list)
 
 
-def test_work_is_done_in_the_thread(running):
+def test_work_is_done_in_the_thread_and_what_it_raises_is_for_who_waits(running):
     assert running.do(lambda: threading.current_thread().name) == "test-loop"
-    assert running.do(lambda: running.is_current)
     assert running.do(lambda: running.do(lambda: running.is_current))
-    assert not running.is_current
-    done = threading.Event()
-    assert running.post(done.set)
-    assert done.wait(DEADLINE)
-
-
-def test_what_work_raises_is_for_who_waits(running):
     with pytest.raises(ZeroDivisionError):
         running.do(lambda: 1 // 0)
     assert running.do(lambda: 1) == 1
@@ -44,7 +36,6 @@ def test_what_work_raises_is_for_who_waits(running):
 
 def test_without_a_loop_work_is_done_at_once():
     thread = LoopThread("never")
-    assert not thread.was_started
     assert thread.do(threading.current_thread) is threading.current_thread()
     assert not thread.post(list)
     thread.join()
