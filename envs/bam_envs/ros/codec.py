@@ -258,14 +258,10 @@ def _signed(raw: list[float] | Array) -> bytes:
 class Decoded(NamedTuple):
     """A message that commands."""
 
-    places: list[int]
-    """Where its numbers are in the command."""
-    values: Array
-    """Its numbers [SI]."""
-    tag: Tag | None
-    """Its tag, if it has one."""
-    content: bytes
-    """What a signature in the tag is for; empty without one."""
+    places: list[int]  # where its numbers are in the command
+    values: Array  # its numbers [SI]
+    tag: Tag | None  # its tag, if it has one
+    content: bytes  # what a signature in the tag is for; empty without one
 
 
 def decode_command(profile: RobotProfile, spec: RobotSpec, topic: str, message: object) -> Decoded:

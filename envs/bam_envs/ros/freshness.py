@@ -120,8 +120,7 @@ class ClockOffset:
     """
 
     def __init__(self, drift: float = 1e-4) -> None:
-        self.offset: float | None = None
-        """Our clock minus theirs [s]; None before the first message."""
+        self.offset: float | None = None  # our clock minus theirs [s]; None before the first message
         self._drift, self._at = drift, 0.0
 
     def age(self, sent: float, arrived: float) -> float:

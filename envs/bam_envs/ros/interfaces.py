@@ -58,14 +58,11 @@ class _Misfit(Exception):  # noqa: N818 - becomes an InvalidValue
 class Field:
     """One field of a message type."""
 
-    name: str
-    """As on the wire."""
-    type: str
-    """A primitive, or the normal name of a message type."""
+    name: str  # as on the wire
+    type: str  # a primitive, or the normal name of a message type
     array: str | None = None
     """None for one value, ``""`` for a list of any length, a number for a fixed one, ``"?"`` for one or a list."""
-    default: float = 0
-    """Of a number."""
+    default: float = 0  # of a number
 
 
 def normal_name(kind: str) -> str:

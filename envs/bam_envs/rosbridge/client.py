@@ -34,13 +34,11 @@ from bam_envs.rosbridge.threads import LoopThread, Workers
 
 _LOG = logging.getLogger(__name__)
 _FIRST_DELAY, _LONGEST_DELAY = 0.05, 2.0
-_STEADY = 2.0
-"""A connection that lasted so long [s] is worth trying again at once."""
+_STEADY = 2.0  # A connection that lasted so long [s] is worth trying again at once
 _SEND_WITHIN = 0.5
 _LEAVE_WITHIN = 3.0
 _STATUSES_KEPT = 20
-_MOST_ANSWERING = 64
-"""Requests of the server that are answered at the same time; more of them are refused."""
+_MOST_ANSWERING = 64  # requests of the server that are answered at the same time; more of them are refused
 _ENDED = "Timeout exceeded"
 """What servers say of a call that they end; rosbridge from 2.2 on does after 5 s, if it is told no other time."""
 _NEARLY = 0.9

@@ -30,22 +30,15 @@ from bam_envs.rosbridge.endpoint import Address, Endpoint
 _LOG = logging.getLogger(__name__)
 _QUIET = logging.getLogger(f"{__name__}.websockets")
 _QUIET.setLevel(logging.CRITICAL)  # a link says itself, and in one line, why it ended or did not open
-_CLOSE_WITHIN = 1.0
-"""Longest time for a closing handshake [s]."""
+_CLOSE_WITHIN = 1.0  # longest time for a closing handshake [s]
 _CLOCK_PROBES = 3
-_LOOK = 0.5
-"""Time between two looks at a connection whose silence is no loss [s]."""
-_PINGS = 5
-"""How often a server is asked for a sign of life before its silence is a loss."""
-_MOST_UNSENT = 1024 * 1024
-"""Bytes that wait for the server to read, from which on nothing more is sent."""
-_MOST_PASSED_OVER = 20
-"""Meaningless messages of one connection, after which it is ended."""
-_TOO_LARGE = 1009
-"""WebSocket's close code for a message above the limit."""
+_LOOK = 0.5  # time between two looks at a connection whose silence is no loss [s]
+_PINGS = 5  # how often a server is asked for a sign of life before its silence is a loss
+_MOST_UNSENT = 1024 * 1024  # bytes that wait for the server to read, from which on nothing more is sent
+_MOST_PASSED_OVER = 20  # meaningless messages of one connection, after which it is ended
+_TOO_LARGE = 1009  # WebSocket's close code for a message above the limit
 _NOT_KEPT = "Nothing was sent, and nothing is kept."
-_DEAD_NODE = "context is invalid"
-"""What rosbridge_suite answers to everything after its node was told to end."""
+_DEAD_NODE = "context is invalid"  # what rosbridge_suite answers to everything after its node was told to end
 _HOST_MISMATCH = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
 
 
@@ -58,8 +51,7 @@ def bare_reason(url: str, error: BamEnvsError) -> str:
 class ServerClock:
     """What a server says of itself and its time."""
 
-    ros: str | None = None
-    """``"ros1"`` or ``"ros2"``, by how it spells a time; None where it tells none."""
+    ros: str | None = None  # ``"ros1"`` or ``"ros2"``, by how it spells a time; None where it tells none
     offset: float | None = None
     """Our wall clock minus the server's [s], to within half the round trip; None where it tells none."""
 
@@ -86,13 +78,10 @@ class Connection:
         on_end: Callable[[Connection, BamEnvsError], None],
     ) -> None:
         self.url, self.epoch = endpoint.address.url, epoch
-        self.error: BamEnvsError | None = None
-        """Why it ended; None before."""
+        self.error: BamEnvsError | None = None  # why it ended; None before
         self.ended = asyncio.Event()
-        self.announced: dict[str, str] = {}
-        """What has been declared on it: id of the declaration -> its frame."""
-        self.clock = ServerClock()
-        """Known once it is open."""
+        self.announced: dict[str, str] = {}  # what has been declared on it: id of the declaration -> its frame
+        self.clock = ServerClock()  # known once it is open
         self._endpoint, self._max_message, self._lost_after = endpoint, max_message, lost_after
         self._on_message, self._on_end = on_message, on_end
         self._heard_at = time.monotonic()  # when the server last gave a sign of life [s]

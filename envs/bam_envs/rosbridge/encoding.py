@@ -27,16 +27,11 @@ MOST_ITEMS_OF_A_SERVER = 4_000_000
 """The same for messages of a server: an image may come as a list of numbers."""
 _NOT_BRACKETS = bytes(set(range(256)) - set(b'"[]{}'))
 _ONE_KIND = bytes.maketrans(b"{}", b"[]")
-_LONGEST_ID = 256
-"""Most characters of an id: it is kept, and repeated, for as long as what it names is unfinished."""
-_LARGEST_ID = 2**53
-"""Largest id that is a number: what every JSON reader holds exactly."""
-_MOST_FRAGMENTS = 10_000
-"""Of one outgoing message: a smaller fragment size would cost more than it carries."""
-_EMPTY = 100
-"""About what a fragment without any text costs [bytes]."""
-_MOST_UNFINISHED = 16
-"""Messages of one connection of which fragments may be missing at the same time."""
+_LONGEST_ID = 256  # most characters of an id: it is kept, and repeated, for as long as what it names is unfinished
+_LARGEST_ID = 2**53  # largest id that is a number: what every JSON reader holds exactly
+_MOST_FRAGMENTS = 10_000  # of one outgoing message: a smaller fragment size would cost more than it carries
+_EMPTY = 100  # about what a fragment without any text costs [bytes]
+_MOST_UNFINISHED = 16  # messages of one connection of which fragments may be missing at the same time
 Id = str | int | None
 """What a client calls an interaction; None if it does not."""
 
@@ -243,8 +238,7 @@ class _Parts:
     total: int
     deadline: float
     texts: dict[int, str] = field(default_factory=dict)
-    size: int = 0
-    """Bytes: a text that is not ASCII takes up to four for a character."""
+    size: int = 0  # bytes: a text that is not ASCII takes up to four for a character
 
 
 class Fragments:

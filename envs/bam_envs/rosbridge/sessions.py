@@ -27,8 +27,7 @@ LEASE_TOPIC = "/bam/lease"
 """Where the driver says that it is there, or leaves (std_msgs/String: `RENEW` or `LEAVE`, a blank, a signed tag)."""
 RENEW, LEAVE = "renew", "leave"
 _NOT_OPEN, _ELSEWHERE = "is not open here", "is of another connection"
-_MOST = 64
-"""Sessions of one caller; the oldest is closed for a new one."""
+_MOST = 64  # sessions of one caller; the oldest is closed for a new one
 
 
 class _Session:

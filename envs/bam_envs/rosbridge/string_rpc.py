@@ -30,8 +30,7 @@ _STRING = "std_msgs/String"
 _RESEND = 0.5
 """Time between two publications of a request until a first reply came [s]: a ROS graph loses what is published before
 the two ends of a topic found each other. The service executes one id once."""
-_MOST_WAITING = 64
-"""Requests that a service executes or keeps waiting at once."""
+_MOST_WAITING = 64  # requests that a service executes or keeps waiting at once
 _WORKERS = 8
 
 Answer = TypeVar("Answer")

@@ -17,8 +17,7 @@ from bam_envs.core.errors import InvalidValue
 
 Role = Literal["client", "operator"]
 _WINDOW = 1.0
-_OF_ONE, _OF_ALL = 4, 32
-"""Wrong tokens from one address, and from all that were wrong lately, in `_WINDOW` [s]."""
+_OF_ONE, _OF_ALL = 4, 32  # wrong tokens from one address, and from all that were wrong lately, in `_WINDOW` [s]
 _LATELY = 60.0
 _MOST_ADDRESSES = 4096
 
@@ -46,8 +45,7 @@ class Tokens:
         if operator is not None and operator == client:
             raise InvalidValue("The operator's token must be another one than that of the clients.")
         self._client, self._operator = client, operator
-        self.needed = client is not None
-        """Whether nobody comes in without one."""
+        self.needed = client is not None  # whether nobody comes in without one
 
     @property
     def exist(self) -> bool:

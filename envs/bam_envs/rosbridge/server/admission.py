@@ -30,8 +30,7 @@ _PAGE_REFUSED = (
     'To let it in, start the server with one, and send it as the first message: {"op": "auth", "token": TOKEN}.'
 )
 _FIRST = 'The first message of a page must be its token, within {:g} s: {{"op": "auth", "token": TOKEN}}'
-_POLICY_VIOLATION = 1008
-"""Close code of who does not show its token."""
+_POLICY_VIOLATION = 1008  # close code of who does not show its token
 _logger = logging.getLogger(__name__)
 
 

@@ -51,13 +51,10 @@ class Incoming:
     """A frame of a client, read; what it carries (a message, arguments, a response) is checked."""
 
     message: Mapping[str, Any]
-    error: ProtocolError | None = None
-    """Why it says nothing."""
-    kind: str = ""
-    """The type that its content was checked for; empty where there was nothing to check."""
+    error: ProtocolError | None = None  # why it says nothing
+    kind: str = ""  # the type that its content was checked for; empty where there was nothing to check
     content: Any = None
-    wrong: BamEnvsError | None = None
-    """Why there is no content."""
+    wrong: BamEnvsError | None = None  # why there is no content
 
     def content_of(self, kind: str) -> Any:
         """The content, or the error that it does not fit, or should be of another type by now."""

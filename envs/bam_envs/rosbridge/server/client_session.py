@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 
 LEVELS = ("none", "error", "warning", "info")
 """Of status messages: each one includes those before it."""
-_NEVER_SPLIT = 2**31
-"""A fragment size above that of every message."""
+_NEVER_SPLIT = 2**31  # A fragment size above that of every message
 _NUMBERS = itertools.count(1)
 _NAME = re.compile(r"/?[A-Za-z_~][\w~]*(?:/[\w~]+)*", re.ASCII)
 _LONGEST = 256
@@ -75,10 +74,8 @@ class ServerOptions:
 class Wire:
     """How a client wants a message packed."""
 
-    compression: str = "none"
-    """One of `encoding.COMPRESSIONS`."""
-    fragment_size: int = _NEVER_SPLIT
-    """Most characters of a message in one frame; CBOR is never split."""
+    compression: str = "none"  # one of `encoding.COMPRESSIONS`
+    fragment_size: int = _NEVER_SPLIT  # most characters of a message in one frame; CBOR is never split
 
 
 @dataclass(frozen=True)
@@ -86,8 +83,7 @@ class Packet:
     """The WebSocket frames of one message."""
 
     frames: tuple[bytes, ...]
-    text: bool
-    """Whether they are text frames."""
+    text: bool  # whether they are text frames
     stream: str | None = None
     """What it belongs to, if a newer one of the same may take its place; None for what must arrive."""
 
@@ -134,8 +130,7 @@ class Send:
 
     session: Session
     packet: Packet
-    keep: int = 0
-    """Most packets of the same stream that may wait for a slow client; 0: as many as there is room for."""
+    keep: int = 0  # most packets of the same stream that may wait for a slow client; 0: as many as there is room for
 
 
 @dataclass(frozen=True)
@@ -157,19 +152,14 @@ class Session:
 
     caller: Caller
     options: ServerOptions
-    level: str = "error"
-    """The status messages it wants: this one of LEVELS and those before it."""
+    level: str = "error"  # the status messages it wants: this one of LEVELS and those before it
     advertised: dict[str, set[Id]] = field(default_factory=dict)
     """Its topics, with the ids of its advertisements of each."""
-    streams: dict[str, Stream] = field(default_factory=dict)
-    """What it has subscribed, by topic."""
+    streams: dict[str, Stream] = field(default_factory=dict)  # what it has subscribed, by topic
     services: set[str] = field(default_factory=set)
-    calls: set[int] = field(default_factory=set)
-    """Numbers of its unanswered calls."""
-    running: int = 0
-    """How many of its calls are with handlers."""
-    waiting: deque[Invoke] = field(default_factory=deque)
-    """Its calls that wait for their turn."""
+    calls: set[int] = field(default_factory=set)  # numbers of its unanswered calls
+    running: int = 0  # how many of its calls are with handlers
+    waiting: deque[Invoke] = field(default_factory=deque)  # its calls that wait for their turn
 
     def __post_init__(self) -> None:
         self.fragments = Fragments(self.options.max_incoming, self.options.fragment_lifetime)

@@ -18,10 +18,8 @@ TRY_AGAIN_LATER = 1013
 """Close code of a client that does not read what it must get."""
 _STRANGERS, _STRANGERS_OF_ONE = 128, 32
 """Most sockets without an admitted client, in all and of one address. The oldest is closed for a new one."""
-_OF_A_STRANGER = 65536
-"""What a stranger may say [bytes]."""
-_FRAME = 200
-"""About what a frame costs beside what it holds [bytes]."""
+_OF_A_STRANGER = 65536  # what a stranger may say [bytes]
+_FRAME = 200  # about what a frame costs beside what it holds [bytes]
 
 
 class Outbox:
@@ -32,8 +30,7 @@ class Outbox:
     """
 
     def __init__(self, most_bytes: int, most_of_a_stream: int) -> None:
-        self.size = 0
-        """Bytes that wait."""
+        self.size = 0  # bytes that wait
         self._most_bytes, self._most_of_a_stream = most_bytes, most_of_a_stream
         self._packets: deque[Packet] = deque()
         self._waiting: Counter[str] = Counter()
@@ -86,14 +83,10 @@ class BridgeConnection(ServerConnection):
         self._sockets, self._most_unfinished = sockets, limits.unfinished
         self._most_unsent = limits.max_message + limits.outbox_size
         self.outbox = Outbox(limits.outbox_size, limits.outbox_of_a_topic)
-        self.role: Role | None = None
-        """What the client was let in as; None before."""
-        self.host = ""
-        """The IP address of the client."""
-        self.heard = time.monotonic()
-        """When anything came last [s, monotonic]."""
-        self.born = self.heard
-        """When the socket opened [s, monotonic]."""
+        self.role: Role | None = None  # what the client was let in as; None before
+        self.host = ""  # the IP address of the client
+        self.heard = time.monotonic()  # when anything came last [s, monotonic]
+        self.born = self.heard  # when the socket opened [s, monotonic]
         self._waiting = 0  # what whole frames cost that are not taken yet [bytes]
         self._message, self._whole = 0, deque[int]()  # what those of the unfinished message cost, and of whole ones
         self._takes_more = True

@@ -21,8 +21,7 @@ from bam_envs.rosbridge.server.client_session import Event, Invoke, Packet, Send
 
 _LENIENT = ("bam_msgs/GymAPI",)
 """Types that are still growing: fields of a newer version are ignored, as every transport does."""
-_LONGEST_NUMBER = 20
-"""Digits of the number of a call."""
+_LONGEST_NUMBER = 20  # digits of the number of a call
 _logger = logging.getLogger(__name__)
 
 
@@ -30,18 +29,12 @@ _logger = logging.getLogger(__name__)
 class Service:
     """A service, and who offers it."""
 
-    name: str
-    """With a leading slash."""
-    kind: str
-    """Normal name of its type."""
-    spelling: str
-    """Its name as its provider spells it."""
-    provider: Session | None = None
-    """The client that offers it; None for this process."""
-    handler: Handler | None = None
-    """What answers it in this process."""
-    inline: bool = False
-    """Whether the handler is quick and may run in the thread of the network."""
+    name: str  # with a leading slash
+    kind: str  # normal name of its type
+    spelling: str  # its name as its provider spells it
+    provider: Session | None = None  # the client that offers it; None for this process
+    handler: Handler | None = None  # what answers it in this process
+    inline: bool = False  # whether the handler is quick and may run in the thread of the network
 
 
 @dataclass(frozen=True)
@@ -50,11 +43,9 @@ class Request:
 
     session: Session
     id: Id
-    name: str
-    """Of the service, as the client spells it."""
+    name: str  # of the service, as the client spells it
     wire: Wire = field(default_factory=Wire)
-    timeout: float | None = None
-    """How long it waits [s]; None for the usual time."""
+    timeout: float | None = None  # how long it waits [s]; None for the usual time
 
 
 @dataclass(frozen=True)
@@ -64,10 +55,8 @@ class Call:
     number: int
     service: Service
     request: Request
-    timeout: float
-    """After which time it is answered in any case [s]."""
-    deadline: float
-    """When that is [s], clock of `Bridge`."""
+    timeout: float  # after which time it is answered in any case [s]
+    deadline: float  # when that is [s], clock of `Bridge`
 
 
 class Services(dict[str, Service]):
@@ -78,8 +67,7 @@ class Services(dict[str, Service]):
         self._emit = emit
         self._calls: dict[int, Call] = {}
         self._numbers = itertools.count(1)
-        self.deadline = math.inf
-        """When to call `expire` next [s]; a call that was answered may have set it."""
+        self.deadline = math.inf  # when to call `expire` next [s]; a call that was answered may have set it
 
     def offer(self, service: Service) -> Service | None:
         """Add a service; returns the one of another client whose place it takes."""

@@ -19,10 +19,8 @@ from bam_envs.rosbridge.server.client_session import Publication, Send, Session,
 class Wish:
     """What one subscription asks for."""
 
-    throttle: float = 0.0
-    """Least time between two messages [s]."""
-    queue_length: int = 0
-    """How many messages may wait; 0: no limit of its own."""
+    throttle: float = 0.0  # least time between two messages [s]
+    queue_length: int = 0  # how many messages may wait; 0: no limit of its own
     wire: Wire = field(default_factory=Wire)
 
 
@@ -32,8 +30,7 @@ class Stream:
     def __init__(self, session: Session, topic: str, name: str) -> None:
         self.session, self.topic, self.name = session, topic, name
         self.wishes: dict[Id, Wish] = {}
-        self.wish = Wish()
-        """All of them together."""
+        self.wish = Wish()  # all of them together
         self._waiting: deque[Publication] = deque(maxlen=1)
         self._next = -math.inf
 
@@ -83,17 +80,13 @@ class Topic:
     """One topic."""
 
     name: str
-    kind: str
-    """Normal name of its type."""
-    publishers: set[Session | None] = field(default_factory=set)
-    """None is this process."""
+    kind: str  # normal name of its type
+    publishers: set[Session | None] = field(default_factory=set)  # None is this process
     streams: dict[Session, Stream] = field(default_factory=dict)
-    listeners: list[Listener] = field(default_factory=list)
-    """Those of this process."""
+    listeners: list[Listener] = field(default_factory=list)  # those of this process
     latching: set[Session | None] = field(default_factory=set)
     """The publishers whose last message is repeated to newcomers."""
-    latched: tuple[Session | None, Publication] | None = None
-    """That message, and whose it is."""
+    latched: tuple[Session | None, Publication] | None = None  # that message, and whose it is
 
 
 class Topics(dict[str, Topic]):
