@@ -196,11 +196,8 @@ def make_vector_env(
     if is_batched(env_id):
         return _made(env_id, lambda: gym.make_vec(env_id, num_envs=num_envs, **(env_kwargs or {})))
     arguments = {"disable_env_checker": True, **(env_kwargs or {})}
-    same_step = {"autoreset_mode": AutoresetMode.SAME_STEP}
-    return _made(
-        env_id,
-        lambda: gym.make_vec(env_id, num_envs, vectorization_mode="sync", vector_kwargs=same_step, **arguments),
-    )
+    arguments["vector_kwargs"] = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    return _made(env_id, lambda: gym.make_vec(env_id, num_envs, vectorization_mode="sync", **arguments))
 
 
 def control_period(env: gym.Env[Any, Any]) -> float | None:

@@ -32,21 +32,16 @@ class FiniteEnv(gym.Wrapper[Any, Any, Any, Any]):
         """Begin an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._steps = 0
-        self._require("observation", observation)
+        _require_finite(self, self._name, "observation", observation, self._steps, self._index)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Take one step."""
         results = self.env.step(action)
         self._steps += 1
-        self._require("reward", results[1])
-        self._require("observation", results[0])
+        _require_finite(self, self._name, "reward", results[1], self._steps, self._index)
+        _require_finite(self, self._name, "observation", results[0], self._steps, self._index)
         return results
-
-    def _require(self, signal: str, value: Any) -> None:
-        found = _not_finite(signal, value)
-        if found is not None:
-            raise _failed(self, self._name, *found, self._steps, self._index)
 
 
 class FiniteVectorEnv(VectorWrapper):
@@ -95,14 +90,7 @@ class FiniteVectorEnv(VectorWrapper):
         return observations, rewards, terminated, truncated, infos
 
     def _require(self, signal: str, values: Any, which: int | None = None) -> None:
-        """Refuse a number of all environments, or of one."""
-        found = _not_finite(signal, values)
-        if found is None:
-            return
-        name, index, number = found
-        if which is None:
-            which, *index = index
-        raise _failed(self, self._name, name, index, number, int(self.episode_steps[which]), which)
+        _require_finite(self, self._name, signal, values, self.episode_steps, which)
 
 
 def _of(observations: Any, which: int) -> Any:
@@ -124,16 +112,35 @@ def _not_finite(name: str, value: Any) -> tuple[str, list[int], float] | None:
     return name, index, float(array[tuple(index)])
 
 
-def _failed(
-    env: Any, env_id: str, name: str, index: list[int], number: float, steps: int, which: int | None
-) -> EnvironmentFailed:
-    """The error for a number; a label of the environment's own names it, if there is one."""
+def _require_finite(env: Any, env_id: str, signal: str, value: Any, steps: Any, which: int | None = None) -> None:
+    """Refuse the first number that is not finite; a label of the environment's own names it, if there is one.
+
+    Args:
+        env: The environment.
+        env_id: How the error names it.
+        signal: ``"observation"`` or ``"reward"``.
+        value: Of one environment, or of a batch.
+        steps: Of its episode, or an array of them for a batch.
+        which: The environment that `value` is of; None for one that is alone, and for a whole batch.
+
+    Raises:
+        EnvironmentFailed: With the number and its place.
+    """
+    found = _not_finite(signal, value)
+    if found is None:
+        return
+    name, index, number = found
+    if isinstance(steps, np.ndarray):
+        if which is None:
+            which, *index = index
+        steps = steps[which]
     describe = getattr(env.unwrapped, "describe", None)
     labels = describe().get(name, ()) if describe else ()
-    label = f" {labels[index[0]]['name']!r}" if len(index) == 1 and index[0] < len(labels) else ""
-    where = label or (str(index) if index else "")
+    where = str(index) if index else ""
+    if len(index) == 1 and index[0] < len(labels):
+        where = f" {labels[index[0]]['name']!r}"
     one = "" if which is None else f" in environment {which}"
-    return EnvironmentFailed(
+    raise EnvironmentFailed(
         f"{env_id}: {name}{where} is {number} at step {steps} of an episode{one}; "
         "expected finite numbers: correct the environment"
     )

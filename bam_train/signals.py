@@ -64,8 +64,8 @@ class _Handler:
 @contextlib.contextmanager
 def handled(
     handle: Callable[[int], object], numbers: Sequence[int] = SIGNALS, *, ignored_too: bool = False
-) -> Iterator[Callable[[], None]]:
-    """Within this, `handle` is called with the number of each signal; gives what restores the old handlers before.
+) -> Iterator[None]:
+    """Within this, `handle` is called with the number of each signal.
 
     Args:
         handle: Runs in the main thread; what it raises comes out of whatever runs there.
@@ -73,21 +73,16 @@ def handled(
         ignored_too: Whether to handle also those that are ignored, as ``nohup`` does with SIGHUP and a shell with the
             SIGINT of a background job.
     """
-    before: dict[int, Any] = {}
-
-    def restore() -> None:
-        while before:
-            signal.signal(*before.popitem())
-
-    if threading.current_thread() is threading.main_thread():
-        unheard = (None,) if ignored_too else (None, signal.SIG_IGN)  # None: of a handler that is not Python's
-        before.update((n, signal.getsignal(n)) for n in numbers if signal.getsignal(n) not in unheard)
-    for number, around in list(before.items()):
+    unheard = (None,) if ignored_too else (None, signal.SIG_IGN)  # None: of a handler that is not Python's
+    here = threading.current_thread() is threading.main_thread()
+    before = {n: signal.getsignal(n) for n in numbers if here and signal.getsignal(n) not in unheard}
+    for number, around in before.items():
         signal.signal(number, _Handler(handle, around))
     try:
-        yield restore
+        yield
     finally:
-        restore()
+        for number, around in before.items():
+            signal.signal(number, around)
 
 
 @contextlib.contextmanager
@@ -107,29 +102,24 @@ class SignalMemory:
     before anything moves.
     """
 
-    def __init__(self, numbers: Sequence[int] = SIGNALS) -> None:
+    def __init__(self) -> None:
         self.came: list[int] = []
         """The signals that came, in order."""
-        self._numbers = numbers
-        self._stack = contextlib.ExitStack()
+        self._handled = handled(self._handle)
 
     def __enter__(self) -> SignalMemory:
-        self._stack.enter_context(handled(self._handle, self._numbers))
+        self._handled.__enter__()
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
+    def __exit__(self, *error: Any) -> None:
+        self._handled.__exit__(*error)
 
     def _handle(self, number: int) -> None:
         self.came.append(number)
         interrupt(number)
 
     def raise_again(self) -> None:
-        """Raise for a signal that came before now, if one did.
-
-        Raises:
-            KeyboardInterrupt: As of `interrupt`.
-        """
+        """`interrupt` for a signal that came before now, if one did."""
         if self.came:
             interrupt(self.came[0])
 

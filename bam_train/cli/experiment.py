@@ -27,10 +27,8 @@ class ScriptParser(argparse.ArgumentParser):
     """
 
     def __init__(self, file: str, description: str | None) -> None:
-        kind = argparse.RawDescriptionHelpFormatter
-        super().__init__(
-            Path(file).stem, "%(prog)s.py [options]", description, formatter_class=kind, allow_abbrev=False
-        )
+        kind, name = argparse.RawDescriptionHelpFormatter, Path(file).stem
+        super().__init__(name, "%(prog)s.py [options]", description, formatter_class=kind, allow_abbrev=False)
 
     def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
         """Read the command line, or `args`.
@@ -50,17 +48,13 @@ class ScriptParser(argparse.ArgumentParser):
         """Add ``--env``, ``--parity`` and ``--out``, what is trained on and where it goes."""
         self.add_argument("--env", metavar="ID", help=f"environment, any that bam-train takes (default {own})")
         self.add_argument("--parity", action="store_true", help="robo-gym's own arithmetic: env_kwargs.parity=true")
-        self.add_argument(
-            "--out", type=Path, metavar="FILE", help="checkpoint (default checkpoints/NAME.zip, or a numbered one)"
-        )
+        where = "checkpoint (default checkpoints/NAME.zip, or a numbered one)"
+        self.add_argument("--out", type=Path, metavar="FILE", help=where)
 
     def add_robot(self) -> None:
         """Add ``--robot``, ``--yes`` and ``--render``, where the policy acts and who watches."""
-        self.add_argument(
-            "--robot",
-            metavar="URL",
-            help="use the policy on a live robot behind rosbridge, such as ws://10.0.0.5:9090",
-        )
+        what = "use the policy on a live robot behind rosbridge, such as ws://10.0.0.5:9090"
+        self.add_argument("--robot", metavar="URL", help=what)
         self.add_argument("--yes", action="store_true", help="do not ask before a real robot moves")
         self.add_argument("--render", action="store_true", help="show the policy's episodes in a window")
 

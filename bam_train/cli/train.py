@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from bam_train.trainers.training_run import TrainingRun
 
 _STARTED = time.monotonic()
+_KEPT: list[contextlib.ExitStack] = []
 
 
 def train(config: TrainConfig) -> int:
@@ -114,7 +115,7 @@ def _stopped_by_signals(run: TrainingRun) -> Iterator[list[int]]:
         handlers.enter_context(handled(stop))
         yield came
         if came:
-            handlers.pop_all()
+            _KEPT.append(handlers.pop_all())  # the handlers of before return as soon as this is collected
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
