@@ -1,12 +1,16 @@
+import gc
 import os
 import signal
+import tracemalloc
 import weakref
+from collections import deque
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
-from bam_envs.core.errors import LinkLost, RobotFault, SafetyStop, StaleState
+from bam_envs.core.errors import LinkLost, ResetNeeded, RobotFault, SafetyStop, StaleState
 from bam_envs.core.robot_env import RobotEnv
 from bam_envs.core.timing import Pacer
 from bam_envs.robots.fake import FakeRobot
@@ -17,6 +21,10 @@ from bam_envs.tasks.reach import ReachTask
 from bam_envs.testing.drivers import DrivenRobot
 from bam_train.deploy.deployment import Deployment
 from bam_train.deploy.journal import Ending, Journal
+from bam_train.errors import WiringError
+from bam_train.loop import Agent, CopyTAgent
+
+DONE = Ending("episodes done", 0)
 
 
 class Right:
@@ -71,10 +79,9 @@ class Driven(gym.Wrapper):
         super().close()
 
 
-def run(env, policy=None, episodes=3, seed=7, watcher=None):
-    journal = Journal(episodes)
-    pacer = Pacer(None)
-    ending = Deployment(env, policy or Right(), pacer, journal).run(watcher or Silent(), seed=seed)
+def run(env, policy=None, episodes=3, seed=7, watcher=None, **options):
+    journal, pacer = Journal(episodes), Pacer(None)
+    ending = Deployment(env, policy or Right(), pacer, journal, **options).run(watcher or Silent(), seed=seed)
     return ending, journal, pacer
 
 
@@ -115,7 +122,7 @@ def test_all_episodes(corridor, starting_cell):
     env, policy, watcher = Driven(gym.make(corridor)), Right(), Silent()
     ending, journal, pacer = run(env, policy, watcher=watcher)
     lengths = [4 - starting_cell(seed) for seed in (7, 8, 9)]
-    assert ending == Ending("episodes done", 0)
+    assert ending == DONE
     assert [record.to_json() for record in journal.records] == [
         {"seed": seed, "length": length, "return": 1 - 0.25 * length, "success": True, "end": "terminated"}
         for seed, length in zip((7, 8, 9), lengths, strict=True)
@@ -222,7 +229,7 @@ def test_a_signal_while_closing_changes_nothing(corridor):
             super().close()
 
     ending, _, _ = run(Slow(gym.make(corridor)))
-    assert ending == Ending("episodes done", 0)
+    assert ending == DONE
 
 
 def test_a_failing_close_is_a_fault(corridor):
@@ -254,7 +261,7 @@ def test_the_same_loop_drives_any_robot():
     robot = FakeRobot()
     env = gym.wrappers.TimeLimit(RobotEnv(robot, PickTask(1)), 7)
     ending, journal, pacer = run(env, Right(np.array([1, 0, 0, 0, 1], np.float32)), episodes=2)
-    assert ending == Ending("episodes done", 0)
+    assert ending == DONE
     assert [(record.length, record.end) for record in journal.records] == [(7, "truncated")] * 2
     assert len(robot.sent) == pacer.ticks == 14
     assert robot.halts >= 1
@@ -277,3 +284,137 @@ def test_what_the_operator_looks_for_first_is_in_the_status(corridor, error, end
     env = Driven(gym.make(corridor), raises(error), at=1)
     assert run(env)[0] == ending
     assert "halt" in env.robot.calls
+
+
+# The chain of agents, and the sink that gets what happens
+
+
+class Endless(gym.Env):
+    """Counts; nothing ends."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,))
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        self.count = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.count += 1
+        return np.array([self.count], np.float32), 1.0, False, False, {}
+
+
+class Sees(Agent):
+    """Another agent of the chain: sees what was acted on."""
+
+    reads = ("action", "env/env_obs")
+    writes = ("seen",)
+
+    def __init__(self):
+        super().__init__()
+        self.seen = []
+
+    def forward(self, t, **kwargs):
+        if not self.get(("env/done", t))[0]:
+            self.seen.append(self.get(("env/env_obs", t)).tolist())
+        self.set(("seen", t), np.array([len(self.seen)]))
+
+
+def test_the_sink_gets_every_tick_once_episode_by_episode(corridor, starting_cell):
+    pieces = []
+    assert run(gym.make(corridor), sink=lambda *piece: pieces.append(piece))[0] == DONE
+    assert [first for first, _ in pieces] == [0, 0, 0]
+    for (_, piece), seed in zip(pieces, (7, 8, 9), strict=True):
+        cells = list(range(starting_cell(seed), 5))
+        assert piece["env/env_obs"].ravel().tolist() == cells
+        assert piece["env/timestep"].ravel().tolist() == list(range(len(cells)))
+        assert piece["action"].ravel().tolist() == [1] * len(cells)  # of the last one nothing comes
+
+
+def test_a_sink_that_fails_is_a_fault_and_is_not_called_again():
+    calls = []
+
+    def sink(first, piece):
+        calls.append(first)
+        raise OSError(28, "No space left on device")
+
+    ending, _, _ = run(Endless(), window=40, sink=sink)
+    assert ending == Ending("fault: OSError: [Errno 28] No space left on device", 1)
+    assert calls == [0]
+
+
+def test_a_sink_that_fails_at_the_end_of_an_episode_cut_short_does_not_hide_the_fault(corridor):
+    pieces = []
+
+    def sink(first, piece):
+        pieces.append((first, piece["action"].tolist()))
+        raise OSError("full")
+
+    env = Driven(gym.make(corridor), raises(ValueError("the real cause")), at=1)
+    assert run(env, sink=sink)[0] == Ending("fault: ValueError: the real cause", 1)
+    assert pieces == [(0, [[1]])]
+
+
+def test_the_robot_is_halted_before_the_sink_may_take_its_time(corridor):
+    env = Driven(gym.make(corridor))
+    run(env, episodes=2, sink=lambda *piece: env.robot.calls.append("sink"))
+    assert env.robot.calls == ["halt", "sink", "halt", "sink", "halt", "close"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_inside_the_sink(corridor, number):
+    pieces = []
+
+    def sink(first, piece):
+        pieces.append(first)
+        os.kill(os.getpid(), number)
+
+    assert run(gym.make(corridor), sink=sink)[0] == Ending("interrupted", 128 + number)
+    assert pieces == [0]
+
+
+def test_agents_of_ones_own_join_the_chain(corridor, starting_cell):
+    """Those behind the policy may read its action at the end, too."""
+    sees = Sees()
+    assert run(gym.make(corridor), episodes=1, agents=[sees, CopyTAgent("action", "sent")])[0] == DONE
+    assert sees.seen == [[[cell]] for cell in range(starting_cell(7), 4)]
+
+
+def test_an_agent_that_reads_what_nobody_writes_is_refused_before_the_robot_is_connected():
+    class Lost(Sees):
+        reads = ("camera",)
+
+    robot = FakeRobot()
+    env = gym.wrappers.TimeLimit(RobotEnv(robot, PickTask(1)), 7)
+    with pytest.raises(WiringError, match=r"^Lost reads 'camera', which nobody writes\. Written are 'action', "):
+        run(env, agents=[Lost()])
+    with pytest.raises(ResetNeeded, match="not connected"):
+        robot.step(np.zeros((1, 7)))
+
+
+@pytest.mark.parametrize("limit", [None, 2], ids=["one endless episode", "many short ones"])
+def test_memory_stays_flat(limit):
+    """Policy, watcher and sink keep nothing; 1,000 ticks fill the window and all records, 1,000 more add nothing."""
+    held = []
+
+    class Looks(Silent):
+        def ticked(self, record, action, pacer):
+            self.ticks += 1
+            self.episodes.clear()
+            if self.ticks == 250:
+                tracemalloc.start()
+            if self.ticks in (1_000, 2_000):
+                gc.collect()
+                held.append(tracemalloc.get_traced_memory()[0])
+            if self.ticks == 2_000:
+                raise StopIteration
+
+    env = Endless() if limit is None else gym.wrappers.TimeLimit(Endless(), limit)
+    policy = SimpleNamespace(reset=lambda: None, act=lambda observation: 1)
+    journal = Journal(10**6, records=deque(maxlen=100))
+    deployment = Deployment(env, policy, Pacer(None), journal, window=100, sink=lambda first, piece: None)
+    try:
+        deployment.run(Looks(), seed=0)
+    finally:
+        tracemalloc.stop()
+    assert held[1] - held[0] < 8_000
