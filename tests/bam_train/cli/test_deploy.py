@@ -160,23 +160,23 @@ def test_a_truncated_checkpoint(corridor_checkpoint, run):
     assert err.count("\n") == 1
 
 
-def test_nothing_moves_when_the_spaces_differ(corridor_checkpoint, corridor, run, monkeypatch):
-    space = {"type": "Box", "shape": [1], "dtype": "float32", "low": 0.0, "high": 9.0}
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        (
+            {"observation_space": {"type": "Box", "shape": [1], "dtype": "float32", "low": 0.0, "high": 9.0}},
+            "observation_space.high is 9.0 in the checkpoint and 4.0 in test/Corridor-v0 as installed; "
+            "train it anew, or install the version it was trained with\n",
+        ),
+        ({"env": "bam/stack-v9"}, "its manifest: Unknown environment 'bam/stack-v9'. "),
+    ],
+)
+def test_nothing_moves_in_another_environment(corridor_checkpoint, corridor, run, monkeypatch, fields, text):
     monkeypatch.delattr(corridor_class(corridor), "step")
-    path = corridor_checkpoint(observation_space=space)
-    assert run(main, path, "--fast") == (
-        1,
-        "",
-        f"bam-deploy: {path}: observation_space.high is 9.0 in the checkpoint and 4.0 in test/Corridor-v0 "
-        "as installed; train it anew, or install the version it was trained with\n",
-    )
-
-
-def test_an_environment_that_is_not_here(corridor_checkpoint, run):
-    path = corridor_checkpoint(env="bam/stack-v9")
+    path = corridor_checkpoint(**fields)
     status, out, err = run(main, path, "--fast")
     assert (status, out, err.count("\n")) == (1, "", 1)
-    assert err.startswith(f"bam-deploy: {path}: its manifest: Unknown environment 'bam/stack-v9'. ")
+    assert err.startswith(f"bam-deploy: {path}: {text}")
 
 
 def test_a_robot_that_cannot_be_connected(corridor_checkpoint, corridor, run, monkeypatch):
