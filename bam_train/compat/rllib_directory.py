@@ -69,18 +69,26 @@ def find_policy(given: Path, name: str | None = None) -> Directory:
         CheckpointMismatch: Several policies and no name, or none of this name, or of a version that is not known.
     """
     given = given.expanduser()
-    _require_directory(given)
+    try:
+        if not given.is_dir():
+            wrong = "is a file, expected a checkpoint directory of RLlib"
+            missing = "no such directory. Give one that algo.save_to_path or algo.save wrote"
+            raise NotACheckpoint(given, wrong if given.exists() else missing)
+        next(given.iterdir(), None)
+    except OSError as error:
+        raise NotACheckpoint(given, f"cannot be read: {error.strerror or error}") from error
     root, policies, old = _policies(Path(os.path.abspath(given)))
     if not policies:
         raise NotACheckpoint(given, _not_rllib(given))
+    names = ", ".join(policies)
     if name is not None and name not in policies:
-        raise CheckpointMismatch(given, f"has no policy {name!r}; it has {', '.join(policies)}")
+        raise CheckpointMismatch(given, f"has no policy {name!r}; it has {names}")
     if name is None and len(policies) > 1:
-        names = ", ".join(policies)
         raise CheckpointMismatch(given, f"has {len(policies)} policies; choose one with --policy: {names}")
     name = name or next(iter(policies))
     facts = (_facts(root) if root else {}) or _facts(policies[name])
-    version, by = (_word(facts.get(key, "")) for key in ("checkpoint_version", "ray_version"))
+    words = [str(facts.get(key, "")) for key in ("checkpoint_version", "ray_version")]  # which may be anything
+    version, by = ("".join(one for one in word if one.isprintable() and one != " ")[:40] for word in words)
     if version and version not in _VERSIONS:
         by = f" by Ray {by}" if by else ""
         text = f"was written{by} in checkpoint version {version}; expected one of {', '.join(_VERSIONS)}"
@@ -146,24 +154,6 @@ def _content(path: Path, most: int) -> bytes:
     if found.st_size > most:
         raise OSError(None, f"it has {found.st_size} bytes, expected at most {most}")
     return path.read_bytes()
-
-
-def _word(value: Any) -> str:
-    """A version as a file says it, which may be anything: one short word."""
-    return "".join(letter for letter in str(value) if letter.isprintable() and letter != " ")[:40]
-
-
-def _require_directory(given: Path) -> None:
-    try:
-        if given.is_dir():
-            next(given.iterdir(), None)
-            return
-        found = given.exists()
-    except OSError as error:
-        raise NotACheckpoint(given, f"cannot be read: {error.strerror or error}") from error
-    if found:
-        raise NotACheckpoint(given, "is a file, expected a checkpoint directory of RLlib")
-    raise NotACheckpoint(given, "no such directory. Give one that algo.save_to_path or algo.save wrote")
 
 
 def _not_rllib(given: Path) -> str:

@@ -48,7 +48,6 @@ from bam_train.trainers.rllib.rllib_freezing import (
     FrozenModule,
     PolicyParts,
     clear_observations,
-    flat_width,
     freeze,
     golden,
     leaf_spaces,
@@ -71,12 +70,10 @@ class Exported:
     steps: int
     signals: dict[str, Any]
     period: float | None
-    graph: bytes
-    """ONNX."""
-    golden: bytes
-    """Observations and the actions that the graph was checked against."""
+    members: dict[str, bytes]
+    """The graph, and the observations and actions that it was checked against."""
     checked_by: str
-    """What computed those actions: RLlib with its version, or NumPy."""
+    """What computed those actions: RLlib with its version, or PyTorch."""
     difference: float
     """The largest difference from them."""
     policy: FrozenPolicy
@@ -96,23 +93,19 @@ class Exported:
             "golden": self.checked_by,
         }
         settings: dict[str, Any] = {EXPORTED: source}
-        members = {POLICY: self.graph, GOLDEN: self.golden}
-        made_by = origin()
+        members, made_by = self.members, origin()
         if isinstance(self.training, TrainSettings):
             settings |= self.training.to_mapping()
-            members |= states(self.directory)
+            members = {**members, **states(self.directory)}
             made_by["versions"] = {**made_by["versions"], "ray": self.directory.ray_version}  # whose states they are
+        own = {name: getattr(self, name) for name in ("env", "env_kwargs", "signals", "period", "steps")}
         fields = {
-            "env": self.env,
-            "env_kwargs": self.env_kwargs,
+            **own,
             "observation_space": self.policy.observation_space,
             "action_space": self.policy.action_space,
-            "signals": self.signals,
-            "period": self.period,
             "algorithm": self.parts.algorithm,
             "trainer": "rllib",
             "settings": settings,
-            "steps": self.steps,
             "seed": settings.get("seed", 0),
             "scores": {},
             **made_by,
@@ -157,7 +150,14 @@ def export(
     kwargs, (parts, signals, period) = parity_if_needed(env_id, {**kwargs, **(env_kwargs or {})}, fitted, warn)
     parts = replace(parts, algorithm=_algorithm(saved, algo))
     graph = freeze(parts)
-    arrays, by = _golden(saved, parts)
+    if saved.module is None:  # the network in PyTorch
+        by, observations = "PyTorch", clear_observations(parts)
+        with torch.no_grad():
+            actions = FrozenModule(parts)(*map(torch.as_tensor, observations.values())).numpy()
+        arrays = pack(observations, np.asarray(actions, parts.action_space.dtype))
+    else:
+        by = f"RLlib {metadata.version('ray')}"
+        arrays = golden(parts, saved.by_rllib((parts.observation_space, parts.action_space)))
     frozen = FrozenPolicy.from_graph(graph, *map(space_to_json, (parts.observation_space, parts.action_space)))
     worst, _ = frozen.worst_difference(safetensors_file.parse(arrays))
     if not worst <= TOLERANCE:  # NaN too
@@ -168,7 +168,7 @@ def export(
     except SettingsError as error:
         training = str(error)
     made = directory, parts, env_id, kwargs, saved.steps, signals, period
-    return Exported(*made, graph, arrays, by, worst, frozen, training)
+    return Exported(*made, {POLICY: graph, GOLDEN: arrays}, by, worst, frozen, training)
 
 
 def _read(directory: Directory, trust: bool, warn: Callable[[str], None]) -> SavedPolicy:
@@ -284,7 +284,7 @@ def _guessed(saved: SavedPolicy, env_id: str, ours: AnySpace, warn: Callable[[st
     theirs = parts.observation_space
     if space_to_json(theirs) == space_to_json(ours):
         return parts
-    shape, width = theirs.shape or (), sum(flat_width(leaf) for leaf in leaf_spaces(ours).values())
+    shape, width = theirs.shape or (), sum(spaces.flatdim(leaf) for leaf in leaf_spaces(ours).values())
     text = f"its network takes observations {_space(theirs)}, and {env_id} gives {_space(ours)}"
     if not isinstance(theirs, spaces.Box) or (theirs.shape != ours.shape and shape != (width,)):
         raise CheckpointMismatch(given, f"{text}; {_NAME_IT}")
@@ -312,14 +312,3 @@ def _space(space: AnySpace) -> str:
 def _short(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def _golden(saved: SavedPolicy, parts: PolicyParts) -> tuple[bytes, str]:
-    """Observations and actions for them, and what computed those: RLlib, of the old layout the network in PyTorch."""
-    if saved.module is not None:
-        policy = saved.by_rllib((parts.observation_space, parts.action_space))
-        return golden(parts, policy), f"RLlib {metadata.version('ray')}"
-    observations = clear_observations(parts)
-    with torch.no_grad():
-        actions = FrozenModule(parts)(*map(torch.as_tensor, observations.values())).numpy()
-    return pack(observations, np.asarray(actions, parts.action_space.dtype)), "PyTorch"

@@ -113,13 +113,7 @@ class PolicyParts:
 
 
 def parts_of(module: Any, env_to_module: Any, config: Any, env_spaces: tuple[AnySpace, AnySpace]) -> PolicyParts:
-    """The parts of a live policy, which stays as it is.
-
-    Args:
-        module: The RLModule.
-        env_to_module: The env runner's pipeline; None if there are no connectors.
-        config: The AlgorithmConfig.
-        env_spaces: Observation and action space of the environment, before any connector.
+    """The parts of a live policy; arguments as of `RLlibPolicy`.
 
     Raises:
         PolicyError: The network, a connector or a space is of a kind that cannot be frozen.
@@ -189,15 +183,6 @@ def leaf_spaces(space: AnySpace) -> dict[str, AnySpace]:
     return leaves
 
 
-def flat_width(space: AnySpace) -> int:
-    """How many numbers one array has after `FlattenObservations`."""
-    if isinstance(space, spaces.Discrete):
-        return int(space.n)
-    if isinstance(space, spaces.MultiDiscrete):
-        return int(space.nvec.sum())
-    return math.prod(space.shape or ())
-
-
 # The graph
 
 
@@ -225,7 +210,7 @@ class FrozenModule(Layer):
         self.observation = _Observation(parts, leaves)
         self.network = copy.deepcopy(parts.network).cpu()
         self.head = _head(parts)
-        self.outputs = flat_width(parts.action_space)
+        self.outputs = spaces.flatdim(parts.action_space)
         self.eval().requires_grad_(False)
         try:  # once: weights, observation and action space must belong together
             with torch.no_grad():
@@ -274,24 +259,19 @@ class _Network(Layer):
         return _Network(module)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        if hasattr(self.module, "af"):
-            return self._values(x)
-        outputs = self.module._forward_inference({"obs": x})
-        if "action_dist_inputs" not in outputs:
-            raise PolicyError(f"{type(self.module).__name__} gives no action_dist_inputs and cannot be frozen")
-        found = outputs["action_dist_inputs"]
-        return torch.tanh(found) if self.squash else found
-
-    def _values(self, x: torch.Tensor) -> torch.Tensor:
-        """DQN's value of each choice, up to what a dueling network adds to all of them alike.
-
-        A distributional DQN gives logits of each choice over equally spaced values; the mean of these counts, and what
-        a dueling network adds to all logits of a choice changes nothing about it.
-        """
         module = self.module
+        if not hasattr(module, "af"):
+            outputs = module._forward_inference({"obs": x})
+            if "action_dist_inputs" not in outputs:
+                raise PolicyError(f"{type(module).__name__} gives no action_dist_inputs and cannot be frozen")
+            found = outputs["action_dist_inputs"]
+            return torch.tanh(found) if self.squash else found
+        # DQN: the value of each choice, up to what a dueling network adds to all of them alike.
         advantages = module.af(module.encoder({"obs": x})["encoder_out"])
         if module.num_atoms == 1:
             return advantages
+        # A distributional one gives logits of each choice over equally spaced values; the mean of these counts, and
+        # what a dueling network adds to all logits of a choice changes nothing about it.
         steps = torch.arange(0.0, module.num_atoms, dtype=torch.float32)
         support = module.v_min + steps * (module.v_max - module.v_min) / float(module.num_atoms - 1)
         logits = advantages.reshape(-1, int(module.action_space.n), module.num_atoms)
@@ -446,13 +426,7 @@ class RLlibPolicy:
 
 
 def golden(parts: PolicyParts, policy: RLlibPolicy, n: int = 256, seed: int = 0) -> bytes:
-    """Draw observations and record RLlib's deterministic actions for them.
-
-    Args:
-        parts: Of the policy.
-        policy: The same policy, run by RLlib.
-        n: Number of observations; fewer if they are large.
-        seed: Of the observations.
+    """Draw n observations, fewer if they are large, and record RLlib's deterministic actions for them.
 
     Returns:
         A safetensors file with ``observation`` (or ``observation.<key>``), (n, ...), and ``action``, (n, ...).
@@ -481,7 +455,7 @@ def draw(parts: PolicyParts, n: int, rng: np.random.Generator) -> dict[str, Arra
     """
     drawn, at = {}, 0
     for key, leaf in leaf_spaces(parts.observation_space).items():
-        moments, part = None, slice(at, at := at + flat_width(leaf))
+        moments, part = None, slice(at, at := at + spaces.flatdim(leaf))
         if parts.filter is not None and isinstance(leaf, spaces.Box):
             mean, spread = (numbers.ravel()[part] for numbers in (parts.filter.offset, parts.filter.divisor))
             moments = mean.reshape(leaf.shape), spread.reshape(leaf.shape)

@@ -152,7 +152,6 @@ def _fit(name: str, value: Any, hint: Any) -> Any:
 
 _SCHEDULE = [[0, 3e-4], [1000000, 0.0]]
 
-
 _MAY_BE_NONE = frozenset(
     {"grad_clip", "vf_clip_param", "minibatch_size", "target_entropy"}
     | {"vtrace_clip_rho_threshold", "vtrace_clip_pg_rho_threshold"}
@@ -179,10 +178,7 @@ def _plain(value: Any) -> Any:
     return json.loads(json.dumps(value, default=str))
 
 
-_BUFFERS = {
-    "EpisodeReplayBuffer": EpisodeReplayBuffer,
-    "PrioritizedEpisodeReplayBuffer": PrioritizedEpisodeReplayBuffer,
-}
+_BUFFERS = {one.__name__: one for one in (EpisodeReplayBuffer, PrioritizedEpisodeReplayBuffer)}
 
 
 def _complete_buffer(config: Any, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -205,10 +201,8 @@ def _complete_buffer(config: Any, given: Mapping[str, Any]) -> dict[str, Any]:
 def _complete_model(config: Any, given: Any) -> dict[str, Any]:
     """Check ``model_config`` and add RLlib's defaults."""
     given = fit("model_config", given, dict)
-    hints = {
-        name: typing.Optional[str] if name.endswith("_initializer") else hint  # noqa: UP045 - not a function
-        for name, hint in typing.get_type_hints(DefaultModelConfig).items()
-    }
+    hints = typing.get_type_hints(DefaultModelConfig)
+    hints |= {name: typing.Optional[str] for name in hints if name.endswith("_initializer")}  # noqa: UP045 - no function
     own = dataclasses.asdict(DefaultModelConfig()) | config._model_config_auto_includes
     _require_known(given, hints, "model_config argument")
     return {

@@ -14,7 +14,6 @@ from typing import Any
 import gymnasium as gym
 
 import bam_envs  # noqa: F401 - registers our environments with Gymnasium
-from bam_envs.core.errors import InvalidValue
 from bam_envs.core.registry import ENVIRONMENTS
 from bam_train.finite_envs import FiniteEnv
 from bam_train.trainers.zero_based_spaces import from_zero
@@ -42,7 +41,7 @@ def register_foreign(env_id: str) -> str:
         module, _, name = env_id.rpartition(":")
         if module:
             importlib.import_module(module)  # which registers it
-        register_env(env_id, functools.partial(_create_foreign, gym.spec(name)))
+        register_env(env_id, functools.partial(create, gym.spec(name)))
     return env_id
 
 
@@ -52,25 +51,12 @@ def own_ids() -> list[str]:
     return sorted({*ENVIRONMENTS, *made_here})
 
 
-def create(env_id: str, context: Mapping[str, Any]) -> gym.Env[Any, Any]:
+def create(env: str | gym.envs.registration.EnvSpec, context: Mapping[str, Any]) -> gym.Env[Any, Any]:
     """One environment, as RLlib's own runner takes it.
 
     Args:
-        env_id: Its full id.
-        context: What ``.environment(env_config=...)`` was given: our keyword arguments.
-
-    Raises:
-        InvalidValue: RLlib asks for many at once (``gym_env_vectorize_mode="vector_entry_point"``).
+        env: Its full id, or where a runner elsewhere does not know that, its specification.
+        context: What ``.environment(env_config=...)`` was given: keyword arguments.
     """
-    kwargs = dict(context)
-    if "num_envs" in kwargs:
-        raise InvalidValue(
-            f"{env_id}: RLlib's own runner expects environments that restart in the step after their end, and ours "
-            "restart in the same. Use .env_runners(env_runner_cls=bam_train.trainers.rllib.RobotEnvRunner), which "
-            "steps all of them at once, and leave gym_env_vectorize_mode out."
-        )
-    return FiniteEnv(gym.make(env_id, disable_env_checker=True, **kwargs), env_id)
-
-
-def _create_foreign(spec: gym.envs.registration.EnvSpec, context: Mapping[str, Any]) -> gym.Env[Any, Any]:
-    return from_zero(FiniteEnv(gym.make(spec, disable_env_checker=True, **dict(context)), spec.id))
+    name = env if isinstance(env, str) else env.id
+    return from_zero(FiniteEnv(gym.make(env, disable_env_checker=True, **dict(context)), name))

@@ -15,7 +15,7 @@ import math
 import os
 import uuid
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium as gym
@@ -59,7 +59,7 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
         super().__init__(config=config, **kwargs)
         self._observation: Array = np.empty(0)
         """What the module sees next, (n, ...)."""
-        self._running = Running(self.num_envs)
+        self._running = [Running() for _ in range(self.num_envs)]
         self._ended: list[End] = []
         pieces = list(self._env_to_module.connectors)
         filters = [piece for piece in pieces if type(piece).__module__ == MeanStdFilter.__module__]
@@ -138,7 +138,7 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
             seed = int(self._seed - index + max(0, index - 1) * self.num_envs)
         observations, _ = self._try_env_reset(seed=seed, options=None)
         self._observation = self._filtered(observations)
-        self._running = Running(self.num_envs)
+        self._running = [Running() for _ in range(self.num_envs)]
 
     def _filtered(self, observations: Array) -> Array:
         """Observations as the module sees them: a copy, for the environment may write into its own."""
@@ -161,29 +161,79 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
         return done[:count]
 
     def _collect(self, steps: int, explore: bool, random_actions: bool) -> list[SingleAgentEpisode] | None:
-        """Step every environment `steps` times; None if the environment failed and was made anew."""
-        rollout = Rollout(self.num_envs, steps, self._observation)
-        for _ in range(steps):
+        """Step every environment `steps` times; None if the environment failed and was made anew.
+
+        Returns:
+            Episodes and pieces of episodes, those that ended first.
+        """
+        seen: list[Array] = [self._observation]
+        taken: list[dict[str, Array]] = []
+        finals: dict[
+            tuple[int, int], tuple[Array, bool | None]
+        ] = {}  # of (environment, step): last observation, success
+        for t in range(steps):
             if random_actions:
                 actions = self.env.action_space.sample()
                 columns = {Columns.ACTIONS: actions}
             else:
-                columns, actions = self._act(rollout.steps, explore)
+                columns, actions = self._act(t, explore)
             results = self._try_env_step(actions)
             if results == ENV_STEP_FAILURE:
                 return None
             observations, rewards, terminated, truncated, infos = results
             ended = np.flatnonzero(terminated | truncated)
             if len(ended):
-                finals = self._filtered(np.asarray(infos["final_obs"])[ended])
-                rollout.end(ended, finals, infos.get("final_info", {}).get("is_success"))
+                success = infos.get("final_info", {}).get("is_success")
+                last = self._filtered(np.asarray(infos["final_obs"])[ended])
+                for env_id, observation in zip(ended.tolist(), last, strict=True):
+                    finals[env_id, t] = observation, None if success is None else bool(success[env_id])
             self._observation = self._filtered(observations)
-            rollout.add(columns, rewards, terminated, truncated, self._observation)
-        space = self._env_to_module.observation_space
-        extra = {WEIGHTS_SEQ_NO: self._weights_seq_no}
-        episodes, ends = rollout.episodes(self._running, space, self.env.single_action_space, extra)
-        self._ended += ends
-        return episodes
+            seen.append(self._observation)
+            ends = {Columns.TERMINATEDS: np.array(terminated), Columns.TRUNCATEDS: np.array(truncated)}
+            taken.append({**columns, Columns.REWARDS: np.array(rewards, np.float32), **ends})
+        table = {name: np.stack([one[name] for one in taken], axis=1) for name in taken[0]}
+        return self._cut(np.stack(seen, axis=1), table, finals)
+
+    def _cut(
+        self, seen: Array, table: dict[str, Array], finals: Mapping[tuple[int, int], tuple[Array, bool | None]]
+    ) -> list[SingleAgentEpisode]:
+        """Observations (n, T + 1, ...) and columns (n, T, ...) as episodes; the running ones are continued."""
+        ended, open_ = [], []
+        space, action_space = self._env_to_module.observation_space, self.env.single_action_space
+        dones = {name: table.pop(name) for name in (Columns.TERMINATEDS, Columns.TRUNCATEDS)}
+        table[WEIGHTS_SEQ_NO] = np.full(table[Columns.REWARDS].shape, self._weights_seq_no)
+        for env_id, running in enumerate(self._running):
+            ends = np.flatnonzero(dones[Columns.TERMINATEDS][env_id] | dones[Columns.TRUNCATEDS][env_id]) + 1
+            for start, stop in itertools.pairwise(np.unique([0, *ends, seen.shape[1] - 1]).tolist()):
+                observations = seen[env_id, start : stop + 1].copy()
+                terminated, truncated = (bool(one[env_id, stop - 1]) for one in dones.values())
+                if terminated or truncated:
+                    observations[-1], success = finals[env_id, stop - 1]
+                columns = {name: values[env_id, start:stop].copy() for name, values in table.items()}
+                actions, rewards = columns.pop(Columns.ACTIONS), columns.pop(Columns.REWARDS)
+                episode = SingleAgentEpisode(
+                    id_=running.id,
+                    observations=InfiniteLookbackBuffer(observations, 0, space),
+                    observation_space=space,
+                    actions=InfiniteLookbackBuffer(actions, 0, action_space),
+                    action_space=action_space,
+                    rewards=InfiniteLookbackBuffer(rewards, 0),
+                    infos=[{}] * (stop - start + 1),
+                    terminated=terminated,
+                    truncated=truncated and not terminated,
+                    extra_model_outputs={name: InfiniteLookbackBuffer(one, 0) for name, one in columns.items()},
+                    t_started=running.length,
+                    len_lookback_buffer=0,
+                )
+                running.length += stop - start
+                running.total += float(rewards.sum(dtype=np.float64))
+                if not (terminated or truncated):
+                    open_.append(episode)
+                    continue
+                ended.append(episode)
+                self._ended.append(End(running.length, running.total, success))
+                running = self._running[env_id] = Running()
+        return ended + open_
 
     def _act(self, step: int, explore: bool) -> tuple[dict[str, Array], Array]:
         """The module's outputs with its actions, each (n, ...), and the actions as the environment takes them."""
@@ -267,135 +317,10 @@ class End:
     """None if the environment does not say."""
 
 
+@dataclass
 class Running:
-    """The running episode of every environment: its name, how far it is, and what it has earned.
+    """The running episode of an environment: its name, its steps so far, and what it has earned."""
 
-    Attributes:
-        ids: Names, n.
-        lengths: Steps so far. Shape: (n,).
-        returns: Undiscounted sums of rewards. Shape: (n,).
-    """
-
-    def __init__(self, num_envs: int) -> None:
-        self.ids = [uuid.uuid4().hex for _ in range(num_envs)]
-        self.lengths = np.zeros(num_envs, np.int64)
-        self.returns = np.zeros(num_envs)
-
-    def restart(self, env_id: int) -> None:
-        """The environment's next episode begins."""
-        self.ids[env_id] = uuid.uuid4().hex
-        self.lengths[env_id], self.returns[env_id] = 0, 0.0
-
-
-class Rollout:
-    """T steps of n environments.
-
-    Args:
-        num_envs: n.
-        steps: T at most.
-        first: What the environments observe at its start, as the module sees it. Shape: (n, ...).
-    """
-
-    def __init__(self, num_envs: int, steps: int, first: Array) -> None:
-        self.steps = 0
-        self.observations = np.empty((num_envs, steps + 1, *first.shape[1:]), first.dtype)
-        self.observations[:, 0] = first
-        self.rewards = np.empty((num_envs, steps), np.float32)
-        self.terminated = np.zeros((num_envs, steps), bool)
-        self.truncated = np.zeros((num_envs, steps), bool)
-        self._finals: dict[tuple[int, int], tuple[Array, bool | None]] = {}
-        self._capacity = steps
-        self._columns: dict[str, Array] = {}
-
-    def add(
-        self,
-        columns: Mapping[str, Array],
-        rewards: Array,
-        terminated: Array,
-        truncated: Array,
-        following: Array,
-    ) -> None:
-        """One step of every environment.
-
-        Args:
-            columns: Actions and whatever else the module said, each (n, ...).
-            rewards: (n,).
-            terminated: (n,) bool.
-            truncated: (n,) bool.
-            following: What the environments observe now, as the module sees it, (n, ...).
-        """
-        t = self.steps
-        for name, values in columns.items():
-            if name not in self._columns:
-                self._columns[name] = np.empty((len(values), self._capacity, *values.shape[1:]), values.dtype)
-            self._columns[name][:, t] = values
-        self.rewards[:, t], self.terminated[:, t], self.truncated[:, t] = rewards, terminated, truncated
-        self.observations[:, t + 1] = following
-        self.steps = t + 1
-
-    def end(self, env_ids: Array, observations: Array, success: Array | None) -> None:
-        """The step that is added next ends the episodes of some environments.
-
-        Args:
-            env_ids: Which, (k,).
-            observations: What they observe last, as the module sees it, (k, ...); `add` is given what follows.
-            success: Of all environments, (n,) bool; None if the environment does not say.
-        """
-        for env_id, last in zip(env_ids.tolist(), observations, strict=True):
-            self._finals[env_id, self.steps] = last, None if success is None else bool(success[env_id])
-
-    def episodes(
-        self,
-        running: Running,
-        observation_space: gym.Space[Any],
-        action_space: gym.Space[Any],
-        extra: Mapping[str, Any],
-    ) -> tuple[list[SingleAgentEpisode], list[End]]:
-        """The steps as episodes and pieces of episodes, those that ended first; and how these went.
-
-        Args:
-            running: The episodes as they were when the rollout began; afterwards as they are at its end.
-            observation_space: As the module sees it.
-            action_space: The environment's.
-            extra: Values that every step has, whoever took it.
-        """
-        ended, open_, ends = [], [], []
-        for env_id in range(len(self.rewards)):
-            done = self.terminated[env_id, : self.steps] | self.truncated[env_id, : self.steps]
-            bounds = np.unique([0, *(np.flatnonzero(done) + 1), self.steps]).tolist()
-            for start, stop in itertools.pairwise(bounds):
-                observations = self.observations[env_id, start : stop + 1].copy()
-                terminated, truncated = bool(self.terminated[env_id, stop - 1]), bool(self.truncated[env_id, stop - 1])
-                if terminated or truncated:
-                    observations[-1] = self._finals[env_id, stop - 1][0]
-                rewards = self.rewards[env_id, start:stop].copy()
-                columns = {name: _buffer(values[env_id, start:stop].copy()) for name, values in self._columns.items()}
-                episode = SingleAgentEpisode(
-                    id_=running.ids[env_id],
-                    observations=_buffer(observations, observation_space),
-                    observation_space=observation_space,
-                    actions=_buffer(columns.pop(Columns.ACTIONS).data, action_space),
-                    action_space=action_space,
-                    rewards=_buffer(rewards),
-                    infos=[{}] * (stop - start + 1),
-                    terminated=terminated,
-                    truncated=truncated and not terminated,
-                    extra_model_outputs=columns
-                    | {name: _buffer(np.full(stop - start, value)) for name, value in extra.items()},
-                    t_started=int(running.lengths[env_id]),
-                    len_lookback_buffer=0,
-                )
-                running.lengths[env_id] += stop - start
-                running.returns[env_id] += rewards.sum(dtype=np.float64)
-                if not (terminated or truncated):
-                    open_.append(episode)
-                    continue
-                ended.append(episode)
-                success = self._finals[env_id, stop - 1][1]
-                ends.append(End(int(running.lengths[env_id]), float(running.returns[env_id]), success))
-                running.restart(env_id)
-        return ended + open_, ends
-
-
-def _buffer(values: Array, space: gym.Space[Any] | None = None) -> InfiniteLookbackBuffer:
-    return InfiniteLookbackBuffer(values, 0, space)
+    id: str = field(default_factory=lambda: uuid.uuid4().hex)
+    length: int = 0
+    total: float = 0.0

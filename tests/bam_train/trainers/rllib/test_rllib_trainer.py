@@ -168,6 +168,7 @@ def test_an_episode_that_ends_alone_in_an_iteration_counts(env):
     assert 1 in np.diff(counts)
     assert statistics.episodes >= 4
     assert statistics.length_mean <= 20
+    assert (statistics.success_rate is None) == (env == "CartPole-v1")
     if env == "CartPole-v1":
         assert statistics.return_mean == statistics.length_mean
 

@@ -19,32 +19,9 @@ from ray.rllib.utils.filter import RunningStat
 
 from bam_train.trainers.rllib.mean_std_filter import MeanStdFilter, forget_deltas, push
 from bam_train.trainers.rllib.rllib_registration import register
-from bam_train.trainers.rllib.robot_env_runner import RobotEnvRunner, Rollout, Running
+from bam_train.trainers.rllib.robot_env_runner import RobotEnvRunner
 
 BOX = gym.spaces.Box(-10, 10, (2,), np.float32)
-
-
-def test_steps_are_cut_into_episodes_with_their_last_observations():
-    rollout, running = Rollout(2, 4, np.zeros((2, 2), np.float32)), Running(2)
-    ids = list(running.ids)
-    for t in range(4):
-        ended = np.array([t == 1, False])
-        if ended.any():
-            rollout.end(np.array([0]), np.full((1, 2), 9, np.float32), np.array([True, False]))
-        following = np.full((2, 2), t + 1, np.float32)
-        rollout.add({"actions": np.full((2, 1), t, np.float32)}, np.array([1.0, 2.0]), ended, ~ended & False, following)
-    episodes, ends = rollout.episodes(running, BOX, gym.spaces.Box(-1, 1, (1,), np.float32), {"weights_seq_no": 7})
-    assert [(episode.id_, len(episode), episode.is_terminated) for episode in episodes] == [
-        (ids[0], 2, True),
-        (running.ids[0], 2, False),
-        (ids[1], 4, False),
-    ]
-    assert episodes[0].get_observations()[:, 0].tolist() == [0, 1, 9]
-    assert episodes[1].get_observations()[:, 0].tolist() == [2, 3, 4]
-    assert episodes[1].get_actions()[:, 0].tolist() == [2, 3]
-    assert episodes[2].get_extra_model_outputs("weights_seq_no").tolist() == [7] * 4
-    assert [(end.length, end.total, end.success) for end in ends] == [(2, 2.0, True)]
-    assert (running.lengths.tolist(), running.returns.tolist()) == ([2, 4], [2.0, 8.0])
 
 
 def test_counting_many_at_once_is_counting_one_by_one():
