@@ -59,7 +59,8 @@ class ServedEnvironment:
         self.tcp: TcpServer | None = None
         """The TCP transport, if there is one."""
         self._tell, self._stack = tell, ExitStack()
-        self._robot_service: RobotService | None = None
+        self.robot_service: RobotService | None = None
+        """The topics of its robot, if it has any."""
         self._refusals: dict[str, str] = {}  # id of a declaration -> why the server of `via` does not carry it
         self._token, self._operator_token = (
             None if path is None else read_token(path, private=private)
@@ -84,7 +85,7 @@ class ServedEnvironment:
 
     def require_running(self) -> None:
         """Check that everything that it needs still runs. Raises RemoteError: the robot's clock stands still."""
-        if self._robot_service is not None and not self._robot_service.clock.running:
+        if self.robot_service is not None and not self.robot_service.clock.running:
             raise RemoteError("The clock of the robot stands still.")
 
     def _start(self, started: ExitStack) -> None:
@@ -102,9 +103,9 @@ class ServedEnvironment:
         if robot is not None and profile is not None:
             if isinstance(bus, RosbridgeLink):
                 self._require_own_names(bus)
-            self._robot_service = RobotService(robot, profile, bus, self.lease, namespace=self.prefix)
-            started.callback(self._robot_service.close)
-            self._robot_service.start()
+            self.robot_service = RobotService(robot, profile, bus, self.lease, namespace=self.prefix)
+            started.callback(self.robot_service.close)
+            self.robot_service.start()
         started.callback(server.end)  # while the robot's clock still ticks: a step that runs waits for it
         service = GymApiService(
             server, bus, self.prefix, image_format=options.image_format, version=options.gymapi_version

@@ -1,7 +1,6 @@
 """One environment, several clients: turns, command, errors, real time."""
 
 import threading
-import time
 
 import gymnasium as gym
 import numpy as np
@@ -154,28 +153,37 @@ def test_a_turn_that_comes_too_late_does_nothing():
     server.step("ann", 1, deadline=10.3)
 
 
-def test_a_step_that_ends_after_command_was_taken_leaves_no_episode_to_the_other(monkeypatch):
-    env, server = mirror()
+def test_a_step_that_ends_after_command_was_taken_leaves_no_episode_to_the_other():
+    class Taken(MirrorEnv):
+        def step(self, action):
+            server.lease.take("bob", force=True)
+            return super().step(action)
+
+    env = Taken(spaces.Box(-1, 1, (2,)))
+    server = EnvServer(env)
     server.reset("ann")
-    step = env.step
-    monkeypatch.setattr(env, "step", lambda action: (server.lease.take("bob", force=True), step(action))[1])
     server.step("ann", np.zeros(2))
     assert raised(ResetNeeded, lambda: server.step("bob", np.zeros(2))) == NO_EPISODE
     assert len(env.seen) == 1
 
 
 def test_a_client_that_lost_command_while_it_waited_does_nothing():
-    env, server = mirror()
+    asked, told = threading.Event(), []
+
+    class Lease(CommandLease):
+        def busy(self, client):
+            asked.set()
+            return super().busy(client)
+
+    env = MirrorEnv(spaces.Box(-1, 1, (2,)))
+    server = EnvServer(env, lease=Lease())
     server.reset("ann")
-    told = []
+    asked.clear()
+    act = lambda: told.append(raised(NotInCommand, lambda: server.step("ann", np.zeros(2))))  # noqa: E731
     with server.lock:
-        waiting = threading.Thread(
-            target=lambda: told.append(raised(NotInCommand, lambda: server.step("ann", np.zeros(2))))
-        )
+        waiting = threading.Thread(target=act)
         waiting.start()
-        deadline = time.monotonic() + 10
-        while not server.lease._running and time.monotonic() < deadline:  # until it is in the queue
-            pass
+        assert asked.wait(10)
         server.lease.take("bob", force=True)
     waiting.join(10)
     assert told[0].startswith("bob is in command, not ann")

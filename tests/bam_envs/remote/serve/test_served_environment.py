@@ -251,6 +251,6 @@ def test_a_token(serve_env, link, transport, tmp_path):
 
 def test_a_clock_that_ended_is_noticed(serve_env):
     served = serve_env()
-    served._robot_service.clock.stop()
+    served.robot_service.clock.stop()
     with pytest.raises(RemoteError, match=r"The clock of the robot stands still\."):
         served.require_running()
