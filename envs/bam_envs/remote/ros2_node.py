@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost
-from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller, Handler, Listener, Message, refusal_of
+from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Bus, Handler, Listener, Message, refusal_of
 
 _log = logging.getLogger(__name__)
 _DEPTH = 10
@@ -32,7 +32,7 @@ _INTEGERS = {
 _INSTALL = "pip install 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-std-msgs ros-jazzy-sensor-msgs ros-jazzy-geometry-msgs"
 
 
-class RclpyBus:
+class RclpyBus(Bus):
     """Topics and services of one ROS 2 node.
 
     ROS reports neither who sent a message nor who leaves: callers are unknown, and `on_leave` never calls.
@@ -82,10 +82,17 @@ class RclpyBus:
     def _spinning(self, name: str, executor: Any) -> Any:
         """Create a node whose callbacks `executor` runs."""
         import rclpy
+        from rclpy.executors import ExternalShutdownException
+
+        def spin() -> None:
+            try:
+                executor.spin()
+            except ExternalShutdownException:
+                _log.info("the node was shut down")
 
         node = rclpy.create_node(name, context=self._context, start_parameter_services=False)
         executor.add_node(node)
-        thread = threading.Thread(target=_spin, args=(executor,), name=name, daemon=True)
+        thread = threading.Thread(target=spin, name=name, daemon=True)
         thread.start()
         self._executors.append(executor)
         self._threads.append(thread)
@@ -101,25 +108,23 @@ class RclpyBus:
                 make, quality = interface(kind, "msg"), QoSProfile(depth=_DEPTH, durability=durability)
                 self._publishers[topic] = (make, self._require_node().create_publisher(make, topic, quality))
 
-    def publish(self, topic: str, message: Message) -> None:
-        """Send `message` on a topic that was advertised.
+    def publish_all(self, messages: Sequence[tuple[str, Message]]) -> None:
+        """Send several messages now, each on its topic, in this order: all of them or none.
 
         Raises:
-            LinkLost: The node is gone, or does not publish this topic.
-            InvalidValue: `message` does not fit its type, or a number in it is not finite.
+            LinkLost: The node is gone, or does not publish such a topic.
+            InvalidValue: A message does not fit its type, or a number in it is not finite.
         """
-        if topic not in self._publishers:
-            raise LinkLost(f"{topic} is not advertised by the node {self.name}.")
-        make, publisher = self._publishers[topic]
-        made = to_message(make, message, topic)
+        made = []
+        for topic, message in messages:
+            if topic not in self._publishers:
+                raise LinkLost(f"{topic} is not advertised by the node {self.name}.")
+            make, publisher = self._publishers[topic]
+            made.append((publisher, to_message(make, message, topic)))
         with self._lock:  # not while it is being destroyed
             self._require_node()
-            publisher.publish(made)
-
-    def publish_all(self, messages: Sequence[tuple[str, Message]]) -> None:
-        """Send several messages, each with its topic, in this order. Raises as `publish`."""
-        for topic, message in messages:
-            self.publish(topic, message)
+            for publisher, message in made:
+                publisher.publish(message)
 
     def subscribe(self, topic: str, kind: str, listener: Listener) -> Callable[[], None]:
         """Call `listener` for each message, until what is returned is called."""
@@ -216,9 +221,6 @@ class RclpyBus:
         """Whether some node listens to `topic`."""
         return bool(self._require_node().count_subscribers(topic))
 
-    def on_leave(self, callback: Callable[[Caller], None]) -> None:
-        """Do nothing: ROS does not report who leaves."""
-
     def _require_node(self) -> Any:
         if self._node is None:
             raise LinkLost(f"The ROS 2 node {self.name} is not running.")
@@ -246,15 +248,6 @@ class RclpyBus:
             node.destroy_node()
         if self._context is not None:
             self._context.try_shutdown()
-
-
-def _spin(executor: Any) -> None:
-    from rclpy.executors import ExternalShutdownException
-
-    try:
-        executor.spin()
-    except ExternalShutdownException:
-        _log.info("the node was shut down")
 
 
 def need_rclpy(purpose: str) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import uuid
+from collections.abc import Callable
 from typing import Any, Literal
 
 from bam_envs.core.errors import InvalidValue, LinkLost, NoServer
@@ -97,6 +98,9 @@ class RclpyLink(RclpyBus):
         """Raise LinkLost if the link was closed; there is nothing to wait for."""
         if not self.is_up:
             raise LinkLost(f"{self.url}: the node has left the graph.")
+
+    def on_down(self, callback: Callable[[LinkLost], None]) -> None:
+        """Do nothing: a ROS graph has no connection that drops."""
 
     def stamp(self, seconds: float) -> dict[str, int]:
         """A time as ROS 2 spells it."""

@@ -33,6 +33,9 @@ class CompiledLink:
     def close(self):
         pass
 
+    def on_down(self, callback):
+        pass
+
     def stamp(self, t):
         return {"sec": int(t), "nanosec": 0}
 

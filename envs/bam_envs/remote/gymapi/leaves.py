@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -149,13 +150,8 @@ class Lists:
 
     def read(self, message: Mapping[str, Any]) -> list[tuple[Leaf, list[Any]]]:
         """Each leaf with its numbers, or with its one pose. Raises ProtocolError for one missing or one too many."""
-        ordered, at = self.in_order(message[self.values], message[self.names]), 0
-        parts = []
-        for leaf in self.leaves:
-            size = len(leaf.labels) or 1
-            parts.append((leaf, list(ordered[at : at + size])))
-            at += size
-        return parts
+        ordered = iter(self.in_order(message[self.values], message[self.names]))
+        return [(leaf, list(islice(ordered, len(leaf.labels) or 1))) for leaf in self.leaves]
 
     def in_order(self, values: Sequence[Any], names: Sequence[str], field: str = "") -> Sequence[Any]:
         """`values` in the order of the leaves: by their `names` if there are any, else as they come.
