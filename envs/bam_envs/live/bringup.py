@@ -29,8 +29,6 @@ TIMEOUT = 3.0
 """Longest wait for the answer of a service, and for a first message, if the endpoint says nothing else [s]."""
 _TRIES, _TRY_AGAIN = 3, 0.1
 """How often a service is called within that time, and the time between two looks at a topic [s]."""
-_STATES = 5
-"""How many states of a topic should arrive in a period, and in the time after which one is too old."""
 FIRST_WITHIN = 0.3
 """Longest wait for the latched topics by which a robot says whether it is ready [s]."""
 _ANSWER_WITHIN = 2.0
@@ -159,18 +157,6 @@ class TopicTypes:
             return ""
         kind = answer.get("type")
         return kind if isinstance(kind, str) else ""
-
-
-def throttle(profile: RobotProfile, topic: str, period: float) -> int:
-    """Minimum time between two states on `topic` that a bridge is asked for [ms].
-
-    A driver may send 500 states a second, and queues of a busy bridge delay every one of them. A fifth of the `period`
-    [s], or of the maximum age, costs no freshness that matters. A topic of several publishers is not throttled: the
-    bridge might always drop the messages of the same one.
-    """
-    if any(source.partial for source in profile.state if source.topic == topic):
-        return 0
-    return int(1000 * min(period, profile.max_age) / _STATES)
 
 
 def await_first(link: RosbridgeLink, state: LiveState, profile: RobotProfile, timeout: float) -> None:

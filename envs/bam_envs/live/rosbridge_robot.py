@@ -40,7 +40,6 @@ from bam_envs.live.bringup import (
     await_first,
     info_by_profile,
     tagged_sinks,
-    throttle,
 )
 from bam_envs.live.state import Letter, LiveState
 from bam_envs.ros.codec import HALT_TOPIC, SCENE_TOPIC, RobotInfo, encode_sink, has_room
@@ -57,6 +56,8 @@ from bam_envs.safety.guard import measured_places
 Array = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
 _LOST_AFTER = 1.0
+_STATES = 5
+"""How many states of a topic should arrive in a period, and in the time after which one is too old."""
 _ANSWER_TIMEOUT = 5.0
 """Longest time that a robot in lockstep takes for a period, if the endpoint says nothing else [s]."""
 _RESET_TIMEOUT = 3.0
@@ -187,10 +188,14 @@ class RosbridgeRobot:
 
     def _declare(self, control: RosbridgeLink, halting: RosbridgeLink, types: TopicTypes) -> None:
         """Subscribe states and advertise commands, with the types that they have there."""
+        shared = {source.topic for source in self.profile.state if source.partial}
+        fewest = int(1000 * min(self.spec.period, self.profile.max_age) / _STATES)
         for topic, kind in {source.topic: source.type for source in self._state.sources}.items():
             name = self.namespace + topic
-            # A robot that describes itself sends no more than is needed; in lockstep each state answers a command.
-            least = 0 if self._describes_itself else throttle(self.profile, topic, self.spec.period)
+            # A driver may send 500 states a second, and queues of a busy bridge delay every one of them; a fifth of
+            # the period costs no freshness that matters. Where several publish on a topic, the bridge might always drop
+            # the messages of the same one. A robot that describes itself sends no more than is needed.
+            least = 0 if self._describes_itself or topic in shared else fewest
             listener, kind = self._state.listener(topic), types.check(name, kind)
             control.subscribe(name, kind, listener, throttle_ms=least, queue_length=1 if least else 0)
         for sink in self._sinks:
@@ -311,10 +316,14 @@ class RosbridgeRobot:
         tag = self._session.tagger.next(self._epoch, self._answer_timeout if lockstep else self._command_life)
         self._pacer.tick()
         self._send(control, values, tag, halts)
-        if lockstep:
-            self._await_answer(tag)
-        else:
+        if not lockstep:
             self._cut.wait(max(0.0, self._pacer.slack))
+        elif not self._state.await_answer(tag.echo, self._is_interrupted, self._answer_timeout):
+            raise StaleState(
+                f"{self.url}: no state answered the command in {self._answer_timeout:g} s. Does the simulation run?",
+                self.age(),
+                self.profile.max_age,
+            )
         self._require_link()
         self._require_accepted()
         return self.measure()
@@ -336,14 +345,8 @@ class RosbridgeRobot:
         self._drove = True
         self._session.drive()
 
-    def _await_answer(self, tag: Tag) -> None:
-        stopped = lambda: self._cut.is_set() or bool(self._refusals)  # noqa: E731
-        if not self._state.await_answer(tag.echo, stopped, self._answer_timeout):
-            raise StaleState(
-                f"{self.url}: no state answered the command in {self._answer_timeout:g} s. Does the simulation run?",
-                self.age(),
-                self.profile.max_age,
-            )
+    def _is_interrupted(self) -> bool:
+        return self._cut.is_set() or bool(self._refusals)
 
     def measure(self) -> RobotState:
         """The newest state, with the command that was sent last.

@@ -213,15 +213,15 @@ class MeasuredJump(Guard):
 
     def fault(self, tick: Tick) -> str | None:
         """Names the joint that jumped most."""
-        way = np.abs(tick.measured - tick.before)[self._joints]
-        can = self._fastest * (max(tick.period, tick.pause) + tick.age) + self.limit_value
-        over = way > can  # NaN: there was no tick before
+        turned = np.abs(tick.measured - tick.before)[self._joints]
+        most = self._fastest * (max(tick.period, tick.pause) + tick.age) + self.limit_value
+        over = turned > most  # NaN: there was no tick before
         if not over.any():
             return None
-        at = int(np.argmax(way - can))
+        at = int(np.argmax(turned - most))
         return (
-            f"{self._labels[at]} was measured {way[at]:.3f} rad from where it was a tick before, and it turns "
-            f"{can[at]:.3f} rad at most in that time: look at what publishes its position"
+            f"{self._labels[at]} was measured {turned[at]:.3f} rad from where it was a tick before, and it turns "
+            f"{most[at]:.3f} rad at most in that time: look at what publishes its position"
         )
 
 

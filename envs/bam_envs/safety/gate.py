@@ -1,4 +1,4 @@
-"""SafeRobot: the one gate between whoever commands a live robot and the robot.
+"""SafeRobot: the one gate through which commands reach a live robot.
 
 Every command passes the guards of `bam_envs.safety`. If a command or state cannot be used, the robot holds at once: an
 arm is sent its last command again, a base zero. Several such ticks in a row, or a measurement beyond the data sheet,
@@ -268,7 +268,7 @@ class SafeRobot(metaclass=Sealed):
             StaleState: The same, because there was no fresh state.
         """
         self._require_free()
-        return self._advance(self._shape.row(command))
+        return self._advance(self._shape.numbers(command))
 
     def _advance(self, goal: Array, *, approach: bool = False) -> RobotState:
         """One tick towards `goal` (m,)."""
@@ -394,7 +394,7 @@ class SafeRobot(metaclass=Sealed):
         for guard in self._further:
             asked = _copy(tick)
             if guard.limit(asked):
-                tick.goal = self._shape.row(asked.command[None])
+                tick.goal = self._shape.numbers(asked.command[None])
                 tick.command = tick.goal.copy()
                 self._note(guard, "altered")
         for guard in self._guards:

@@ -1,6 +1,6 @@
-"""The guards between whoever commands a live robot and the robot, in one list: `default_guards`.
+"""The guards between a live robot and its commands, in one list: `default_guards`.
 
-Each guard has a number, a name, a limit and a unit, and acts in one of three ways:
+Each guard has a number, a name, a limit and a unit, and acts by one of three methods:
 
 * `Guard.fault`: the command is not executed at all, the robot holds;
 * `Guard.limit`: the command goes as far as the limit and no farther;
@@ -65,7 +65,7 @@ class Shape(Guard):
     def __init__(self, spec: RobotSpec) -> None:
         self.limit_value = len(spec.command.labels)
 
-    def row(self, command: Array) -> Array:
+    def numbers(self, command: Array) -> Array:
         """`command` (1, m) as numbers (m,); a copy.
 
         Raises:
@@ -78,8 +78,8 @@ class Shape(Guard):
         expected = (1, int(self.limit_value))
         if array.shape != expected:
             raise InvalidValue(f"The command must have shape {expected}, not {array.shape}.")
-        row: Array = array[0]
-        return row
+        numbers: Array = array[0]
+        return numbers
 
 
 class Finite(Guard):

@@ -7,7 +7,7 @@ import threading
 import numpy as np
 import pytest
 
-from bam_envs.core.errors import InvalidValue, MissingExtra, ProtocolError, ResetNeeded, StaleState, UnknownName
+from bam_envs.core.errors import MissingExtra, ProtocolError, ResetNeeded, StaleState, UnknownName
 from bam_envs.live.camera import LiveCamera, decode_pixels
 from bam_envs.robots.profile import load_profile
 from bam_envs.ros.images import color_message
@@ -85,15 +85,6 @@ def test_a_compressed_image(show, connect):
     with pytest.raises(ResetNeeded) as caught:
         one.latest()
     assert str(caught.value) == f"The camera hand at {one.url} is not connected. Call connect() first."
-
-
-def test_a_jpeg(show, connect):
-    flat = np.full((40, 60, 3), (200, 100, 50), np.uint8)
-    show("/hand/compressed", "sensor_msgs/CompressedImage", color_message(flat, "jpeg"))
-    image = connect(JPEG).latest()
-    assert image.stamp is None
-    assert image.pixels.shape == (40, 60, 3)
-    assert np.abs(image.pixels.astype(int) - flat).max() <= 4
 
 
 def test_a_raw_image_comes_as_cbor(show, connect):
@@ -216,11 +207,6 @@ def test_without_a_library(monkeypatch):
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(MissingExtra):
         decode_pixels(message, "/c")
-
-
-def test_another_address():
-    with pytest.raises(InvalidValue):
-        LiveCamera("http://robot", JPEG)
 
 
 def test_cameras_of_a_profile(tmp_path):

@@ -23,12 +23,11 @@ from bam_envs.core.errors import (
 from bam_envs.core.robot import Initial
 from bam_envs.core.timing import Deadline
 from bam_envs.live.rosbridge_robot import RosbridgeRobot
-from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import JOINTS
 from bam_envs.ros.codec import HALT_TOPIC, SCENE_TOPIC, RobotInfo
 from bam_envs.ros.freshness import read_tag
-from bam_envs.ros.messages import tag_text, write_stamp
+from bam_envs.ros.messages import tag_text
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.rosbridge.string_rpc import StringRpcService
@@ -147,13 +146,6 @@ def test_before_connect_and_after_close(server, robot_on, connect):
     robot.connect()
     robot.connect()
     assert robot.measure().signals["gripper_width"] == 0.085
-
-
-def test_only_what_is_needed_is_subscribed(server, robot_on, connect):
-    scripted = robot_on(server)
-    scripted.mangle = lambda topic, message: None if topic == "/object_pose" else message
-    _, gate = connect(server.url, spec=FakeRobot(with_object=False).spec)
-    assert list(gate.state.signals) == ["joint_position", "joint_velocity", "gripper_width"]
 
 
 def test_wrong_addresses_and_ways():
@@ -528,19 +520,6 @@ def test_two_robots_behind_one_server(server, robot_on, connect):
     second.step(second.state.command + 0.01)
     two.wait_for(lambda: len(two.commands) == 2)
     assert one.commands == []
-
-
-def test_age(server, robot_on, connect):
-    scripted = robot_on(server)
-    robot, _ = connect(server.url)
-    assert robot.age() < 1.0
-    scripted.mangle = lambda topic, message: None if topic == "/object_pose" else message
-    begin = robot.age()
-    threading.Event().wait(0.05)
-    assert robot.age() >= begin + 0.04
-    scripted.mangle = lambda topic, message: message
-    scripted.stamp = lambda: write_stamp(1_000_000_000.0)
-    until(lambda: robot.age() >= 0.05)
 
 
 def drive(url, results):

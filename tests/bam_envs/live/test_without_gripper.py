@@ -6,19 +6,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.core.robot import Initial
 from bam_envs.live.building import live_robot
-from bam_envs.live.rosbridge_robot import RosbridgeRobot
 from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.robot_service import RobotService
 from bam_envs.remote.serve.served_robot import ServedRobot
 from bam_envs.robots.fake import FakeRobot
-from bam_envs.robots.physics.kinematic_arm import empty_arm
 from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur import START as EMPTY_START
 from bam_envs.robots.ur import ur_model, ur_spec
-from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.tasks.ur_reach import START
 
@@ -114,31 +110,3 @@ def test_a_served_arm_with_a_gripper_keeps_its_width(serve, make, realtime):
         served.step(np.array([[*EMPTY_START, HELD]]))
     assert run(make("bam/ur-empty-v0", url), start=EMPTY_START) > 0.05
     np.testing.assert_array_equal(served.state.signals["gripper_width"], [[HELD]])
-
-
-def test_a_served_arm_without_gripper_offers_none_and_says_so(serve):
-    """To who commands one: one error, at once when connecting, and nothing has moved."""
-    url, served = serve(empty_arm(1, ur_model="ur5e"), realtime=True)
-    robot = RosbridgeRobot(Endpoint(url, timeout=0.5), load_profile("ur5e"), spec=FakeRobot(1).spec)
-    with pytest.raises(ProtocolError) as caught:
-        robot.connect()
-    assert str(caught.value) == (
-        f"Nobody listens to {GRIPPER} (std_msgs/Float64MultiArray), which takes gripper_width. Is the controller "
-        "active, and is the topic called so? Topics are in the profile of ur5e; this may be another robot "
-        "than it describes."
-    )
-    np.testing.assert_array_equal(served.state.signals["joint_position"], [START])
-
-
-def test_a_message_is_never_cut(tmp_path):
-    (tmp_path / "one.toml").write_text(
-        'extends = "ur5e"\nname = "one"\n\n[[commands.all]]\ntopic = "/all"\ntype = "std_msgs/Float64MultiArray"\n'
-        f"labels = {json.dumps([*SIX.command.labels, 'gripper_width'])}\n"
-    )
-    with pytest.raises(InvalidValue) as caught:
-        live_robot("ws://127.0.0.1:9", SIX, profile=tmp_path / "one.toml")
-    joints = ", ".join(SIX.command.labels)
-    assert str(caught.value) == (
-        f"/all takes {joints}, gripper_width in one message, and gripper_width is not commanded. "
-        f"Give the profile of one a command mode with a topic for {joints} alone."
-    )

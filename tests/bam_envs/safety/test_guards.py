@@ -49,10 +49,10 @@ def test_what_is_not_executed():
     shape, finite, age = guards.Shape(ARM), guards.Finite(ARM, Limits()), guards.Freshness(ARM, Limits())
     for bad in ((7,), (1, 6), (2, 7), (1, 7, 1)):
         with pytest.raises(InvalidValue) as caught:
-            shape.row(np.zeros(bad))
+            shape.numbers(np.zeros(bad))
         assert str(caught.value) == f"The command must have shape (1, 7), not {bad}."
     with pytest.raises(InvalidValue, match=r"^The command must be numbers: could not convert string"):
-        shape.row(["a"] * 7)
+        shape.numbers(["a"] * 7)
     assert finite.fault(arm_tick(joints(0.1))) is None
     text = "the command for shoulder_pan_joint, elbow_joint is not a finite number"
     assert finite.fault(arm_tick(joints(math.nan, 0, math.inf))) == text
