@@ -77,6 +77,11 @@ class TestLiveArm(LiveContract):
 class TestLiveArmInRealTime(TestLiveArm):
     realtime = True
 
+    def test_stamps_go_on(self) -> None:
+        """On a busy computer a state may come a period late."""
+        with self.running() as (robot, first):
+            assert any((robot.step(self.stay(first)).stamp > first.stamp).all() for _ in range(10))
+
 
 class TestLiveBase(LiveContract):
     def served(self):
