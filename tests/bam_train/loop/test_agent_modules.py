@@ -38,11 +38,6 @@ class Planned(Agent, ABC):
         self.set(("x", t), self.plan())
 
 
-class Both(Agent, nn.Module):
-    def forward(self, t, **kwargs):
-        self.set(("x", t), torch.tensor([1.0]))
-
-
 def loop():
     return TemporalAgent(Agents(Observing(), Policy(name="policy")))
 
@@ -87,17 +82,6 @@ def test_children_are_a_module_list_that_can_be_assigned_into():
     agents.agents.append(CopyTAgent("action", "again"))
     agents(ws, t=4)
     assert ws["again"][4].tolist() == [[5.0]]
-
-
-def test_train_eval_and_conversion_reach_every_agent():
-    agent = loop()
-    assert agent.eval() is agent
-    assert [one.training for one in agent.modules()] == [False] * len(list(agent.modules()))
-    agent.train()
-    assert agent.agent.agents[1].training
-    agent.double()
-    assert agent.agent.agents[1].model.weight.dtype == torch.float64
-    assert agent.to("meta").agent.agents[1].steps.device.type == "meta"
 
 
 def test_learning_through_a_workspace():
@@ -178,14 +162,6 @@ def test_classes_that_count_their_subclasses_count_each_once():
 
     assert isinstance(One(), nn.Module)
     assert Counted.found == [("One", "one")]
-
-
-def test_an_agent_that_names_nn_module_itself():
-    ws, agent = Workspace(), Both(name="both")
-    agent(ws, t=0)
-    assert ws["x"].tolist() == [[1.0]]
-    assert pickle.loads(pickle.dumps(agent)).name == "both"
-    assert list(TemporalAgent(agent).state_dict()) == []
 
 
 BEFORE_TORCH = """

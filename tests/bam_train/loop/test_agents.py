@@ -37,15 +37,6 @@ def test_members_run_in_order_with_the_same_keywords(ws, kind):
     kind.check(ws["x"], [[12288.0]])
 
 
-def test_members_can_be_reached():
-    one, two = Add(1, name="add"), Add(2, name="add")
-    agents = Agents(one, two, name="all")
-    assert agents[0] is one
-    assert agents[-1] is two
-    assert list(agents.agents) == [one, two]
-    assert agents.name == "all"
-
-
 def test_get_by_name_finds_children_first_then_the_container():
     one, two = Add(1, name="a"), Add(2, name="b")
     inner = Agents(one, name="a")

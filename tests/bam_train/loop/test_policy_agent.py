@@ -1,9 +1,8 @@
-import gymnasium as gym
 import numpy as np
 import pytest
 
 from bam_train.errors import PolicyError
-from bam_train.loop import Agents, ParallelGymAgent, PolicyAgent, TemporalAgent, VecGymAgent, Workspace, make_env
+from bam_train.loop import PolicyAgent, Workspace
 
 
 class Recorded:
@@ -22,14 +21,6 @@ class Recorded:
     act = act_batch
 
 
-def make_parallel():
-    return ParallelGymAgent(lambda: make_env("CartPole-v1", autoreset=True), 1, arrays="numpy")
-
-
-def make_vector():
-    return VecGymAgent(lambda: gym.make_vec("CartPole-v1", 1, vectorization_mode="sync"), arrays="numpy")
-
-
 def at(workspace, t, timestep, done=False, **observations):
     for name, value in (observations or {"env_obs": np.zeros((len(timestep), 2), np.float32)}).items():
         workspace.set("env/" + name.replace("__", "/"), t, value)
@@ -45,16 +36,6 @@ def test_rows_whose_episode_begins_are_forgotten():
         agent(workspace, t=t)
     assert policy.forgotten == [None, [1], [0, 2]]
     assert workspace["action"].tolist() == [[0, 1, 2]] * 5
-
-
-@pytest.mark.parametrize("make", [make_parallel, make_vector])
-def test_environments_with_auto_reset(make):
-    """Always to the left: every episode of CartPole is over within some ten steps."""
-    workspace = Workspace()
-    agent = PolicyAgent(Recorded(np.zeros(1, np.int64)))
-    TemporalAgent(Agents(make(), agent))(workspace, t=0, n_steps=60)
-    assert workspace["env/done"].sum() >= 4
-    assert workspace["action"].shape == (60, 1)
 
 
 def test_what_is_not_finite_is_forgiven_when_all_have_ended():

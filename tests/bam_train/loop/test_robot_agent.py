@@ -86,11 +86,6 @@ def test_parts_of_a_dict_are_variables(corridor):
     assert workspace["env/env_obs/cell"].shape == (1, 1, 1)
 
 
-def test_a_gymnasium_environment_is_not_live_and_a_robot_is(corridor):
-    assert not RobotAgent(gym.make(corridor)).live
-    assert RobotAgent(robot_env()).live
-
-
 def test_wiring_is_checked_before_the_robot_is_connected():
     env = robot_env()
     robot = env.unwrapped.robot

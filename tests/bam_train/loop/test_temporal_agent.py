@@ -93,17 +93,6 @@ def test_keywords_go_to_every_agent():
     assert one.seen == two.seen == [(0, {"stochastic": False}), (1, {"stochastic": False})]
 
 
-def test_a_second_agent_over_a_filled_workspace(kind):
-    class Square(Agent):
-        def forward(self, t, **kwargs):
-            self.set(("square", t), self.get(("x", t)) ** 2)
-
-    ws = Workspace()
-    TemporalAgent(Clock(kind, ends=(9,)))(ws, n_steps=4)
-    TemporalAgent(Square())(ws, t=0, n_steps=4)
-    kind.check(ws["square"], [[0.0], [1.0], [4.0], [9.0]])
-
-
 def test_epochs_lose_no_transition_and_double_none(kind):
     class Count(Agent):
         """The number after the one before; it begins at 0 when there is none."""
@@ -120,17 +109,6 @@ def test_epochs_lose_no_transition_and_double_none(kind):
         loop(ws, t=1, n_steps=3)
     assert seen == [(float(k), k + 1.0) for k in range(9)]
     kind.check(ws["x"], [[9.0], [10.0], [11.0], [12.0]])
-
-
-def test_reading_the_time_before_the_first_gives_the_last(kind):
-    class Before(Agent):
-        def forward(self, t, **kwargs):
-            self.set(("before", t), self.get(("x", t - 1)))
-
-    ws = Workspace()
-    TemporalAgent(Clock(kind, ends=(9,)))(ws, n_steps=3)
-    TemporalAgent(Before())(ws, t=0, n_steps=3)
-    kind.check(ws["before"], [[2.0], [0.0], [1.0]])
 
 
 class Later(Agent):

@@ -115,18 +115,6 @@ def test_a_variable_that_begins_late(kind):
     assert set(map(tuple, sink.times["late"][:-50])) <= {(0,)}
 
 
-def test_a_variable_written_once(kind):
-    """Such as an advantage at t = 0: it goes to the sink with its piece."""
-    sink = Sink()
-    ws = Workspace(window=2, sink=sink)
-    ws.set("once", 0, kind([5], "int64"))
-    for t in range(200):
-        ws.set("x", t, kind([t], "int64"))
-    ws.flush()
-    assert sink.times["once"] == [[5]]
-    assert sink.times["x"] == [[t] for t in range(200)]
-
-
 def test_flush_begins_a_new_episode_at_time_zero(kind):
     sink = Sink()
     ws, loop = Workspace(window=3, sink=sink), TemporalAgent(Count(kind))

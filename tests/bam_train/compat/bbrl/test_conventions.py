@@ -73,11 +73,6 @@ def test_one_seed_only():
     assert agent._seed == 3
 
 
-def test_a_seed_of_the_constructor_is_the_one():
-    with pytest.raises(LoopError):
-        SeedableAgent(seed=0).seed(1)
-
-
 @pytest.mark.parametrize(("kind", "expected"), [(SeedableAgentLast, 5), (SeedableAgentSum, 11), (SeedableAgentMean, 3)])
 def test_several_seeds(kind, expected):
     agent = kind(name="a")
@@ -154,10 +149,6 @@ def test_a_configuration_is_not_changed():
     instantiate_class(config)
     get_arguments(config)["numerator"] = 5
     assert config == CONFIG
-
-
-def test_arguments_need_no_classname():
-    assert get_arguments({"size": 3}) == {"size": 3}
 
 
 @pytest.mark.parametrize(

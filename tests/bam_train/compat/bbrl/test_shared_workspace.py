@@ -1,5 +1,3 @@
-import pickle
-
 import numpy as np
 import pytest
 import torch
@@ -93,11 +91,6 @@ def test_what_is_made_from_it_is_an_ordinary_workspace(array):
     ):
         assert not made.is_shared
         made.set("new", 0, made.get("x", 0))
-
-
-def test_numpy_memory_survives_pickling():
-    shared = shared_workspace(written(np.array))
-    assert pickle.loads(pickle.dumps(shared))["x"].tolist() == shared["x"].tolist()
 
 
 @pytest.mark.parametrize(

@@ -58,23 +58,6 @@ def test_images_are_int64(toys):
     assert toys.run(agent_of(toys, image, CAMERA, arrays="numpy"), 2)["env/env_obs"].dtype == np.uint8
 
 
-def test_nested_dict_observations(toys):
-    observation = {"arm": {"joints": np.array([1, 2], np.float32), "grip": 2}, "goal": np.array([3, 4], np.float32)}
-    agent = agent_of(toys, observation, NESTED)
-    ws = toys.run(agent, 2)
-    assert list(ws.variables)[:3] == ["env/env_obs/arm/joints", "env/env_obs/arm/grip", "env/env_obs/goal"]
-    assert set(agent.writes) == set(ws.variables) - {"action"}
-    assert ws["env/env_obs/arm/joints"].tolist() == [[[1, 2], [1, 2]]] * 2
-    assert ws["env/env_obs/arm/grip"].tolist() == [[2, 2]] * 2
-    assert ws["env/env_obs/arm/grip"].dtype == torch.int64
-    frame = ParallelGymAgent._format_frame(observation)
-    assert {name: one.tolist() for name, one in frame.items()} == {
-        "env_obs/arm/joints": [[1, 2]],
-        "env_obs/arm/grip": [2],
-        "env_obs/goal": [[3, 4]],
-    }
-
-
 def test_observations_that_are_no_numbers(toys):
     agent = agent_of(toys, (1, 2), spaces.Tuple([spaces.Discrete(4), spaces.Discrete(4)]))
     with refused(
