@@ -19,10 +19,9 @@ from bam_train.loop.gym.parallel_gym_agent import Env, ParallelGymAgent, has_aut
 
 
 class _OldGymAgent(ParallelGymAgent):
-    """Writes what `ParallelGymAgent` does, with a seed for each environment.
+    """Writes env_obs, done, truncated, reward, timestep and cumulated_reward as `ParallelGymAgent` does.
 
-    That is in the variables env_obs, done, truncated, reward, timestep and
-    cumulated_reward. Environment k is seeded with ``seed + k`` when it is made; no reset seeds it again.
+    Environment k is seeded with ``seed + k`` when it is made; no reset seeds it again.
 
     Args:
         make_env_fn: Called `n_envs` times with `make_env_args`.

@@ -138,7 +138,7 @@ class GymAgent(SeedableAgent):
         raise NotImplementedError
 
     def _opened(self, observation_space: Space[Any], action_space: Space[Any]) -> None:
-        """Take the spaces of one environment, and declare what is written."""
+        """Take the spaces of one environment and declare what is written."""
         self.observation_space, self.action_space = observation_space, action_space
         self._declare(GymAgent, reads=None, writes=self._written())
 
@@ -152,9 +152,8 @@ class GymAgent(SeedableAgent):
                 keywords are not looked at.
 
         Raises:
-            LoopError: t > 0 and the environments were never reset, or closed since.
-            UnknownVariable: t > 0 and nobody wrote an action.
-            ValueMismatch: The action does not fit the action space.
+            LoopError: t > 0 and the environments were never reset, or closed since; or nobody wrote an action, or one
+                that does not fit the action space.
         """
         if t == 0:
             seed = kwargs.get("seed")
@@ -209,11 +208,7 @@ class GymAgent(SeedableAgent):
     def _reset_seeds(self, seed: Any) -> int | list[int | None]:
         """What the environments are reset with at t = 0: one seed to count from, or one for each.
 
-        Args:
-            seed: What the call was given: None for the agent's own rule.
-
-        Raises:
-            SettingsError: Neither a whole number nor as many as there are environments.
+        `seed` is what the call was given: None for the agent's own rule.
         """
         if seed is None:
             # Environment k gets num_envs * (number of the reset, from 2) * seed + k + 1, as BBRL's ParallelGymAgent.

@@ -51,17 +51,14 @@ def names(space: Space[Any], name: str = NAME) -> tuple[str, ...]:
 def entries(
     value: Any, space: Space[Any] | None, for_torch: bool, name: str = NAME, path: tuple[str, ...] = ()
 ) -> list[Entry]:
-    """What an observation consists of.
+    """The variables of the observation `value` of one environment.
 
     Args:
-        value: Observation of one environment.
+        value: An array, a number or a dict of them; anything else raises `ValueMismatch`.
         space: Where the dtype comes from unless `for_torch`; None for the observation's own.
         for_torch: Floats become float32 and integers int64, whatever they are.
-        name: Its variable.
+        name: The variable; of a dict, the first part of its entries'.
         path: The keys to it.
-
-    Raises:
-        ValueMismatch: It is neither an array, nor a number, nor a dict of them.
     """
     if isinstance(value, Mapping):
         found = []
@@ -108,11 +105,7 @@ def pack(entry: Entry, observations: Sequence[Any]) -> Array:
 
 
 def pick(entry: Entry, observation: Any) -> Any:
-    """The part of an observation that `entry` is about.
-
-    Raises:
-        ValueMismatch: It lacks a key.
-    """
+    """The part of an observation that `entry` is about."""
     try:
         for key in entry.path:
             observation = observation[key]

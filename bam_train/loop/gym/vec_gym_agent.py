@@ -93,11 +93,7 @@ class _VectorEnvs(Stepper):
     def _turn(
         self, packed: _Arrays, rewards: Array, terminated: Array, truncated: Array, infos: Any, recorded: _Arrays
     ) -> None:
-        """Put the last observation where episodes end, and the first where they begin; changes what it is given.
-
-        Raises:
-            LoopError: The environment did not keep the last observation, or resets others than it was told to.
-        """
+        """Put the last observation where episodes end, and the first where they begin; changes what it is given."""
         begin = self._begin & self._ahead
         ended = terminated | truncated
         if self._mode == AutoresetMode.SAME_STEP and ended.any():
