@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from bam_envs.core.errors import InvalidValue, NoServer, NotInCommand, RemoteError
-from bam_envs.rosbridge.client import RosbridgeLink
-from bam_envs.rosbridge.endpoint import Endpoint
+from bam_envs.core.errors import InvalidValue, RemoteError
 from bam_envs.rosbridge.server import BridgeServer
 
 STRING = "std_msgs/String"
@@ -20,15 +18,6 @@ def server():
 def test_what_it_is_found_out_at_connect(server, new_link):
     link = new_link(server)
     assert (link.is_up, link.ros, abs(link.clock_offset) < 0.5) == (True, "ros2", True)
-
-
-def test_two_links_talk_through_it(server, new_link, heard):
-    link, other = new_link(server), new_link(server)
-    link.subscribe("/ping", STRING, heard)
-    link.call("/rosapi/get_time", "rosapi/GetTime", {}, 5.0)
-    other.advertise("/ping", STRING)
-    other.publish("/ping", {"data": "hello"})
-    assert heard.wait() == [{"data": "hello"}]
 
 
 def test_a_service_is_called(server, new_link):
@@ -49,36 +38,6 @@ def test_a_service_of_one_link_is_called_by_another(server, new_link):
     provider.close()
     with pytest.raises(RemoteError):
         caller.call("/act", "std_srvs/Trigger", {}, 5.0)
-
-
-def test_a_refused_message_is_a_status(server, new_link, heard):
-    def refuse(message, caller):
-        raise NotInCommand("another client is in command")
-
-    server.subscribe("/cmd", STRING, refuse)
-    link = new_link(server)
-    link.on_status(heard)
-    link.advertise("/cmd", STRING)
-    link.publish("/cmd", {"data": "go"})
-    assert "another client is in command" in heard.wait()[0]["msg"]
-
-
-def test_the_token_is_needed():
-    with BridgeServer(port=0, token="secret") as server:
-        link = RosbridgeLink(Endpoint(server.url, token="secret"))
-        link.connect()
-        link.close()
-        for wrong in (None, "wrong"):
-            with pytest.raises(NoServer, match=r"the token was refused \(HTTP 40[13]\)"):
-                RosbridgeLink(Endpoint(server.url, token=wrong)).connect()
-
-
-def test_tls(certificates, new_link, tmp_path):
-    cert, _ = certificates("127.0.0.1")
-    with BridgeServer(port=0, cert=cert, key=cert.replace("cert.pem", "key.pem")) as server:
-        assert new_link(server, ca_file=cert).is_up
-        with pytest.raises(NoServer, match=r"the certificate is not trusted: self-signed certificate\."):
-            new_link(server)
 
 
 @pytest.mark.parametrize(

@@ -77,8 +77,9 @@ def test_numbers_without_end_are_refused_and_those_that_are_not_finite_are_for_o
 
 def test_json_is_ascii_and_finite():
     assert dump_json({"a": "é", "b": b"\x00\xff", "c": [1.5, None]}) == '{"a":"\\u00e9","b":"AP8=","c":[1.5,null]}'
-    with pytest.raises(InvalidValue, match=r"^message\.a: expected a plain value, found <object object at "):
-        dump_json({"a": object()})
+    for value in (object(), {1}, float("nan"), float("inf")):
+        with pytest.raises(InvalidValue, match=r"^A thing\.a: expected a (plain value|finite number), found "):
+            dump_json({"a": value}, "A thing")
 
 
 @pytest.mark.parametrize("length", [0, 1, 2, 3, 4, 11, 12, 13, 1000])
@@ -223,13 +224,3 @@ def test_json_that_is_not_strict(text, reason):
 
 def test_json_keeps_every_bit_of_a_number():
     assert load_json(dump_json({"a": [0.1, 1e-310, 2**60]}, "x"), "x") == {"a": [0.1, 1e-310, 2**60]}
-
-
-def test_bytes_are_base64():
-    assert dump_json({"data": b"\0\1"}, "x") == '{"data":"AAE="}'
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), {1}, object()])
-def test_what_json_has_no_word_for(value):
-    with pytest.raises(InvalidValue, match=r"^A thing\[0\]: expected "):
-        dump_json([value], "A thing")

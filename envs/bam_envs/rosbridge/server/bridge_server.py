@@ -16,7 +16,6 @@ import ssl
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from types import TracebackType
 from typing import Any, TypeVar, cast
 
 from websockets.asyncio.server import Server, serve
@@ -126,9 +125,7 @@ class BridgeServer(Bus):
     def __enter__(self) -> BridgeServer:
         return self.start()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     # ---- the Bus; see there

@@ -179,16 +179,6 @@ def test_a_goal_of_an_action_is_answered_as_one(peers):
     assert peers.say(peers.client(), op="send_action_goal", action="/a", action_type="x/Y", id="g") == [answer]
 
 
-def test_a_wrong_type_harms_nobody_else(peers):
-    first, second, third = (peers.client(name) for name in "abc")
-    peers.say(first, op="subscribe", topic="/t", type=TEXT)
-    peers.say(second, op="subscribe", topic="/t", type="std_msgs/Int32")
-    assert peers.say(third, op="subscribe", topic="/t", type="std_msgs/msg/String") == []
-    peers.say(second, op="publish", topic="/t", msg=text("x"))
-    told = [published("/t", text("x"))]
-    assert [peers.take(one) for one in (first, second, third)] == [told, [], told]
-
-
 def test_levels_of_status(peers):
     client = peers.client()
     assert peers.say(client, {"op": "set_level", "level": "none"}, {"op": "dance"}) == []
@@ -302,16 +292,6 @@ def test_a_latched_message_waits_for_newcomers_as_long_as_its_publisher(peers):
 # This process.
 
 
-def test_listeners_of_this_process(peers):
-    heard, client = [], peers.client("c")
-    stop = peers.bridge.subscribe("cmd", FLOATS, lambda message, caller: heard.append((message["data"], caller)))
-    peers.say(client, op="publish", topic="/cmd", msg={"data": [1]})
-    stop()
-    stop()
-    peers.say(client, op="publish", topic="/cmd", msg={"data": [2]})
-    assert heard == [([1.0], Caller("c", "here"))]
-
-
 @pytest.mark.parametrize(
     ("reason", "text"),
     [
@@ -375,14 +355,6 @@ def test_who_left_is_told(peers, caplog):
 # Services.
 
 
-def test_a_handler_answers(peers):
-    peers.bridge.serve("s", SET_BOOL, lambda request, caller: {"success": request["data"], "message": caller.name})
-    client = peers.client("c")
-    assert peers.say(client, op="call_service", service="/s", args={"data": True}, id="x") == []
-    peers.run()
-    assert peers.take(client) == response({"success": True, "message": "c"}, True, id="x")
-
-
 def test_arguments_may_have_no_names(peers):
     peers.bridge.serve("/s", SET_BOOL, lambda request, caller: {"success": request["data"]})
     client = peers.client()
@@ -430,12 +402,6 @@ def test_a_handler_that_fails_or_answers_wrongly_is_an_answer(caplog, handler, t
     peers = Peers(ServerOptions(max_message=1000))
     peers.bridge.serve("/s", TRIGGER, handler)
     assert peers.call(peers.client()) == response(told, False)
-
-
-def test_a_response_in_fragments(peers):
-    peers.bridge.serve("/s", TRIGGER, lambda request, caller: {"message": "x" * 100})
-    answer = json.loads("".join(part["data"] for part in peers.call(peers.client(), fragment_size=60)))
-    assert [answer] == response({"success": False, "message": "x" * 100}, True)
 
 
 def test_a_client_offers_a_service(peers):
@@ -494,16 +460,6 @@ def test_a_silent_service_is_answered_for(peers):
     assert peers.take(client) == response("Timeout exceeded: service /s did not answer in 30 s.", False)
     (told,) = peers.say(robot, op="service_response", id=late["id"], service="/s", values={}, result=True)
     assert told["msg"] == f"service_response /s: Nobody waits for a response with the id '{late['id']}'."
-
-
-def test_a_service_that_goes_is_answered_for(peers):
-    robot, client = peers.client("robot"), peers.client("c")
-    peers.say(robot, op="advertise_service", service="/s", type=TRIGGER)
-    peers.say(client, op="call_service", service="/s")
-    peers.bridge.lost(robot)
-    gone = "Service /s is gone: the client that offered it left or withdrew it."
-    assert peers.take(client) == response(gone, False)
-    assert peers.say(client, op="call_service", service="/s") == response("Service /s does not exist", False)
 
 
 def test_a_service_of_a_client_that_came_back_takes_the_place_of_the_old_one(peers):

@@ -197,16 +197,6 @@ def test_a_handler_that_takes_its_time_delays_nobody(server, new_client):
     assert slow.receive()["values"]["success"] is True
 
 
-def test_who_leaves_is_told(server, client):
-    left, gone = [], threading.Event()
-    server.on_leave(lambda caller: (left.append(caller), gone.set()))
-    address = "{}:{}".format(*client.socket.local_address)
-    client.sync()
-    client.close()
-    assert gone.wait(DEADLINE)
-    assert [(caller.name, caller.address) for caller in left] == [("client1", address)]
-
-
 def test_time_limits_are_kept_without_traffic(server, client):
     client.send(op="advertise_service", service="/mine", type=TRIGGER)
     client.send(op="call_service", service="/mine", timeout=0.01)
@@ -366,12 +356,6 @@ def test_a_message_that_is_too_large_ends_only_its_connection(server, new_client
         big.receive()
     assert end.value.rcvd is None or end.value.rcvd.code == 1009
     other.sync()
-
-
-def test_a_message_of_a_usual_size_is_done(server, client):
-    answer = client.call("/rosapi/topic_type", args={"topic": "/t" + "x" * 16_000_000})
-    assert answer["result"] is False
-    assert answer["values"].startswith("Name: expected one such as '/joint_states', found '/txxx")
 
 
 def test_what_comes_is_bounded_otherwise_than_answers(new_server, new_client):
