@@ -37,6 +37,7 @@ def test_exceptions_are_python_exceptions_of_the_same_kind():
 
 
 PIECES = ((2, 2), (2, 1), (-1, 2))
+U, T, V, W = UnknownVariable, TimeNotWritten, ValueMismatch, WorkspaceError
 UNKNOWN = "'rewrd' is not in the workspace, did you mean 'reward'? It has 'action', 'obs', 'reward'."
 ONE = "'obs' at t=3: expected shape (2, 4), found {}."
 PIECE = "'obs': expected times with 0 <= from < to, found from {} to {}."
@@ -48,105 +49,74 @@ BATCHES = "The variables have different batch sizes: 'obs' has 2, 'other' has 1.
 @pytest.mark.parametrize(
     ("error", "use", "text"),
     [
-        (UnknownVariable, lambda ws, kind: ws.get("rewrd", 0), UNKNOWN),
-        (UnknownVariable, lambda ws, kind: ws.get_full("rewrd"), UNKNOWN),
-        (UnknownVariable, lambda ws, kind: ws["rewrd"], UNKNOWN),
-        (UnknownVariable, lambda ws, kind: list(ws["obs", "rewrd"]), UNKNOWN),
-        (UnknownVariable, lambda ws, kind: ws.get_time_truncated("rewrd", 0, 1), UNKNOWN),
-        (UnknownVariable, lambda ws, kind: ws.clear("rewrd"), UNKNOWN),
-        (UnknownVariable, lambda ws, kind: ws.remove_variable("rewrd"), UNKNOWN),
-        (UnknownVariable, lambda ws, kind: ws.copy_time(0, 1, 1, var_names=["rewrd"]), UNKNOWN),
-        (UnknownVariable, lambda ws, kind: ws.copy_n_last_steps(1, var_names=["rewrd"]), UNKNOWN),
+        (U, lambda ws, k: ws.get("rewrd", 0), UNKNOWN),
+        (U, lambda ws, k: ws.get_full("rewrd"), UNKNOWN),
+        (U, lambda ws, k: ws["rewrd"], UNKNOWN),
+        (U, lambda ws, k: list(ws["obs", "rewrd"]), UNKNOWN),
+        (U, lambda ws, k: ws.get_time_truncated("rewrd", 0, 1), UNKNOWN),
+        (U, lambda ws, k: ws.clear("rewrd"), UNKNOWN),
+        (U, lambda ws, k: ws.remove_variable("rewrd"), UNKNOWN),
+        (U, lambda ws, k: ws.copy_time(0, 1, 1, var_names=["rewrd"]), UNKNOWN),
+        (U, lambda ws, k: ws.copy_n_last_steps(1, var_names=["rewrd"]), UNKNOWN),
         (
-            UnknownVariable,
-            lambda ws, kind: ws.get_transitions(),
+            U,
+            lambda ws, k: ws.get_transitions(),
             "filter_key 'env/done' is not in the workspace. It has 'action', 'obs', 'reward'.",
         ),
-        (UnknownVariable, lambda ws, kind: Workspace()["x"], "'x' is not in the workspace. It is empty."),
+        (U, lambda ws, k: Workspace()["x"], "'x' is not in the workspace. It is empty."),
         *(
             (
-                TimeNotWritten,
-                lambda ws, kind, name=name, t=t: ws.get(name, t),
+                T,
+                lambda ws, k, name=name, t=t: ws.get(name, t),
                 f"{name!r} is not written at t={t}; it has times 0 to 2.",
             )
             for name in ("obs", "action")
             for t in (3, 12, -4)
         ),
+        (T, lambda ws, k: ws.copy_time(3, 0, 1), "'obs' is not written at t=3; it has times 0 to 2."),
         (
-            TimeNotWritten,
-            lambda ws, kind: ws.copy_time(3, 0, 1),
-            "'obs' is not written at t=3; it has times 0 to 2.",
-        ),
-        (
-            TimeNotWritten,
-            lambda ws, kind: ws.select_subtime(kind([0, 2], "int64"), 2),
+            T,
+            lambda ws, k: ws.select_subtime(k([0, 2], "int64"), 2),
             "'obs': windows of 2 from t=0 to 2 are wanted; it has times 0 to 2.",
         ),
+        (T, lambda ws, k: ws.set("x", -1, k([1.0])), "'x' is not written at t=-1; it has none."),
+        (V, lambda ws, k: ws.set("obs", 3, k.zeros(3, 4)), ONE.format((3, 4))),
+        (V, lambda ws, k: ws.set("obs", 3, k.zeros(2)), ONE.format((2,))),
+        (V, lambda ws, k: ws.set("obs", 3, k.zeros()), ONE.format(())),
         (
-            TimeNotWritten,
-            lambda ws, kind: ws.set("x", -1, kind([1.0])),
-            "'x' is not written at t=-1; it has none.",
-        ),
-        (ValueMismatch, lambda ws, kind: ws.set("obs", 3, kind.zeros(3, 4)), ONE.format((3, 4))),
-        (ValueMismatch, lambda ws, kind: ws.set("obs", 3, kind.zeros(2)), ONE.format((2,))),
-        (ValueMismatch, lambda ws, kind: ws.set("obs", 3, kind.zeros()), ONE.format(())),
-        (
-            ValueMismatch,
-            lambda ws, kind: ws.set("action", 3, kind.zeros(3, dtype="int64")),
+            V,
+            lambda ws, k: ws.set("action", 3, k.zeros(3, dtype="int64")),
             "'action' at t=3: expected shape (2,), found (3,).",
         ),
-        (
-            ValueMismatch,
-            lambda ws, kind: ws.set_full("reward", kind.zeros(3, 5)),
-            "'reward' at t=0: expected shape (2,), found (5,).",
-        ),
+        (V, lambda ws, k: ws.set_full("reward", k.zeros(3, 5)), "'reward' at t=0: expected shape (2,), found (5,)."),
         *(
             (
-                ValueMismatch,
-                lambda ws, kind, value=value: ws.set("x", 0, value(kind)),
+                V,
+                lambda ws, k, value=value: ws.set("x", 0, value(k)),
                 "'x' at t=0: expected a batch axis first (B x ...), found a single number; give it shape (1,).",
             )
-            for value in (lambda kind: kind(1.0), lambda kind: np.float32(1.0))
+            for value in (lambda k: k(1.0), lambda k: np.float32(1.0))
         ),
         (
-            ValueMismatch,
-            lambda ws, kind: ws.set_full("x", kind(1.0)),
+            V,
+            lambda ws, k: ws.set_full("x", k(1.0)),
             "'x' at all times: expected time and batch first (T x B x ...), found a single number.",
         ),
-        *((WorkspaceError, lambda ws, kind, t=t: ws.get_time_truncated("obs", *t), PIECE.format(*t)) for t in PIECES),
-        *(
-            (WorkspaceError, lambda ws, kind, t=t: ws.get_time_truncated_workspace(*t), PIECE.format(*t))
-            for t in PIECES
-        ),
+        *((W, lambda ws, k, t=t: ws.get_time_truncated("obs", *t), PIECE.format(*t)) for t in PIECES),
+        *((W, lambda ws, k, t=t: ws.get_time_truncated_workspace(*t), PIECE.format(*t)) for t in PIECES),
+        (W, lambda ws, k: ws.copy_n_last_steps(4), "copy_n_last_steps: expected at most 3 steps, found 4."),
+        (W, lambda ws, k: ws.sample_subworkspace(1, 1, 4), SAMPLE),
         (
-            WorkspaceError,
-            lambda ws, kind: ws.copy_n_last_steps(4),
-            "copy_n_last_steps: expected at most 3 steps, found 4.",
-        ),
-        (WorkspaceError, lambda ws, kind: ws.sample_subworkspace(1, 1, 4), SAMPLE),
-        (
-            WorkspaceError,
-            lambda ws, kind: Workspace.cat_batch([ws, ws.subtime(0, 2)]),
+            W,
+            lambda ws, k: Workspace.cat_batch([ws, ws.subtime(0, 2)]),
             "cat_batch: expected workspaces of 3 times, found one of 2.",
         ),
-        (
-            WorkspaceError,
-            lambda ws, kind: Workspace.cat_batch([]),
-            "cat_batch: expected one workspace or more, found none.",
-        ),
+        (W, lambda ws, k: Workspace.cat_batch([]), "cat_batch: expected one workspace or more, found none."),
         *(
-            (
-                WorkspaceError,
-                lambda ws, kind, t=t: ws.get("obs", t),
-                f"'obs': expected a whole number as time, found {t!r}.",
-            )
+            (W, lambda ws, k, t=t: ws.get("obs", t), f"'obs': expected a whole number as time, found {t!r}.")
             for t in ("a", None, 1.5, (0,))
         ),
-        (
-            WorkspaceError,
-            lambda ws, kind: Workspace(window=2, sink=3),
-            "sink: expected sink(first_time, values), found int.",
-        ),
+        (W, lambda ws, k: Workspace(window=2, sink=3), "sink: expected sink(first_time, values), found int."),
     ],
 )
 def test_what_is_refused(ws, kind, error, use, text):
