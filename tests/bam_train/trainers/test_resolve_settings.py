@@ -164,9 +164,6 @@ def test_where_a_run_computes_is_not_read_from_a_file(saved, fields, tmp_path):
     [
         ("num_envs", 10**9, "num_envs: expected a whole number from 1 to 100000, found 1000000000"),
         ("num_env_runners", 10**9, "num_env_runners: expected a whole number from 0 to 10000, found 1000000000"),
-        ("threads", 10**6, "threads: expected a whole number from 1 to 1024, found 1000000"),
-        ("steps", 1e300, "steps: expected a whole number from 1 to 1000000000000000, found 1"),
-        ("eval_episodes", 1e12, "eval_episodes: expected a whole number from 1 to 1000000, found 1000000000000"),
         ("eval_episodes", "many", "eval_episodes: expected a whole number from 1 to 1000000, found 'many'"),
         ("hyperparameters", [1], "hyperparameters: expected a table of named values, found [1]"),
         ("hyperparameters", {"n_steps": "x"}, "n_steps: expected a whole number, found 'x'"),
@@ -183,13 +180,8 @@ def test_settings_that_no_run_has_are_refused(saved, fields, tmp_path, name, val
 
 
 def test_what_is_said_again_is_no_difference(saved):
-    again = {
-        "env": "CartPole-v1",
-        "algo": "ppo",
-        "seed": 3,
-        "normalize": True,
-        "hyperparameters": {"gamma": 0.99, "policy_kwargs": {}},
-    }
+    same = {"gamma": 0.99, "policy_kwargs": {}}
+    again = {"env": "CartPole-v1", "algo": "ppo", "seed": 3, "normalize": True, "hyperparameters": same}
     assert resolve_resumed(again, saved.checkpoint) == saved.settings
 
 
@@ -349,21 +341,9 @@ def test_a_best_checkpoint_goes_on_in_its_own_place(saved, here):
     [
         ([], "Expected `object`, got `array`"),
         ({"best": 1}, "Expected `object | null`, got `int` - at `$.best`"),
-        ({"best": []}, "Expected `object | null`, got `array` - at `$.best`"),
-        ({"best": {"path": 1}}, "Expected `str`, got `int` - at `$.best.path`"),
         ({"best": {"path": "a"}}, "Object missing required field `steps` - at `$.best`"),
-        (
-            {"best": {"steps": 1, "success_rate": None, "return_mean": 0, "path": 1}},
-            "Expected `str`, got `int` - at `$",
-        ),
-        (
-            {"best": {"steps": "1", "success_rate": None, "return_mean": 0, "path": "a"}},
-            "Expected `int`, got `str` - at",
-        ),
-        (
-            {"best": {"steps": 1, "success_rate": {}, "return_mean": 0, "path": "a"}},
-            "Expected `float | null`, got `obj",
-        ),
+        ({"best": {**BEST, "path": 1}}, "Expected `str`, got `int` - at `$.best.path`"),
+        ({"best": {**BEST, "success_rate": {}, "path": "a"}}, "Expected `float | null`, got `obj"),
     ],
 )
 def test_notes_of_another_form_are_refused(saved, fields, here, notes, message):
