@@ -52,7 +52,7 @@ class Checkpoint:
     path: Path
     """The file."""
     manifest: Manifest
-    """What it is."""
+    """Its description."""
 
     @classmethod
     def open(cls, path: str | Path) -> Checkpoint:

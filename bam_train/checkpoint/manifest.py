@@ -35,7 +35,7 @@ _Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 
 @dataclass(frozen=True)
 class Manifest:
-    """What a checkpoint is; `bam/manifest.json`."""
+    """`bam/manifest.json`."""
 
     format: Literal[1]
     """Version of the file's layout."""
@@ -62,7 +62,7 @@ class Manifest:
     seed: _Count
     """Seed of the run."""
     scores: dict[str, Any]
-    """What evaluation found when this was saved."""
+    """The last evaluation before it was saved."""
     versions: dict[str, Any]
     """Versions of Python and of the packages that made it."""
     git_commit: str | None
@@ -117,7 +117,7 @@ class _Scores(Struct):
 
 
 class _Contents(Struct):
-    """What the types of `Manifest` do not say."""
+    """Checked beside the types of `Manifest`."""
 
     observation_space: _Space
     action_space: _Space

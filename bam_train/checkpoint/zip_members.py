@@ -17,7 +17,7 @@ from bam_train.errors import AlteredCheckpoint, NotACheckpoint
 CHUNK = 2**20  # bytes read at once
 MOST_MEMBERS = 10_000
 RESUME = "bam/resume/"
-"""Beginning of the names of members that only going on with training needs."""
+"""Beginning of the names of members that only resumed training needs."""
 _MOST_DIRECTORY = 4 * 2**20  # bytes of the zip's own list of members
 _MOST_BYTES = {
     MANIFEST: MOST_MANIFEST,
@@ -29,7 +29,7 @@ _MOST_BYTES = {
 """Bytes of a member at most, unpacked, by the beginning of its name; the first that fits."""
 _MOST_JSON = 2**24
 """Bytes at most of a JSON member, which is many times as large once it is read."""
-# What zipfile lets out for damaged headers and streams; NotImplementedError and RecursionError are RuntimeErrors.
+# Exceptions of zipfile for damaged headers and streams; NotImplementedError and RecursionError are RuntimeErrors.
 _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError, KeyError, OverflowError, struct.error)
 
 

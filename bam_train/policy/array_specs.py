@@ -1,4 +1,4 @@
-"""What a frozen policy knows of its spaces: their JSON form, read without Gymnasium; the check of an observation."""
+"""Spaces of a frozen policy, read from JSON without Gymnasium; the check of an observation."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ _SINGLE = 8  # golden observations that are acted on one by one too
 
 
 class FrozenPolicy:
-    """What a checkpoint does on a robot; used by one thread at a time.
+    """The policy of a checkpoint; used by one thread at a time.
 
     Attributes:
         observation_space: JSON form, as in the manifest.

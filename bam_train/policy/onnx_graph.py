@@ -1,4 +1,4 @@
-"""What is refused of an ONNX file before onnxruntime reads it: the file may come from an untrusted source.
+"""Checks of an ONNX file before onnxruntime reads it: the file may come from an untrusted source.
 
 A policy is one graph of known operations with its weights inside. Functions, training graphs, graphs inside nodes,
 sparse weights, weights in other files and results whose size depends on the observation are refused. Field numbers are

@@ -48,8 +48,8 @@ class OnnxSession:
         onnx: The file, accepted by `require_policy`.
 
     Attributes:
-        inputs: What it takes, by name.
-        outputs: Names of what it returns.
+        inputs: Its inputs, by name.
+        outputs: Names of its outputs.
         most_seconds: Longest time for the first run.
 
     Raises:

@@ -1,7 +1,4 @@
-"""What every trainer is: it trains in steps, saves a whole checkpoint, goes on from one, and freezes its policy.
-
-And what each writes into the manifest of its checkpoints.
-"""
+"""The interface of every trainer: train in steps, save, resume, freeze the policy; and its checkpoints' manifest."""
 
 from __future__ import annotations
 
@@ -66,7 +63,7 @@ class Trainer(Protocol):
 
     settings: TrainSettings
     notices: list[str]
-    """What the user should know about this run, one line each."""
+    """Messages for the user about this run, one line each."""
 
     @classmethod
     def complete(cls, settings: TrainSettings) -> TrainSettings:
@@ -82,7 +79,7 @@ class Trainer(Protocol):
 
     @classmethod
     def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None) -> Self:
-        """Set up a run that goes on from a checkpoint, with its settings or with these."""
+        """Set up a run that continues from a checkpoint, with its settings or with these."""
 
     def log_to(self, folder: Path) -> None:
         """Write TensorBoard files into a folder from now on."""
@@ -101,7 +98,7 @@ class Trainer(Protocol):
     def save(self, path: Path, scores: Mapping[str, Any], notes: Mapping[str, Any]) -> Checkpoint:
         """Write a checkpoint that can be resumed and deployed; training is not disturbed, not even its random numbers.
 
-        The scores are for the manifest, the notes JSON values in ``bam/resume/notes.json`` for who resumes.
+        The scores go into the manifest, the notes (JSON values) into ``bam/resume/notes.json``.
         """
 
     def freeze(self) -> FrozenPolicy:
@@ -111,13 +108,13 @@ class Trainer(Protocol):
         """Do something between two updates, an evaluation say, that leaves training's random numbers as they were."""
 
     def evaluation_envs(self) -> AbstractContextManager[VectorEnv[Any, Any, Any] | None]:
-        """What to evaluate on between two updates, where no other environments can be made; None: make some."""
+        """The environments to evaluate on between two updates, if no others can be made; else None."""
 
     def log(self, metrics: Mapping[str, float]) -> None:
         """Put numbers next to the trainer's own in TensorBoard."""
 
     def close(self) -> None:
-        """Let go of environments and log files."""
+        """Close environments and log files."""
 
 
 def manifest(
@@ -145,7 +142,7 @@ _PACKAGES = ("bam-train", "gymnasium", "numpy", "mujoco", "torch", "stable-basel
 
 
 def origin() -> dict[str, Any]:
-    """What made a checkpoint, and when (UTC, ISO 8601)."""
+    """The software that made a checkpoint, and the time (UTC, ISO 8601)."""
     created = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
     versions, commit = _software()
     return {"versions": dict(versions), "git_commit": commit, "created": created}

@@ -1,4 +1,4 @@
-"""Where a run's best checkpoint goes: never over somebody else's, and found writable before training begins."""
+"""The place of a run's best checkpoint: it overwrites no other run's, and can be written before training begins."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class Output:
 
     path: Path
     best: Best | None
-    """What is there already, if it is of the same run and goes on being improved."""
+    """The evaluation of the file that is there already, if it is of the same run and will be improved."""
     notices: tuple[str, ...] = ()
-    """What the user should know about it."""
+    """Messages for the user."""
 
 
 def choose_output(settings: TrainSettings, out: Path | None, force: bool, resumed: Checkpoint | None) -> Output:
@@ -38,9 +38,9 @@ def choose_output(settings: TrainSettings, out: Path | None, force: bool, resume
 
     Args:
         settings: Of the run.
-        out: What was asked for, if anything.
+        out: The path that the user gave, if any.
         force: Overwrite what is there.
-        resumed: The checkpoint that the run goes on from; its own best goes on being improved in its place.
+        resumed: The checkpoint that the run continues from; its own best keeps its place.
 
     Raises:
         OutputError: It cannot be written there.
@@ -65,7 +65,7 @@ def choose_output(settings: TrainSettings, out: Path | None, force: bool, resume
 
 
 class _Noted(Struct):
-    """What a run noted of its best evaluation."""
+    """Notes of a run on its best evaluation."""
 
     steps: int
     success_rate: float | None

@@ -1,4 +1,4 @@
-"""What freezing a policy takes, whichever library trained it: layers, the ONNX file, golden observations."""
+"""Freezing a policy of any library: common layers, the ONNX file, golden observations."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def onnx_file(
     """Trace a module on the CPU into an ONNX file; the first axis of every input and output is the batch.
 
     Args:
-        module: What to trace.
+        module: The module.
         inputs: An example of each, in the order of ``forward``, by name.
         outputs: Their names.
         quiet: Beginnings of warnings that say nothing here, with their categories.

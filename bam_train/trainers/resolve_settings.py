@@ -89,7 +89,7 @@ def own_settings(checkpoint: Checkpoint, env: str | None = None, *, elsewhere: b
 
 
 def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSettings:
-    """Complete settings of a run that goes on from a checkpoint: its own, but for what may change.
+    """Complete settings of a run that continues from a checkpoint: its own, but for what may change.
 
     Raises:
         CheckpointMismatch: Something else was asked for than the checkpoint has; names it and both values.

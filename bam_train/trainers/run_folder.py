@@ -1,4 +1,4 @@
-"""``runs/<name>/``: what a run leaves behind to be looked at.
+"""``runs/<name>/``: the files of a run.
 
 ::
 
@@ -8,7 +8,7 @@
     last.zip            the newest checkpoint; `--resume` goes on from it
     learning-curve.png  return and success over steps
 
-And copies of its best checkpoint at an fsspec address, such as a bucket: what is left of a computer that goes away.
+And copies of its best checkpoint at an fsspec address, such as a bucket, which outlive the computer.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class RunFolder:
 
     Args:
         root: The folder that runs are kept in.
-        name: What the run is called; ``-2``, ``-3``, … is added while the name is taken, also by another process.
+        name: Name of the run; ``-2``, ``-3``, … is added while the name is taken, also by another process.
 
     Attributes:
         path: The folder.
@@ -84,7 +84,7 @@ class RunFolder:
         return records
 
     def remove_unfinished(self) -> None:
-        """Remove what an interrupted save left behind."""
+        """Remove temporary files of an interrupted save."""
         for path in self.path.glob(".*.tmp"):
             path.unlink(missing_ok=True)
 

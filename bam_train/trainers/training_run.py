@@ -25,7 +25,7 @@ from bam_train.trainers.base import Progress, Statistics, Trainer
 from bam_train.trainers.run_folder import Copies, RunFolder, unwritable
 
 FIRST_SAVE = 2.0
-"""Seconds until the first save: a run that is killed early has something to go on from."""
+"""Seconds until the first save, so that a run that is killed early can be resumed."""
 SAVE_EVERY = 30.0
 """Seconds between two saves at least, unless an evaluation comes first."""
 SAVE_SHARE = 0.02
@@ -35,7 +35,7 @@ RECORD_EVERY = 0.1
 
 
 class Watcher(Protocol):
-    """What is told how a run goes, such as a display."""
+    """Receives the progress of a run; a display, for example."""
 
     def training(
         self, progress: Progress, statistics: Statistics, steps_per_second: float, seconds_left: float | None
@@ -46,7 +46,7 @@ class Watcher(Protocol):
         """The policy was evaluated."""
 
     def note(self, text: str) -> None:
-        """Something that the user should know."""
+        """A message for the user."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class TrainingRun:
         trainer: Set up and ready.
         folder: Where the run's files go.
         out: Where the best checkpoint goes.
-        watcher: Who is told.
+        watcher: Receives the progress.
         best: The best evaluation of the part of this run that was trained before, whose checkpoint is at `out`.
         clock: Monotonic time [s].
         copies: Where every checkpoint that goes to `out` is copied to.
@@ -142,7 +142,7 @@ class TrainingRun:
 
     @property
     def last(self) -> Path | None:
-        """The newest checkpoint on the disk that can be gone on from."""
+        """The newest checkpoint on the disk that can be resumed."""
         return next((path for path in (self.folder.last, self._kept) if path is not None and path.exists()), None)
 
     def run(self) -> Outcome:
@@ -170,7 +170,7 @@ class TrainingRun:
             self._kept = self.out if self._write(self.out, None, "--out") else None  # the newest: none was evaluated
             self._copy()
         if "copy" in self._failures:
-            self._copy()  # what was in the way may be gone
+            self._copy()  # the cause of the failure may be gone
         self.done = True
         return Outcome(
             reason="stopped" if self._stop else "success" if self._reached else "steps",
@@ -185,7 +185,7 @@ class TrainingRun:
         )
 
     def _between(self, progress: Progress) -> bool:
-        """What happens between two updates; False ends training."""
+        """Record, evaluate and save between two updates; False ends training."""
         for notice in self.trainer.notices[self._noted :]:
             self.watcher.note(notice)
         self._noted = len(self.trainer.notices)
@@ -258,7 +258,7 @@ class TrainingRun:
             self._failures["progress"] = error
 
     def _keep(self, found: Best) -> None:
-        """Save the policy as the best so far; if `out` cannot be written, in the run's folder. Training goes on."""
+        """Save the policy as the best so far; if `out` cannot be written, in the run's folder. Training continues."""
         before = self.best, self._best_scores
         self.best, self._best_scores = found, self._scores()
         if self._write(self.out, self.out, "--out"):
@@ -301,7 +301,7 @@ class TrainingRun:
 
     def _write(self, path: Path, kept: Path | None, flag: str) -> bool:
         """Write a checkpoint, which notes that the best one is at `kept`; whether it could be."""
-        notes: dict[str, Any] = {"best": None}  # what a resumed run needs to go on keeping the best in the same file
+        notes: dict[str, Any] = {"best": None}  # with these a resumed run keeps the best in the same file
         if (best := self.best) is not None and kept is not None:
             noted = {"steps": best.steps, "success_rate": best.success_rate, "return_mean": best.return_mean}
             notes = {"best": {**noted, "path": str(kept.resolve())}}  # the rest is among the scores of that file

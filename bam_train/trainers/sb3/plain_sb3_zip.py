@@ -20,7 +20,7 @@ from bam_train.policy import FrozenPolicy
 from bam_train.trainers.algorithms import SB3_ALGORITHMS
 from bam_train.trainers.zero_based_spaces import from_zero
 
-# What SB3's load lets out for a file of another algorithm or another version, then what it does for a damaged one.
+# Exceptions of SB3's load for a file of another algorithm or another version, then those for a damaged one.
 _MISFIT = (ValueError, TypeError, KeyError, AttributeError, RuntimeError, AssertionError, ImportError)
 _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, pickle.UnpicklingError)
 

@@ -212,7 +212,7 @@ def freeze(
 
     Args:
         model: Of any algorithm of stable-baselines3 or sb3-contrib but ARS.
-        normaliser: What the observations were normalised with, if anything.
+        normaliser: Normaliser of the observations, if any.
         observation_space: The environment's own, before any wrapper of SB3.
         action_space: The environment's own; its ``start`` is added to what SB3 counts from 0.
 

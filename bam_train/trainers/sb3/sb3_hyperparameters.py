@@ -198,7 +198,7 @@ def _checked_policy(policy: Any, given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 _REFUSALS = (AssertionError, ValueError, TypeError, RuntimeError, ZeroDivisionError, NotImplementedError)
-"""What stable-baselines3 and torch raise for settings that cannot be."""
+"""Exceptions of stable-baselines3 and torch for settings that cannot work."""
 
 
 def make_model(settings: TrainSettings, venv: VecEnv) -> tuple[Any, list[str]]:

@@ -1,7 +1,7 @@
-"""What a run of stable-baselines3 needs to go on exactly: ``bam/resume/…`` in its checkpoints.
+"""The state from which a run of stable-baselines3 continues exactly: ``bam/resume/…`` in its checkpoints.
 
 It is taken between two updates (before a rollout begins): no rollout is half collected, no gradient half applied. It is
-put back into a freshly made model. The file is long because each kind of state is taken and put back in its own way.
+restored into a new model. The file is long because each kind of state is saved and restored differently.
 """
 
 from __future__ import annotations
@@ -32,24 +32,24 @@ _COUNTS = ("num_timesteps", "_episode_num", "_n_updates", "_n_calls")
 _SHARES = ("_current_progress_remaining", "exploration_rate")
 """Numbers that a model counts with, where it has them: counts, and shares of the run."""
 _LAST = ("_last_obs", "_last_original_obs", "_last_episode_starts")
-"""What the model saw last, where its next rollout begins."""
+"""The last observations, with which the next rollout begins."""
 _DEQUES = ("ep_info_buffer", "ep_success_buffer")
 _REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
 @dataclass(frozen=True)
 class Waiting:
-    """What is put back only when training takes its next step: setting up draws random numbers and resets noise."""
+    """State to restore only before the next step of training: setting up draws random numbers and resets noise."""
 
     checkpoint: Checkpoint
     """Where it comes from."""
     random: dict[str, Any]
     noise: list[Any]
     same_episodes: bool
-    """Whether the episodes that ran when the checkpoint was saved go on."""
+    """Whether the episodes that ran when the checkpoint was saved continue."""
 
     def restore(self, model: Any) -> None:
-        """Put it back; raises AlteredCheckpoint if it does not fit the model."""
+        """Restore it; raises AlteredCheckpoint if it does not fit the model."""
         with _fits(self.checkpoint, STATE):
             for one, previous in zip(_correlated_noises(model), self.noise, strict=True):
                 one.noise_prev = previous
@@ -59,13 +59,13 @@ class Waiting:
 def members(
     model: Any, venv: Any, normaliser: VecNormalize | None, waiting: Waiting | None, notes: Mapping[str, Any]
 ) -> dict[str, bytes]:
-    """Everything that the run needs to go on, by name in its checkpoint.
+    """The members of a checkpoint from which the run continues.
 
     Args:
         model: The model, between two updates.
         venv: Its environments, without wrappers.
         normaliser: Its `VecNormalize`, if any.
-        waiting: What a loaded run has not put back yet.
+        waiting: State that a loaded run has not restored yet.
         notes: JSON values to keep.
     """
     _, loose = model._get_torch_save_params()  # such as SAC's entropy coefficient
@@ -96,7 +96,7 @@ def members(
 
 
 def load(checkpoint: Checkpoint, model: Any, venv: Any, normaliser: VecNormalize | None) -> Waiting:
-    """Put a checkpoint's state into a new model of the same settings; what is left is returned.
+    """Restore a checkpoint's state into a new model of the same settings; returns the rest, to be restored later.
 
     Raises:
         AlteredCheckpoint: A member is missing, or does not fit the model.
@@ -136,7 +136,7 @@ def load(checkpoint: Checkpoint, model: Any, venv: Any, normaliser: VecNormalize
 
 @contextmanager
 def _fits(checkpoint: Checkpoint, name: str) -> Iterator[None]:
-    """What goes wrong when a state is put into a model that is not made like the saved one, in one line."""
+    """Maps the errors of restoring a state into a model that is not made like the saved one."""
     try:
         yield
     except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
@@ -153,7 +153,7 @@ def _read(checkpoint: Checkpoint, name: str) -> Any:
 
 
 def _counters(model: Any) -> dict[str, Any]:
-    """How far the run is, what it saw last, and the last episodes' returns."""
+    """Counters, the last observations, and the returns of the last episodes."""
     tree: dict[str, Any] = {name: getattr(model, name) for name in (*_COUNTS, *_SHARES) if hasattr(model, name)}
     tree["last"] = {name: getattr(model, name) for name in _LAST}
     tree["deques"] = {name: list(getattr(model, name) or ()) for name in _DEQUES}
@@ -163,7 +163,7 @@ def _counters(model: Any) -> dict[str, Any]:
 
 
 def _load_counters(model: Any, tree: Mapping[str, Any]) -> None:
-    """Put `_counters` back.
+    """Restore `_counters`.
 
     Raises:
         ValueError: One is of another kind, or what was seen last has another shape than the environments'.
@@ -205,7 +205,7 @@ def _statistics(env: VecNormalize | None) -> dict[str, Any] | None:
 
 
 def _load_statistics(env: VecNormalize, tree: Mapping[str, Any]) -> None:
-    """Put `_statistics` back."""
+    """Restore `_statistics`."""
     observed, returns = _running(env)
     both = [(observed[key], moments) for key, moments in tree["observations"].items()]
     for one, moments in [*both, (returns, tree["returns"])]:
@@ -240,7 +240,7 @@ def random_states(model: Any) -> dict[str, Any]:
 
 
 def load_random_states(model: Any, tree: Mapping[str, Any]) -> None:
-    """Put `random_states` back; the last thing to do before going on."""
+    """Restore `random_states`; the last thing to do before training continues."""
     version, numbers, gauss = tree["python"]
     random.setstate((version, tuple(numbers), gauss))
     saved = tree["numpy"]

@@ -1,4 +1,4 @@
-"""`SB3Trainer`: a run of a stable-baselines3 algorithm that can be stopped, saved and gone on with between two updates.
+"""`SB3Trainer`: a run of a stable-baselines3 algorithm that can be stopped, saved and resumed between two updates.
 
 Everything happens where the algorithm asks for its next rollout: the last update is done, the next step not yet taken.
 """
@@ -94,7 +94,7 @@ class SB3Trainer:
 
     @classmethod
     def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None) -> SB3Trainer:
-        """Set up a run that goes on from a checkpoint, with its settings or with these."""
+        """Set up a run that continues from a checkpoint, with its settings or with these."""
         settings = settings or TrainSettings.from_mapping(own_settings(checkpoint), str(checkpoint.path))
         trainer = cls.create(settings)
         require_fit(checkpoint, one_env(trainer.venv), settings.place)
@@ -129,7 +129,7 @@ class SB3Trainer:
         if SB3_ALGORITHMS[self.settings.algo].on_policy:
             log_interval = int(max(1, 2048 // (self.model.n_steps * self.settings.num_envs)))
         with contextlib.suppress(_Stop), self._finite_distributions():
-            # reset_num_timesteps=False: the total is what is left, and a restored episode goes on.
+            # reset_num_timesteps=False: the total is what is left, and a restored episode continues.
             with np.errstate(over="ignore", invalid="ignore"):  # NaN is looked for, and said once
                 self.model.learn(steps - self.steps, log_interval=log_interval, reset_num_timesteps=False)
             self._between()
@@ -146,7 +146,7 @@ class SB3Trainer:
             raise TrainingFailed(text) from error
 
     def _roll_out(self, collect: Any, *arguments: Any, **named: Any) -> Any:
-        """Stands before the algorithm's own `collect_rollouts`, where nothing is half done."""
+        """Called in place of the algorithm's own `collect_rollouts`: between two updates."""
         if self._waiting is not None:
             waiting, self._waiting = self._waiting, None
             waiting.restore(self.model)
@@ -227,7 +227,7 @@ class SB3Trainer:
             self.model.logger.record(name, value)
 
     def close(self) -> None:
-        """Let go of environments and log files."""
+        """Close environments and log files."""
         self.model.logger.dump(self.steps)
         self.model.logger.close()
         self.model.env.close()

@@ -37,7 +37,7 @@ def make_training_env(env_id: str, env_kwargs: Mapping[str, Any], num_envs: int,
 
 
 def one_env(venv: VecEnv) -> Any:
-    """What stands behind `venv`: our vector environment, or the first of the others."""
+    """Our vector environment behind `venv`, or the first of the others."""
     if isinstance(venv, BatchVecEnv):
         return venv.batch
     env = venv.envs[0]
@@ -76,7 +76,7 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
 
     @property
     def can_be_saved(self) -> bool:
-        """Whether running episodes can be saved and gone on with; those of a robot elsewhere cannot."""
+        """Whether running episodes can be saved and restored; those of a robot elsewhere cannot."""
         return hasattr(self.batch, "state_dict")
 
     def reset(self) -> Observations:
@@ -89,7 +89,7 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         return self._own(observations)
 
     def interrupt(self, last: Observations) -> None:
-        """Somebody else used the environments: at the next step the running episodes are truncated, and new ones begin.
+        """An evaluation used the environments: at the next step the running episodes are truncated, and new ones begin.
 
         The `last` observations are those of the running episodes; None if there are none.
         """
@@ -157,7 +157,7 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         self.batch.episode_steps = self._lengths.copy()
 
     def close(self) -> None:
-        """Let go of the simulation."""
+        """Close the environments."""
         self.batch.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
