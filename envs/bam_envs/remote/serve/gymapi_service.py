@@ -8,7 +8,6 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from concurrent.futures import TimeoutError as NoAnswer  # not the builtin before Python 3.11
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -33,14 +32,9 @@ from bam_envs.ros.freshness import FreshnessCheck
 from bam_envs.ros.messages import write_stamp
 from bam_envs.rosbridge.bus import Bus, Caller, Message
 from bam_envs.rosbridge.sessions import Sessions
-from bam_envs.rosbridge.string_rpc import RecentAnswers, StringRpcService
+from bam_envs.rosbridge.string_rpc import StringRpcService
 
-Feedback = list[dict[str, Any]]
 _log = logging.getLogger(__name__)
-_ANSWERS = 8
-"""Kept for requests that come twice; with images they are large."""
-_PATIENCE = 60.0
-"""Longest wait for the answer to a request that came twice while the first one is executed [s]."""
 _MOST_CLIENTS = 1024
 _LONGEST_NAME = 100
 """Characters of a client's name that are kept and shown to others."""
@@ -82,7 +76,7 @@ class GymApiService:
         self._codec = EnvCodec(env.spec(), image_format=image_format)
         self._clock = clock
         self._version = None if version is None else version_named(version)
-        self._freshness, self._answers = FreshnessCheck(), RecentAnswers[Feedback](_ANSWERS)
+        self._freshness = FreshnessCheck()
         self._lock = threading.Lock()
         self._connections: OrderedDict[str, str] = OrderedDict()
         self._leaving = ThreadPoolExecutor(1, "bam-gymapi-leaving")
@@ -110,7 +104,11 @@ class GymApiService:
         """The response to a request; never raises: what goes wrong is the text of a failure."""
         begun, version = time.monotonic(), version_of_request(message) or self._version or JUNE_22
         try:
-            feedback = self._once(read_request(message), version, caller, begun, published)
+            request = read_request(message)
+            if request.tag is not None and not published:  # what carries a published one has looked at a tag of its own
+                self._freshness.require(request.tag)
+            deadline = None if request.tag is None else begun + request.tag.deadline - request.tag.sent
+            feedback = self._perform(request, version, caller, deadline, published)
             return write_response(feedback, time.monotonic() - begun, self._stamp(), version)
         except BamEnvsError as error:
             failure = error
@@ -119,28 +117,9 @@ class GymApiService:
             failure = RemoteError(f"{type(error).__name__}: {error}")
         return write_failure(failure, time.monotonic() - begun, self._stamp(), version)
 
-    def _once(self, request: GymRequest, version: Version, caller: Caller, begun: float, published: bool) -> Feedback:
-        """The feedback; a request that came before gets the same again."""
-        tag = request.tag
-        if tag is None:
-            return self._perform(request, version, caller, None)
-        if published:  # what carries it has looked at a tag of its own
-            return self._perform(request, version, caller, begun + tag.deadline - tag.sent, published=True)
-        future, new = self._answers.claim((tag.session, tag.epoch, tag.sequence))
-        if new:
-            try:
-                self._freshness.require(tag)
-                future.set_result(self._perform(request, version, caller, begun + tag.deadline - tag.sent))
-            except Exception as error:  # whatever it was, it is the answer
-                future.set_exception(error)
-        try:
-            return future.result(_PATIENCE)
-        except NoAnswer:
-            raise RemoteError("The same request came before, and is still being executed.") from None
-
     def _perform(
-        self, request: GymRequest, version: Version, caller: Caller, deadline: float | None, *, published: bool = False
-    ) -> Feedback:
+        self, request: GymRequest, version: Version, caller: Caller, deadline: float | None, published: bool
+    ) -> list[dict[str, Any]]:
         self.env.require_name(request.env_name)
         name = request.client_id[:_LONGEST_NAME] or "somebody"
         # The same client when it comes back on another connection: the session in the tag of a service call is known to
