@@ -25,7 +25,7 @@ from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NoServer,
 from bam_envs.core.wording import brief
 from bam_envs.ros.interfaces import normal_name
 from bam_envs.ros.messages import write_stamp
-from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Bus, Handler, Listener, Message, tell
+from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Handler, Message, tell
 from bam_envs.rosbridge.client_connection import Connection, ServerClock, bare_reason
 from bam_envs.rosbridge.declarations import Declarations
 from bam_envs.rosbridge.encoding import dump_json
@@ -44,7 +44,7 @@ _ENDED = "Timeout exceeded"
 _NEARLY = 0.9
 
 
-class RosbridgeLink(Bus):
+class RosbridgeLink(Declarations):
     """A client of a rosbridge server; a `Bus` that can also call services.
 
     Args:
@@ -67,7 +67,8 @@ class RosbridgeLink(Bus):
         max_message: int = 64 * 1024 * 1024,
     ) -> None:
         self._endpoint = Endpoint(endpoint) if isinstance(endpoint, str) else endpoint
-        self.url, self.namespace, self.name = self._endpoint.address.url, self._endpoint.address.namespace, name
+        super().__init__(self._endpoint.address.url)
+        self.namespace, self.name = self._endpoint.address.namespace, name
         self.statuses: deque[dict[str, Any]] = deque(maxlen=_STATUSES_KEPT)
         """The last `status` messages of the server."""
         self.epoch = 0
@@ -75,9 +76,6 @@ class RosbridgeLink(Bus):
         if not lost_after > 0.0:
             raise InvalidValue(f"lost_after: expected a time above 0 s, found {lost_after!r}.")
         self._lost_after, self._max_message = lost_after, max_message
-        self._declarations = Declarations()
-        # A declaration and its announcement must reach the network thread in the same order.
-        self._declaring = threading.Lock()
         self._up: Connection | None = None
         self._why = "not connected yet: call connect()"
         self._server = ServerClock()
@@ -90,7 +88,7 @@ class RosbridgeLink(Bus):
         self._thread = LoopThread(f"bam-link-{name}")
         self._main_task: asyncio.Task[None] | None = None
         self._connecting, self._changed = threading.Lock(), threading.Condition()
-        self._closed, self._pid = False, os.getpid()
+        self._closed = False
 
     # ---- connecting
 
@@ -164,55 +162,13 @@ class RosbridgeLink(Bus):
 
     # ---- topics
 
-    @property
-    def declared(self) -> dict[str, tuple[str, str]]:
-        """What was declared: id of the declaration, which a `status` may name -> topic or service, and type."""
-        return {one["id"]: (one.get("topic") or one["service"], one["type"]) for one in self._declarations.greeting()}
-
-    def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
-        """Say that `topic` of type `kind` will be published."""
-        self._declare(lambda: self._declarations.advertise(topic, kind, latch))
-
     def publish_all(self, messages: Sequence[tuple[str, Message]]) -> None:
         """Send several messages now or not at all: on return they have been written to the socket. See `Bus`."""
         connection = self._require_up()
         for topic, _ in messages:
-            self._declarations.require_advertised(topic)
+            if topic not in self._topics:
+                raise InvalidValue(f"Topic {topic!r} was not advertised: call advertise(topic, type) before publish.")
         self._send(connection, *(dump_json({"op": "publish", "topic": one, "msg": msg}) for one, msg in messages))
-
-    def subscribe(
-        self,
-        topic: str,
-        kind: str,
-        listener: Listener,
-        *,
-        throttle_ms: int = 0,
-        queue_length: int = 0,
-        compression: str = "none",
-    ) -> Callable[[], None]:
-        """Call `listener` for each message on the network thread, until what is returned is called.
-
-        Args:
-            topic: Its name.
-            kind: Its type.
-            listener: Must return at once. Other listeners of the topic are independent of it.
-            throttle_ms: Least time between two messages [ms]; the server drops the others.
-            queue_length: How many messages the server keeps while they are throttled, the newest; 0: none.
-            compression: ``"none"`` for JSON, or ``"cbor"`` for images and large arrays, which JSON makes seven times
-                slower; their typed arrays come as NumPy arrays, byte arrays as `bytes`.
-
-        Raises:
-            InvalidValue: The topic has another type here already, or a number is not whole.
-        """
-        key: object = None
-
-        def declare() -> dict[str, Any]:
-            nonlocal key
-            key, request = self._declarations.subscribe(topic, kind, listener, throttle_ms, queue_length, compression)
-            return request
-
-        self._declare(declare)
-        return lambda: self._declare(lambda: self._declarations.unsubscribe(topic, key))
 
     def on_status(self, callback: Callable[[Mapping[str, Any]], None]) -> None:
         """Call `callback` with each `status` message; on the network thread."""
@@ -271,10 +227,6 @@ class RosbridgeLink(Bus):
             raise ProtocolError(f"{service}: expected a response with fields, found {values!r}.")
         return values
 
-    def serve(self, service: str, kind: str, handler: Handler) -> None:
-        """Answer `service` of type `kind` through the server: always, also when the handler fails."""
-        self._declare(lambda: self._declarations.serve(service, kind, handler))
-
     # ---- any thread: sending
 
     def _send(self, connection: Connection, *frames: str) -> None:
@@ -318,13 +270,9 @@ class RosbridgeLink(Bus):
                 "A listener must return at once: do work in another thread."
             )
 
-    def _declare(self, declare: Callable[[], dict[str, Any] | None]) -> None:
-        """Note a declaration; tell it now if there is a connection: the greeting of the next one contains it anyway."""
-        self._require_process()
-        with self._declaring:
-            request = declare()
-            if request is not None:
-                self._thread.post(partial(self._tell, request, dump_json(request)))
+    def _announce(self, request: dict[str, Any]) -> None:
+        # In the lock of the declarations: they reach the network thread in the order in which they were made.
+        self._thread.post(partial(self._tell, request, dump_json(request)))
 
     def _require_up(self) -> Connection:
         self._require_process()
@@ -336,13 +284,6 @@ class RosbridgeLink(Bus):
     def _require_open(self) -> None:
         if self._closed:
             raise LinkLost(f"{self.url}: this link was closed. Make a new one.")
-
-    def _require_process(self) -> None:
-        if self._pid != os.getpid():
-            raise InvalidValue(
-                f"This link to {self.url} was made in process {self._pid}, and this is a fork of it. "
-                "Make and connect a link in the child itself."
-            )
 
     def _require_waiting_allowed(self, method: str) -> None:
         self._require_process()
@@ -409,7 +350,7 @@ class RosbridgeLink(Bus):
         )
         await connection.open(timeout)
         try:
-            for request in self._declarations.greeting():
+            for request in self._greeting():
                 frame = connection.announced[request["id"]] = dump_json(request)
                 connection.send(frame)
             self._require_open()
@@ -433,7 +374,7 @@ class RosbridgeLink(Bus):
         connection, self._up = self._up, None
         if connection is not None:
             try:
-                connection.send(*map(dump_json, self._declarations.farewell()))
+                connection.send(*map(dump_json, self._farewell()))
             except LinkLost as error:
                 _LOG.debug("no farewell: %s", error)
             await connection.close()
@@ -460,7 +401,7 @@ class RosbridgeLink(Bus):
             stamp = header.get("stamp") if isinstance(header, Mapping) else None
             if isinstance(stamp, Mapping):
                 self._seen_ros = "ros2" if "sec" in stamp else "ros1" if "secs" in stamp else None
-            self._declarations.deliver(topic, content)
+            self._deliver(topic, content)
         elif operation == "call_service":
             self._answer(connection, message)
         elif operation == "status":
@@ -474,7 +415,7 @@ class RosbridgeLink(Bus):
         """Answer a request of the server in a worker thread; the network thread waits for no handler."""
         service = request.get("service")
         response = {"op": "service_response", "service": service, "id": request.get("id")}
-        handler = self._declarations.handler(str(service))
+        handler = self._services.get(str(service), (None, None))[1]
         if handler is None:
             refusal = f"Service {service} is not served here"
         elif self._may_answer.acquire(blocking=False):

@@ -7,14 +7,16 @@ whatever the number of listeners: it sends one stream per topic, and ends it at 
 from __future__ import annotations
 
 import logging
+import os
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue
 from bam_envs.ros.interfaces import normal_name
-from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Handler, Listener, refusal_of
+from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Bus, Handler, Listener, refusal_of
 
 _LOG = logging.getLogger(__name__)
 
@@ -25,30 +27,54 @@ class _Subscription:
     listeners: dict[object, Listener] = field(default_factory=dict)
 
 
-class Declarations:
-    """The tables of one client; any thread. What declares something returns what to tell the server."""
+class Declarations(Bus):
+    """The half of a link that declares; a subclass tells the server of `url`, and may be used in this process only."""
 
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
+    def __init__(self, url: str) -> None:
+        self.url = url
+        self._pid, self._lock = os.getpid(), threading.Lock()
         self._topics: dict[str, dict[str, Any]] = {}
         self._subscriptions: dict[str, _Subscription] = {}
         self._services: dict[str, tuple[dict[str, Any], Handler]] = {}
 
-    def advertise(self, topic: str, kind: str, latch: bool) -> dict[str, Any]:
-        """`topic` will be published."""
+    @property
+    def declared(self) -> dict[str, tuple[str, str]]:
+        """What was declared: id of the declaration, which a `status` may name -> topic or service, and type."""
+        return {one["id"]: (one.get("topic") or one["service"], one["type"]) for one in self._greeting()}
+
+    def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
+        """Say that `topic` of type `kind` will be published."""
+        self._require_process()
         request = {"op": "advertise", "id": f"advertise:{topic}", "topic": topic, "type": normal_name(kind)}
         with self._lock:
-            return _same_type(self._topics.setdefault(topic, {**request, "latch": latch}), topic, kind)
-
-    def require_advertised(self, topic: str) -> None:
-        """Raise `InvalidValue` unless `topic` may be published."""
-        if topic not in self._topics:
-            raise InvalidValue(f"Topic {topic!r} was not advertised: call advertise(topic, type) before publish.")
+            known = self._topics.setdefault(topic, {**request, "latch": latch})
+            self._announce(_same_type(known, topic, kind))
 
     def subscribe(
-        self, topic: str, kind: str, listener: Listener, throttle_ms: int, queue_length: int, compression: str
-    ) -> tuple[object, dict[str, Any]]:
-        """`listener` wants `topic`; also returns a key to remove it by. The lowest throttle of a topic counts."""
+        self,
+        topic: str,
+        kind: str,
+        listener: Listener,
+        *,
+        throttle_ms: int = 0,
+        queue_length: int = 0,
+        compression: str = "none",
+    ) -> Callable[[], None]:
+        """Call `listener` for each message on the network thread, until what is returned is called.
+
+        Args:
+            topic: Its name.
+            kind: Its type.
+            listener: Must return at once. Other listeners of the topic are independent of it.
+            throttle_ms: Least time between two messages [ms], the lowest of all listeners; the server drops the others.
+            queue_length: How many messages the server keeps while they are throttled, the newest; 0: none.
+            compression: ``"none"`` for JSON, or ``"cbor"`` for images and large arrays, which JSON makes seven times
+                slower; their typed arrays come as NumPy arrays, byte arrays as `bytes`.
+
+        Raises:
+            InvalidValue: The topic has another type here already, or a number is not whole.
+        """
+        self._require_process()
         wish = {"throttle_rate": throttle_ms, "queue_length": queue_length}
         for name, value in (("throttle_ms", throttle_ms), ("queue_length", queue_length)):
             # The Python servers drop a subscription without a word for anything but an integer.
@@ -64,34 +90,42 @@ class Declarations:
             entry.request = {**known, **{name: min(known[name], value) for name, value in wish.items()}}
             # A new table each time, so that the fan-out can walk over the old one without a lock.
             entry.listeners = {**entry.listeners, key: listener}
-            return key, entry.request
+            self._announce(entry.request)
+        return partial(self._unsubscribe, topic, key)
 
-    def unsubscribe(self, topic: str, key: object) -> dict[str, Any] | None:
-        """The listener of `key` wants `topic` no more. None if others still do, or it is gone already."""
+    def _unsubscribe(self, topic: str, key: object) -> None:
+        self._require_process()
         with self._lock:
             entry = self._subscriptions.get(topic)
             if entry is None or key not in entry.listeners:
-                return None
+                return
             entry.listeners = {other: listener for other, listener in entry.listeners.items() if other is not key}
-            if entry.listeners:
-                return None
-            del self._subscriptions[topic]
-        return {"op": "unsubscribe", "id": f"subscribe:{topic}", "topic": topic}
+            if not entry.listeners:
+                del self._subscriptions[topic]
+                self._announce({"op": "unsubscribe", "id": f"subscribe:{topic}", "topic": topic})
 
-    def serve(self, service: str, kind: str, handler: Handler) -> dict[str, Any]:
-        """`handler` answers `service`."""
+    def serve(self, service: str, kind: str, handler: Handler) -> None:
+        """Answer `service` of type `kind` through the server: always, also when the handler fails."""
+        self._require_process()
         request = {"op": "advertise_service", "id": f"serve:{service}", "service": service, "type": normal_name(kind)}
         with self._lock:
             if service in self._services:
                 raise InvalidValue(f"Service {service!r} is served by this client already.")
             self._services[service] = (request, handler)
-        return request
+            self._announce(request)
 
-    def handler(self, service: str) -> Handler | None:
-        """Who answers `service`."""
-        return self._services.get(service, (None, None))[1]
+    def _announce(self, request: dict[str, Any]) -> None:
+        """Tell the server `request` if there is a connection: the greeting of the next one contains it anyway."""
+        raise NotImplementedError
 
-    def deliver(self, topic: str, message: Mapping[str, Any]) -> None:
+    def _require_process(self) -> None:
+        if self._pid != os.getpid():
+            raise InvalidValue(
+                f"This link to {self.url} was made in process {self._pid}, and this is a fork of it. "
+                "Make and connect a link in the child itself."
+            )
+
+    def _deliver(self, topic: str, message: Mapping[str, Any]) -> None:
         """Give a message to each listener of `topic`. What one of them raises is logged, and the others still hear."""
         entry = self._subscriptions.get(topic)
         for listener in () if entry is None else entry.listeners.values():
@@ -102,13 +136,13 @@ class Declarations:
             except Exception:  # listeners are foreign code
                 _LOG.exception("%s: a listener failed", topic)
 
-    def greeting(self) -> list[dict[str, Any]]:
+    def _greeting(self) -> list[dict[str, Any]]:
         """Everything, for a server that knows nothing yet."""
         with self._lock:
             services = (request for request, _ in self._services.values())
             return [*self._topics.values(), *services, *(entry.request for entry in self._subscriptions.values())]
 
-    def farewell(self) -> list[dict[str, Any]]:
+    def _farewell(self) -> list[dict[str, Any]]:
         """What to take back before leaving: some servers keep a service whose client has left."""
         with self._lock:
             return [
