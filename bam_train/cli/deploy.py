@@ -49,7 +49,7 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     env = make_env(env_id, env_kwargs, render_mode="human" if config.render else None, place=place)
     try:
         require_fit(checkpoint, env, place)
-        pacer = Pacer(period_of(config, checkpoint, env))
+        pacer = Pacer(_period(config, checkpoint, env))
         deployment = Deployment(env, policy, pacer, Journal(config.episodes, startup))
         signals.raise_again()
         deployment.connect()
@@ -133,7 +133,7 @@ def require_screen(*, remote: bool) -> None:
         )
 
 
-def period_of(config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> float | None:
+def _period(config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> float | None:
     """Time between two actions [s]; None for as fast as it goes.
 
     Raises:
