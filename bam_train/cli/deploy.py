@@ -90,11 +90,7 @@ def _run(
 
 
 def _checked_place(config: DeployConfig) -> Place:
-    """Where the flags say that the environment runs; what cannot be is refused before anything is loaded.
-
-    Raises:
-        SettingsError: Flags that exclude each other, or nothing to show.
-    """
+    """Where the flags say that the environment runs; what cannot be is refused before anything is loaded."""
     from bam_train.env_location import Place, addresses
     from bam_train.errors import SettingsError
 
@@ -134,11 +130,7 @@ def require_screen(*, remote: bool) -> None:
 
 
 def _period(config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> float | None:
-    """Time between two actions [s]; None for as fast as it goes.
-
-    Raises:
-        SettingsError: Neither the flags nor the environment nor the checkpoint say.
-    """
+    """Time between two actions [s], by the flags, the environment or the checkpoint; None for as fast as it goes."""
     from bam_train.environments import control_period
     from bam_train.errors import SettingsError
 

@@ -74,11 +74,7 @@ def _consented_env(config: ServeConfig) -> Any:
 
 
 def env_kwargs(assignments: Sequence[str]) -> dict[str, Any]:
-    """Keyword arguments out of ``name=value``.
-
-    Raises:
-        SettingsError: One of them is none.
-    """
+    """Keyword arguments out of ``name=value``."""
     from bam_train.errors import SettingsError
     from bam_train.settings import parse_assignment
 

@@ -207,11 +207,8 @@ class _JournalAgent(Agent):
             self._record = self._journal.begin(seed)
             self._pacer.start()
         else:  # the step that led to time t
-            record = self._record
-            info: dict[str, Any] = {}
-            if self.get((f"env/{SAYS_SUCCESS}", t))[0]:
-                info["is_success"] = self.get((f"env/{SUCCESS}", t))[0]
-            record.add(self.get(("env/reward", t))[0], info)
+            record, says = self._record, self.get((f"env/{SAYS_SUCCESS}", t))[0]
+            record.add(self.get(("env/reward", t))[0], self.get((f"env/{SUCCESS}", t))[0] if says else None)
             record.end = next((end for end in _ENDS if self.get((f"env/{end}", t))[0]), "stopped")
             watcher.ticked(record, self.get(("action", t - 1))[0], self._pacer)
             if record.complete:
