@@ -74,15 +74,3 @@ def test_a_token_file(tmp_path):
     with pytest.raises(InvalidValue) as caught:
         open_transport("tcp://x:1", token_file=str(tmp_path / "none"))
     assert str(caught.value) == f"The token file {tmp_path / 'none'} cannot be read: No such file or directory."
-
-
-@pytest.mark.parametrize("url", ["tcp://x:1", "ws://x:1"])
-@pytest.mark.parametrize(
-    ("content", "text"), [(b" \n", "is empty; put a secret into it."), (b"\xff", "cannot be read: it is not text.")]
-)
-def test_a_token_file_that_holds_none(tmp_path, url, content, text):
-    path = tmp_path / "token"
-    path.write_bytes(content)
-    with pytest.raises(InvalidValue) as caught:
-        open_transport(url, token_file=str(path))
-    assert str(caught.value) == f"The token file {path} {text}"

@@ -166,7 +166,7 @@ def test_no_server_at_all():
     with closing(socket.create_server(("127.0.0.1", 0))) as listener:
         url = f"ws://127.0.0.1:{listener.getsockname()[1]}"
     with pytest.raises(NoServer, match=r"(?i)refused"):
-        RosbridgeTransport(url).connect()
+        RosbridgeTransport(url, connect_timeout=0.2).connect()
 
 
 def test_closed_is_closed(served, open_to):

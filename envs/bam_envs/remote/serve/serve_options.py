@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.validation import Port, Positive, check_fields
 from bam_envs.core.wording import as_flag
-from bam_envs.remote.gymapi.versions import version_named
+from bam_envs.remote.gymapi_versions import version_named
 from bam_envs.remote.serve.command_lease import LEASE_SECONDS
 
 _NAMESPACE = re.compile(r"(/[A-Za-z]\w*)*")

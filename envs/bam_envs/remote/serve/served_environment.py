@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Any
 
 from bam_envs.core.errors import InvalidValue, RemoteError
-from bam_envs.remote.gymapi.gymapi_messages import base_name, service_name
+from bam_envs.remote.gymapi_messages import base_name, service_name
 from bam_envs.remote.ros2_node import RclpyBus
 from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.env_server import Env, EnvServer

@@ -1,4 +1,4 @@
-"""Actions and results of one environment as GymAPI messages and back; see `leaves` for what goes where.
+"""Actions and results of one environment as GymAPI messages and back; see `gymapi_leaves` for what goes where.
 
 What the lists of an action cannot hold exactly (Text, Sequence, images, infinities) is JSON in ``prefix``, marked by
 ``bam:``; what the fields of an observation cannot hold is JSON in ``info``, by the name of its leaf. Images go into
@@ -16,8 +16,7 @@ from gymnasium import Space, spaces
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.core.wording import brief
-from bam_envs.remote.gymapi.gymapi_messages import PREFIX, GymResponse, write_feedback
-from bam_envs.remote.gymapi.leaves import (
+from bam_envs.remote.gymapi_leaves import (
     EXACT,
     GRIPPER_WIDTH,
     IMAGE,
@@ -32,7 +31,8 @@ from bam_envs.remote.gymapi.leaves import (
     read_numbers,
     read_pose,
 )
-from bam_envs.remote.gymapi.versions import JUNE_22, Version
+from bam_envs.remote.gymapi_messages import PREFIX, GymResponse, write_feedback
+from bam_envs.remote.gymapi_versions import JUNE_22, Version
 from bam_envs.remote.transport import EnvSpecMessage, Info
 from bam_envs.remote.values import exact, pack, tree_from_json, tree_to_json
 from bam_envs.ros.images import FORMATS, color_message, read_color_message, read_depth_message

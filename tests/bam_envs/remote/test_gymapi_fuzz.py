@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bam_envs.core.errors import BamEnvsError
-from bam_envs.remote.gymapi.gymapi_codec import EnvCodec
-from bam_envs.remote.gymapi.gymapi_messages import read_response
+from bam_envs.remote.gymapi_codec import EnvCodec
+from bam_envs.remote.gymapi_messages import read_response
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
 from bam_envs.remote.transport import EnvSpecMessage

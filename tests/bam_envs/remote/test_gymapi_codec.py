@@ -8,8 +8,8 @@ import pytest
 from gymnasium import spaces
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
-from bam_envs.remote.gymapi.gymapi_codec import EnvCodec
-from bam_envs.remote.gymapi.gymapi_messages import (
+from bam_envs.remote.gymapi_codec import EnvCodec
+from bam_envs.remote.gymapi_messages import (
     GymRequest,
     RequestType,
     read_request,

@@ -7,7 +7,7 @@ import pytest
 from gymnasium import spaces
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
-from bam_envs.remote.gymapi.gymapi_codec import WAYPOINT, ActionCodec
+from bam_envs.remote.gymapi_codec import WAYPOINT, ActionCodec
 from bam_envs.ros.interfaces import complete
 
 POSE = spaces.Dict(
@@ -103,11 +103,8 @@ def test_parts_go_by_their_names():
     ("space", "action"),
     [
         (spaces.Text(5), "abc"),
-        (spaces.Sequence(spaces.Discrete(3)), (1, 2)),
         (box(2), np.array([np.inf, 0], np.float32)),
         (spaces.Box(0, 2**62, (1,), np.int64), np.array([2**60 + 1])),
-        (spaces.Box(0, 255, (8, 8, 3), np.uint8), np.zeros((8, 8, 3), np.uint8)),
-        (box(0), np.zeros(0, np.float32)),
         (box(5000), np.zeros(5000, np.float32)),
         (spaces.Dict({"a[0]": box(), "a": box(1)}), {"a[0]": 1, "a": [2]}),
     ],

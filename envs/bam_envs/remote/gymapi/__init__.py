@@ -1,1 +1,0 @@
-"""bam_msgs/GymAPI: requests, responses, and spaces in its fields; pure functions."""
