@@ -49,7 +49,7 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     env = make_env(env_id, env_kwargs, render_mode="human" if config.render else None, place=place)
     try:
         require_fit(checkpoint, env, place)
-        pacer = Pacer(period_of(config, checkpoint, env))
+        pacer = Pacer(_period(config, checkpoint, env))
         deployment = Deployment(env, policy, pacer, Journal(config.episodes, startup))
         signals.raise_again()
         deployment.connect()
@@ -90,11 +90,7 @@ def _run(
 
 
 def _checked_place(config: DeployConfig) -> Place:
-    """Where the flags say that the environment runs; what cannot be is refused before anything is loaded.
-
-    Raises:
-        SettingsError: Flags that exclude each other, or nothing to show.
-    """
+    """Where the flags say that the environment runs; what cannot be is refused before anything is loaded."""
     from bam_train.env_location import Place, addresses
     from bam_train.errors import SettingsError
 
@@ -133,12 +129,8 @@ def require_screen(*, remote: bool) -> None:
         )
 
 
-def period_of(config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> float | None:
-    """Time between two actions [s]; None for as fast as it goes.
-
-    Raises:
-        SettingsError: Neither the flags nor the environment nor the checkpoint say.
-    """
+def _period(config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> float | None:
+    """Time between two actions [s], by the flags, the environment or the checkpoint; None for as fast as it goes."""
     from bam_train.environments import control_period
     from bam_train.errors import SettingsError
 

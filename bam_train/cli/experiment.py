@@ -31,11 +31,7 @@ class ScriptParser(argparse.ArgumentParser):
         super().__init__(name, "%(prog)s.py [options]", description, formatter_class=kind, allow_abbrev=False)
 
     def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
-        """Read the command line, or `args`.
-
-        Raises:
-            SystemExit: After ``-h`` (0), or for what cannot be (2).
-        """
+        """Read the command line, or `args`; what cannot be ends the program with status 2."""
         known, rest = self.parse_known_args(args, namespace)
         if rest:
             from bam_envs.core.wording import did_you_mean

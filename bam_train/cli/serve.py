@@ -57,7 +57,7 @@ def _consented_env(config: ServeConfig) -> Any:
     from bam_envs.core.registry import MAKE_OPTIONS, resolve_id
     from bam_train.environments import make_env, make_vector_env, require_env_kwargs
 
-    env_id, kwargs = resolve_id(config.env), env_kwargs(config.set)
+    env_id, kwargs = resolve_id(config.env), _env_kwargs(config.set)
     # What says where it runs, such as robot=, may be given here.
     require_env_kwargs(env_id, {name: value for name, value in kwargs.items() if name not in MAKE_OPTIONS})
     many = config.num_envs > 1
@@ -73,12 +73,8 @@ def _consented_env(config: ServeConfig) -> Any:
     return env
 
 
-def env_kwargs(assignments: Sequence[str]) -> dict[str, Any]:
-    """Keyword arguments out of ``name=value``.
-
-    Raises:
-        SettingsError: One of them is none.
-    """
+def _env_kwargs(assignments: Sequence[str]) -> dict[str, Any]:
+    """Keyword arguments out of ``name=value``."""
     from bam_train.errors import SettingsError
     from bam_train.settings import parse_assignment
 

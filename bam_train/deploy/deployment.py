@@ -27,8 +27,6 @@ from bam_train.signals import handled
 
 WINDOW = 1000
 """Ticks that the workspace of a deployment keeps at least: 50 s at 20 Hz."""
-LINK_LOST, SAFETY_STOP = 4, 3
-"""Exit statuses."""
 _ENDS = ("terminated", "truncated")
 
 
@@ -127,9 +125,9 @@ def _ending_of(error: Exception) -> Ending:
     """Tells the operator what to look at first: the network, the robot, or the program."""
     text = fault_text(error).replace("call resume()", "run it again")  # the program ends here, nobody can resume it
     if isinstance(error, LinkLost):
-        return Ending(f"link lost: {text}", LINK_LOST)
+        return Ending(f"link lost: {text}", 4)
     if isinstance(error, SafetyStop):
-        return Ending(f"safety stop: {text}", SAFETY_STOP)
+        return Ending(f"safety stop: {text}", 3)
     return Ending(f"fault: {text}", 1)
 
 
@@ -209,11 +207,8 @@ class _JournalAgent(Agent):
             self._record = self._journal.begin(seed)
             self._pacer.start()
         else:  # the step that led to time t
-            record = self._record
-            info: dict[str, Any] = {}
-            if self.get((f"env/{SAYS_SUCCESS}", t))[0]:
-                info["is_success"] = self.get((f"env/{SUCCESS}", t))[0]
-            record.add(self.get(("env/reward", t))[0], info)
+            record, says = self._record, self.get((f"env/{SAYS_SUCCESS}", t))[0]
+            record.add(self.get(("env/reward", t))[0], self.get((f"env/{SUCCESS}", t))[0] if says else None)
             record.end = next((end for end in _ENDS if self.get((f"env/{end}", t))[0]), "stopped")
             watcher.ticked(record, self.get(("action", t - 1))[0], self._pacer)
             if record.complete:

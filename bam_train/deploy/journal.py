@@ -33,12 +33,11 @@ class EpisodeRecord:
         """Whether the environment ended it."""
         return self.end != "stopped"
 
-    def add(self, reward: float, info: Mapping[str, Any]) -> None:
+    def add(self, reward: float, success: bool | None) -> None:
         """Count one step."""
         self.total += float(reward)
         self.length += 1
-        if "is_success" in info:
-            self.success = bool(info["is_success"])
+        self.success = self.success if success is None else bool(success)
 
     def to_json(self) -> dict[str, Any]:
         """Plain values; a return that is not finite is None."""

@@ -1,7 +1,18 @@
-"""Tasks as `gymnasium.make` makes them, variants of plug-ins among them, without their robot."""
+"""Tasks as `gymnasium.make` makes them, variants of plug-ins among them, without their robot; and states of arms."""
+
+import numpy as np
 
 from bam_envs.core.registry import ENVIRONMENTS
+from bam_envs.core.robot import RobotState
 
 
 def make_task(env_id, num_envs=1, **options):
     return ENVIRONMENTS[env_id].make_task(num_envs, options)
+
+
+def arm_state(joints, velocity=(0.0,) * 6, collision=False, obstacle=(0.0, 0.0, 1.9)):
+    """One arm that was told to be at `joints`, and is; its obstacle is out of the way."""
+    joints = np.array([joints], dtype=float)
+    signals = {"joint_position": joints, "joint_velocity": np.array([velocity], dtype=float)}
+    signals |= {"object_position": np.array([obstacle], dtype=float), "object_quaternion": np.array([[1.0, 0, 0, 0]])}
+    return RobotState(signals, np.zeros(1), joints, {"collision": np.array([collision])})

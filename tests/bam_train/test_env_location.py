@@ -6,17 +6,10 @@ from bam_train.env_location import HERE, Place, addresses
 from bam_train.errors import SettingsError
 
 
-def test_the_simulation_is_here():
-    HERE.require_sane()
-    assert (HERE.is_remote, HERE.text) == (False, "")
-
-
 @pytest.mark.parametrize(
     ("text", "found"),
     [
         (None, ()),
-        ("", ()),
-        ("tcp://a:1", ("tcp://a:1",)),
         ("tcp://a:1, ws://b:2 ,", ("tcp://a:1", "ws://b:2")),
         (["a", "b"], ("a", "b")),
     ],
@@ -38,10 +31,6 @@ def test_addresses(text, found):
             "--ca-file is for a link, and the robot is simulated here; give --robot or --transport",
         ),
         (
-            Place(token_file="token"),
-            "--token-file is for a link, and the robot is simulated here; give --robot or --transport",
-        ),
-        (
             Place(robot="ws://a:1", ca_file="ca.pem"),
             "--ca-file says whom wss:// trusts, and ws://a:1 is without TLS; leave it out",
         ),
@@ -52,10 +41,6 @@ def test_addresses(text, found):
         (
             Place(transport=("tcp://a:1", "tcp://b:2", "tcp://a:1/")),
             "--transport: tcp://a:1 comes twice, and an address is one environment; give it once",
-        ),
-        (
-            Place(robot="ws://a:1", timeout=5.0),
-            "--timeout is how long an answer of --transport is waited for; leave it out",
         ),
         (Place(timeout=5.0), "--timeout is how long an answer of --transport is waited for; leave it out"),
         (Place(transport=("tcp://a:1",), timeout=0.0), "--timeout: expected a number above 0, found 0.0"),
@@ -68,6 +53,8 @@ def test_what_excludes_each_other_is_refused(place, message):
 
 
 def test_what_a_transport_is_opened_with():
+    HERE.require_sane()
+    assert (HERE.is_remote, HERE.text) == (False, "")
     place = Place(transport=("wss://a:1", "wss://b:2"), ca_file="ca.pem", timeout=2.5)
     place.require_sane()
     assert place.link_options == {"ca_file": "ca.pem", "token_file": None, "timeout": 2.5}

@@ -18,13 +18,13 @@ from bam_train.evaluation import (
 
 
 class Always:
-    """The same action in every row; remembers which rows were told to forget."""
+    """The same action in every environment; remembers which were told to forget."""
 
     def __init__(self, action=1):
         self.action, self.forgotten, self.batches = action, [], []
 
-    def reset(self, rows=None):
-        self.forgotten.append(None if rows is None else list(rows))
+    def reset(self, env_ids=None):
+        self.forgotten.append(None if env_ids is None else list(env_ids))
 
     def act_batch(self, observations):
         self.batches.append(len(observations))
@@ -67,12 +67,9 @@ def test_numbers_do_not_depend_on_how_many_run_side_by_side(corridor, num_envs):
     )
 
 
-def test_time_limit_ends_an_episode(corridor):
+def test_time_limit_and_no_success_where_the_environment_has_none(corridor):
     report = evaluate(Always(), corridor, {"slow": True}, episodes=2, seed=0)
     assert (report.length_mean, report.return_mean, report.success_rate) == (10.0, -2.5, 0.0)
-
-
-def test_no_success_where_the_environment_has_none(corridor):
     report = evaluate(Always(), corridor, {"says_success": False}, episodes=3, seed=0)
     assert (report.success_rate, report.success_interval, report.successes) == (None, None, None)
     assert json.loads(json.dumps(report.to_json(), allow_nan=False))["success_rate"] is None
@@ -89,28 +86,19 @@ def test_recurrent_state_is_forgotten_at_the_start_of_every_wave(corridor, start
     assert len(policy.batches) == 6  # at the end of an episode too, for nobody
 
 
-def test_given_rows_are_used_again_and_left_open(corridor):
-    rows = make_vector_env(corridor, None, 4)
-    policy = Always(1)
-    first = evaluate(policy, corridor, episodes=6, seed=1, env=rows)
-    again = evaluate(policy, corridor, episodes=6, seed=1, env=rows)
-    assert first == again
+def test_a_given_environment_is_used_again_and_left_open(corridor):
+    envs = make_vector_env(corridor, None, 4)
+    policy, seen = Always(1), []
+    first = evaluate(policy, corridor, episodes=6, seed=1, env=envs, on_progress=lambda *counts: seen.append(counts))
+    assert first == evaluate(policy, corridor, episodes=6, seed=1, env=envs)
     assert set(policy.batches) == {4}
-    assert not rows.closed
-    rows.close()
-
-
-def test_given_rows_must_reset_in_the_same_step(corridor):
-    rows = gym.make_vec(corridor, 2, vectorization_mode="sync")
+    assert seen == [(4, 6), (6, 6)]  # after every wave
+    assert not envs.closed
+    envs.close()
+    envs = gym.make_vec(corridor, 2, vectorization_mode="sync")
     with pytest.raises(SettingsError, match=r"^env: expected autoreset mode SAME_STEP, found AutoresetMode.NEXT_STEP$"):
-        evaluate(Always(), corridor, episodes=2, env=rows)
-    rows.close()
-
-
-def test_progress_after_every_wave(corridor):
-    seen = []
-    evaluate(Always(), corridor, episodes=5, seed=0, num_envs=2, on_progress=lambda *counts: seen.append(counts))
-    assert seen == [(2, 5), (4, 5), (5, 5)]
+        evaluate(Always(), corridor, episodes=2, env=envs)
+    envs.close()
 
 
 @pytest.mark.parametrize(
@@ -159,7 +147,7 @@ class Steady:
     def __init__(self, size):
         self.size = size
 
-    def reset(self, rows=None):
+    def reset(self, env_ids=None):
         pass
 
     def act_batch(self, observations):

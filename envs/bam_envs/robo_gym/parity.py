@@ -241,7 +241,7 @@ class DriveParity(DriveTask):
         self._previous[env_ids] = np.nan
 
     def _columns(self, state: RobotState) -> list[Array]:
-        return [*self.way(state), *state.signals["base_velocity"].T]
+        return [*self.distance_and_bearing(state), *state.signals["base_velocity"].T]
 
     def _bounded(self, observation: Floats) -> Floats:
         return require_inside(observation, self.observation_space, self.observation_labels)

@@ -188,7 +188,7 @@ class SafeRobot(metaclass=Sealed):
         self._bad, self._halts, self._status = 0, 0, ""
         self._sent_at: float | None = None
         self._forget()
-        if self._live is not None:  # a second gate would let a whole step through, as the first one does
+        if self._live is not None:  # of two gates, each would let a whole step through
             other = _GUARDED.get(robot)
             if other is not None and other() is not None:
                 raise InvalidValue(f"{self.spec.name} stands behind a SafeRobot already; command it through that one.")
@@ -325,8 +325,9 @@ class SafeRobot(metaclass=Sealed):
     def _begin_at(self, pause: float) -> Array:
         """The last command if the robot still follows it; else where the robot is, at rest. Shape: (m,)."""
         goes_on = self._sent_at is not None or self._live is None or self._in_lockstep()
-        if self._last is not None and goes_on and pause <= LATE * self.spec.period:
-            return self._last
+        last = self._last  # looked at once: a halt in another thread clears it
+        if last is not None and goes_on and pause <= LATE * self.spec.period:
+            return last
         if self._live is not None and self._state is not None:
             self._state = self._fresh_state()
         measured, command = self._measured(), self.spec.command

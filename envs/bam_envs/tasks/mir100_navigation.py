@@ -152,7 +152,7 @@ class DriveTask(TaskMemory):
         distance: Array = np.sqrt(dx * dx + dy * dy)
         return distance
 
-    def way(self, state: RobotState) -> tuple[Array, Array]:
+    def distance_and_bearing(self, state: RobotState) -> tuple[Array, Array]:
         """Distance [m] and bearing from -pi to pi [rad] of the target, seen from the base. Shape: (n,) each."""
         pose = state.signals["base_pose"]
         bearing = np.arctan2(self.target[:, 1] - pose[:, 1], self.target[:, 0] - pose[:, 0]) - pose[:, 2]
@@ -160,7 +160,7 @@ class DriveTask(TaskMemory):
 
     def _columns(self, state: RobotState) -> list[Array]:
         """The first four numbers of an observation. Shape: (n,) each."""
-        (distance, bearing), (v, w) = self.way(state), state.signals["base_velocity"].T
+        (distance, bearing), (v, w) = self.distance_and_bearing(state), state.signals["base_velocity"].T
         return [distance / DISTANCE_SCALE, bearing / math.pi, v / FASTEST[0], w / FASTEST[1]]
 
     def observe(self, state: RobotState) -> Floats:

@@ -1,4 +1,4 @@
-"""A simulated robot as a live one, in this process and in its own time, whose driver misbehaves when it is told to."""
+"""A simulated robot in the place of a live one, in this process and in simulated time; its driver can misbehave."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class DrivenRobot:
         return self.now
 
     def misbehave(self, fault: str, seconds: float, number: float = 0.0, after: float = 0.0) -> None:
-        """For some time the driver does not do what it is told; then the newest command counts at once.
+        """For some time the driver does not follow commands; then the newest one counts at once.
 
         Args:
             fault: ``"ignore"``: the robot stands where it is. ``"slow"``: it is no faster than `number`, a joint
@@ -112,7 +112,7 @@ class DrivenRobot:
         return self.measure()
 
     def _driven(self, command: Array) -> Array:
-        """What the robot is told when the driver is told `command`. Shape: (1, m) both."""
+        """What the driver sends the robot when it is sent `command`. Shape: (1, m) both."""
         if not self._begins - _ROUNDING <= self.now < self._ends - _ROUNDING:
             return command
         if self._fault == "delay":

@@ -24,7 +24,7 @@ _INT64 = np.iinfo(np.int64)
 
 
 class MirrorEnv(gym.Env[Any, Any]):
-    """Shows each action as the next observation, so that one sees what the link does to it.
+    """Returns each action as the next observation, which shows what the link does to it.
 
     Args:
         space: Of actions and observations.
@@ -194,8 +194,8 @@ class TransportContract:
         with self.serving(env) as transport:
             transport.connect()
             transport.reset()
-            env.fault = ZeroDivisionError("seven by nought")
-            assert "ZeroDivisionError: seven by nought" in str(raised(RemoteError, lambda: transport.step(1)))
+            env.fault = ZeroDivisionError("division by zero")
+            assert "ZeroDivisionError: division by zero" in str(raised(RemoteError, lambda: transport.step(1)))
             transport.reset()
             transport.step(2)
 
@@ -210,7 +210,7 @@ class TransportContract:
             assert "observation['x'][1] is NaN" in str(error)
 
     def test_closing_is_for_good(self) -> None:
-        """As often as one likes; a step afterwards is a lost link."""
+        """`close` is idempotent; a step afterwards is a lost link."""
         with self.serving(MirrorEnv(spaces.Discrete(3))) as transport:
             transport.connect()
             transport.reset()

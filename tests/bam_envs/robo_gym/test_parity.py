@@ -185,6 +185,8 @@ def test_arms_that_hardly_move(stem):
         options = {"fixed_object_position": [0.5, 0.6, 0.9]}
     steps, info = both.play(1, stay, **options)
     assert (steps, info["final_status"]) == (limit, status)
+    if both.follows:
+        assert info["targets_reached"] > 0
 
 
 def holding(both):
@@ -214,7 +216,7 @@ OPTIONS = [
 @pytest.mark.parametrize(("stem", "options", "scale", "hold", "steps"), OPTIONS)
 def test_options_of_arms(stem, options, scale, hold, steps):
     both = Both(stem, **options)
-    assert sum(both.play(seed, randomly(seed, scale, hold), steps=steps)[0] for seed in range(2)) > 20
+    assert both.play(1, randomly(1, scale, hold), steps=steps)[0] > 10
 
 
 def test_the_flange_reaches_its_target():
@@ -228,19 +230,10 @@ def test_the_flange_reaches_its_target():
     assert "success" in ends
 
 
-def test_ends_of_arms():
-    ends = {
-        stem: {Both(stem).play(seed, randomly(seed, hold=30))[1]["final_status"] for seed in range(4)} for stem in UR
-    }
-    assert all("collision" in statuses for statuses in ends.values()), ends
-
-
-def test_a_trajectory_is_followed():
-    """Without an obstacle near, waypoints are reached and counted."""
-    both = Both("AvoidanceRaad2022UR")
-    _, info = both.play(0, always(*np.zeros(5)), fixed_object_position=[0.9, 0.9, 0.95])
-    assert info["final_status"] == "success"
-    assert info["targets_reached"] > 0
+@pytest.mark.parametrize("stem", UR)
+def test_an_arm_collides(stem):
+    both = Both(stem)
+    assert any(both.play(seed, randomly(seed, hold=30))[1]["final_status"] == "collision" for seed in range(4))
 
 
 @pytest.mark.parametrize("live", [False, True])

@@ -7,9 +7,9 @@ import pytest
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.kinematics import UR10, quaternions
-from bam_envs.core.robot import RobotState
 from bam_envs.robots.ur import ur_model
 from bam_envs.tasks.isaac_reach import DEFAULT, EE_LINK, TOOL1
+from tests.bam_envs.making import arm_state as state
 from tests.bam_envs.making import make_task
 
 ROW = np.zeros(1, np.int64)
@@ -22,11 +22,6 @@ def began(options=None, **arguments):
     task = make_task("bam/isaac-reach-v0", **arguments)
     task.initial = task.sample_initial(ROW, [np.random.default_rng(0)], options or {})
     return task
-
-
-def state(joints, velocity=(0.0,) * 6, collision=False):
-    signals = {"joint_position": np.array([joints], float), "joint_velocity": np.array([velocity], float)}
-    return RobotState(signals, np.zeros(1), np.zeros((1, 6)), {"collision": np.array([collision])})
 
 
 def pose_of(joints, parity=False):

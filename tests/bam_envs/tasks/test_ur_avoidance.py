@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue
-from bam_envs.core.robot import RobotState
 from bam_envs.robots.ur import START, ur_model
 from bam_envs.tasks.ur_avoidance import POSE
+from tests.bam_envs.making import arm_state as state
 from tests.bam_envs.making import make_task
 
 ROW = np.zeros(1, np.int64)
 UR5 = ur_model("ur5").geometry
-AWAY = np.array([0.0, 0.0, 1.9])
 QUIET = np.zeros((1, 5), np.float32)
 LIMITS = np.array([2 * math.pi, 2 * math.pi, math.pi, 2 * math.pi, 2 * math.pi, 2 * math.pi])
 
@@ -23,13 +22,6 @@ def began(options=None, **arguments):
     task = make_task("bam/ur-avoidance-v0", **arguments)
     initial = task.sample_initial(ROW, [np.random.default_rng(0)], options or {})
     return task, initial
-
-
-def state(joints, obstacle=AWAY, collision=False):
-    """One arm at rest at `joints`."""
-    signals = {"joint_position": np.array([joints], float), "joint_velocity": np.zeros((1, 6))}
-    signals |= {"object_position": np.array([obstacle], float), "object_quaternion": np.array([[1.0, 0, 0, 0]])}
-    return RobotState(signals, np.zeros(1), np.zeros((1, 6)), {"collision": np.array([collision])})
 
 
 def scored(task, where, action=QUIET):
@@ -92,7 +84,9 @@ def test_nearness_to_flange_and_elbow():
     for place in (positions[0, -1], positions[0, 2]):
         for distance, reward in ((0.29, 0.0), (0.31, 0.002)):
             task, _ = began()
-            assert scored(task, state(POSE, np.add(place, [0, 0, distance])))[0] == pytest.approx(reward, abs=1e-15)
+            assert scored(task, state(POSE, obstacle=np.add(place, [0, 0, distance])))[0] == pytest.approx(
+                reward, abs=1e-15
+            )
 
 
 def test_collisions():
@@ -132,7 +126,7 @@ def test_what_is_seen_with_parity():
     reference = np.array([0.2, -0.1, 0.3, 0.4, 0.0, 0.0]) / LIMITS
     expected = [0.3, math.acos(2 / 3), math.atan2(0.2, 0.1), *[0.0] * 6, *-reference]
     expected += [length, math.acos(elbow[2] / length), math.atan2(elbow[1], elbow[0])]
-    observation = task.observe(state(np.zeros(6), obstacle))
+    observation = task.observe(state(np.zeros(6), obstacle=obstacle))
     np.testing.assert_array_equal(observation, np.array([expected], np.float32))
     space = task.observation_space
     assert space.contains(observation[0])
@@ -144,7 +138,7 @@ def test_what_is_seen_with_parity():
 def test_what_is_seen_scaled():
     task, _ = began({"joint_positions": [0.2, -0.1, 0.3, 0.4, 0.0, 0.0]})
     positions, rotations = UR5.link_poses(np.zeros((1, 6)))
-    observation = task.observe(state(np.zeros(6), positions[0, -1] + rotations[0, -1] @ [0.1, 0.2, 0.2]))
+    observation = task.observe(state(np.zeros(6), obstacle=positions[0, -1] + rotations[0, -1] @ [0.1, 0.2, 0.2]))
     expected = [0.15, math.acos(2 / 3) / math.pi, math.atan2(0.2, 0.1) / math.pi, *[0.0] * 6]
     expected += [*-np.array([0.2, -0.1, 0.3, 0.4, 0.0, 0.0]) / LIMITS * 10, 0.0, 0.0, 0.0]
     np.testing.assert_allclose(observation, [expected], rtol=1e-6)

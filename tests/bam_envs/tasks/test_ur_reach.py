@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue, UnknownName
-from bam_envs.core.robot import RobotState
 from bam_envs.robots.ur import START as STRAIGHT
 from bam_envs.robots.ur import UR_MODELS
 from bam_envs.tasks.ur_reach import START, workspace_point
+from tests.bam_envs.making import arm_state as state_at
 from tests.bam_envs.making import make_task
 
 UR5 = UR_MODELS["ur5"]
@@ -23,12 +23,6 @@ def above(offset):
 
 def far_pose(distance=0.4):
     return [*(above([0.0, 0.0, distance])), 0.0, 0.0, 0.0]
-
-
-def state_at(joints, collision=False):
-    joints = np.array([joints], dtype=float)
-    signals = {"joint_position": joints, "joint_velocity": np.zeros((1, 6))}
-    return RobotState(signals, np.zeros(1), joints, {"collision": np.array([collision])})
 
 
 def begun(parity=False, target=None, **options):

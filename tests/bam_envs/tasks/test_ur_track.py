@@ -6,14 +6,13 @@ import math
 import numpy as np
 import pytest
 
-from bam_envs.core.robot import RobotState
 from bam_envs.core.splines import splines_through
 from bam_envs.robots.ur import ur_model
+from tests.bam_envs.making import arm_state as state
 from tests.bam_envs.making import make_task
 
 ROW = np.zeros(1, np.int64)
 UR5 = ur_model("ur5").geometry
-AWAY = np.array([0.0, 0.0, 1.9])
 QUIET = np.zeros((1, 5), np.float32)
 LIMITS = np.array([2 * math.pi, 2 * math.pi, math.pi, 2 * math.pi, 2 * math.pi, 2 * math.pi])
 FIRST = [[0.0, -1.5, -1.0, 0.0, 0.5, 0.0], [0.01, -1.5, -1.0, 0.0, 0.5, 0.0], [0.02, -1.5, -1.0, 0.0, 0.5, 0.0]]
@@ -32,13 +31,6 @@ def began(tmp_path):
         return task
 
     return begin
-
-
-def state(joints, obstacle=AWAY, collision=False):
-    """One arm at rest at `joints`."""
-    signals = {"joint_position": np.array([joints], float), "joint_velocity": np.zeros((1, 6))}
-    signals |= {"object_position": np.array([obstacle], float), "object_quaternion": np.array([[1.0, 0, 0, 0]])}
-    return RobotState(signals, np.zeros(1), np.zeros((1, 6)), {"collision": np.array([collision])})
 
 
 def step(task, joints, action=QUIET, **others):
@@ -143,7 +135,7 @@ def test_what_is_seen(began, parity):
     step(task, FIRST[0])
     step(task, FIRST[0])
     task.command(QUIET, state(FIRST[0]))
-    observation = task.observe(state(FIRST[0], [0.3, 0.2, 0.4]))[0]
+    observation = task.observe(state(FIRST[0], obstacle=[0.3, 0.2, 0.4]))[0]
     assert task.observation_space.contains(observation)
     np.testing.assert_allclose(observation[3:9], np.array(FIRST[0]) / LIMITS, rtol=1e-6)
     delta = -0.02 / (2 * math.pi) * (1 if parity else 10)

@@ -13,7 +13,7 @@ import pytest
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.eval import main as evaluate
 from bam_train.cli.export import main
-from bam_train.policy import FrozenPolicy
+from bam_train.cli.train import main as train
 
 NEW = "learner_group/learner/rl_module/default_policy"
 WARNING = "bam-export: warning: reading {} runs whatever code is in it (--trust-pickle)\n"
@@ -54,20 +54,31 @@ def test_the_script_runs_the_policy_of_a_directory_of_no_robot(rllib_directories
     assert re.fullmatch(r"episode 1: return \d+\.00, no success, clipped 0 of \d+ actions", out.splitlines()[0])
 
 
-def test_it_acts_as_rllib_does(rllib_directories, run):
+def test_one_of_the_present_api(rllib_directories, run):
     given = rllib_directories / "ppo"
-    status, out, err = run(main, given, "--trust-pickle", "--out", "policy.zip")
+    status, out, err = run(main, given, "--trust-pickle")
+    name = "checkpoints/Pendulum-v1-rllib-ppo.zip"
     assert (status, err) == (0, WARNING.format(given))
     lines = out.splitlines()
-    assert lines[0].startswith(f"policy.zip: ppo on Pendulum-v1, 100 steps, out of {given} of Ray 2.")
+    assert lines[0].startswith(f"{name}: ppo on Pendulum-v1, 100 steps, out of {given} of Ray 2.")
     assert lines[1].startswith("  checked   against the actions of RLlib 2.")
     assert lines[2:] == [
-        "  next      bam-eval policy.zip, bam-deploy policy.zip",
-        "            bam-train --resume policy.zip --steps N",
+        f"  next      bam-eval {name}, bam-deploy {name}",
+        f"            bam-train --resume {name} --steps N",
     ]
-    with np.load(rllib_directories / "ppo.npz") as arrays:
-        found = FrozenPolicy.load("policy.zip").act_batch(arrays["observation"])
-        np.testing.assert_allclose(found, arrays["action"], rtol=0, atol=1e-5)
+    checkpoint = Checkpoint.open(name)
+    manifest = checkpoint.manifest
+    source = manifest.settings["exported"]
+    own = (manifest.env, manifest.env_kwargs, manifest.algorithm, manifest.trainer)
+    assert own == ("Pendulum-v1", {}, "ppo", "rllib")
+    assert (manifest.scores, manifest.steps, manifest.seed) == ({}, 100, 0)
+    assert (source["directory"], source["policy"]) == (str(given), "default_policy")
+    assert source["golden"] == f"RLlib {source['ray']}"
+    names = sorted(manifest.sha256)
+    assert names[:2] == ["bam/golden.safetensors", "bam/policy.onnx"]
+    kinds = {name.rpartition("/")[2] for name in names[2:]}  # states alone, and not how objects are made
+    assert kinds == {"notes.json", "algorithm_state.pkl", "module_state.pkl", "state.pkl"}
+    assert checkpoint.arrays("bam/golden.safetensors")["observation"].shape == (256, 3)
 
 
 def test_one_of_the_old_layout_needs_no_trust_and_cannot_be_resumed(run):
@@ -77,32 +88,10 @@ def test_one_of_the_old_layout_needs_no_trust_and_cannot_be_resumed(run):
     assert lines[0].startswith(f"policy.zip: sac on Pendulum-v1, out of {OLD_LAYOUT / 'sac'} of Ray 2.")
     assert lines[1].startswith("  checked   against the actions of PyTorch")
     assert lines[3] == "  bam-train --resume cannot go on from it: it is not of RLlib's present API"
-    command = [sys.executable, "-m", "bam_train.cli.train", "--resume", "policy.zip", "--steps", "1000"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
     text = "was exported from a directory of RLlib and holds the policy alone: training cannot go on from it"
     remedy = "Train anew, or go on with RLlib from its own directory"
-    assert (done.returncode, done.stderr) == (1, f"bam-train: policy.zip: {text}. {remedy}\n")
-
-
-def test_manifest(rllib_directories, run):
-    run(main, rllib_directories / "ppo", "--trust-pickle")
-    checkpoint = Checkpoint.open("checkpoints/Pendulum-v1-rllib-ppo.zip")
-    manifest = checkpoint.manifest
-    source = manifest.settings["exported"]
-    assert (manifest.env, manifest.env_kwargs, manifest.algorithm, manifest.trainer) == (
-        "Pendulum-v1",
-        {},
-        "ppo",
-        "rllib",
-    )
-    assert (manifest.scores, manifest.steps, manifest.seed) == ({}, 100, 0)
-    assert (source["directory"], source["policy"]) == (str(rllib_directories / "ppo"), "default_policy")
-    assert source["golden"] == f"RLlib {source['ray']}"
-    names = sorted(manifest.sha256)
-    assert names[:2] == ["bam/golden.safetensors", "bam/policy.onnx"]
-    kinds = {name.rpartition("/")[2] for name in names[2:]}  # states alone, and not how objects are made
-    assert kinds == {"notes.json", "algorithm_state.pkl", "module_state.pkl", "state.pkl"}
-    assert checkpoint.arrays("bam/golden.safetensors")["observation"].shape == (256, 3)
+    refused = (1, "", f"bam-train: policy.zip: {text}. {remedy}\n")
+    assert run(train, "--resume", "policy.zip", "--steps", 1000) == refused
 
 
 def test_it_can_be_evaluated(rllib_directories, run):
@@ -111,24 +100,20 @@ def test_it_can_be_evaluated(rllib_directories, run):
     assert (status, json.loads(out)["env"]) == (0, "CartPole-v1")
 
 
-def test_neither_ray_nor_torch_is_needed_to_act(run):
-    run(main, OLD_LAYOUT / "sac", "--out", "policy.zip")
-    program = (
+def test_neither_ray_nor_torch_is_needed_to_act_nor_ray_to_export_the_old_layout():
+    export = (
+        "import sys; sys.modules['ray'] = None; from bam_train.cli.export import main; "
+        f"main([{str(OLD_LAYOUT / 'ppo')!r}, '--out', 'policy.zip'])"
+    )
+    act = (
         "import sys, time, numpy as np; from bam_train.policy import FrozenPolicy; "
         "FrozenPolicy.load('policy.zip').act(np.zeros(3, np.float32)); "
         "print(sorted({'ray', 'torch'} & set(sys.modules)), time.process_time() < 1.2)"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout == "[] True\n"
-
-
-def test_the_old_layout_needs_no_ray():
-    program = (
-        "import sys; sys.modules['ray'] = None; from bam_train.cli.export import main; "
-        f"main([{str(OLD_LAYOUT / 'ppo')!r}, '--out', 'policy.zip'])"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    done = subprocess.run([sys.executable, "-c", export], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
+    done = subprocess.run([sys.executable, "-c", act], capture_output=True, text=True, check=True)
+    assert done.stdout == "[] True\n"
 
 
 def test_names_of_files(run, refused, folder):
@@ -212,15 +197,3 @@ def test_a_module_that_a_directory_names_is_not_imported(with_config, run, refus
     assert not (folder / "mark").exists()
     assert run(main, root, "--env", "theirs:Pendulum-v1", "--out", "b.zip")[0] == 0
     assert (folder / "mark").exists()
-
-
-def test_what_is_no_directory_of_rllib(refused, folder):
-    assert refused("nowhere") == "nowhere: no such directory. Give one that algo.save_to_path or algo.save wrote"
-    (folder / "file").touch()
-    assert refused("file") == "file: is a file, expected a checkpoint directory of RLlib"
-
-
-def test_only_rllib_reads_the_present_layout(rllib_directories, refused):
-    text = "is read by RLlib itself, which runs whatever code is in its pickles. If you trust its maker, add "
-    given = rllib_directories / "ppo"
-    assert refused(given) == f"{given}: {text}--trust-pickle"

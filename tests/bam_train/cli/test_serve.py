@@ -10,8 +10,7 @@ import pytest
 
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_train.cli.flags import ServeConfig
-from bam_train.cli.serve import env_kwargs, main
-from bam_train.errors import SettingsError
+from bam_train.cli.serve import main
 
 
 @pytest.fixture
@@ -60,12 +59,6 @@ def test_it_says_who_is_in_command_and_one_line_for_each_way_in(start):
     assert process.stderr.readline() == said.replace("is in command", "is no longer in command")
 
 
-def test_wrong_flags_are_one_line(run):
-    status, out, err = run(main, "--fast", "--realtime")
-    assert (status, out) == (1, "")
-    assert err == "bam-serve: --realtime and --fast exclude each other; give one of the two.\n"
-
-
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
@@ -77,6 +70,7 @@ def test_wrong_flags_are_one_line(run):
         ),
         (["--set", "robot=ws://127.0.0.1:1", "--set", "randomise=1"], "env_kwargs: unknown setting 'randomise'"),
         (["--set", "robot=ws://127.0.0.1:1"], "ws://127.0.0.1:1: refused: nothing listens there."),
+        (["--fast", "--realtime"], "--realtime and --fast exclude each other; give one of the two."),
         (["--num-envs", "0"], "--num-envs: expected a whole number of at least 1, found 0"),
         (["--env", "CartPole-v1", "--token-file", "/no/such"], "The token file /no/such cannot be read: No such file"),
         (
@@ -89,6 +83,7 @@ def test_wrong_flags_are_one_line(run):
             ["--bind", "0.0.0.0:9091"],
             "--bind: expected an address without a port, found '0.0.0.0:9091'; give --bind 0.0.0.0 --port 9091",
         ),
+        (["--set", "a.b=1"], "--set a.b=1: expected the name of an argument, found one with a dot"),
         (["--namespace", "a b"], "--namespace must be letters, digits and _, such as bam_001, not 'a b'."),
     ],
 )
@@ -107,12 +102,6 @@ def test_a_port_in_use(run):
         status, _, err = run(main, "--env", "CartPole-v1", "--port", port)
     assert status == 1
     assert err.startswith(f"bam-serve: Port {port} on 127.0.0.1 is in use.")
-
-
-def test_arguments_of_the_environment():
-    assert env_kwargs(["randomize=true", "x=3"]) == {"randomize": True, "x": 3}
-    with pytest.raises(SettingsError, match=r"--set a\.b=1: expected the name of an argument, found one with a dot"):
-        env_kwargs(["a.b=1"])
 
 
 def test_the_flags_are_the_options_of_a_server():

@@ -64,9 +64,3 @@ def test_a_terminal_gets_a_panel(monkeypatch):
     for words in ("ppo on bam/pick-v0, seed 0", "12.29k of 300k steps", "5,164 steps/s", "50 %", "55.7 s", "97 %"):
         assert words in shown
     assert "[dim]" not in shown
-
-
-def test_elsewhere_there_are_plain_lines(capsys):
-    with make_display("ppo on bam/pick-v0"):
-        pass
-    assert capsys.readouterr().err == "ppo on bam/pick-v0\n"

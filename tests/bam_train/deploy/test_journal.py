@@ -45,7 +45,7 @@ def journal():
     journal.startup.finish("first action")
     for success, end in ((True, "terminated"), (False, "truncated"), (False, "stopped")):
         record = journal.begin(len(journal.records))
-        record.add(1.5, {"is_success": success})
+        record.add(1.5, success)
         record.end = end
     return journal
 

@@ -111,10 +111,10 @@ class ArmContacts:
         start, end, radius = arms.start[:, _LOW_LINKS], arms.end[:, _LOW_LINKS], arms.radius[_LOW_LINKS]
         lowest = np.minimum(start[:, :, 2], end[:, :, 2]) - radius
         touching: Flags = np.logical_or.reduce(lowest < GROUND, axis=1)
-        row, link = np.nonzero(lowest < TABLE[1, 2])
-        if len(row):  # the others are above the table
-            overlaps = box_distance2(start[row, link], end[row, link]) < radius[link] ** 2
-            touching[row[overlaps]] = True
+        arm, link = np.nonzero(lowest < TABLE[1, 2])
+        if len(arm):  # the others are above the table
+            overlaps = box_distance2(start[arm, link], end[arm, link]) < radius[link] ** 2
+            touching[arm[overlaps]] = True
         return touching
 
     def touching_ball(self, arms: Capsules, middle: Array) -> Flags:
@@ -163,7 +163,7 @@ def _outside(point: Array) -> Array:
 
 
 def _dot(one: Array, other: Array) -> Array:
-    """Products along the last axis, written out: a row's sum does not depend on how many rows there are."""
+    """Dot products along the last axis, written out: each is the same in a batch of any size."""
     product: Array = one[..., 0] * other[..., 0] + one[..., 1] * other[..., 1] + one[..., 2] * other[..., 2]
     return product
 

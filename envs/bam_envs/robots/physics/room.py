@@ -21,7 +21,7 @@ Seeds = NDArray[np.uint64]
 BOX_EDGE = 0.5
 """Edge of a box [m]."""
 NOWHERE = (1000.0, 1000.0, 0.0)
-"""Pose of a box that is not there: out of everybody's sight [m, m, rad]."""
+"""Pose of a box that is not there: out of sight [m, m, rad]."""
 _HALF = (FOOTPRINT[0] / 2, FOOTPRINT[1] / 2)
 NOISE = 0.01
 """Standard deviation of a measured range [m]."""

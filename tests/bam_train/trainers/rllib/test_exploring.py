@@ -16,66 +16,43 @@ ACTED = gym.spaces.Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 4.0], n
 SEEN = np.array([0.1, -0.5, 0.3], np.float32)
 
 
-@pytest.fixture(scope="module")
-def config():
-    made = PPOConfig().environment(observation_space=OBSERVED, action_space=ACTED)
-    return made.rl_module(model_config={"fcnet_hiddens": [8]})
-
-
-@pytest.fixture(scope="module")
-def module(config):
+def made(**model):
+    """Module and configuration."""
+    config = PPOConfig().environment(observation_space=OBSERVED, action_space=ACTED)
+    config.rl_module(model_config={"fcnet_hiddens": [8], **model})
     torch.manual_seed(0)  # its weights; what ran before has drawn from the same generator
-    return config.get_rl_module_spec(spaces={"default_policy": (OBSERVED, ACTED)}).build()
+    return config.get_rl_module_spec(spaces={"default_policy": (OBSERVED, ACTED)}).build(), config
 
 
-@pytest.fixture(scope="module")
-def parts(module, config):
-    return parts_of(module, None, config, (OBSERVED, ACTED))
-
-
-@pytest.fixture(autouse=True)
-def same_draws():
-    torch.manual_seed(1)
-
-
-def drawn(policy, count):
+def drawn(policy, count, seed):
+    torch.manual_seed(seed)
     return np.array([policy.act(SEEN) for _ in range(count)])
 
 
-def test_actions_are_drawn_about_the_best_one_and_stay_inside(parts, module, config):
+def test_actions_are_drawn_about_the_best_one_and_stay_inside():
+    module, config = made()
     policy = RLlibPolicy(module, None, config, (OBSERVED, ACTED), explore=True)
     policy.reset()
-    actions = drawn(policy, 300)
+    actions = drawn(policy, 300, seed=1)
     assert actions.dtype == np.float32
     assert ((ACTED.low <= actions) & (actions <= ACTED.high)).all()
     assert (actions.std(axis=0) > 0.5).all()
-    frozen = FrozenPolicy.from_graph(freeze(parts), space_to_json(OBSERVED), space_to_json(ACTED))
+    graph = freeze(parts_of(module, None, config, (OBSERVED, ACTED)))
+    frozen = FrozenPolicy.from_graph(graph, space_to_json(OBSERVED), space_to_json(ACTED))
     np.testing.assert_allclose(actions.mean(axis=0), frozen.act(SEEN), atol=0.4)
 
 
-def test_a_seed_gives_the_same_actions(parts, module, config):
+def test_a_seed_gives_the_same_actions_though_the_trainer_goes_on():
+    module, config = made()
     policy = RLlibPolicy(module, None, config, (OBSERVED, ACTED), explore=True)
-    torch.manual_seed(3)
-    first = drawn(policy, 4)
-    torch.manual_seed(3)
-    np.testing.assert_array_equal(drawn(policy, 4), first)
-
-
-def test_the_trainer_may_go_on(parts, module, config):
-    policy = RLlibPolicy(module, None, config, (OBSERVED, ACTED), explore=True)
-    before = {name: value.clone() for name, value in module.state_dict().items()}
-    torch.manual_seed(0)
-    first = policy.act(SEEN)
+    first = drawn(policy, 4, seed=3)
     with torch.no_grad():
         for value in module.parameters():
             value.add_(1.0)
-    torch.manual_seed(0)
-    np.testing.assert_array_equal(policy.act(SEEN), first)
-    module.load_state_dict(before)
+    np.testing.assert_array_equal(drawn(policy, 4, seed=3), first)
 
 
-def test_a_recurrent_policy_is_refused(config):
-    recurrent = config.copy(copy_frozen=False).rl_module(model_config={"fcnet_hiddens": [8], "use_lstm": True})
-    module = recurrent.get_rl_module_spec(spaces={"default_policy": (OBSERVED, ACTED)}).build()
+def test_a_recurrent_policy_is_refused():
+    module, config = made(use_lstm=True)
     with pytest.raises(SettingsError, match="a recurrent policy cannot explore here"):
-        RLlibPolicy(module, None, recurrent, (OBSERVED, ACTED), explore=True)
+        RLlibPolicy(module, None, config, (OBSERVED, ACTED), explore=True)

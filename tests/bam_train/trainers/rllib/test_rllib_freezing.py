@@ -1,6 +1,5 @@
 """The frozen graph against RLlib's own module, distribution and connectors, for every algorithm and kind of network."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -37,7 +36,7 @@ SEVERAL = Dict(
 class Live:
     """A module of an algorithm, untrained, with the connectors and the configuration that it would be trained with."""
 
-    def __init__(self, algo="ppo", seen=NUMBERS, acts=ARM, pieces=(), training=None, spec=None, **model):
+    def __init__(self, algo="ppo", seen=NUMBERS, acts=ARM, pieces=(), training=None, actions=None, spec=None, **model):
         self.spaces = (seen, acts)
         config = RLLIB_ALGORITHMS[algo].load()().environment(observation_space=seen, action_space=acts)
         if spec is None:
@@ -46,7 +45,7 @@ class Live:
             config.rl_module(rl_module_spec=spec)
         if pieces:
             config.env_runners(env_to_module_connector=lambda env=None, spaces=None, device=None: [p() for p in pieces])
-        self.config = config.training(**(training or {}))
+        self.config = config.training(**(training or {})).environment(**(actions or {}))
         pair = {INPUT_ENV_SPACES: self.spaces, INPUT_ENV_SINGLE_SPACES: self.spaces}
         self.before = config.build_env_to_module_connector(env=None, spaces=pair)
         self._learn_statistics()
@@ -84,120 +83,6 @@ class Live:
         return self.own.actions(one_by_one(observations))
 
 
-def both(live, n=300):
-    """RLlib's actions and the frozen policy's for the same observations."""
-    observations = draw(live.parts, n, np.random.default_rng(0))
-    found = live.policy().act_batch(observations.get("", observations))
-    return live.actions(observations), found
-
-
-def require_same(live, n=300):
-    expected, found = both(live, n)
-    assert found.dtype == live.spaces[1].dtype
-    assert len(np.unique(expected, axis=0)) > 1
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
-    if isinstance(live.spaces[1], Box):
-        assert not np.array_equal(found, expected.round(2))
-
-
-@pytest.mark.parametrize("algo", [name for name, row in RLLIB_ALGORITHMS.items() if "Box" in row.actions])
-def test_continuous_actions(algo):
-    require_same(Live(algo))
-
-
-@pytest.mark.parametrize("algo", [name for name, row in RLLIB_ALGORITHMS.items() if "Discrete" in row.actions])
-def test_discrete_actions(algo):
-    require_same(Live(algo, acts=Discrete(4), head_fcnet_hiddens=[8]))
-
-
-@pytest.mark.parametrize("algo", ["ppo", "appo", "impala", "bc", "marwil"])
-def test_several_discrete_actions(algo):
-    require_same(Live(algo, acts=MultiDiscrete([3, 4])))
-
-
-@pytest.mark.parametrize("shared", [True, False])
-def test_value_network_of_its_own_or_not(shared):
-    require_same(Live(vf_share_layers=shared))
-
-
-@pytest.mark.parametrize("word", ["tanh", "relu", "swish", "silu", "elu", "linear", None, "LeakyReLU", "GELU"])
-def test_activations(word):
-    require_same(Live(fcnet_activation=word, head_fcnet_hiddens=[8], head_fcnet_activation=word))
-
-
-@pytest.mark.parametrize("model", [{"free_log_std": True}, {"fcnet_use_layernorm": True}, {"fcnet_hiddens": [16]}])
-def test_other_networks(model):
-    require_same(Live(**model))
-
-
-def test_normalised_observations():
-    require_same(Live("sac", pieces=[MeanStdFilter]))
-
-
-def test_observations_that_are_normalised_far_from_their_mean():
-    live = Live(pieces=[MeanStdFilter])
-    observation = np.array([[0.9, -1.9, 2.9], [1e6, 1e6, -1e6]], np.float32)
-    np.testing.assert_allclose(live.policy().act_batch(observation), live.actions({"": observation}), rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("pieces", [[FlattenObservations], [FlattenObservations, MeanStdFilter]])
-def test_dict_observations(pieces):
-    require_same(Live(seen=SEVERAL, pieces=pieces))
-
-
-def test_filter_before_flattening():
-    require_same(Live(seen=Box(-1, 1, (2, 3), np.float64), pieces=[MeanStdFilter, FlattenObservations]))
-
-
-@pytest.mark.parametrize("seen", [Discrete(4), MultiBinary(4), MultiDiscrete([2, 3])])
-def test_whole_numbers_one_hot(seen):
-    require_same(Live(seen=seen, pieces=[FlattenObservations]))
-
-
-def test_double_precision():
-    live = Live(seen=Box(-1, 1, (3,), np.float64), acts=Box(-2, 2, (2,), np.float64), pieces=[MeanStdFilter])
-    require_same(live)
-
-
-@pytest.mark.parametrize(
-    ("normalize", "clip"), [(True, False), (False, True), (False, False), (True, True)], ids=["n", "c", "-", "nc"]
-)
-def test_what_is_done_with_actions(normalize, clip):
-    live = Live()
-    live.config.environment(normalize_actions=normalize, clip_actions=clip)
-    require_same(live)
-
-
-def test_unbounded_actions():
-    require_same(Live(acts=Box(-np.inf, np.inf, (2,), np.float32)))
-
-
-@pytest.mark.parametrize(
-    ("algo", "shape", "model"),
-    [
-        ("ppo", (10, 10, 3), {}),
-        ("sac", (64, 64, 1), {}),
-        ("dqn", (20, 30, 4), {"conv_filters": [[8, 4, 2, "valid"], [8, [3, 3], 1]], "conv_activation": "elu"}),
-    ],
-)
-def test_images(algo, shape, model):
-    live = Live(algo, Box(-1, 1, shape, np.float32), Discrete(3), **model)
-    require_same(live, 60)
-
-
-@pytest.mark.parametrize(
-    "training",
-    [
-        {"dueling": False},
-        {"double_q": False},
-        {"num_atoms": 11, "v_min": -5.0, "v_max": 5.0},
-        {"num_atoms": 11, "v_min": -5.0, "v_max": 5.0, "dueling": False},
-    ],
-)
-def test_kinds_of_dqn(training):
-    require_same(Live("dqn", acts=Discrete(3), training=training))
-
-
 class OwnModule(TorchRLModule):
     """A network that is not RLlib's."""
 
@@ -208,8 +93,78 @@ class OwnModule(TorchRLModule):
         return {"action_dist_inputs": torch.sin(self.layer(batch["obs"]))}
 
 
-def test_a_module_of_ones_own_is_traced():
-    require_same(Live(spec=RLModuleSpec(module_class=OwnModule)))
+ALGORITHMS = {
+    "continuous": ("Box", {}),
+    "discrete": ("Discrete", {"acts": Discrete(4), "head_fcnet_hiddens": [8]}),
+    "several": ("MultiDiscrete", {"acts": MultiDiscrete([3, 4])}),
+}
+ATOMS = {"num_atoms": 11, "v_min": -5.0, "v_max": 5.0}
+MATRIX = Box(-1, 1, (2, 3), np.float64)
+CASES = {
+    **{
+        f"{algo}-{kind}": {"algo": algo, **given}
+        for kind, (space, given) in ALGORITHMS.items()
+        for algo, row in RLLIB_ALGORITHMS.items()
+        if space in row.actions
+    },
+    **{
+        f"activation-{word}": {"fcnet_activation": word, "head_fcnet_hiddens": [8], "head_fcnet_activation": word}
+        for word in ("tanh", "relu", "swish", "silu", "elu", "linear", None, "LeakyReLU", "GELU")
+    },
+    "value-shared": {"vf_share_layers": True},
+    "value-alone": {"vf_share_layers": False},
+    "free-log-std": {"free_log_std": True},
+    "layer-norm": {"fcnet_use_layernorm": True},
+    "one-layer": {"fcnet_hiddens": [16]},
+    "own-module": {"spec": RLModuleSpec(module_class=OwnModule)},
+    "normalised": {"algo": "sac", "pieces": [MeanStdFilter]},
+    "dict": {"seen": SEVERAL, "pieces": [FlattenObservations]},
+    "dict-normalised": {"seen": SEVERAL, "pieces": [FlattenObservations, MeanStdFilter]},
+    "filter-first": {"seen": MATRIX, "pieces": [MeanStdFilter, FlattenObservations]},
+    "one-hot": {"seen": Discrete(4), "pieces": [FlattenObservations]},
+    "bits": {"seen": MultiBinary(4), "pieces": [FlattenObservations]},
+    "one-hots": {"seen": MultiDiscrete([2, 3]), "pieces": [FlattenObservations]},
+    "double-precision": {
+        "seen": Box(-1, 1, (3,), np.float64),
+        "acts": Box(-2, 2, (2,), np.float64),
+        "pieces": [MeanStdFilter],
+    },
+    "clipped-actions": {"actions": {"normalize_actions": False, "clip_actions": True}},
+    "raw-actions": {"actions": {"normalize_actions": False, "clip_actions": False}},
+    "normalised-and-clipped": {"actions": {"normalize_actions": True, "clip_actions": True}},
+    "unbounded-actions": {"acts": Box(-np.inf, np.inf, (2,), np.float32)},
+    "image-ppo": {"seen": Box(-1, 1, (10, 10, 3), np.float32), "acts": Discrete(3)},
+    "image-sac": {"algo": "sac", "seen": Box(-1, 1, (64, 64, 1), np.float32), "acts": Discrete(3)},
+    "image-dqn": {
+        "algo": "dqn",
+        "seen": Box(-1, 1, (20, 30, 4), np.float32),
+        "acts": Discrete(3),
+        "conv_filters": [[8, 4, 2, "valid"], [8, [3, 3], 1]],
+        "conv_activation": "elu",
+    },
+    **{
+        f"dqn-{k}": {"algo": "dqn", "acts": Discrete(3), "training": training}
+        for k, training in enumerate(({"dueling": False}, {"double_q": False}, ATOMS, {**ATOMS, "dueling": False}))
+    },
+}
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_the_graph_acts_as_rllib(case):
+    live = Live(**case)
+    observations = draw(live.parts, 60 if "conv_filters" in case else 200, np.random.default_rng(0))
+    expected, found = live.actions(observations), live.policy().act_batch(observations.get("", observations))
+    assert found.dtype == live.spaces[1].dtype
+    assert len(np.unique(expected, axis=0)) > 1
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
+    if isinstance(live.spaces[1], Box):
+        assert not np.array_equal(found, expected.round(2))
+
+
+def test_observations_that_are_normalised_far_from_their_mean():
+    live = Live(pieces=[MeanStdFilter])
+    observation = np.array([[0.9, -1.9, 2.9], [1e6, 1e6, -1e6]], np.float32)
+    np.testing.assert_allclose(live.policy().act_batch(observation), live.actions({"": observation}), rtol=0, atol=1e-5)
 
 
 def test_the_live_module_is_left_as_it_was():
@@ -232,12 +187,6 @@ def test_golden_actions_are_rllibs():
 class OwnConnector(ConnectorV2):
     def __call__(self, *, batch, **kwargs):
         return batch
-
-
-def test_what_cannot_be_frozen():
-    with pytest.raises(PolicyError) as error:
-        freeze(Live(use_lstm=True).parts)
-    assert str(error.value) == "a recurrent network of RLlib cannot be frozen; train without use_lstm"
 
 
 @pytest.mark.parametrize(
@@ -273,8 +222,7 @@ def test_spaces_that_do_not_fit_the_weights():
         freeze(parts)
 
 
-def test_the_config_is_not_one_of_an_algorithm():
+def test_a_config_of_no_algorithm():
     live = Live()
     config = AlgorithmConfig().environment(observation_space=NUMBERS, action_space=ARM)
     assert parts_of(live.module, live.before, config, live.spaces).algorithm == ""
-    assert isinstance(live.parts.observation_space, gym.Space)

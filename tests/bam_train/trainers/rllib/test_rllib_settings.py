@@ -23,90 +23,59 @@ def test_runners_share_the_environments(number, runners, each):
     assert envs_each(TrainSettings(env="bam/reach-v0", algo="ppo", num_envs=number, num_env_runners=runners)) == each
 
 
+SCHEDULE = "{}: expected a number or a schedule [[0, value], [step, value]"
+WRONG = [
+    ("ppo", "gama", 0.9, "Unknown ppo hyperparameter 'gama'. Did you mean 'gamma'?"),
+    ("ppo", "train_batch_size", 9, "train_batch_size is not a hyperparameter here: use train_batch_size_per_learner"),
+    ("ppo", "num_workers", 1, "num_workers is not a hyperparameter here: use --num-env-runners"),
+    ("ppo", "learning_rate", 1, "learning_rate is not a hyperparameter here: use lr"),
+    ("ppo", "horizon", 1, "horizon: there is none here; the environment ends its episodes"),
+    ("ppo", "lr", "fast", "lr: expected a number or a schedule [[step, value], ...], found 'fast'"),
+    ("ppo", "lr", -1, "lr: expected a number above 0, found -1"),
+    ("ppo", "lr", [], SCHEDULE.format("lr")),
+    ("ppo", "lr", [[0, 1e-3]], SCHEDULE.format("lr")),
+    ("ppo", "lr", [[5, 1e-3], [9, 0.0]], SCHEDULE.format("lr")),
+    ("ppo", "lr", [[0, 1e-3], [9, 0.0], [8, 0.0]], SCHEDULE.format("lr")),
+    ("ppo", "entropy_coeff", [[0, 1e-3], [9]], SCHEDULE.format("entropy_coeff")),
+    ("ppo", "lr", [[0, 1e-3], [9, -1]], "lr: expected a number of at least 0, found -1"),
+    ("ppo", "gamma", None, "gamma: expected a number, found None"),
+    ("ppo", "num_epochs", None, "num_epochs: expected a whole number, found None"),
+    ("ppo", "model_config", 5, "model_config: expected a table of named values, found 5"),
+    ("ppo", "model_config", {"fcnet_hiddens": []}, "model_config.fcnet_hiddens: expected one"),
+    ("ppo", "model_config", {"fcnet_hiddens": [8, -3]}, "model_config.fcnet_hiddens: expected one"),
+    ("ppo", "model_config", {"head_fcnet_hiddens": [0]}, "model_config.head_fcnet_hiddens: expected"),
+    ("ppo", "model_config", {"fcnet_hidden": []}, "Unknown model_config argument 'fcnet_hidden'"),
+    ("sac", "n_step", 0, "n_step: expected a whole number of at least 1, found 0"),
+    ("sac", "n_step", [3, 1], "n_step: expected [least, most] of at least 1, found"),
+    ("sac", "target_entropy", "x", "target_entropy: expected a number or 'auto', found"),
+    ("sac", "initial_alpha", -1, "initial_alpha: expected a number above 0, found -1"),
+    ("sac", "replay_buffer_config", {"capacty": 9}, "argument 'capacty'. Did you mean 'capacity'?"),
+    ("sac", "replay_buffer_config", {"capacity": 0}, "replay_buffer_config.capacity: expected at least 1, found 0"),
+    ("sac", "replay_buffer_config", {"type": "Foo"}, "expected EpisodeReplayBuffer or PrioritizedEpisodeReplayBuffer,"),
+]
+
+
+@pytest.mark.parametrize(("algo", "name", "value", "text"), WRONG)
+def test_hyperparameters_are_refused(algo, name, value, text):
+    with pytest.raises(SettingsError) as caught:
+        hyperparameters.complete(RLLIB_ALGORITHMS[algo], {name: value})
+    assert text in str(caught.value)
+
+
 @pytest.mark.parametrize(
     ("given", "text"),
     [
         ({"algo": "pp"}, "Unknown algorithm 'pp'. Did you mean 'ppo'?"),
-        ({"hyperparameters": {"gama": 0.9}}, "Unknown ppo hyperparameter 'gama'. Did you mean 'gamma'?"),
-        (
-            {"hyperparameters": {"train_batch_size": 9}},
-            "train_batch_size is not a hyperparameter here: use train_batch",
-        ),
-        (
-            {"env": "CartPole-v1", "algo": "sac", "hyperparameters": {"twin_q": False}},
-            "twin_q: expected true, as actions are choices, found false. Leave it out",
-        ),
-        *(
-            ({"hyperparameters": {old: 1}}, f"{old} is not a hyperparameter here: use {now}")
-            for old, now in (
-                ("num_workers", "--num-env-runners"),
-                ("num_rollout_workers", "--num-env-runners"),
-                ("num_envs_per_worker", "--num-envs"),
-                ("observation_filter", "normalize=true"),
-                ("learning_rate", "lr"),
-            )
-        ),
-        *(
-            ({"hyperparameters": {old: 1}}, f"{old}: there is none here; {why}")
-            for old, why in (
-                ("num_gpus_per_worker", "env runners use no GPU, and --num-gpus is for the learners"),
-                ("log_level", "RLlib's log is off"),
-                ("horizon", "the environment ends its episodes"),
-            )
-        ),
-        (
-            {"hyperparameters": {"lr": "fast"}},
-            "lr: expected a number or a schedule [[step, value], ...], found 'fast'",
-        ),
-        ({"hyperparameters": {"lr": -1}}, "lr: expected a number above 0, found -1"),
-        *(
-            (
-                {"hyperparameters": {name: schedule}},
-                f"{name}: expected a number or a schedule [[0, value], [step, value]",
-            )
-            for name in ("lr", "entropy_coeff")
-            for schedule in ([], [[0, 1e-3]], [[5, 1e-3], [9, 0.0]], [[0, 1e-3], [9, 0.0], [8, 0.0]], [[0, 1e-3], [9]])
-        ),
-        ({"hyperparameters": {"lr": [[0, 1e-3], [9, -1]]}}, "lr: expected a number of at least 0, found -1"),
-        ({"hyperparameters": {"gamma": None}}, "gamma: expected a number, found None"),
-        ({"hyperparameters": {"num_epochs": None}}, "num_epochs: expected a whole number, found None"),
-        ({"hyperparameters": {"model_config": 5}}, "model_config: expected a table of named values, found 5"),
-        *(
-            (
-                {"hyperparameters": {"model_config": {"fcnet_hiddens": sizes}}},
-                "model_config.fcnet_hiddens: expected one",
-            )
-            for sizes in ([], [0], [8, -3])
-        ),
-        (
-            {"hyperparameters": {"model_config": {"head_fcnet_hiddens": [0]}}},
-            "model_config.head_fcnet_hiddens: expected",
-        ),
-        ({"algo": "sac", "hyperparameters": {"n_step": 0}}, "n_step: expected a whole number of at least 1, found 0"),
-        (
-            {"algo": "sac", "hyperparameters": {"target_entropy": "x"}},
-            "target_entropy: expected a number or 'auto', found",
-        ),
-        ({"algo": "sac", "hyperparameters": {"n_step": [3, 1]}}, "n_step: expected [least, most] of at least 1, found"),
-        (
-            {"algo": "sac", "hyperparameters": {"initial_alpha": -1}},
-            "initial_alpha: expected a number above 0, found -1",
-        ),
-        *(
-            ({"algo": "sac", "hyperparameters": {"replay_buffer_config": buffer}}, f"replay_buffer_config{text}")
-            for buffer, text in (
-                ({"capacty": 9}, " argument 'capacty'. Did you mean 'capacity'?"),
-                ({"capacity": 0}, ".capacity: expected at least 1, found 0"),
-                ({"type": "Foo"}, ".type: expected EpisodeReplayBuffer or PrioritizedEpisodeReplayBuffer, found 'Foo'"),
-            )
-        ),
-        ({"hyperparameters": {"model_config": {"fcnet_hidden": []}}}, "Unknown model_config argument 'fcnet_hidden'"),
         ({"algo": "dqn"}, "dqn does not fit bam/reach-v0: it takes Discrete actions, found Box"),
         ({"algo": "bc"}, "data: bc learns from recorded episodes, found none"),
         ({"data": "x"}, "data: ppo learns in the environment"),
         ({"device": "cuda"}, "device: rllib learns on the CPU, or on as many GPUs as --num-gpus says; found 'cuda'."),
         ({"transport": ["tcp://127.0.0.1:1"]}, "transport: the rllib trainer makes its environments"),
         ({"normalize": {"clip_value": 1}}, "Unknown normalize argument 'clip_value'. Did you mean 'clip_by_value'?"),
+        (
+            {"env": "CartPole-v1", "algo": "sac", "hyperparameters": {"twin_q": False}},
+            "twin_q: expected true, as actions are choices, found false. Leave it out",
+        ),
     ],
 )
 def test_settings_are_refused(given, text):

@@ -55,23 +55,15 @@ def test_ordered_and_default_dicts_become_plain():
     assert (list(found), type(found), type(found["a"])) == (["b", "a"], dict, dict)
 
 
-PAYLOADS = [
-    (os.system, "posix.system"),
-    (subprocess.Popen, "subprocess.Popen"),
-    (eval, "builtins.eval"),
-    (getattr, "builtins.getattr"),
-    (__import__, "builtins.__import__"),
-    (io.open, "io.open"),
-    (np.load, "numpy.load"),
-    (pickle.loads, "_pickle.loads"),
-]
+FUNCTIONS = [os.system, subprocess.Popen, eval, getattr, __import__, io.open, np.load, pickle.loads]
 
 
-@pytest.mark.parametrize(("function", "name"), PAYLOADS, ids=[name for _, name in PAYLOADS])
+@pytest.mark.parametrize("function", FUNCTIONS)
 @pytest.mark.parametrize("protocol", [4, 5])
-def test_calls_are_refused_by_name(function, name, protocol):
+def test_calls_are_refused_by_name(function, protocol):
     with pytest.raises(RefusedPickle) as error:
         read_state(dumped({"weights": [1, Call(function, "exit 7")]}, protocol))
+    name = f"{function.__module__}.{function.__qualname__}"
     assert str(error.value) == f"names {name}, which is not read without running it"
 
 
@@ -84,9 +76,8 @@ def test_nothing_is_called(tmp_path):
     assert not mark.exists()
 
 
-def test_objects_of_rllib_are_refused_among_states():
-    with pytest.raises(RefusedPickle, match=r"^names gymnasium\.spaces\.box\.Box, which is not read"):
-        read_state(dumped(spaces.Box(-1, 1)))
+DTYPE = b"cnumpy\ndtype\nX\x02\x00\x00\x00u1K\x00K\x01\x87R"
+MANY_ZEROS = "names an array whose data are a int, which is not read"  # as many as the number says
 
 
 @pytest.mark.parametrize(
@@ -99,6 +90,17 @@ def test_objects_of_rllib_are_refused_among_states():
         (b"\x80\x04\x82\x01.", "is not a whole pickle of RLlib's: unregistered extension code 1"),
         (b"\x80\x02K\x01r" + struct.pack("<I", 2**31) + b".", "numbers a value 2147483648 after 3 instructions"),
         (dumped(range(3)), "names builtins.range, which is not read without running it"),
+        (dumped(spaces.Box(-1, 1)), "names gymnasium.spaces.box.Box, which is not read without running it"),
+        (b"\x80\x04\x8c\x09evil\nline\x8c\x06A\x1b[31m\x93.", "names evil?line.A?[31m, which is not read"),
+        (b"\x80\x04cnumpy._core.multiarray\nscalar\n" + DTYPE + b"J\xff\xff\xff\x7f\x86R.", MANY_ZEROS),
+        (
+            b"\x80\x04cnumpy._core.numeric\n_frombuffer\n(J\xff\xff\xff\x7f"
+            + DTYPE
+            + b"J\xff\xff\xff\x7f\x85X\x01\x00\x00\x00CtR.",
+            MANY_ZEROS,
+        ),
+        (dumped(Call(np.ndarray, (10**12,))), "names numpy.ndarray called"),
+        (dumped(np.zeros(3)).replace(b"K\x03\x85", b"K\x7f\x85"), ""),  # more numbers than there are data
         (dumped(np.array([[1], [1, 2]], object)), "names numpy.dtype('O8'), which is not read without running it"),
         (dumped(np.zeros(2, "f4,i4")), "names numpy.dtype('V8'), which is not read without running it"),
         (dumped(np.array(["a"])), "names numpy.dtype('U1'), which is not read without running it"),
@@ -110,32 +112,6 @@ def test_damage_and_what_is_no_state(data, message):
     assert str(error.value).startswith(message)
 
 
-def test_an_array_takes_no_more_memory_than_its_file():
-    call = Call(np.ndarray, (10**12,))
-    with pytest.raises(RefusedPickle, match=r"names numpy\.ndarray called"):
-        read_state(dumped(call))
-    with pytest.raises(FormatError):
-        read_state(dumped(np.zeros(3)).replace(b"K\x03\x85", b"K\x7f\x85"))
-
-
-DTYPE = b"cnumpy\ndtype\nX\x02\x00\x00\x00u1K\x00K\x01\x87R"
-
-
-@pytest.mark.parametrize(
-    "data",
-    [
-        b"\x80\x04cnumpy._core.numeric\n_frombuffer\n(J\xff\xff\xff\x7f"
-        + DTYPE
-        + b"J\xff\xff\xff\x7f\x85X\x01\x00\x00\x00CtR.",
-        b"\x80\x04cnumpy._core.multiarray\nscalar\n" + DTYPE + b"J\xff\xff\xff\x7f\x86R.",
-    ],
-    ids=["array", "number"],
-)
-def test_a_number_does_not_become_so_many_zeros(data):
-    with pytest.raises(RefusedPickle, match=r"^names an array whose data are a int, which is not read"):
-        read_state(data)
-
-
 def test_lists_that_are_many_more_written_out():
     value, itself = ["a"], []
     for _ in range(40):
@@ -145,11 +121,6 @@ def test_lists_that_are_many_more_written_out():
         read_state(dumped({"a": value}))
     with pytest.raises(FormatError, match=r"^holds a list within itself$"):
         read_state(dumped({"a": itself}))
-
-
-def test_names_are_said_in_letters():
-    with pytest.raises(RefusedPickle, match=r"^names evil\?line\.A\?\[31m, which is not read"):
-        read_state(b"\x80\x04\x8c\x09evil\nline\x8c\x06A\x1b[31m\x93.")
 
 
 def test_stand_ins_cannot_be_changed():
