@@ -46,7 +46,7 @@ Sign = Callable[[Tag, str, bytes], str]
 INFO_SERVICE = "/bam/robot"
 """Where a served robot says what it is (std_srvs/Trigger; `RobotInfo` in its message)."""
 HALT_TOPIC = "/bam/halt"
-"""Where a served robot hears that it must stop (std_msgs/Empty)."""
+"""Where a served robot is told to stop (std_msgs/Empty)."""
 SCENE_TOPIC = "/bam/scene"
 """Where a simulated robot is told how an episode begins, by requests on ``request`` and replies on ``reply`` below."""
 _ARRAYS = ("std_msgs/Float64MultiArray", "std_msgs/Float32MultiArray")
@@ -148,14 +148,14 @@ def _places(labels: tuple[str, ...], command: tuple[str, ...]) -> list[int]:
 
 
 def encode_state(
-    profile: RobotProfile, state: RobotState, row: int, stamp: Mapping[str, int], tag: str = ""
+    profile: RobotProfile, state: RobotState, env_id: int, stamp: Mapping[str, int], tag: str = ""
 ) -> list[Envelope]:
-    """The messages that a served robot publishes of one row of `state`.
+    """The messages that a served robot publishes of one environment of `state`.
 
     Args:
         profile: The robot; signals that `state` has not are left out.
-        state: Of all rows.
-        row: Which row.
+        state: Of all environments.
+        env_id: Which of them.
         stamp: When, as ROS 1 or ROS 2 writes it.
         tag: `Tag.echo` of the command that this state is the answer to; it goes into ``frame_id`` of the last of the
             messages, which is one without a frame, so that with it everything has arrived.
@@ -168,7 +168,7 @@ def encode_state(
         if key not in messages:
             header = {"header": {"stamp": dict(stamp), "frame_id": source.frame}} if has_header(source.type) else {}
             messages[key] = (source.topic, source.type, {**header, **source.constants})
-        message, raw = messages[key][2], _from_si(source, state.signals[source.signal][row])
+        message, raw = messages[key][2], _from_si(source, state.signals[source.signal][env_id])
         if source.fields:
             for path, value in zip(source.fields, raw, strict=True):
                 put_at(message, path, value)

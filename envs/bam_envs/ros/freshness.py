@@ -113,7 +113,7 @@ class Tagger:
 
 
 class ClockOffset:
-    """Estimates the offset to the clock of a sender from one-way messages: the quickest one took about no time.
+    """Estimates the offset to the clock of a sender from one-way messages, assuming that the quickest one took no time.
 
     The offset is the smallest difference seen, so the age of a message is how much longer it took than the quickest.
     The smallest difference grows by `drift` [s/s], which follows clocks that drift apart.
@@ -157,7 +157,7 @@ class Freshness:
 
 
 class FreshnessCheck:
-    """`Freshness` of each of the sessions that were heard of last. Thread-safe."""
+    """`Freshness` of each of the latest sessions. Thread-safe."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._lock = clock, threading.Lock()

@@ -81,7 +81,7 @@ def number_at(message: Message, path: str, where: str) -> float:
     quaternion = _quaternion(path)
     if not quaternion:
         value = value_at(message, path, where)
-        # What comes a thousand times a second is not to make a text that nobody reads.
+        # The usual case first: an error's text is not made a thousand times a second.
         return value if type(value) is float and math.isfinite(value) else number(value, f"{where}: {path}")
     x, y, z, w = (number_at(message, axis, where) for axis in quaternion)
     return math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
@@ -196,7 +196,7 @@ def read_stamp(message: Message, where: str) -> float | None:
         if name not in stamp:
             raise ProtocolError(f"{where}: header.stamp has no {ros2}; found: {', '.join(stamp)}.")
         part = stamp[name]
-        # What comes a thousand times a second is not to make a text that nobody reads.
+        # The usual case first: an error's text is not made a thousand times a second.
         plain = type(part) is int and part < 2**63
         parts.append(part if plain else number(part, f"{where}: header.stamp.{name}"))
     seconds, nano = parts

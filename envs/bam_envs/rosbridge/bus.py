@@ -1,4 +1,4 @@
-"""The Bus protocol: topics and services, whoever carries them.
+"""The Bus protocol: topics and services, over any carrier.
 
 Three carry them: the embedded server inside its own process (`bam_envs.rosbridge.server`), a link to a rosbridge
 server (`bam_envs.rosbridge.client`), and a native ROS 2 node (`bam_envs.remote.ros2_node`). Messages are plain

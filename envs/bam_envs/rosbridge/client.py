@@ -34,7 +34,7 @@ from bam_envs.rosbridge.threads import LoopThread, Workers
 
 _LOG = logging.getLogger(__name__)
 _FIRST_DELAY, _LONGEST_DELAY = 0.05, 2.0
-_STEADY = 2.0  # A connection that lasted so long [s] is worth trying again at once
+_STEADY = 2.0  # a connection that lasted so long [s] is tried again at once
 _SEND_WITHIN = 0.5
 _LEAVE_WITHIN = 3.0
 _STATUSES_KEPT = 20
@@ -51,7 +51,7 @@ class RosbridgeLink(Declarations):
         endpoint: The server; the text of a URL stands for `Endpoint(url)`.
         name: What it is for; in the names of its threads.
         lost_after: The link drops when the server answers no WebSocket ping for so long [s]; a bridge does also while
-            it holds everything else back for a call. Infinite: only when the network says so.
+            it holds everything else back for a call. Infinite: only when the network reports it.
         max_message: Largest message, in either direction [bytes].
 
     Raises:
@@ -108,7 +108,7 @@ class RosbridgeLink(Declarations):
                 return
             try:
                 self._thread.start(self._main)
-            except BaseException:  # also Ctrl-C: nobody would know of a connection that came about later
+            except BaseException:  # also Ctrl-C: a connection that opened later would have no owner
                 self._thread.post(self._stop)
                 self._thread = LoopThread(f"bam-link-{self.name}")
                 raise
@@ -319,7 +319,7 @@ class RosbridgeLink(Declarations):
             try:
                 return await self._open(deadline - time.monotonic())
             except NoServer as error:
-                # What refuses may still be starting; everything else will stay as it is.
+                # A server that refuses connections may still be starting; no other error goes away by itself.
                 if not isinstance(error.__cause__, ConnectionRefusedError) or time.monotonic() + delay >= deadline:
                     raise
             await asyncio.sleep(delay)
@@ -330,7 +330,7 @@ class RosbridgeLink(Declarations):
         while True:
             since = time.monotonic()
             await connection.ended.wait()
-            # One that breaks at once, again and again, must not be tried again at once.
+            # A connection that breaks at once, again and again, is tried after longer and longer delays.
             if time.monotonic() - since > _STEADY:
                 delay = _FIRST_DELAY
             while connection.error is not None:

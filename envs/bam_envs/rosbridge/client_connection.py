@@ -65,7 +65,7 @@ class Connection:
         max_message: As of `RosbridgeLink`, as is `lost_after`.
         lost_after: Silence of the server after which the connection is lost [s]; infinite: it never is.
         on_message: Takes each message that is not an answer: publish, call_service, status.
-        on_end: Called once, when it has ended, before whoever waits for an answer is told.
+        on_end: Called once, when it has ended, before pending answers get the error.
     """
 
     def __init__(

@@ -54,7 +54,7 @@ class Endpoint:
     connect_timeout: float = 3.0
     """Longest time to connect [s]."""
     timeout: float | None = None
-    """Longest time to wait for an answer [s]; None: the default of whoever asks."""
+    """Longest time to wait for an answer [s]; None: the default of the caller."""
 
     def __post_init__(self) -> None:
         if self.is_websocket:

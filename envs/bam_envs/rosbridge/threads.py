@@ -83,7 +83,7 @@ class LoopThread:
         self._loop = asyncio.get_running_loop()
         try:
             await main(ready)
-        except Exception as error:  # whoever waits for `ready` must hear of it, whatever it is
+        except Exception as error:  # any error goes to the thread that waits for `ready`
             if ready.done():
                 raise
             ready.set_exception(error)

@@ -45,7 +45,7 @@ class Tokens:
         if operator is not None and operator == client:
             raise InvalidValue("The operator's token must be another one than that of the clients.")
         self._client, self._operator = client, operator
-        self.needed = client is not None  # whether nobody comes in without one
+        self.needed = client is not None  # whether a client must show one
 
     @property
     def exist(self) -> bool:
@@ -53,7 +53,7 @@ class Tokens:
         return self._client is not None or self._operator is not None
 
     def role(self, shown: Iterable[str]) -> Role | None:
-        """What who shows these is; None for nobody who is known."""
+        """The role that one of these tokens gives; None if all are wrong."""
         found: Role | None = None
         # In constant time: how long a refusal takes must not tell how much of the token was right.
         for text in shown:

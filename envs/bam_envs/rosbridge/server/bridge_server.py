@@ -34,7 +34,7 @@ from bam_envs.rosbridge.tokens import Tokens
 T = TypeVar("T")
 
 _HANDLER_THREADS = 32
-_SHORT = 4096  # A frame up to this is read in the thread of the network [bytes]
+_SHORT = 4096  # a frame up to this is read in the thread of the network [bytes]
 _TURN = 4  # frames of one client that are read before the others have their turn
 _QUEUE = 2  # messages of a client that are taken from its socket before they are done
 _logger = logging.getLogger(__name__)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 LEVELS = ("none", "error", "warning", "info")
 """Of status messages: each one includes those before it."""
-_NEVER_SPLIT = 2**31  # A fragment size above that of every message
+_NEVER_SPLIT = 2**31  # a fragment size above that of every message
 _NUMBERS = itertools.count(1)
 _NAME = re.compile(r"/?[A-Za-z_~][\w~]*(?:/[\w~]+)*", re.ASCII)
 _LONGEST = 256

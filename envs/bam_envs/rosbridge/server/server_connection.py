@@ -85,7 +85,7 @@ class BridgeConnection(ServerConnection):
         self.outbox = Outbox(limits.outbox_size, limits.outbox_of_a_topic)
         self.role: Role | None = None  # what the client was let in as; None before
         self.host = ""  # the IP address of the client
-        self.heard = time.monotonic()  # when anything came last [s, monotonic]
+        self.heard = time.monotonic()  # when data last arrived [s, monotonic]
         self.born = self.heard  # when the socket opened [s, monotonic]
         self._waiting = 0  # what whole frames cost that are not taken yet [bytes]
         self._message, self._whole = 0, deque[int]()  # what those of the unfinished message cost, and of whole ones

@@ -130,7 +130,7 @@ class Services(dict[str, Service]):
                 self._emit(invoke)
 
     def packed_answer(self, invoke: Invoke) -> Packet | None:
-        """What the handler answers, as a packet; None if nobody waits for it any more. From any thread."""
+        """What the handler answers, as a packet; None if the call is answered already. From any thread."""
         call = self._calls.get(invoke.number)
         if call is None:
             return None
@@ -141,7 +141,7 @@ class Services(dict[str, Service]):
             return _packed(call, values, True)
         except BamEnvsError as error:
             return _packed(call, str(error), False)
-        # A caller is always answered, whatever the handler, which is foreign code, does.
+        # A caller always gets an answer; the handler is foreign code and may raise anything.
         except Exception as error:
             _logger.exception("The handler of %s failed.", call.service.name)
             line = " ".join(f"{type(error).__name__}: {error}".split())
