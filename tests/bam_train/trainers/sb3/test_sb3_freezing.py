@@ -5,8 +5,6 @@ from __future__ import annotations
 import copy
 import os
 import random
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -391,35 +389,3 @@ def test_weights_that_are_not_numbers_are_refused(save: Any):
     path = save(model, None, VECTOR, model.action_space)
     with pytest.raises(PolicyError, match="the frozen policy differs from the trainer's by nan in row 0"):
         FrozenPolicy.load(path)
-
-
-BLOCK = """
-import sys
-BLOCKED = {blocked!r}
-class Block:
-    def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in BLOCKED:
-            raise ImportError(f"{{name}} must not be imported")
-sys.meta_path.insert(0, Block())
-import numpy as np
-from bam_train.policy import FrozenPolicy
-policy = FrozenPolicy.load({path!r})
-print(policy.act(np.zeros({shape!r}, {dtype!r})).tolist())
-"""
-
-
-def test_a_process_without_torch_runs_a_policy(save: Any):
-    model, _ = make(PPO, IMAGE, ARM, **copy.deepcopy(SMALL_CNN))
-    path = save(model, None, IMAGE, ARM)
-    blocked = ["torch", "gymnasium", "bam_envs", "onnx", "stable_baselines3", "cloudpickle", "tyro", "rich"]
-    script = BLOCK.format(blocked=blocked, path=str(path), shape=IMAGE.shape, dtype=str(IMAGE.dtype))
-    done = subprocess.run(
-        [sys.executable, "-c", script],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    expected = model.predict(np.zeros(IMAGE.shape, IMAGE.dtype), deterministic=True)[0]
-    np.testing.assert_allclose(eval(done.stdout), expected, atol=1e-4)
