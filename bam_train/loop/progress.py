@@ -74,7 +74,7 @@ def _nothing(*steps: int) -> None:
 
 @contextmanager
 def _task(progress: Progress, n_steps: int | None, text: str, redraw: Callable[[], None]) -> Iterator[Advance]:
-    """One task of a display, told how far it is every REDRAW_SECONDS."""
+    """One task of a display, updated every REDRAW_SECONDS."""
     task = progress.add_task(text, total=n_steps)
     clock = time.perf_counter
     done, due = 0, clock() + REDRAW_SECONDS

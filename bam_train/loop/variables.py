@@ -148,7 +148,7 @@ class Variable:
     def detach(self) -> None:
         """Cut every value off its graph."""
 
-    # -- what another kind of array does its own way ---------------------------------------------------------------
+    # -- what `TensorVariable` overrides ---------------------------------------------------------------------------
 
     def _fits(self, value: Any) -> bool:
         """Whether the value is like those before; quick."""
