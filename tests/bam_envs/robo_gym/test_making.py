@@ -137,18 +137,6 @@ def test_a_live_robot_is_no_vector_environment():
     )
 
 
-def test_reset_options():
-    base = make("NoObstacleNavigationMir100Sim-v0")
-    base.reset(options={"start_pose": [1.0, 0.0, 0.5], "target_pose": [-1.0, 0.5, 0.0]})
-    np.testing.assert_allclose(base.unwrapped.get_rs_state()[:6], [-1.0, 0.5, 0.0, 1.0, 0.0, 0.5])
-    arm = make("EndEffectorPositioningURSim-v0")
-    joints = [0.1, -2.0, 1.0, -1.0, -1.4, 0.2]
-    arm.reset(options={"joint_positions": joints, "ee_target_pose": [0.3, 0.2, 0.4, 0, 0, 0]})
-    wire = arm.unwrapped.get_rs_state()
-    assert [wire[f"{name}_joint_position"] for name in ("base", "shoulder", "elbow", "wrist_1")] == joints[:4]
-    assert [wire[f"object_0_to_ref_translation_{axis}"] for axis in "xyz"] == [0.3, 0.2, 0.4]
-
-
 def test_a_robot_without_an_address_is_none():
     with pytest.raises(InvalidValue, match="A live robot's address is ws://host:port"):
         make("EndEffectorPositioningURRob-v0", robot="")

@@ -114,15 +114,6 @@ def test_a_ball_touches_from_the_shoulder_on():
     assert contacts.touching(pose, flange)[0]
 
 
-def test_a_row_is_the_row_alone():
-    contacts = ArmContacts(UR_MODELS["ur5"])
-    rng = np.random.default_rng(4)
-    joints, balls = rng.uniform(-np.pi, np.pi, (300, 6)), rng.uniform(-0.5, 0.5, (300, 3))
-    together = contacts.touching(joints, balls)
-    alone = [contacts.touching(joints[row : row + 1], balls[row : row + 1])[0] for row in range(300)]
-    np.testing.assert_array_equal(together, alone)
-
-
 @pytest.mark.parametrize("name", UR_MODELS)
 def test_tubes_join(name):
     """Each begins where the one before ends."""

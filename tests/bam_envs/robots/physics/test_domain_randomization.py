@@ -182,19 +182,6 @@ def test_the_tape_of_noise_is_read_in_a_circle(drawn):
     np.testing.assert_array_equal(seen[0], seen[TAPE])
 
 
-def test_saved_and_restored_exactly(drawn):
-    ranges = {"mass": (0.5, 2.0), "position_noise": 0.01, "angle_noise": 0.1, "drop": 0.3, "max_delay": 2}
-    (physics, one), (other_physics, two) = drawn(**ranges), drawn(**ranges)
-    for row in range(ROWS):
-        one.reset(row, 1000 + row, np.zeros(7))
-    looked(one, 5)
-    one.delayed(np.ones((ROWS, 7)))
-    two.load_state_dict(one.state_dict())
-    np.testing.assert_array_equal(factors(physics, body_mass), factors(other_physics, body_mass))
-    np.testing.assert_array_equal(looked(one), looked(two))
-    np.testing.assert_array_equal(one.delayed(np.zeros((ROWS, 7))), two.delayed(np.zeros((ROWS, 7))))
-
-
 def test_without_an_object_only_gains_and_delays_differ(drawn):
     physics, imperfection = drawn(scene="ur5e_gripper.xml", gain=(0.8, 1.2), mass=(0.5, 2.0), max_delay=2)
     assert len(np.unique(factors(physics, lambda model: model.actuator_gainprm[0, 0]))) == ROWS

@@ -8,7 +8,7 @@ from bam_envs.core.robot import Initial, Robot
 from bam_envs.robots.physics.kinematic_arm import empty_arm, isaac_arm, obstacle_arm, reach_arm
 from bam_envs.robots.ur import START, UR_MODELS
 from bam_envs.testing import RobotContract
-from bam_envs.testing.assertions import assert_same_state, assert_same_tree
+from bam_envs.testing.assertions import assert_same_state
 
 ROWS = np.arange(2)
 DOWN = np.array([0.0, 0.3, 0.0, 0.0, 0.0, 0.0])
@@ -122,20 +122,6 @@ def test_the_tool_is_at_the_pads_of_a_gripper():
     robot, joints = reach_arm(1, ur_model="ur3"), np.array([START])
     position, axes = UR_MODELS["ur3"].geometry.flange_pose(joints)
     np.testing.assert_allclose(robot.tool_position(joints), position + 0.15 * axes[:, :, 2], atol=1e-12)
-
-
-@pytest.mark.parametrize("factory", [reach_arm, obstacle_arm])
-def test_it_goes_on_from_a_saved_state(factory):
-    robot, other = factory(2, randomize=True), factory(2, randomize=True)
-    state = started(robot)
-    state = robot.step(state.command + 0.05)
-    saved = robot.state_dict()
-    assert_same_state(other.load_state_dict(saved), state)
-    for _ in range(3):
-        command = state.command - 0.02
-        state = robot.step(command)
-        assert_same_state(other.step(command), state)
-    assert_same_tree(robot.state_dict(), other.state_dict())
 
 
 def test_it_sees_its_obstacle():

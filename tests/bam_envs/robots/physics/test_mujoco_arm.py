@@ -8,7 +8,6 @@ from bam_envs.core.robot import Initial, Robot
 from bam_envs.robots.physics.mujoco_arm import SimulatedArm, arm_scene, cube_scene
 from bam_envs.robots.ur5e import GEOMETRY
 from bam_envs.testing import ARM_HOME
-from bam_envs.testing.assertions import assert_same_state
 
 
 @pytest.fixture
@@ -94,20 +93,6 @@ def test_not_connected():
         with pytest.raises(ResetNeeded) as caught:
             act()
         assert str(caught.value) == "The simulated robot is not connected. Call reset() first."
-
-
-def test_saved_and_restored_in_another_robot():
-    one, two = SimulatedArm(2, randomize=True), SimulatedArm(2, randomize=True)
-    one.connect()
-    begin(one)
-    command = np.repeat(hold(), 2, axis=0)
-    one.step(command + 0.02)
-    here = two.load_state_dict(one.state_dict())
-    there = one.load_state_dict(one.state_dict())
-    assert_same_state(here, there)
-    assert_same_state(one.step(command), two.step(command))
-    one.close()
-    two.close()
 
 
 def test_a_command_beyond_the_data_sheet_is_followed_as_far_as_the_arm_can():

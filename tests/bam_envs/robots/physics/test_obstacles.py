@@ -1,14 +1,11 @@
 """Moving obstacles: still, up and down, along closed paths."""
 
-import copy
-
 import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.splines import splines_through
 from bam_envs.robots.physics.obstacles import Obstacles, wave_signals
-from bam_envs.testing.assertions import assert_same_tree
 
 ROW, SEED = np.zeros(1, np.int64), np.zeros(1, np.int64)
 PATH = np.random.default_rng(1).uniform(-1, 1, (1, 10, 3))
@@ -87,19 +84,6 @@ def test_rows_move_each_its_own_way():
     np.testing.assert_array_equal(positions[2], [1.0, 0.0, 0.5])
     obstacles.begin(np.array([1]), {"obstacle_position": np.array([[0.0, 1.0, 0.5]])}, SEED)
     np.testing.assert_array_equal(obstacles.position(np.full(3, 9.0))[1], [0.0, 1.0, 0.5])
-
-
-def test_saved_and_restored():
-    obstacles = begun({}, 3)
-    obstacles.begin(np.array([1]), {"obstacle_path": PATH, "obstacle_samples": np.array([500.0])}, SEED)
-    saved = obstacles.state_dict()
-    kept = copy.deepcopy(saved)
-    other = Obstacles(3)
-    other.load_state_dict(saved)
-    time = np.array([0.3, 1.7, 2.2])
-    np.testing.assert_array_equal(other.position(time), obstacles.position(time))
-    obstacles.begin(np.array([0]), {"obstacle_position": np.ones((1, 3))}, SEED)
-    assert_same_tree(saved, kept)
 
 
 def test_paths_that_are_none():
