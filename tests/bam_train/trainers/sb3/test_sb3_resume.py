@@ -155,7 +155,7 @@ def test_half_a_run_in_simulation_goes_on_in_a_new_process(tmp_path):
         trained(complete, 400).save(tmp_path / f"{algo}.zip", {}, {})
         state = everything(trained(complete, 800))
         expected.append(f"800 {hashlib.sha256(b''.join(state.values())).hexdigest()}")
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
     command = [sys.executable, "-c", PROGRAM, *(str(tmp_path / f"{algo}.zip") for algo in runs)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment, check=False)
     assert done.stdout.splitlines() == expected, done.stderr
