@@ -280,23 +280,22 @@ def _checked_source(where: str, source: Source, size: int) -> Source:
 def _sinks(where: str, mode: str, rows: list[Table], command: SignalSpec) -> tuple[Sink, ...]:
     """The sinks of one command mode; together they take every number of the command once."""
     where = f"{where}: commands.{mode}"
-    sinks = tuple(_checked_sink(at, _topical(Sink, row, at)) for row, at in _rows(where, rows))
+    sinks: list[Sink] = []
+    for row, at in _rows(where, rows):
+        sink = _topical(Sink, row, at)
+        size = len(sink.labels)
+        for key, values in (("names", sink.names), ("fields", sink.fields)):
+            if values and len(values) != size:
+                raise InvalidValue(f"{at}: {key} must have {size} values, not {len(values)}.")
+        if not sink.fields and sink.type not in LISTED_TYPES:
+            raise InvalidValue(f"{at}: {sink.type} needs fields; only {', '.join(sorted(LISTED_TYPES))} do without.")
+        sinks.append(_converted(at, replace(sink, names=sink.names or sink.labels), size))
     labels = [label for sink in sinks for label in sink.labels]
     _require_once(where, "label", labels)
     if set(labels) != set(command.labels):
         raise InvalidValue(f"{where}: labels must be {', '.join(command.labels)}, not {', '.join(labels)}.")
     _require_once(where, "topic", [sink.topic for sink in sinks])
-    return sinks
-
-
-def _checked_sink(where: str, sink: Sink) -> Sink:
-    size = len(sink.labels)
-    for key, values in (("names", sink.names), ("fields", sink.fields)):
-        if values and len(values) != size:
-            raise InvalidValue(f"{where}: {key} must have {size} values, not {len(values)}.")
-    if not sink.fields and sink.type not in LISTED_TYPES:
-        raise InvalidValue(f"{where}: {sink.type} needs fields; only {', '.join(sorted(LISTED_TYPES))} do without.")
-    return _converted(where, replace(sink, names=sink.names or sink.labels), size)
+    return tuple(sinks)
 
 
 def _row(kind: type[T], row: Table, where: str) -> T:

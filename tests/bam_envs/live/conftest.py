@@ -58,8 +58,11 @@ class LaxServer:
         pass
 
     def publish(self, topic, message):
-        frame = json.dumps({"op": "publish", "topic": topic, "msg": message})
-        self._loop.call_soon_threadsafe(self._send, topic, frame)
+        self.send(topic, {"op": "publish", "topic": topic, "msg": message})
+
+    def send(self, topic, frame):
+        """Send a frame to who subscribed to `topic`."""
+        self._loop.call_soon_threadsafe(self._send, topic, json.dumps(frame))
 
     def subscribe(self, topic, kind, listener):
         self._listeners[topic] = listener
@@ -131,7 +134,7 @@ class ScriptedRobot:
         self.profile = self.profile.narrowed(self.spec.command.labels)
         self.commands = []
         """(topic, caller, message), in order."""
-        self.halts = 0
+        self.halts, self.frozen = 0, False
         self.signals = {one.name: np.zeros(len(one.labels)) for one in self.spec.signals}
         self.mangle = lambda topic, message: message
         """Changes a message before it is sent; None instead of it keeps it back."""
@@ -200,6 +203,8 @@ class ScriptedRobot:
             self._changed.notify_all()
 
     def _move(self):
+        if self.frozen:
+            return
         names = [one for one in ("base_velocity", "joint_position", "gripper_width") if one in self.signals]
         now = np.concatenate([self.signals[name] for name in names])
         now[list(self._told)] = list(self._told.values())

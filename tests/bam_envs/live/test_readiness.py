@@ -56,8 +56,7 @@ def connected(server, robot_on):
 
     def connect(profile="ur5e", frozen=False, **options):
         scripted = robot_on(server, profile)
-        if frozen:
-            scripted._move = lambda: None
+        scripted.frozen = frozen
         robots.append(live_robot(server.url, profile=profile, **options))
         robots[-1].connect()
         return robots[-1]
@@ -214,7 +213,6 @@ def test_what_the_server_cannot_pass_on_is_no_refusal(lax, robot_on, start_pose)
     robot_on(server)
     robot = live_robot(server.url, profile="ur5e")
     robot.connect()
-    inner = robot._robot
-    inner._on_status({"op": "status", "level": "error", "msg": "unknown type", "id": f"subscribe:{SAFETY}"})
+    server.send(SAFETY, {"op": "status", "level": "error", "msg": "unknown type", "id": f"subscribe:{SAFETY}"})
     robot.step(robot.reset(ROW, start_pose).command)
     robot.close()

@@ -242,6 +242,7 @@ scale = 0.001\n\n[[c -> max_age = 9\n\n[[c -> state[0]: max_age: expected a numb
 fields = ["data"] -> -> commands.position[0]: std_msgs/Float64 needs fields; only sensor_msgs/JointState, std_msgs/
 labels = ["height"]\nfields -> labels = ["hight"]\nfields -> commands.position: labels must be height, not hight.
 fields = ["data"] -> hold = "first" -> commands.position[0]: hold: expected 'measured', 'last' or 'zero', found 'first'
+sensor_msgs/msg/JointState" -> a/B"\nframe = "map" -> state[0]: frame needs a type with a header, such as a/BStamped.
 [command] -> [limits]\njoint_sped = 1\n[command] -> limits: Unknown limit 'joint_sped'. Did you mean 'joint_speed'?
 [command] -> [limits]\ntool_speed = 25\n[command] -> limits: The limit tool_speed of a live robot must be 0.005 to 1 m/s
 [command] -> [rename]\n"/lift/sta" = "/s"\n[command] -> rename: Unknown topic '/lift/sta'. Did you mean '/lift/joint_s
@@ -308,28 +309,13 @@ def test_a_frame_of_another_name(write):
     profile = load_profile(write('extends = "ur5e"\n[frames]\n"/object_pose" = "world"\n'))
     assert [profile.source(f"object_{name}").frame for name in ("position", "quaternion")] == ["world", "world"]
     assert profile.source("tool_position").frame == "base"
+    other = write('extends = "ur5e"\n[frames]\n"/joint_states" = "world"\n')
+    assert refusal(other) == (
+        "FILE: frames: Unknown topic with a frame '/joint_states'. "
+        "Choose from: /object_pose, /tcp_pose_broadcaster/pose."
+    )
     unchecked = load_profile(write('extends = "ur5e"\n[frames]\n"/object_pose" = ""\n'))
     assert unchecked.source("object_position").frame == ""
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (
-            'extends = "ur5e"\n[frames]\n"/joint_states" = "world"\n',
-            "FILE: frames: Unknown topic with a frame '/joint_states'. "
-            "Choose from: /object_pose, /tcp_pose_broadcaster/pose.",
-        ),
-        (
-            OWN.replace('field = "position"', 'field = "position"\nframe = "map"').replace(
-                "sensor_msgs/msg/JointState", "geometry_msgs/Pose"
-            ),
-            "FILE: state[0]: frame needs a type with a header, such as geometry_msgs/PoseStamped.",
-        ),
-    ],
-)
-def test_frames_that_cannot_be(write, text, message):
-    assert refusal(write(text)) == message
 
 
 @pytest.mark.parametrize(
