@@ -101,13 +101,10 @@ def detail_lines(facts: dict[str, Any]) -> list[str]:
     for kind, signals in facts["signals"].items():
         columns = ("name", "low", "high", "scale", "unit", "meaning")
         keys = [key for key in columns if any(key in one for one in signals)]
-        cells = [[_cell(one.get(key, "")) for key in keys] for one in folded(signals)]
+        values = [[one.get(key, "") for key in keys] for one in folded(signals)]
+        cells = [[one if isinstance(one, str) else f"{one:.4g}" for one in line] for line in values]
         lines += ["", kind, *(f"  {line}" for line in aligned([keys, *cells]))]
     return lines
-
-
-def _cell(value: str | float) -> str:
-    return value if isinstance(value, str) else f"{value:.4g}"
 
 
 def folded(signals: list[dict[str, Any]], most: int = 16) -> list[dict[str, Any]]:

@@ -7,7 +7,7 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -35,22 +35,18 @@ class _Droppable:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        with self._dropping():
-            self._stream.write(text)
+        self._try(lambda: self._stream.write(text))
         return len(text)
 
     def flush(self) -> None:
-        with self._dropping():
-            self._stream.flush()
+        self._try(self._stream.flush)
 
-    @contextlib.contextmanager
-    def _dropping(self) -> Iterator[None]:
-        """After an error, put the null device in the stream's place, so that what is still buffered goes there too."""
+    def _try(self, call: Callable[[], object]) -> None:
         try:
-            yield
+            call()
         except OSError:
             with contextlib.suppress(OSError):  # a stream that is no file
-                null = os.open(os.devnull, os.O_WRONLY)
+                null = os.open(os.devnull, os.O_WRONLY)  # where what is still buffered goes, too
                 os.dup2(null, self._stream.fileno())
                 os.close(null)
 

@@ -1,6 +1,7 @@
 """What tests of the experiment scripts share: running one as a user does, and a policy that one has trained."""
 
 import contextlib
+import importlib.util
 import io
 import os
 import runpy
@@ -11,6 +12,7 @@ from unittest import mock
 
 import pytest
 
+from bam_train.cli.program import guarded
 from tests.one_ray import shared_ray_fixture  # noqa: F401
 
 ROOT = Path(__file__).parents[2]
@@ -41,6 +43,35 @@ def run_script(environment):
         )
 
     return run
+
+
+@pytest.fixture(scope="session")
+def load_script():
+    """``load_script(name)`` is a script as a module."""
+
+    def load(name):
+        spec = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module
+
+    return load
+
+
+@pytest.fixture
+def run(script, capsys, monkeypatch, tmp_path):
+    """Runs the main function of the file's `script` in `tmp_path`; its status, standard output and standard error."""
+    monkeypatch.chdir(tmp_path)
+
+    def run_it(*arguments):
+        monkeypatch.setattr(sys, "argv", [Path(script.__file__).name, *map(str, arguments)])
+        try:
+            status = guarded(script.main, Path(script.__file__).stem)
+        except SystemExit as end:
+            status = end.code
+        return status, *capsys.readouterr()
+
+    return run_it
 
 
 @pytest.fixture(scope="session")

@@ -1,20 +1,14 @@
 """The script that runs every training command of the pages: which ones these are, and what it says of a run."""
 
-import importlib.util
 import shlex
 import sys
-from pathlib import Path
 
 import pytest
 
 
 @pytest.fixture(scope="module")
-def script():
-    path = Path(__file__).parents[2] / "scripts" / "check_commands.py"
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def script(load_script):
+    return load_script("check_commands")
 
 
 def test_the_commands_are_those_that_train_here_each_once(script, monkeypatch, capsys):

@@ -1,6 +1,5 @@
 """The script solves CartPole; the notebook is the script, executed."""
 
-import importlib.util
 import os
 import re
 import signal
@@ -26,11 +25,8 @@ def run(*arguments):
 
 
 @pytest.fixture(scope="module")
-def make_notebook():
-    spec = importlib.util.spec_from_file_location("make_notebook", SCRIPTS / "make_notebook.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def make_notebook(load_script):
+    return load_script("make_notebook")
 
 
 def test_it_solves_cartpole():

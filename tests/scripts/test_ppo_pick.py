@@ -1,6 +1,5 @@
 """PPO written on the loop: its options and lines, that it repeats itself, and what it learns from."""
 
-import importlib.util
 import re
 import sys
 from pathlib import Path
@@ -15,28 +14,14 @@ SHORT = ["--steps", "4096", "--num-envs", "8", "--episodes", "4"]
 
 
 @pytest.fixture(scope="module")
-def script():
-    spec = importlib.util.spec_from_file_location("ppo_pick", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def script(load_script):
+    return load_script("ppo_pick")
 
 
-@pytest.fixture
-def run(script, capsys, monkeypatch):
-    """Run it with these arguments; status, standard output, standard error."""
+@pytest.fixture(autouse=True)
+def torch_as_before():
     threads, state = torch.get_num_threads(), torch.get_rng_state()
-
-    def run_it(*arguments):
-        monkeypatch.setattr(sys, "argv", ["ppo_pick.py", *arguments])
-        status = 0
-        try:
-            script.main()
-        except SystemExit as end:
-            status = end.code
-        return status, *capsys.readouterr()
-
-    yield run_it
+    yield
     torch.set_num_threads(threads)
     torch.set_rng_state(state)
 

@@ -1,6 +1,5 @@
 """The script that records episodes for algorithms that learn from data."""
 
-import importlib.util
 import os
 import sys
 from pathlib import Path
@@ -9,35 +8,14 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 
-from bam_train.cli.program import guarded
-
 ROOT = Path(__file__).parents[2]
 REACH = ROOT / "checkpoints" / "reach-ppo.zip"
 COLUMNS = ["eps_id", "t", "obs", "actions", "rewards", "new_obs", "terminateds", "truncateds"]
 
 
 @pytest.fixture(scope="module")
-def script():
-    spec = importlib.util.spec_from_file_location("record_parquet", ROOT / "scripts" / "record_parquet.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture
-def run(script, capsys, monkeypatch, tmp_path):
-    """Run it in `tmp_path` with these arguments; status, standard output, standard error."""
-    monkeypatch.chdir(tmp_path)
-
-    def run_it(*arguments):
-        monkeypatch.setattr(sys, "argv", ["record_parquet.py", *map(str, arguments)])
-        try:
-            status = guarded(script.main, script.NAME)
-        except SystemExit as end:
-            status = end.code
-        return status, *capsys.readouterr()
-
-    return run_it
+def script(load_script):
+    return load_script("record_parquet")
 
 
 def test_rows_of_whole_episodes(run):

@@ -1,20 +1,11 @@
 """The tasks are feasible: hand-written policies solve them."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import pytest
-
-SCRIPT = Path(__file__).parents[2] / "scripts" / "scripted_policy.py"
 
 
 @pytest.fixture(scope="module")
-def script():
-    spec = importlib.util.spec_from_file_location("scripted_policy", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def script(load_script):
+    return load_script("scripted_policy")
 
 
 @pytest.mark.parametrize(
@@ -35,11 +26,11 @@ def test_almost_every_episode_succeeds(script, env_id, randomize, least):
     assert successes >= least * 128
 
 
-def test_the_table(script, capsys, monkeypatch):
+def test_the_table(run):
     """Without a name, of those that have a policy."""
-    monkeypatch.setattr(sys, "argv", ["scripted_policy.py", "--episodes", "3"])
-    assert script.main() == 0
-    head, *lines = (line.split() for line in capsys.readouterr().out.splitlines())
+    status, out, _ = run("--episodes", 3)
+    head, *lines = (line.split() for line in out.splitlines())
+    assert status == 0
     assert head == ["environment", "success", "episodes", "mean", "steps", "longest", "limit", "time"]
     ids = ("bam/reach-v0", "bam/pick-v0", "bam/pick-place-v0")
     assert [line[:3] for line in lines] == [[env_id, "100.00%", "3"] for env_id in ids]
@@ -54,9 +45,7 @@ def test_the_table(script, capsys, monkeypatch):
         (["--episodes", "0"], "--episodes must be at least 1, not 0"),
     ],
 )
-def test_bad_arguments(script, capsys, monkeypatch, arguments, text):
-    monkeypatch.setattr(sys, "argv", ["scripted_policy.py", *arguments])
-    with pytest.raises(SystemExit) as caught:
-        script.main()
-    assert caught.value.code == 2
-    assert text in capsys.readouterr().err
+def test_bad_arguments(run, arguments, text):
+    status, _, err = run(*arguments)
+    assert status == 2
+    assert text in err
