@@ -144,17 +144,17 @@ for path in sys.argv[1:]:
 @pytest.mark.slow
 def test_half_a_run_in_simulation_goes_on_in_a_new_process(tmp_path):
     runs = {
-        "ppo": {"n_steps": 50, "batch_size": 100, "n_epochs": 3},
-        "sac": {"learning_starts": 300, "train_freq": 25, "gradient_steps": 5, "batch_size": 64},
+        "ppo": {"n_steps": 25, "batch_size": 100, "n_epochs": 2},
+        "sac": {"learning_starts": 100, "train_freq": 25, "gradient_steps": 2, "batch_size": 32},
     }
-    given = {"env": "bam/pick-v0", "steps": 800, "num_envs": 8}
+    given = {"env": "bam/pick-v0", "steps": 400, "num_envs": 8}
     expected = []
     for algo, hyperparameters in runs.items():
         mapping = {**given, "algo": algo, "hyperparameters": hyperparameters}
         complete = SB3Trainer.complete(TrainSettings.from_mapping(mapping))
-        trained(complete, 400).save(tmp_path / f"{algo}.zip", {}, {})
-        state = everything(trained(complete, 800))
-        expected.append(f"800 {hashlib.sha256(b''.join(state.values())).hexdigest()}")
+        trained(complete, 200).save(tmp_path / f"{algo}.zip", {}, {})
+        state = everything(trained(complete, 400))
+        expected.append(f"400 {hashlib.sha256(b''.join(state.values())).hexdigest()}")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
     command = [sys.executable, "-c", PROGRAM, *(str(tmp_path / f"{algo}.zip") for algo in runs)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment, check=False)
