@@ -139,11 +139,7 @@ def _unpickled(directory: Directory, path: Path) -> Any:
 def training_settings(saved: SavedPolicy, parts: PolicyParts, env: str, env_kwargs: Mapping[str, Any]) -> TrainSettings:
     """The settings of a run that goes on where the directory's algorithm stopped.
 
-    Args:
-        saved: What the directory holds.
-        parts: Its policy, with the environment's own spaces.
-        env: Versioned id.
-        env_kwargs: The environment's arguments.
+    `parts` are those of `saved` with the environment's own spaces; `env` is a versioned id.
 
     Raises:
         SettingsError: There is no such run here; says why.

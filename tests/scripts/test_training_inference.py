@@ -16,22 +16,11 @@ SCRIPTS = Path(__file__).parents[2] / "scripts"
 RLLIB = ("training_inference_mir", "training_inference_ur")
 TRAINING = (*RLLIB, "td3_mir")
 ALL = (*TRAINING, "policy_from_cp_mir", "policy_from_cp_ur")
-OPTIONS = (
-    "--run",
-    "--num-cpus",
-    "--framework",
-    "--stop-iters",
-    "--stop-timesteps",
-    "--stop-reward",
-    "--explore-during-inference",
-    "--num-episodes-during-inference",
-    "--robot",
-    "--seed",
-    "--env",
-    "--parity",
-    "--out",
+OPTIONS = {
+    *("--run", "--num-cpus", "--framework", "--stop-iters", "--stop-timesteps", "--stop-reward", "--robot", "--yes"),
+    *("--explore-during-inference", "--num-episodes-during-inference", "--seed", "--env", "--parity", "--out"),
     "--render",
-)
+}
 
 
 @pytest.mark.parametrize("name", [*ALL, "training_inference", "policy_from_cp"])
@@ -46,7 +35,7 @@ def test_help(run_here, name, tmp_path):
     assert done.stdout.count(f"\n  python scripts/{name}.py") >= 3
     assert "\nExamples:\n" in done.stdout
     if name in RLLIB:
-        assert set(re.findall(r"^  (--[a-z-]+)", done.stdout, re.MULTILINE)) == {*OPTIONS, "--yes"}
+        assert set(re.findall(r"^  (--[a-z-]+)", done.stdout, re.MULTILINE)) == OPTIONS
 
 
 WRONG = [
@@ -83,24 +72,27 @@ def test_what_cannot_be_is_one_line(run_here, arguments, status, text, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_address_that_is_none_is_refused_before_td3_trains(run_here, tmp_path):
-    done = run_here("td3_mir", "--robot", "10.0.0.5:9090", folder=tmp_path)
-    assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr == (
-        "td3_mir: A live robot's address is ws://host:port or wss://host:port, not '10.0.0.5:9090'. "
-        "Did you mean 'ws://10.0.0.5:9090'?\n"
-    )
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_gpus_that_are_no_number(run_here, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "arguments", "text"),
+    [
+        (
+            "td3_mir",
+            ("--robot", "10.0.0.5:9090"),
+            "A live robot's address is ws://host:port or wss://host:port, not '10.0.0.5:9090'. "
+            "Did you mean 'ws://10.0.0.5:9090'?",
+        ),
+        (
+            "training_inference_ur",
+            (),
+            "RLLIB_NUM_GPUS: expected a whole number of GPUs, such as 1, found 'abc'. Mend or unset it",
+        ),
+    ],
+)
+def test_what_is_refused_before_training(run_here, name, arguments, text, tmp_path, monkeypatch):
     monkeypatch.setenv("RLLIB_NUM_GPUS", "abc")
-    done = run_here("training_inference_ur", folder=tmp_path)
-    assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr == (
-        "training_inference_ur: RLLIB_NUM_GPUS: expected a whole number of GPUs, such as 1, found 'abc'. "
-        "Mend or unset it\n"
-    )
+    done = run_here(name, *arguments, folder=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", f"{name}: {text}\n")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_without_ray(run_script, environment, tmp_path):

@@ -35,14 +35,7 @@ STEPS_AT_LEAST = 200
 
 
 def make_config(settings: TrainSettings, observation_space: Space[Any], action_space: Space[Any], seed: int) -> Any:
-    """The configuration of a run.
-
-    Args:
-        settings: Complete.
-        observation_space: The environment's own.
-        action_space: The environment's own.
-        seed: Of weights, exploration and environments.
-    """
+    """The configuration of a run of complete settings; the spaces are the environment's own."""
     algorithm, values = RLLIB_ALGORITHMS[settings.algo], settings.hyperparameters
     number, gpus_each = learners(settings)
     config = algorithm.load()()

@@ -365,11 +365,7 @@ ray.shutdown()
 
 
 def reach(place: str, timeout: float = REACH_TIMEOUT) -> None:
-    """Find out whether a run can join the cluster at ``host:port``.
-
-    Args:
-        place: Its address.
-        timeout: How long joining may take once the host has accepted a connection [s].
+    """Find out whether a run can join the cluster at ``host:port``, within so many seconds once the host accepts.
 
     Raises:
         TrainingFailed: Nothing answers there, what answers is no cluster, or it refuses us; says which.
@@ -396,11 +392,7 @@ def reach(place: str, timeout: float = REACH_TIMEOUT) -> None:
 
 
 def reason(said: str) -> str:
-    """Why another process could not join a cluster, and what to do.
-
-    Args:
-        said: What it printed.
-    """
+    """Why another process, which printed this, could not join a cluster, and what to do."""
     if re.search("InvalidAuthToken|AuthenticationError|authentication token", said):
         return (
             "the cluster does not accept the token, or none was given. Set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN to "

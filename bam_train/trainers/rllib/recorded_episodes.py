@@ -65,11 +65,7 @@ def add_data(config: Any, settings: TrainSettings, observation_space: Space[Any]
 
 
 class RecordedData(OfflineData):  # type: ignore[misc]
-    """RLlib's `OfflineData` over files that fit into memory: what `AlgorithmConfig.offline_data` takes.
-
-    Args:
-        config: Its ``input_`` names the files, its spaces say what is in them.
-    """
+    """RLlib's `OfflineData` over files that fit into memory: what `AlgorithmConfig.offline_data` takes."""
 
     def __init__(self, config: Any) -> None:  # not RLlib's, which opens the files with Ray Data
         self._config = config
@@ -83,13 +79,7 @@ class RecordedData(OfflineData):  # type: ignore[misc]
 
 
 class Draws:
-    """Rows drawn at random, batch after batch; travels to its learner without the rows.
-
-    Args:
-        data: Folder or address of the files.
-        config: Says the spaces and the discount.
-        seed: Of the draws.
-    """
+    """Rows of files drawn at random, batch after batch; travels to its learner without the rows."""
 
     def __init__(self, data: str, config: Any, seed: int) -> None:
         self._data, self._seed = data, seed
@@ -109,14 +99,9 @@ class Draws:
 def load(data: str, observation_space: Space[Any], action_space: Space[Any], gamma: float) -> dict[str, Array]:
     """All rows, as RLlib's learners take them.
 
-    Args:
-        data: Folder or address of the files.
-        observation_space: The environment's.
-        action_space: The environment's.
-        gamma: Discount of ``value_targets``, the rewards from a row to the end of what was recorded of its episode.
-
     Returns:
-        Columns (rows, ...): obs, new_obs, actions, rewards, terminateds, truncateds, value_targets, weights, n_step.
+        Columns (rows, ...): obs, new_obs, actions, rewards, terminateds, truncateds, value_targets (the rewards from a
+        row to the end of what was recorded of its episode, discounted by `gamma`), weights, n_step.
 
     Raises:
         SettingsError: There are no rows, or one has a value that is missing, not finite or not in its space.

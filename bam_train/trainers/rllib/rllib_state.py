@@ -31,12 +31,7 @@ STATES = ("state.pkl", "algorithm_state.pkl", "module_state.pkl", "policy_state.
 
 
 def members(algorithm: Any, notes: Mapping[str, Any]) -> dict[str, bytes]:
-    """Everything that the run needs to go on.
-
-    Args:
-        algorithm: RLlib's, between two iterations.
-        notes: JSON values to keep.
-    """
+    """Everything that the run needs to go on, between two iterations; notes are JSON values."""
     with tempfile.TemporaryDirectory(prefix="bam-rllib-") as name:
         root = Path(name).resolve()  # RLlib takes absolute paths alone
         algorithm.save_to_path(str(root))
@@ -124,10 +119,8 @@ def hand_out(algorithm: Any) -> None:
 def start_actions(algorithm: Any, log_std: float | None, scale: float) -> None:
     """Change where the actions of a new algorithm start.
 
-    Args:
-        algorithm: RLlib's.
-        log_std: Of the standard deviation, where it is a parameter of its own; None leaves it.
-        scale: What the weights and biases of the policy's last layer are multiplied by.
+    `log_std` is of the standard deviation, where that is a parameter of its own; None leaves it. The weights and
+    biases of the policy's last layer are multiplied by `scale`.
     """
     if log_std is None and scale == 1.0:
         return

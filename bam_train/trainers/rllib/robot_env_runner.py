@@ -22,9 +22,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from ray.rllib.callbacks.utils import make_callback
 from ray.rllib.core.columns import Columns
-from ray.rllib.env.env_context import EnvContext
 from ray.rllib.env.env_runner import ENV_STEP_FAILURE
 from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
@@ -49,7 +47,7 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
     """Collects episodes on ``num_envs_per_env_runner`` batched copies of one of our environments.
 
     Its connectors are RLlib's defaults and, before them, `MeanStdFilter` or nothing; its module has no state.
-    Callbacks on single steps and episodes are not called.
+    Callbacks on environments, single steps and episodes are not called.
     """
 
     env: Any
@@ -92,18 +90,6 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
             self.env = FiniteVectorEnv(make_vector_env(env_id, kwargs, self.config.num_envs_per_env_runner), env_id)
         self.num_envs = self.env.num_envs
         self._needs_initial_reset = True
-        context = EnvContext(kwargs, worker_index=self.worker_index or 0, num_workers=self.num_workers)
-        make_callback(
-            "on_environment_created",
-            callbacks_objects=self._callbacks,
-            callbacks_functions=self.config.callbacks_on_environment_created,
-            kwargs={
-                "env_runner": self,
-                "metrics_logger": self.metrics,
-                "env": self.env.unwrapped,
-                "env_context": context,
-            },
-        )
 
     def _sample(
         self,

@@ -137,10 +137,7 @@ class RunnerWatch:
             algorithm.restore_env_runners = self._restore  # an algorithm without samples may never leave its loop
 
     def train(self) -> tuple[dict[str, Any], list[str]]:
-        """One iteration of the algorithm.
-
-        Returns:
-            RLlib's result, and what the user should know about runners, one line each.
+        """One iteration: RLlib's result, and what the user should know about runners, one line each.
 
         Raises:
             ProcessesLost: A runner dies again and again, or all are gone for good; says why they died if they could.

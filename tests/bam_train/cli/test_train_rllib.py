@@ -180,31 +180,25 @@ SENT = ((signal.SIGINT, os.killpg, 130), (signal.SIGTERM, as_timeout_does, 143),
 @pytest.mark.slow
 def test_a_signal_saves_and_leaves_no_process(here, start):
     """Three runs at once, each with a Ray of its own, the first with a runner."""
-    folders = [here / str(status) for *_, status in SENT]
-    for folder in folders:
+    runs = []
+    for runners, sent in zip((1, 0, 0), SENT, strict=True):
+        folder = here / sent[0].name
         folder.mkdir()
-    processes = [
-        start("--eval-every", "100000000", folder=folder, runners=int(folder == folders[0])) for folder in folders
-    ]
-    for process, folder, (number, send, status) in zip(processes, folders, SENT, strict=True):
-        require_saved_and_gone(process, folder, number, send, status)
-
-
-def require_saved_and_gone(process, here, number, send, status):
-    wait_for(process, "steps/s")
-    processes = psutil.Process(process.pid).children(recursive=True)
-    assert len(processes) > 5
-    folders = folders_of(processes)
-    send(process.pid, number)  # a terminal sends Ctrl-C, and SIGHUP at its end, to the whole group
-    _, err = process.communicate(timeout=120)
-    assert process.returncode == status, err
-    assert "finishing the update and saving" in err
-    assert "Traceback" not in err
-    assert err.splitlines()[-1] == "  bam-train --resume runs/reach-rllib-ppo/last.zip"
-    assert Checkpoint.open(here / "runs" / "reach-rllib-ppo" / "last.zip").manifest.steps >= 256
-    assert not any(one.is_running() for one in processes)
-    assert len(folders) == 1
-    assert not any(map(os.path.exists, folders))
+        runs.append((start("--eval-every", "100000000", folder=folder, runners=runners), folder, sent))
+    for process, folder, (number, send, status) in runs:
+        wait_for(process, "steps/s")
+        processes = psutil.Process(process.pid).children(recursive=True)
+        assert len(processes) > 5
+        (rays,) = folders_of(processes)
+        send(process.pid, number)  # a terminal sends Ctrl-C, and SIGHUP at its end, to the whole group
+        _, err = process.communicate(timeout=120)
+        assert process.returncode == status, err
+        assert "finishing the update and saving" in err
+        assert "Traceback" not in err
+        assert err.splitlines()[-1] == "  bam-train --resume runs/reach-rllib-ppo/last.zip"
+        assert Checkpoint.open(folder / "runs" / "reach-rllib-ppo" / "last.zip").manifest.steps >= 256
+        assert not any(one.is_running() for one in processes)
+        assert not os.path.exists(rays)
 
 
 @pytest.mark.slow

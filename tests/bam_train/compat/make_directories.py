@@ -58,6 +58,7 @@ def make(folder, config, env, *, train=False, pieces=(), spec=None):
         .rl_module(**({"rl_module_spec": spec} if spec else small))
         .debugging(seed=0, log_level="ERROR")
     )
+    gym.registry.pop("rllib-single-agent-env-v0", None)  # RLlib registers it every time
     algorithm = config.build_algo()
     if train:
         algorithm.train()

@@ -141,12 +141,9 @@ def test_a_signal_waits_while_it_starts(number, monkeypatch):
     def came(*_):
         raise Came
 
-    def start(**_):
-        signal.raise_signal(number)
-        ended.append(True)
-
-    ended, before = [], signal.signal(number, came)
-    monkeypatch.setattr(ray, "init", start)
+    ended = []
+    monkeypatch.setattr(ray, "init", lambda **_: (signal.raise_signal(number), ended.append(True)))
+    before = signal.signal(number, came)
     try:
         with pytest.raises(Came), cluster(settings()):
             pass
