@@ -1,6 +1,6 @@
 """Files that are whole or absent: written beside their place and moved into it; a checkpoint, a video.
 
-The temporary file is locked while somebody writes it: a process that is killed cannot remove its file, but the system
+The temporary file is locked while a process writes it: a process that is killed cannot remove its file, but the system
 releases its lock. A process number in the name would not do: computers and containers that share a folder number their
 processes alike.
 """
@@ -73,5 +73,5 @@ def remove_orphans(target: Path) -> None:
         for path in target.parent.iterdir() if fcntl is not None else ():
             if ours.fullmatch(path.name):
                 with contextlib.suppress(OSError), path.open("rb+") as file:
-                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # BlockingIOError: somebody writes it
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # BlockingIOError: a process still writes it
                     path.unlink()

@@ -42,11 +42,11 @@ def environment_of(
 
     Args:
         checkpoint: May be untrusted.
-        named: What a person says that it was trained on; its module is imported.
+        named: The environment that the user expects; its module is imported.
         elsewhere: It runs on another computer, and nothing is imported here.
 
     Raises:
-        CheckpointMismatch: It was trained on another than `named`, or in a module that nobody named or installed.
+        CheckpointMismatch: It was trained on another than `named`, or in a module that was neither named nor installed.
         SettingsError: Nothing is called what the manifest says, or it does not take these arguments.
         UnknownName: Nothing is called `named`.
     """
@@ -72,17 +72,17 @@ def environment_of(
 
 
 def must_be_named(env_id: str) -> bool:
-    """Whether an id has a module that no installed package names: it is imported only because a person says so."""
+    """Whether an id has a module that no installed package registers: it is imported only if the user names it."""
     module = env_id.rpartition(":")[0]
     installed = {point.module for point in metadata.entry_points(group=ENTRY_POINTS)}
     return bool(module) and module.partition(".")[0] not in _OWN and module not in installed
 
 
 def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
-    """Refuse an argument that one of our environments does not have; others are asked when they are made.
+    """Refuse an argument that one of our environments does not take; others check theirs when they are made.
 
     Raises:
-        SettingsError: Carries the closest match of what can be had; or a value is of the wrong kind.
+        SettingsError: An unknown name, with the closest match; or a value of the wrong kind.
     """
     limit = given.get("max_episode_steps")  # Gymnasium's: None for the usual one, -1 for none
     if limit not in (None, -1) and (isinstance(limit, bool) or not isinstance(limit, int) or limit < 1):

@@ -12,7 +12,7 @@
     ├── PolicyError                a frozen policy that cannot run, or an observation that does not fit it
     ├── SettingsError              a setting or option that does not exist or does not fit
     ├── LoopError                  the interaction loop
-    │   ├── UnknownVariable        a variable that nobody wrote
+    │   ├── UnknownVariable        a variable that no agent wrote
     │   ├── TimeNotWritten         a time at which it is not written, or that has left the window
     │   ├── ValueMismatch          another shape, dtype, device or kind of array than before
     │   ├── WorkspaceError         anything else that a workspace refuses, such as variables of different lengths
@@ -90,7 +90,7 @@ class LoopError(BamTrainError):
 
 
 class UnknownVariable(LoopError, LookupError):  # noqa: N818 - reads as what happened
-    """A variable that nobody wrote; the text has the closest match.
+    """A variable that no agent wrote; the text has the closest match.
 
     Args:
         name: As it was asked for.

@@ -26,7 +26,7 @@ from bam_train.loop.video_agent import VideoAgent
 from bam_train.video import Frame
 
 FIRST_SEED = 1_000_000
-"""Where evaluation's seeds start unless told: far from the small seeds that training runs start their episodes from."""
+"""The default seed of the first episode: far from the small seeds that training uses."""
 
 _Z95 = 1.959963984540054
 """97.5 % quantile of the normal distribution, for a two-sided 95 % interval."""
@@ -210,7 +210,7 @@ def record_video(env: gym.Env[Any, Any], policy: Any, add: Callable[[Frame], Any
 
 
 class _Batch(VecGymAgent):
-    """An environment that is somebody else's: an exception does not close it."""
+    """An environment of the caller: an exception does not close it."""
 
     def close(self) -> None:
         """Nothing."""

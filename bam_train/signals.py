@@ -24,7 +24,7 @@ and then to its group. Ctrl-C is a person's, and counts each time."""
 
 
 class Terminated(KeyboardInterrupt):
-    """A signal other than Ctrl-C asked for the end; Ray, waiting in C++, hears of no other kind of exception.
+    """A signal other than Ctrl-C asked for the end; Ray, waiting in C++, passes on KeyboardInterrupt alone.
 
     Attributes:
         signal: Which.
@@ -159,5 +159,5 @@ def at_quit(call: Callable[[], None]) -> Iterator[None]:
 def before_quitting() -> None:
     """Call what is registered, the latest first, whatever becomes of it."""
     for call in reversed(_CALLS):
-        with contextlib.suppress(Exception):  # nobody is left to be told, and quitting must not fail
+        with contextlib.suppress(Exception):  # quitting must not fail
             call()

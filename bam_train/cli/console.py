@@ -38,7 +38,7 @@ def tell(*lines: str) -> None:
 
 
 def is_terminal() -> bool:
-    """Whether somebody watches standard error on a terminal."""
+    """Whether standard error is a terminal."""
     return sys.stderr.isatty()
 
 
@@ -67,7 +67,7 @@ class ShownFormatter(logging.Formatter):
 
 
 def show_logs_and_tracebacks() -> None:
-    """Show what Python itself prints of a program: logs that nobody handles, and the traceback of a mistake of ours."""
+    """Pass what Python itself prints through `shown`: unhandled logs, and the traceback of an error in our code."""
 
     def say_traceback(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
         for line in "".join(traceback.format_exception(kind, error, trace)).rstrip("\n").split("\n"):
@@ -135,7 +135,7 @@ def require_consent(env: Any, who: str, *, yes: bool, plan: Sequence[str] = ()) 
     """Ask once before a real robot moves; it is connected, and stands still.
 
     Args:
-        env: The environment, single or vector; without a real robot nobody is asked.
+        env: The environment, single or vector; without a real robot there is no question.
         who: What will move it, as the first line begins.
         yes: Show it, and do not ask.
         plan: Lines that say what it will do.

@@ -90,7 +90,7 @@ def _run(
 
 
 def _checked_place(config: DeployConfig) -> Place:
-    """Where the flags say that the environment runs; what cannot be is refused before anything is loaded."""
+    """Where the flags say that the environment runs; invalid flags are refused before anything is loaded."""
     from bam_train.env_location import Place, addresses
     from bam_train.errors import SettingsError
 

@@ -120,7 +120,7 @@ def episode_line(number: int, wanted: int, record: EpisodeRecord) -> str:
 def action_labels(env: gym.Env[Any, Any]) -> tuple[str, ...]:
     """Names of the action's numbers, if the environment has any."""
     describe = getattr(env.unwrapped, "describe", None)
-    return () if describe is None else tuple(str(row["name"]) for row in describe()["action"])
+    return () if describe is None else tuple(str(one["name"]) for one in describe()["action"])
 
 
 def action_lines(labels: tuple[str, ...], action: Any) -> Iterator[tuple[str, str]]:

@@ -31,7 +31,7 @@ class ScriptParser(argparse.ArgumentParser):
         super().__init__(name, "%(prog)s.py [options]", description, formatter_class=kind, allow_abbrev=False)
 
     def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
-        """Read the command line, or `args`; what cannot be ends the program with status 2."""
+        """Read the command line, or `args`; an error in it ends the program with status 2."""
         known, rest = self.parse_known_args(args, namespace)
         if rest:
             from bam_envs.core.wording import did_you_mean
@@ -126,14 +126,14 @@ def signals_ask() -> Iterator[Callable[[], bool]]:
     """
     came: list[int] = []
 
-    def hear(number: int) -> None:
+    def handle(number: int) -> None:
         if came:
             interrupt(number)
         came.append(number)
         again = "Ctrl-C again" if number == signal.SIGINT else "another signal"
         say(f"finishing the update and saving; {again} quits at once")
 
-    with handled(hear):
+    with handled(handle):
         yield lambda: bool(came)
     if came:
         interrupt(came[0])
@@ -166,7 +166,7 @@ def open_env(
 
     Raises:
         CheckpointMismatch: The environment is another than the checkpoint was trained in.
-        SettingsError: It cannot be made or shown, or nobody says that the real robot may move.
+        SettingsError: It cannot be made or shown, or nobody agreed that the real robot moves.
     """
     from bam_train.env_location import Place
     from bam_train.environments import environment_of, make_env, require_fit

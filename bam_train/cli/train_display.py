@@ -52,7 +52,7 @@ class _Droppable:
 
 
 def stderr_may_close() -> contextlib.AbstractContextManager[Any]:
-    """Within this, the run goes on whether or not somebody still reads standard error."""
+    """Within this, the run goes on also after standard error was closed."""
     return contextlib.redirect_stderr(_Droppable(sys.stderr))
 
 

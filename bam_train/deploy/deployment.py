@@ -57,7 +57,7 @@ class Deployment:
             It is called between two ticks, so it has to be quick; if it fails, the deployment ends.
 
     Raises:
-        WiringError: An agent reads what nobody writes; nothing has been connected.
+        WiringError: An agent reads what no agent writes; nothing has been connected.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class Deployment:
 
 def _ending_of(error: Exception) -> Ending:
     """Tells the operator what to look at first: the network, the robot, or the program."""
-    text = fault_text(error).replace("call resume()", "run it again")  # the program ends here, nobody can resume it
+    text = fault_text(error).replace("call resume()", "run it again")  # the program ends here and cannot be resumed
     if isinstance(error, LinkLost):
         return Ending(f"link lost: {text}", 4)
     if isinstance(error, SafetyStop):
@@ -262,7 +262,7 @@ class StopSwitch:
         """Called in every tick: Python discards an exception in a callback of its own, such as a ``__del__``.
 
         Raises:
-            Stopped: One was raised, and nobody caught it.
+            Stopped: One was raised and discarded.
         """
         if self._raised is not None:
             raise Stopped(self._raised)
