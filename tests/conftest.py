@@ -24,7 +24,10 @@ for name in ("SIGTERM", "SIGHUP"):
 
 KINDS = {
     "ray": (
-        "bam_train/trainers/rllib",
+        "bam_train/trainers/rllib/test_ray_cluster.py",
+        "bam_train/trainers/rllib/test_ray_nodes.py",
+        "bam_train/trainers/rllib/test_rllib_state.py",
+        "bam_train/trainers/rllib/test_rllib_trainer.py",
         "bam_train/compat/test_rllib_new_layout.py",
         "bam_train/cli/test_train_rllib.py",
         "bam_train/cli/test_export.py",
@@ -33,7 +36,13 @@ KINDS = {
         "scripts/test_training_inference.py",
     ),
     "peers": ("peers",),
-    "training": ("scripts", "bam_train/trainers/sb3", "bam_train/cli/test_train.py", "bam_train/cli/test_elsewhere.py"),
+    "training": (
+        "scripts",
+        "bam_train/trainers/rllib",
+        "bam_train/trainers/sb3",
+        "bam_train/cli/test_train.py",
+        "bam_train/cli/test_elsewhere.py",
+    ),
 }
 """Marker to the folders and files whose tests have it, the longest first; `make quick` leaves them all out."""
 
