@@ -68,7 +68,7 @@ def finite_numbers(value: Any, size: int, name: str) -> NDArray[np.float64]:
     """
     try:
         numbers = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = np.array(np.nan)
     if numbers.shape != (size,) or not np.isfinite(numbers).all():
         raise InvalidValue(f"{name} must be {size} finite numbers, not {value!r}.")

@@ -318,9 +318,10 @@ class SafeRobot(metaclass=Sealed):
 
     def _pause(self) -> float:
         """Time since the last command of a motion [s]; 0 for the first one, and in lockstep."""
-        if self._live is None or self._sent_at is None or self._in_lockstep():
+        sent_at = self._sent_at  # looked at once: a halt in another thread clears it
+        if self._live is None or sent_at is None or self._in_lockstep():
             return 0.0
-        return self._clock() - self._sent_at
+        return self._clock() - sent_at
 
     def _begin_at(self, pause: float) -> Array:
         """The last command if the robot still follows it; else where the robot is, at rest. Shape: (m,)."""

@@ -79,7 +79,10 @@ class Limits:
 
     def __post_init__(self) -> None:
         for one in fields(self):
-            check(getattr(self, one.name), one.metadata["type"], f"The limit {one.name}")
+            value = getattr(self, one.name)
+            number = check(value, one.metadata["type"], f"The limit {one.name}")
+            if isinstance(value, (np.ndarray, np.generic)):  # an array could be changed after it was checked
+                object.__setattr__(self, one.name, number)
 
     @classmethod
     def of(cls, values: Mapping[str, float]) -> Limits:

@@ -1,9 +1,11 @@
 """Options of tasks, before they are made."""
 
+import math
+
 import numpy as np
 import pytest
 
-from bam_envs.core.env_options import constructor_options, require_kinds, require_known
+from bam_envs.core.env_options import constructor_options, finite_numbers, require_kinds, require_known
 from bam_envs.core.errors import InvalidValue, UnknownName
 
 
@@ -70,3 +72,10 @@ def test_what_there_is_not(name, closest):
 
 def test_what_is_no_option_of_the_task():
     require_kinds("bam/task-v0", OPTIONS, {"robot": "ws://a:1", "max_episode_steps": 7})
+
+
+@pytest.mark.parametrize("value", ["x", 1.0, [1.0], [1.0, None], [1.0, math.inf], [1.0, 10**400], [[1.0, 2.0]]])
+def test_numbers_that_do_not_fit(value):
+    with pytest.raises(InvalidValue) as caught:
+        finite_numbers(value, 2, "place")
+    assert str(caught.value) == f"place must be 2 finite numbers, not {value!r}."

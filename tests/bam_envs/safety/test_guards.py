@@ -128,6 +128,11 @@ def test_a_limit_is_a_number_above_zero(name, value, text):
     assert str(caught.value) == f"The limit {name}: expected {text}, found {value!r}"
 
 
+@pytest.mark.parametrize("value", [np.array(0.5), np.float32(0.5), np.int64(1)])
+def test_a_limit_of_numpy_becomes_a_number_that_nobody_can_change(value):
+    assert type(Limits(tool_speed=value).tool_speed) is float
+
+
 def test_a_margin_leaves_room():
     with pytest.raises(InvalidValue) as caught:
         default_guards(ARM, Limits(position_margin=4.0))

@@ -597,6 +597,18 @@ def test_a_halt_that_comes_just_before_the_command_is_repeated_after_it():
     assert np.abs(robot.step(state.command).command[0, :6] - pushed).max() <= 0.0125 + 1e-9
 
 
+def test_a_halt_while_the_time_since_the_last_command_is_measured():
+    arm, meanwhile = LiveArm(), []
+    robot = SafeRobot(arm, clock=lambda: (arm.now, [work() for work in meanwhile])[0])
+    robot.connect()
+    arm.place(ARM_HOME)
+    state = robot.reset(np.arange(1), start_at())
+    robot.step(away(state, 0.02))
+    halts, meanwhile[:] = arm.halts, [lambda: (meanwhile.clear(), robot.halt())]
+    robot.step(away(state, 0.02))
+    assert arm.halts == halts + 2  # the second one after the command
+
+
 def halt(arm, robot, state, pushed):
     robot.halt()
     arm.place(pushed)
