@@ -248,7 +248,8 @@ class RosbridgeTransport:
                 response = self._exchange(RequestType.NONE, None, timeout=limit)
                 break
             except RemoteError as error:
-                if not is_over(error):  # no such service, or a rack that fails at what it does not know
+                # No such service, or a rack that fails at what it does not know; a session that is over is ours.
+                if not (self._tagger.signs and is_over(error)):
                     return self._foreign(str(error))
                 self._sign_with(Tagger())
             except LinkLost as error:

@@ -105,10 +105,11 @@ def read_object(wire: Mapping[str, float]) -> tuple[Array, Array]:
 
 
 def _take(wire: Mapping[str, float], keys: Sequence[str]) -> Array:
-    for key in keys:
-        if not math.isfinite(wire[key]):
+    values = np.array([wire[key] for key in keys], dtype=np.float64)  # None is NaN
+    for key, value in zip(keys, values, strict=True):
+        if not math.isfinite(value):
             raise InvalidValue(f"{key} of the wire state of a UR must be finite, not {wire[key]}.")
-    return np.array([wire[key] for key in keys], dtype=np.float64)
+    return values
 
 
 def _state(signals: Mapping[str, Array], collision: float, commands: int) -> RobotState:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, NotInCommand, ProtocolError
+from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, NotInCommand, ProtocolError, RemoteError
 from bam_envs.remote.rosbridge_transport import RosbridgeTransport
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
@@ -160,6 +160,19 @@ def test_nothing_is_served_in_that_namespace(served, open_to):
 def test_nobody_answers_on_the_topics(server, open_to):
     with pytest.raises(NoServer, match="rosbridge is there, and /bam_001/gym_env/request is silent: "):
         open_to(channel="topics", connect_timeout=1.0).connect()
+
+
+def test_a_server_that_knows_no_session_is_asked_once(server, open_to):
+    asked = []
+
+    def refuse(request, caller):
+        asked.append(request)
+        raise RemoteError("session abc is not open here" if len(asked) < 50 else "enough")
+
+    server.serve("/bam_001/gym_env/gym_api_request", "bam_msgs/GymAPI", refuse)
+    with pytest.raises(NoServer, match="session abc is not open here; give observation_space and action_space"):
+        open_to(env_id="Pick3").connect()
+    assert len(asked) == 1
 
 
 def test_no_server_at_all():

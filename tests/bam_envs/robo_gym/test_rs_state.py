@@ -130,3 +130,8 @@ def test_wrong_arms(mode, change, text):
     with pytest.raises(InvalidValue) as caught:
         read_ur({key: value for key, value in wire.items() if value is not None})
     assert str(caught.value) == text
+
+
+def test_nothing_in_place_of_a_number():
+    with pytest.raises(InvalidValue, match="^in_collision of the wire state of a UR must be finite, not None"):
+        read_ur({**dict.fromkeys(UR_KEYS["only_robot"], 0.0), "in_collision": None})
