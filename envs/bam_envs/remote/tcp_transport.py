@@ -154,8 +154,7 @@ class TcpTransport:
         deadline = time.monotonic() + self.endpoint.connect_timeout
         start = f"bam-serve --env {self.env_id or 'bam/pick'} --tcp"
         try:
-            address = (self._host, self._port)
-            self._frames = FrameSocket(socket.create_connection(address, self.endpoint.connect_timeout))
+            self._frames = FrameSocket(_dial(self._host, self._port, deadline))
         except OSError as error:
             if isinstance(error, ConnectionRefusedError):
                 reason = "nobody listens there (is the port open?)"
@@ -220,3 +219,14 @@ class TcpTransport:
         frames, self._frames = self._frames, None
         if frames is not None and self._pid == os.getpid():
             frames.close()
+
+
+def _dial(host: str, port: int, deadline: float) -> socket.socket:
+    """A socket that is connected before `deadline`, however many addresses the name has."""
+    refusal = OSError("it has no address")
+    for *_, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+        try:
+            return socket.create_connection((str(address[0]), int(address[1])), max(0.01, deadline - time.monotonic()))
+        except OSError as error:  # noqa: PERF203 - the next address may answer
+            refusal = error
+    raise refusal

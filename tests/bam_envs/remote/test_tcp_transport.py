@@ -101,6 +101,21 @@ def refused(url, **options):
     return str(caught.value).removeprefix(f"{url}: ")
 
 
+def test_many_addresses_take_no_longer_than_one(monkeypatch):
+    limits = []
+
+    def silent(address, timeout):
+        limits.append(timeout)
+        threading.Event().wait(timeout)
+        raise TimeoutError
+
+    found = [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (f"10.0.0.{number}", 5)) for number in range(3)]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **options: found)
+    monkeypatch.setattr(socket, "create_connection", silent)
+    assert refused("tcp://many:5", connect_timeout=0.1).startswith("no answer within 0.1 s")
+    assert sum(limits) == pytest.approx(0.1, abs=0.03)
+
+
 def test_nobody_listens():
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]

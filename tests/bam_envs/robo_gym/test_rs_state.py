@@ -133,5 +133,5 @@ def test_wrong_arms(mode, change, text):
 
 
 def test_nothing_in_place_of_a_number():
-    with pytest.raises(InvalidValue, match="^in_collision of the wire state of a UR must be finite, not None"):
+    with pytest.raises(InvalidValue, match=r"^in_collision of the wire state of a UR must be finite, not None"):
         read_ur({**dict.fromkeys(UR_KEYS["only_robot"], 0.0), "in_collision": None})
