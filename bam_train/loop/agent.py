@@ -51,7 +51,7 @@ class Agent(_Base):  # type: ignore[misc]
     workspace: Any = None
     prefix: str = ""
     verbose: bool = False
-    name: str | None = None
+    _name: str | None = None
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """A plain object; once torch is imported, an `nn.Module` too, as a `pathlib.Path` is a `PosixPath`."""
@@ -62,7 +62,7 @@ class Agent(_Base):  # type: ignore[misc]
     def __init__(self, name: str | None = None, verbose: bool = False) -> None:
         if is_module(self):
             sys.modules["torch"].nn.Module.__init__(self)
-        self.name, self.verbose, self.workspace = name, verbose, None
+        self._name, self.verbose, self.workspace = name, verbose, None
 
     # -- running ---------------------------------------------------------------------------------------------------
 
@@ -154,19 +154,28 @@ class Agent(_Base):  # type: ignore[misc]
 
     # -- name, seed, copies ----------------------------------------------------------------------------------------
 
+    @property
+    def name(self) -> str | None:
+        """What `get_by_name` finds; a subclass may have a `name` of its own beside it."""
+        return self._name
+
+    @name.setter
+    def name(self, name: str | None) -> None:
+        self._name = name
+
     def get_name(self) -> str | None:
         """The name."""
-        return self.name
+        return self._name
 
     def set_name(self, n: str | None) -> Self:
         """Set the name; the agent itself is returned."""
-        self.name = n
+        self._name = n
         return self
 
     def get_by_name(self, n: str) -> list[Agent]:
         """The agents of that name in the tree: those in it first, then itself."""
         found = [one for agent in self._inner() for one in agent.get_by_name(n)]
-        return [*found, self] if n == self.name else found
+        return [*found, self] if n == self._name else found
 
     def with_prefix(self, prefix: str) -> Self:
         """Set `prefix`; the agent itself is returned."""
@@ -225,7 +234,7 @@ def import_torch(purpose: str) -> Any:
 
 def agent_name(agent: Agent) -> str:
     """Its class, and its name if it has one, for error messages."""
-    return type(agent).__name__ + (f" {agent.name!r}" if agent.name else "")
+    return type(agent).__name__ + (f" {agent._name!r}" if agent._name else "")
 
 
 def is_live(agent: Agent) -> bool:

@@ -256,6 +256,9 @@ class NRemoteAgent(Agent):
     def close(self) -> None:
         """End all processes; at any time, and idempotent. The next call starts new ones."""
         for agent in self.agents:
+            if agent._worker is not None:
+                agent._worker.ask_to_end()  # so that they end at the same time
+        for agent in self.agents:
             agent.close()
 
     def _columns(self, workspace: Workspace) -> list[SharedWorkspace]:

@@ -92,13 +92,18 @@ class Worker:
             pass
         return self._pending > (0 if self._started else 1)
 
+    def ask_to_end(self) -> None:
+        """Ask an idle process to close its agent and end, without waiting; only `close` may follow."""
+        if not (self._pending or self.closed) and self._owner == os.getpid():
+            with suppress(OSError):  # it has ended, or was asked before
+                self._connection.send_bytes(self._pickled(("exit",)))
+
     def close(self) -> None:
         """End the process, at once if it is busy; in any state, and idempotent."""
         if self.closed or self._owner != os.getpid():  # a forked process has copies of its siblings' ends
             return
+        self.ask_to_end()
         if not self._pending:
-            with suppress(OSError):
-                self._connection.send_bytes(self._pickled(("exit",)))
             self._process.join(PATIENCE)
         for end in (self._process.terminate, self._process.kill):
             if self._process.is_alive():

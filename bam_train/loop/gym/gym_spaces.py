@@ -146,12 +146,12 @@ class InfoRecorder:
 
     def _record(self, found: dict[str, Array], key: str, mask: Array, given: Sequence[tuple[Any, Any]]) -> None:
         """Add one entry to `found`; `given` has indices of environments, and their values."""
-        if given and key not in self._known:
-            first = given[0][1][0] if np.ndim(given[0][0]) else given[0][1]
-            array = np.asarray(first)
-            if array.dtype.kind not in self._dtypes:
-                raise ValueMismatch(f"info {key!r}: expected a number or an array of them, found a {kind_name(first)}.")
-            self._known[key] = self._dtypes[array.dtype.kind], array.shape
+        for index, value in given:
+            one = value[0] if np.ndim(index) else value
+            array = np.asarray(one)
+            if array.dtype.kind not in self._dtypes:  # at every time: NumPy writes None as NaN and "2" as 2
+                raise ValueMismatch(f"info {key!r}: expected a number or an array of them, found a {kind_name(one)}.")
+            self._known.setdefault(key, (self._dtypes[array.dtype.kind], array.shape))
         if key not in self._known:
             return
         dtype, shape = self._known[key]

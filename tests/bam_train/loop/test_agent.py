@@ -109,6 +109,16 @@ def test_names():
     assert Agent().get_by_name(None) != []
 
 
+def test_a_class_may_have_a_name_of_its_own():
+    class Arm(Agent):
+        @property
+        def name(self):
+            return "ur5"
+
+    agent = Arm(name="a")
+    assert (agent.name, agent.get_name(), agent.get_by_name("a")) == ("ur5", "a", [agent])
+
+
 def test_attributes_of_every_agent():
     agent = Agent("a", True)
     assert agent.verbose is True

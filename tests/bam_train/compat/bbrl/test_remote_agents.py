@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import types
 from functools import partial
 from pathlib import Path
@@ -357,6 +358,25 @@ def test_the_agent_is_closed_in_its_process(started, tmp_path):
     remote(workspace, t=0)
     remote.close()
     assert int((tmp_path / "closed").read_text()) != os.getpid()
+
+
+def test_the_processes_of_several_agents_end_at_the_same_time(tmp_path):
+    parent = os.getpid()
+
+    class Closing(Walker):
+        def close(self):
+            if os.getpid() == parent:  # of the agent that `create` was given
+                return
+            (tmp_path / f"closing-{os.getpid()}").touch()
+            until = time.monotonic() + 3
+            while len(list(tmp_path.glob("closing-*"))) < 2 and time.monotonic() < until:
+                time.sleep(0.01)
+            (tmp_path / f"saw-{len(list(tmp_path.glob('closing-*')))}-{os.getpid()}").touch()
+
+    remote, workspace = NRemoteAgent.create(Closing(), num_processes=2, start_method="fork", t=0)
+    remote(workspace, t=0)
+    remote.close()
+    assert [one.name[:5] for one in tmp_path.glob("saw-*")] == ["saw-2"] * 2
 
 
 def test_the_last_reference_ends_the_process():

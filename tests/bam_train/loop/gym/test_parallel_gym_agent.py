@@ -9,7 +9,7 @@ from bam_envs.core.robot_env import RobotEnv
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.tasks.pick import PickTask
-from bam_train.errors import LoopError, SettingsError
+from bam_train.errors import LoopError, SettingsError, ValueMismatch
 from bam_train.loop import ParallelGymAgent, VecGymAgent, Workspace
 
 
@@ -86,6 +86,18 @@ def test_infos(toys):
     assert toys.column(ws, "env/info/_odd") == [False, True, False, True, False, True]
     assert "env/info/never" not in ws.variables
     assert ws["env/info/odd"].dtype == torch.int64
+
+
+@pytest.mark.parametrize("value", [None, "2.5", "open"])
+def test_an_info_is_a_number_at_every_time(toys, value):
+    class Telling(toys.Counting):
+        def step(self, action):
+            observation, reward, terminated, truncated, info = super().step(action)
+            return observation, reward, terminated, truncated, {**info, "told": 1.5 if self.count == 1 else value}
+
+    agent = ParallelGymAgent(Telling, 1, arrays="numpy", info_keys=("told",))
+    with pytest.raises(ValueMismatch, match=r"^info 'told': expected a number or an array of them, found a \w+\.$"):
+        toys.run(agent, 3)
 
 
 def test_closed_environments_are_made_anew_at_0(toys):
