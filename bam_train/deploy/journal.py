@@ -111,7 +111,7 @@ class Journal:
         counts = self._earlier.copy()
         if self.records and self.records[-1].complete:
             success = self.records[-1].success
-            counts.update(completed=1, said=success is not None, succeeded=bool(success))
+            counts.update(completed=1, said=int(success is not None), succeeded=int(bool(success)))
         return counts
 
 

@@ -140,3 +140,11 @@ def test_old_records_are_counted_and_forgotten():
     assert (journal.begun, journal.completed, journal.successes) == (KEPT + 10, KEPT + 10, KEPT // 2 + 5)
     assert len(journal.records) == KEPT
     assert journal.records[0].seed == 10
+
+
+def test_one_success_is_a_number():
+    journal = Journal(1)
+    record = journal.begin(0)
+    record.add(1.0, True)
+    record.end = "terminated"
+    assert repr(journal.successes) == "1"
