@@ -305,10 +305,10 @@ def test_a_halt_overtakes_a_call_that_runs(lax, robot_on, connect):
     scripted = robot_on(server)
     robot, gate = connect(server.url)
     gate.step(gate.state.command + 0.01)
+    calls = [message for _, message in server.frames if "list_controllers" in message.get("service", "")]
     blocks.set()
     asking = threading.Thread(target=robot.not_ready)
     asking.start()
-    calls = [message for _, message in server.frames if "list_controllers" in message.get("service", "")]
     server.wait_for(lambda frames: sum("list_controllers" in one.get("service", "") for _, one in frames) > len(calls))
     robot.halt()
     scripted.wait_for(lambda: scripted.halts == 1)
