@@ -87,8 +87,7 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
 def _stopped_by_signals(run: TrainingRun) -> Iterator[list[int]]:
     """Within this, the first signal asks `run` to stop after its update, the second ends the process there and then.
 
-    Gives the signals that came. Once one came, the next ends the process even after leaving: what is left to do then is
-    not worth waiting for.
+    Gives the signals that came.
     """
     came: list[int] = []
 

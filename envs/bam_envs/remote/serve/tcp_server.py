@@ -140,7 +140,7 @@ class TcpServer:
     def _begin(self, connection: _Connection) -> None:
         with self._lock:
             self._connections[connection] = None
-            strangers = [one for one in self._connections if one.caller is None]
+            strangers = [one for one in self._connections if one.caller is None and not one.dropped]
             mine = [one for one in strangers if one.host == connection.host]
         # Silent connections must not keep others out: a new one is always accepted.
         if len(mine) > _STRANGERS_OF_ONE:
@@ -197,10 +197,12 @@ class _Connection:
     def __init__(self, owner: TcpServer, sock: socket.socket, host: str, port: int) -> None:
         self.host, self.client, self.session = host, f"{host}:{port}", ""
         self.caller: Caller | None = None  # known when it is let in
+        self.dropped = False  # hung up; its thread has yet to end
         self._owner, self._frames = owner, FrameSocket(sock)
         self.thread = threading.Thread(target=self._run, name=f"bam-tcp {self.client}", daemon=True)
 
     def drop(self) -> None:
+        self.dropped = True
         self._frames.hang_up()
 
     def _run(self) -> None:
