@@ -74,6 +74,13 @@ def _status(main: Callable[[SignalMemory], int | None], prog: str) -> int:
                 if not isinstance(error, Terminated) and signals.came[:1] != [signal.SIGINT]:
                     signals.raise_again()  # of SIGTERM, of which Ray raises a plain KeyboardInterrupt
                 raise
+            except Exception as error:
+                cause: BaseException | None = error
+                while cause is not None and not isinstance(cause, ImportError):
+                    cause = cause.__cause__ or cause.__context__
+                if cause is not None:
+                    signals.raise_again()  # an extension that is interrupted while it is imported raises ImportError
+                raise
     except Terminated as stop:
         _complain(prog, f"ended by {stop.signal.name}")
         return 128 + stop.signal

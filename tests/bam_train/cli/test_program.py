@@ -224,6 +224,31 @@ def test_a_signal_that_ray_makes_a_ctrl_c_of_is_still_what_it_was(capsys):
     assert capsys.readouterr().err == "prog: ended by SIGTERM\n"
 
 
+@pytest.mark.parametrize(
+    "error", [ImportError("initialization failed"), MissingExtra("mujoco", "sim", "A simulated robot")]
+)
+def test_an_import_that_ctrl_c_broke_is_an_interruption(error, capsys):
+    def main():
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise error from None
+
+    assert guarded(main, "prog") == 130
+    assert capsys.readouterr().err == "prog: interrupted\n"
+
+
+def test_what_goes_wrong_after_ctrl_c_is_reported(capsys):
+    def main():
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise SettingsError("The robot could not be halted.") from None
+
+    assert guarded(main, "prog") == 1
+    assert capsys.readouterr().err == "prog: The robot could not be halted.\n"
+
+
 def test_the_box_of_a_terminal_without_unicode_is_one_line_too():
     lines = ["+- Unrecognized options ---+", "| Unrecognized options: --qqq |", "| -------- |", "| For full helptext |"]
     box = "\n".join([*lines, "+------+"])
