@@ -5,8 +5,6 @@ releases its lock. A process number in the name would not do: computers and cont
 processes alike.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

@@ -1,7 +1,5 @@
 """Where an environment runs: here and simulated, here with a live robot, or whole on another computer."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Making the environment that a checkpoint belongs to, and proving that it is the same one before anything moves."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

@@ -27,8 +27,6 @@
 Third-party errors are mapped to these at the border, with the cause kept by ``from``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 

@@ -5,8 +5,6 @@ run of one `TemporalAgent` (environment, policy) until all have ended: every env
 does after its end is not counted (it keeps stepping only because others are not done).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass

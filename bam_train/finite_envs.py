@@ -3,8 +3,6 @@
 What learns from such a number is broken by it much later, and then points at the policy or the learning rate.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Pictures of a policy at work, as an animated GIF (Pillow) or an MP4 (imageio with its ffmpeg)."""
 
-from __future__ import annotations
-
 import importlib
 import os
 from collections.abc import Callable, Iterator

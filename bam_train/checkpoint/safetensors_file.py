@@ -5,8 +5,6 @@ it names; exact both ways: ints of any size, floats to the last bit (NaN and inf
 with dtype and shape, tuples, and mappings with keys other than text.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Reading a zip that may be damaged or hostile: every fault is one clear line, and nothing is unpacked to the disk."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import struct

@@ -4,8 +4,6 @@ Programs import this after they have begun to handle signals, as tyro takes a wh
 whose import registers the environments with Gymnasium and takes longer than ``--help`` may.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass, make_dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ Only the standard library is imported before signals are handled, and only tyro 
 Ctrl-C is one line at any moment and ``--help`` is quick.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import io

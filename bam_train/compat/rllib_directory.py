@@ -1,7 +1,5 @@
 """The folders that RLlib writes checkpoints into: which layout one has, which policies, and where."""
 
-from __future__ import annotations
-
 import json
 import os
 import stat

@@ -4,8 +4,6 @@ A directory of RLlib's present API is restored by the installed RLlib, which run
 one of the old layout is read without running anything.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import re

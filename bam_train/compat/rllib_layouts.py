@@ -5,8 +5,6 @@ read what the old API stack wrote (robo-gym's own scripts used Ray 2.10), so ``p
 running what is in it, and its network is built from the names of its weights: dense layers, of SAC and CQL the actor's.
 """
 
-from __future__ import annotations
-
 import json
 import pickle
 import re

@@ -8,8 +8,6 @@ The core needs NumPy only. What needs torch is imported when it is asked for, an
 BBRL need, which is in `bam_train.compat.bbrl`.
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING, Any
 

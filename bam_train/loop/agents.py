@@ -4,8 +4,6 @@ Differences from BBRL: `KWAgentWrapper` wraps anything that can be called, `Agen
 without t as well; `PrintAgent` without names prints what there is each time.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterable, Iterator
 from typing import Any

@@ -1,7 +1,5 @@
 """What a TemporalAgent shows while it runs: steps, steps per second, time left; below a microsecond a step."""
 
-from __future__ import annotations
-
 import importlib
 import io
 import sys

@@ -1,7 +1,5 @@
 """What a deployment runs on, on NumPy arrays: one environment, usually a robot's, and a policy that is no agent."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -8,8 +8,6 @@ NumPy values are copied in. `bam_train.loop.tensors.tensor_variable.TensorVariab
 with their graph: what was written at t and read at t + 1 can still be differentiated through, as in BBRL.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

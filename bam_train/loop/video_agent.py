@@ -1,7 +1,5 @@
 """Videos of an environment at work, one picture at every time of the loop."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path

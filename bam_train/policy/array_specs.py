@@ -1,7 +1,5 @@
 """Spaces of a frozen policy, read from JSON without Gymnasium; the check of an observation."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -5,8 +5,6 @@ sparse weights, weights in other files and results whose size depends on the obs
 those of https://github.com/onnx/onnx/blob/main/onnx/onnx.proto; protobuf reads the few fields that are needed.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator, Mapping

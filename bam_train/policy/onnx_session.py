@@ -5,8 +5,6 @@ loaded and run for the first time in a thread that is waited for only so long. A
 no operation of a policy takes longer for other numbers.
 """
 
-from __future__ import annotations
-
 import functools
 import re
 import threading

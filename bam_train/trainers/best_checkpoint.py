@@ -1,7 +1,5 @@
 """The place of a run's best checkpoint: it overwrites no other run's, and can be written before training begins."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Freezing a policy of any library: common layers, the ONNX file, golden observations."""
 
-from __future__ import annotations
-
 import io
 import math
 import warnings

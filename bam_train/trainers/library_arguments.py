@@ -3,8 +3,6 @@
 Everything stays within JSON: settings can be written and read back. A schedule is ``"lin_3e-4"``, linear to 0.
 """
 
-from __future__ import annotations
-
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping

@@ -1,7 +1,5 @@
 """From what was asked for to complete settings: presets for new runs, the checkpoint's own for resumed ones."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any

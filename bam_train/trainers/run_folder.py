@@ -11,8 +11,6 @@
 And copies of its best checkpoint at an fsspec address, such as a bucket, which outlive the computer.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import json

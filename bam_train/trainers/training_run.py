@@ -6,8 +6,6 @@ The best policy by evaluation (success, ties by return) goes to ``out``, the new
 is long because each of these steps may fail in ways that must not end the run, and says what it does then.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Spaces that count from another number than 0, as learning libraries take them: these ignore ``start``."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

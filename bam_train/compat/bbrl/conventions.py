@@ -4,8 +4,6 @@ A configuration names a class, ``{"classname": "package.module.Class", "size": 3
 attributes such as OmegaConf's, and is never changed.
 """
 
-from __future__ import annotations
-
 import importlib
 import pickle
 from pathlib import Path

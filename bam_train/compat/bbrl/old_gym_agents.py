@@ -5,8 +5,6 @@ what ``info["TimeLimit.truncated"]`` was: the time limit, unless the task ended 
 uint8 tensor B x height x width x 3. An action must be there and fit at every t > 0.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

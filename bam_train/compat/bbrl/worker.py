@@ -5,8 +5,6 @@ What goes wrong there is raised here, with the traceback. Weights (parameters an
 everything else of an agent is a copy.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import pickle

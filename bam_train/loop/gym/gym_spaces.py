@@ -6,8 +6,6 @@ infos is the variable ``info/k`` beside the mask ``info/_k``. It begins with the
 since its dtype and shape are not known earlier; from then on it is written at every time, zero where the mask is False.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 

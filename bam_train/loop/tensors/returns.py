@@ -7,8 +7,6 @@ Differences from BBRL's `bbrl.utils.functional`: shapes that differ raise `Value
 and N x 1 give N x N); `gae` takes log2(T) operations on whole tensors instead of T on single times, and keeps float64.
 """
 
-from __future__ import annotations
-
 import torch
 
 from bam_train.errors import ValueMismatch, WorkspaceError

@@ -1,7 +1,5 @@
 """One variable of a workspace whose values are torch tensors."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -3,8 +3,6 @@
 ``<environment>-<algorithm>.toml`` is for sb3, ``<environment>-<trainer>-<algorithm>.toml`` for any other trainer.
 """
 
-from __future__ import annotations
-
 from importlib import resources
 from typing import Any
 

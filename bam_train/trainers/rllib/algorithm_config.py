@@ -1,7 +1,5 @@
 """Complete settings as RLlib's `AlgorithmConfig`."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 from collections.abc import Iterator, Mapping

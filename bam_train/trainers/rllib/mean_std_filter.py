@@ -6,8 +6,6 @@ mean moved), so that with remote runners its merged mean goes towards 0. Here th
 (Chan, Golub and LeVeque 1979: counts n, means m, sums of squares s of two sets combine exactly).
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

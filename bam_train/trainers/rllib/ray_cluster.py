@@ -5,8 +5,6 @@ its own, and is gone when the run ends, however it ends. A cluster is joined and
 address for minutes and may end the whole process; so a socket, then another process, tries it first.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import importlib

@@ -1,7 +1,5 @@
 """How many CPUs and GPUs a run asks for, held against how many there are: RLlib would wait for more without a word."""
 
-from __future__ import annotations
-
 import os
 import time
 

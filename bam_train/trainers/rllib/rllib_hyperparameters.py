@@ -8,8 +8,6 @@ are multiplied by: with 0.01 the first actions are about 0 and not biased. A sch
 ``lr=[[0, 3e-4], [1000000, 0.0]]``. The file is long for its tables of names.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 import json

@@ -4,8 +4,6 @@ RLlib hands a registered name to its runners together with the function that mak
 of this module, so a runner elsewhere imports this package, and with it the table of environments.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib
 from collections.abc import Mapping

@@ -7,8 +7,6 @@ objects are made, is never read. ``bam/resume/learner.json`` is what the tree le
 adapt themselves.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 import random

@@ -5,8 +5,6 @@ delivered, and only those are counted. RLlib ends a runner whose environment fai
 that computer; so a runner writes the cause into the cluster's key-value store before it ends.
 """
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Callable

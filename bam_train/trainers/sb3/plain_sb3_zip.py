@@ -1,7 +1,5 @@
 """Zips that stable-baselines3 wrote without us: loading one runs whatever is pickled in it, so it must be asked for."""
 
-from __future__ import annotations
-
 import pickle
 import textwrap
 import zipfile

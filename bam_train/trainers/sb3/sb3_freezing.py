@@ -10,8 +10,6 @@ recurrent policies ``state.<name>``; outputs are ``action`` and ``next_state.<na
 Golden actions are what the trainer itself does on some observations; the graph is checked against them.
 """
 
-from __future__ import annotations
-
 import copy
 from typing import Any
 

@@ -4,8 +4,6 @@ In settings they are JSON: a schedule is ``"lin_3e-4"`` (linear to 0), action no
 ``"ornstein-uhlenbeck_0.1"``, a class its name (``activation_fn="tanh"``), ``train_freq`` ``1`` or ``[1, "episode"]``.
 """
 
-from __future__ import annotations
-
 import copy
 import functools
 import inspect

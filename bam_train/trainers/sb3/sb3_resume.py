@@ -4,8 +4,6 @@ It is taken between two updates (before a rollout begins): no rollout is half co
 restored into a new model. The file is long because each kind of state is saved and restored differently.
 """
 
-from __future__ import annotations
-
 import json
 import random
 from collections import deque

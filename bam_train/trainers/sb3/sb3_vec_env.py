@@ -1,7 +1,5 @@
 """Environments as stable-baselines3 takes them: `BatchVecEnv` over our batched ones, `DummyVecEnv` over all others."""
 
-from __future__ import annotations
-
 import functools
 import time
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Closing what is still open when Python ends."""
 
-from __future__ import annotations
-
 import atexit
 import logging
 import weakref

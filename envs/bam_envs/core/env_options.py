@@ -4,8 +4,6 @@ They are the arguments of its task's constructor. A text where a flag is meant w
 ``parity="false"`` too.
 """
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Iterable, Mapping
 from numbers import Real

@@ -22,8 +22,6 @@
 Third-party errors are mapped to these at the border, with the cause kept by ``from``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 from bam_envs.core.wording import closest, did_you_mean

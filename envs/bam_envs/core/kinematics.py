@@ -10,8 +10,6 @@ joint, which turns it about its z axis; ``tool0`` is at the flange, its z axis p
 Source of the constants: Universal Robots, "DH parameters for calculations of kinematics and dynamics", article 45257.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

@@ -4,8 +4,6 @@ The two stand side by side because they must agree: environment i of a `RobotVec
 same seed, bit for bit.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 import os

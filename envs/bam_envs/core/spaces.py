@@ -17,8 +17,6 @@ Infinities are the strings ``"inf"`` and ``"-inf"``: JSON has none. Floats keep 
 what it was, except that ``MultiBinary([n])`` comes back as ``MultiBinary(n)``, which holds the same arrays.
 """
 
-from __future__ import annotations
-
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Mapping

@@ -5,8 +5,6 @@ more, the first two share one cubic and so do the last two, so a spline through 
 Source: C. de Boor, A Practical Guide to Splines, chapter IV.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

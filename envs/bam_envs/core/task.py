@@ -1,7 +1,5 @@
 """The Task protocol: what a robot is asked to do. A task is pure: no I/O and no clock; its memory is arrays it owns."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable

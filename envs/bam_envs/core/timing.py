@@ -1,7 +1,5 @@
 """Time: deadlines on the monotonic clock, the pacer of every loop that runs at a fixed rate, and a ticking thread."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time

@@ -14,8 +14,6 @@ A range is ``Annotated[float, msgspec.Meta(gt=0, le=2)]``; the names below are t
 refuses NaN and infinity. ``Meta(description=...)`` replaces the words that an error makes of the type and its range.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 import types

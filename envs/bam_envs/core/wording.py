@@ -1,7 +1,5 @@
 """Words of error messages: the closest match to a misspelt name, a short value, a short list."""
 
-from __future__ import annotations
-
 import difflib
 import reprlib
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """The one function that builds a live robot: a `RosbridgeRobot` behind the guards of a `SafeRobot`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Images, compressed or raw, come as CBOR, on a connection and in a thread of thei
 than a control period, and a compressed one holds up the commands and states behind it.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ everything behind a service call that is running. While a connection is down, no
 Longer than other modules because it is one object with one lifecycle: connect, reset, step, halt, close.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import threading

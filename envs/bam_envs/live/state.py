@@ -7,8 +7,6 @@ stamps may differ from ours: the offset comes from the server's clock if the lin
 took the least time.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 import time

@@ -1,7 +1,5 @@
 """Environments that run in another process: transports to them, Gymnasium environments over these, and servers."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from bam_envs.core.lazy_imports import lazy_imports

@@ -6,8 +6,6 @@ What the lists of an action cannot hold exactly (Text, Sequence, images, infinit
 from ``depth_img``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -17,8 +17,6 @@ kind          spaces                                             names
 Keys of Dict and places in Tuple are joined with ``/``. A space where two names would be the same is one exact leaf.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice

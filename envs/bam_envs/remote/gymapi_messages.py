@@ -6,8 +6,6 @@ an error that names it. What has no field of its own travels in fields of text: 
 observations and infos in ``info``, under ``bam``.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping, Sequence

@@ -15,8 +15,6 @@ shared observation     duplicate_obs_ns    duplicate_obs, duplicate_index       
 Where the types are compiled (ROS 2), a field that the version there lacks is refused, and not ignored.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass

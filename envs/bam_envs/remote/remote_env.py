@@ -1,7 +1,5 @@
 """RemoteEnv: an environment that runs somewhere else, as a normal `gymnasium.Env`; and how to make one of a URL."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """RemoteVectorEnv: environments that run somewhere else, as one `gymnasium.vector.VectorEnv`."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait

@@ -1,7 +1,5 @@
 """The Bus as a native ROS 2 node. rclpy is imported when it starts: it comes with ROS, not with this package."""
 
-from __future__ import annotations
-
 import importlib
 import logging
 import math

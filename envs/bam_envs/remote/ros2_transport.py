@@ -1,7 +1,5 @@
 """RclpyTransport: an environment in a ROS 2 graph, reached as a ROS 2 node without any bridge."""
 
-from __future__ import annotations
-
 import time
 import uuid
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """RosbridgeTransport: an environment behind the GymAPI service of a rosbridge server, ours or a BAM rack's."""
 
-from __future__ import annotations
-
 import os
 import socket
 import threading

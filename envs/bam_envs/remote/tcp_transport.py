@@ -1,7 +1,5 @@
 """TcpTransport: an environment of ``bam-serve --tcp PORT``, for a network where rosbridge is too slow."""
 
-from __future__ import annotations
-
 import os
 import socket
 import threading

@@ -30,8 +30,6 @@ environments, each value has one entry for each.
 `encode` and `decode` are pure; `FrameSocket` owns the socket.
 """
 
-from __future__ import annotations
-
 import math
 import socket
 import struct

@@ -1,7 +1,5 @@
 """The Transport protocol: what carries a whole environment, one or a batch of them, to wherever it runs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -18,8 +18,6 @@ Box are let through: environments clip their actions, and observations overshoot
 `tree_to_json` writes any tree as strict JSON, which has no arrays, no NaN and no infinities.
 """
 
-from __future__ import annotations
-
 import base64
 import math
 import re

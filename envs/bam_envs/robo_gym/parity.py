@@ -1,7 +1,5 @@
 """robo-gym's arithmetic (2.1.0), to the last constant, oddities included: what ``parity=True`` makes of our tasks."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -4,8 +4,6 @@ The other way is the task's: ``task.rs_state(state)`` gives one wire state for e
 knows and a robot does not (a target) is in the wire state too; `read_mir_target` and `read_object` give it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType

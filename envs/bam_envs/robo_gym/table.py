@@ -3,8 +3,6 @@
 `register` adds them, and robo-gym's arithmetic as the flag ``parity`` of our environments; importing this is cheap.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any

@@ -3,8 +3,6 @@
 The names below are imported when they are used, so that importing this package needs no simulator and no network.
 """
 
-from __future__ import annotations
-
 from bam_envs.core.lazy_imports import lazy_imports
 
 _MODULES = {

@@ -1,7 +1,5 @@
 """A robot without physics, for tests: the joints go exactly where they are sent, at most at the arm's maximum speed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

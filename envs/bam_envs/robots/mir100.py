@@ -4,8 +4,6 @@ Sources: MiR100 user guide and robot description (footprint 0.90 x 0.58 m, diffe
 scanners at opposite corners); SICK S300 data sheet (541 rays, 270 degrees, 0.05 to 29 m).
 """
 
-from __future__ import annotations
-
 import math
 
 from bam_envs.core.robot import RobotSpec, SignalSpec

@@ -8,8 +8,6 @@ The types of the keys are those of the dataclasses here and in `bam_envs.ros.pro
 what one key says against another.
 """
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Callable, Iterable, Mapping

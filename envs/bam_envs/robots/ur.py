@@ -7,8 +7,6 @@ recommended workspaces); ROS-Industrial's ur_description (the elbow cannot fold 
 radii of the links, measured from models).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@ Sources: UR5e data sheet and user manual, Universal Robots (+-360 degrees and 18
 cannot fold by more than 180 degrees); Robotiq 2F-85 instruction manual (85 mm stroke, 20 to 150 mm/s).
 """
 
-from __future__ import annotations
-
 import math
 
 from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS

@@ -4,8 +4,6 @@ A live robot reads states and writes commands; a served one writes states and re
 a list of numbers is written and read by its own lines here; all others field by field (``fields`` of the sink).
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass

@@ -6,8 +6,6 @@ a signature, ``m=`` and 32 hexadecimal digits, where its session was opened (`ba
 may read a tag; the state that answers a command repeats only its session and number (`Tag.echo`).
 """
 
-from __future__ import annotations
-
 import hmac
 import math
 import threading

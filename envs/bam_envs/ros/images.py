@@ -3,8 +3,6 @@
 Arrays are RGB. Message data are `bytes`, or base64 text as a JSON bridge sends them.
 """
 
-from __future__ import annotations
-
 import base64
 import importlib
 import io

@@ -3,8 +3,6 @@
 Every error names what was looked at, what was expected and what was found.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping, Sequence

@@ -6,8 +6,6 @@ dicts in the JSON form of rosbridge; a byte array is `bytes`. Types are written 
 ``pkg/srv/Type`` are taken too.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence

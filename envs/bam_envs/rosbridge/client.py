@@ -5,8 +5,6 @@ While the link is down, publishing and calling raise at once, and nothing is kep
 declarations (topics, subscriptions, services) again and no message from before it.
 """
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 import logging

@@ -4,8 +4,6 @@ It outlives connections, because each new one must be told all of it again. The 
 whatever the number of listeners: it sends one stream per topic, and ends it at the first unsubscribe.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import threading

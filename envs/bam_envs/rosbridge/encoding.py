@@ -1,7 +1,5 @@
 """What WebSocket frames of rosbridge hold: JSON, CBOR with typed arrays (RFC 8746), JSON inside a PNG, fragments."""
 
-from __future__ import annotations
-
 import base64
 import json
 import math

@@ -6,8 +6,6 @@ topic and its numbers. Whoever reads the topics learns the name and the signatur
 command that is repeated is refused. Where the server knows connections, a session belongs to the one that opened it.
 """
 
-from __future__ import annotations
-
 import hmac
 import json
 import secrets

@@ -1,7 +1,5 @@
 """Threads that do not keep a program from ending: an asyncio loop in one, and a pool for work that takes its time."""
 
-from __future__ import annotations
-
 import asyncio
 import queue
 import threading

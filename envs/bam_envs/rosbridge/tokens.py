@@ -1,7 +1,5 @@
 """Shared secrets: what servers ask for, and clients show; and how often somebody may guess."""
 
-from __future__ import annotations
-
 import hmac
 import ipaddress
 import os

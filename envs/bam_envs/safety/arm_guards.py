@@ -5,8 +5,6 @@ the farthest position that it was commanded to; and whatever slows one joint dow
 arm keeps its direction.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

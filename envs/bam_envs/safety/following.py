@@ -5,8 +5,6 @@ how far it would jump when it is let go. At rest that is at most what the joint 
 moves faster than its limit.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 

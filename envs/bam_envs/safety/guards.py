@@ -10,8 +10,6 @@ All of them look at one robot and at the last command that was *sent*; speeds an
 since then.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Isaac reach: bring the flange to a pose, position and orientation, with Isaac Lab's observations and actions."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

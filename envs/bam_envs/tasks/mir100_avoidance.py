@@ -1,7 +1,5 @@
 """Drive a MiR100 to the other side of a room, round three boxes that only its lasers see."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -3,8 +3,6 @@
 Poses are x, y [m] and yaw [rad].
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

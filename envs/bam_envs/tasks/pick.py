@@ -1,7 +1,5 @@
 """Pick: grasp a cube that lies anywhere in 30 x 40 cm with any yaw, lift it 10 cm and hold it for 0.25 s."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

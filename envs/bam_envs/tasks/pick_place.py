@@ -1,7 +1,5 @@
 """Pick and place: put the cube down within 2 cm of a goal on the table that differs every episode, and let go of it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

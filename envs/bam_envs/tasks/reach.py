@@ -1,7 +1,5 @@
 """Reach: bring the tool within 2 cm of a point, with actions that turn the joints."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

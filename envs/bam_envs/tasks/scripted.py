@@ -3,8 +3,6 @@
 They keep no memory, so they act on any number of observations in any order, like a frozen policy.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

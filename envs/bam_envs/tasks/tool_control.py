@@ -6,8 +6,6 @@ The tool always points straight down, so the joints follow in closed form. From 
 moves at most `TOOL_STEP` and no joint more than `JOINT_STEP`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

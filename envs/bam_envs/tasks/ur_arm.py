@@ -7,8 +7,6 @@ half a second of the target. Here q is where the controller has got to, the last
 follows it a little later. So simulated and live arms get the same set points.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 

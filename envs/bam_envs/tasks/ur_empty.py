@@ -1,7 +1,5 @@
 """UR empty: a UR arm and nothing to do; robo-gym's EmptyEnvironmentUR."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """UR reach: bring the flange of a UR arm to a point; robo-gym's EndEffectorPositioningUR."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -4,8 +4,6 @@ The trajectory is segments of waypoints 1/20 s apart, in a JSON file of robo-gym
 ``{"trajectory": [[[base, shoulder, elbow, wrist 1, wrist 2, wrist 3], ...], ...]}``: segments, waypoints, joints [rad].
 """
 
-from __future__ import annotations
-
 import json
 import stat
 from collections.abc import Mapping, Sequence

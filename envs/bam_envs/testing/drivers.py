@@ -1,7 +1,5 @@
 """A simulated robot in the place of a live one, in this process and in simulated time; its driver can misbehave."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from typing import Any

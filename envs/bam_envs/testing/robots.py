@@ -1,7 +1,5 @@
 """The contract test for robots of one's own: one list of promises."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Iterator

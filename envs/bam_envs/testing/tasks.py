@@ -1,7 +1,5 @@
 """The contract test for tasks of one's own: one list of promises."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterator
 from contextlib import contextmanager

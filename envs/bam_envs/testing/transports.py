@@ -1,7 +1,5 @@
 """The contract test for transports of one's own: one list of promises, and the environment that it serves."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Which client is in command: one at a time; the others see its name."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator

@@ -5,8 +5,6 @@ cost two hand-overs a step, which is more than a step through TCP, and only rend
 served.
 """
 
-from __future__ import annotations
-
 import re
 import threading
 import time

@@ -1,7 +1,5 @@
 """Transports within one process: `LocalTransport`, with the checks of the others, and `FakeTransport` for tests."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -7,8 +7,6 @@ Everything that moves the robot, or keeps it from moving, is in this file, so th
 each of them.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,7 +1,5 @@
 """Where an environment is served, and how its time passes; imports nothing that serves."""
 
-from __future__ import annotations
-
 import ipaddress
 import re
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ clock calls `ServedRobot.tick`, a command is executed over the period that follo
 robot rests.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 import time

@@ -5,8 +5,6 @@ episode is drawn at its start (a tape of `TAPE` steps, read in a circle), which 
 episode instead of one for each step.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -4,8 +4,6 @@ What makes an arm slow is in its commands (`bam_envs.tasks.ur_arm`), so that a l
 looked for, and nothing stops at them: they are told in ``state.truth["collision"]``, until the next reset.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """MiR100 bases in NumPy, many stepped together: the drive and its limits, walls, boxes, contacts and lasers."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import partial
 from typing import Any

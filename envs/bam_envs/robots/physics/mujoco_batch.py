@@ -5,8 +5,6 @@ an environment depends on its own state and controls only (`mujoco.rollout` star
 one of many equals one alone, bit for bit.
 """
 
-from __future__ import annotations
-
 import copy
 import importlib
 import os

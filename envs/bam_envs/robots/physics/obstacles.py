@@ -3,8 +3,6 @@
 An obstacle jumps from sample to sample 100 times a second, as robo-gym's does. Positions are in ``base_link`` [m].
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -4,8 +4,6 @@ Rays are cast in float32, many bases at a time, and written into scratch arrays 
 its 1012 rays takes about 10 µs.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

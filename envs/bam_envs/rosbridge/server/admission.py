@@ -1,7 +1,5 @@
 """Which clients may come in: tokens, the number of clients, the server's certificate; and why it cannot listen."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import errno

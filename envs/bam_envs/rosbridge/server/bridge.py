@@ -6,8 +6,6 @@ sends, it is answered: a request by its response, everything else that does not 
 Longer than other modules, because every operation of the protocol is in it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import time

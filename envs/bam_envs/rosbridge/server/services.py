@@ -3,8 +3,6 @@
 Every end that a call can have is in this file, which shows that none is missing.
 """
 
-from __future__ import annotations
-
 import itertools
 import logging
 import math

@@ -1,7 +1,5 @@
 """The topics of a rosbridge server: who publishes, who listens, how often and how many messages may wait."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable
