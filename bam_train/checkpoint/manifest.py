@@ -3,6 +3,8 @@
 It is read against one schema before anything is done with it: a checkpoint may be untrusted.
 """
 
+from __future__ import annotations
+
 import json
 import math
 import re
