@@ -38,6 +38,7 @@ KINDS = {
     "peers": ("peers",),
     "training": (
         "scripts",
+        "test_checkpoints.py",
         "bam_train/trainers/rllib",
         "bam_train/trainers/sb3",
         "bam_train/cli/test_train.py",

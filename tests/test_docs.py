@@ -289,9 +289,10 @@ def added(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("name", ["test_hover.py", "test_lagged.py"])
-def test_added_contracts_hold(added, name):
-    assert " passed" in python("-m", "pytest", "-q", "-p", "no:cacheprovider", name, folder=added)
+def test_added_contracts_hold(added):
+    tests = [path.name for path in added.glob("test_*.py")]
+    assert sorted(tests) == ["test_hover.py", "test_lagged.py"]
+    assert " passed" in python("-m", "pytest", "-q", "-p", "no:cacheprovider", *tests, folder=added)
 
 
 ADDED = [words for words in commands(ROOT / "docs" / "adding.md") if words[0] in ("bam-train", "python")]

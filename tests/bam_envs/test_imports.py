@@ -53,6 +53,7 @@ def test_learners_are_imported_below_trainers_and_in_the_loops_torch_layer_only(
     assert imported(python, names, LEARNERS) == ""
 
 
+@pytest.mark.ray
 def test_every_module_can_be_imported(python):
     pytest.importorskip("stable_baselines3")
     pytest.importorskip("sb3_contrib")

@@ -43,19 +43,20 @@ def steps_of(env_id):
 
 
 PARITY = [(env_id, {"parity": True, "rs_state_to_info": True}) for env_id, one in ENVIRONMENTS.items() if one.variants]
-KINDS = [*((env_id, {"randomize": value}) for env_id in ENVIRONMENTS for value in (False, True)), *PARITY]
+SAME = [(env_id, {"randomize": False}) for env_id in ONE_OF_EACH]
+KINDS = [*((env_id, {"randomize": True}) for env_id in ENVIRONMENTS), *SAME, *PARITY]
 IDS = [f"{env_id}-{'-'.join(name for name, value in options.items() if value)}" for env_id, options in KINDS]
 
 
 @pytest.mark.parametrize(("env_id", "options"), KINDS, ids=IDS)
 def test_a_row_is_a_single_environment_bit_for_bit(make, make_rows, actions_of, env_id, options):
-    rows, seed = 4, 40
+    rows, seed = 3, 40
     steps, limit = steps_of(env_id)
     envs = make_rows(env_id, rows, **options, **limit)
     first, _ = envs.reset(seed=seed)
     record, observation = [], first
     for step, action in enumerate(batch(actions_of, rows, steps, size_of(envs))):
-        action = doing_well(env_id, observation[:2], action) if step % 3 else action
+        action = doing_well(env_id, observation[:1], action) if step % 3 else action
         observation, *rest = envs.step(action)
         record.append((action, observation, *rest))
     ends = 0
@@ -85,7 +86,7 @@ def assert_says(infos, row, info):
         assert np.array_equal(infos[name][row], value) or infos[name][row] == value, name
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", ONE_OF_EACH)
 def test_it_speaks_like_gymnasiums_own_rows(make_rows, actions_of, env_id):
     rows = 3
     steps, limit = steps_of(env_id)
@@ -212,10 +213,9 @@ def assert_same_steps(one, two, actions):
 
 
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
-@pytest.mark.parametrize("randomize", [False, True])
-def test_another_one_goes_on_exactly(make_rows, actions_of, env_id, randomize):
-    one, two, three = (make_rows(env_id, 4, randomize=randomize, max_episode_steps=60) for _ in range(3))
-    actions = batch(actions_of, 4, 150, size_of(one))
+def test_another_one_goes_on_exactly(make_rows, actions_of, env_id):
+    one, two, three = (make_rows(env_id, 3, randomize=True, max_episode_steps=40) for _ in range(3))
+    actions = batch(actions_of, 3, 100, size_of(one))
     one.reset(seed=11)
     for action in actions[:37]:
         observation, *_ = one.step(action)
@@ -227,7 +227,7 @@ def test_another_one_goes_on_exactly(make_rows, actions_of, env_id, randomize):
     three.unwrapped.load_state_dict(saved)
     assert_same_tree(three.unwrapped.state_dict(), kept)
     one.unwrapped.load_state_dict(kept)
-    assert_same_steps(one, three, actions[37:100])
+    assert_same_steps(one, three, actions[37:80])
 
 
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
@@ -259,9 +259,8 @@ def test_without_physics_too(actions_of):
 
 
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
-@pytest.mark.parametrize("randomize", [False, True])
-def test_no_number_is_ever_nan(make_rows, env_id, randomize):
-    envs = make_rows(env_id, 64, randomize=randomize)
+def test_no_number_is_ever_nan(make_rows, env_id):
+    envs = make_rows(env_id, 64, randomize=True)
     envs.reset(seed=0)
     space, rng = envs.single_observation_space, np.random.default_rng(0)
     for step in range(400 if env_id == "bam/pick-v0" else 110):
@@ -289,9 +288,8 @@ def test_limits_of_steps_are_those_of_the_table(make_rows):
 
 
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
-@pytest.mark.parametrize("randomize", [False, True])
-def test_a_pickled_environment_goes_on_as_the_first(make_rows, actions_of, env_id, randomize):
-    first = make_rows(env_id, 3, randomize=randomize, max_episode_steps=40)
+def test_a_pickled_environment_goes_on_as_the_first(make_rows, actions_of, env_id):
+    first = make_rows(env_id, 3, randomize=True, max_episode_steps=40)
     first.reset(seed=0)
     actions = batch(actions_of, 3, 60, size_of(first))
     first.step(actions[0])
