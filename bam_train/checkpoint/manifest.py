@@ -112,7 +112,9 @@ _Space = _Box | _Discrete | _MultiDiscrete | _MultiBinary | _Dict
 
 
 class _Scores(Struct):
+    success_rate: float | None = None
     success_interval: tuple[float, float] | None = None
+    return_mean: float | None = None
     episodes: _Count | None = None
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from bam_train.settings import TrainSettings
     from bam_train.trainers.base import Progress, Statistics
     from bam_train.trainers.run_folder import RunFolder
-    from bam_train.trainers.training_run import Best, Outcome
+    from bam_train.trainers.training_run import Outcome, Scores
 
 LINE_EVERY = 1.0
 """Seconds between two plain lines about training at least."""
@@ -189,14 +189,13 @@ def summarise(settings: TrainSettings, outcome: Outcome, folder: RunFolder, seco
         say(line)
 
 
-def _score_text(best: Best) -> str:
-    success = ""
-    if best.success_rate is not None:
-        interval = best.success_interval
+def _score_text(best: Scores) -> str:
+    success, rate, interval = "", best.get("success_rate"), best.get("success_interval")
+    if rate is not None:
         between = f" (95 %: {percent(interval[0])} to {percent(interval[1])})" if interval else ""
-        success = f"success {percent(best.success_rate)}{between}, "
-    episodes = "" if best.episodes is None else f" over {best.episodes} episodes"
-    return f"{success}return {number(best.return_mean)}{episodes}, after {count(best.steps)} steps"
+        success = f"success {percent(rate)}{between}, "
+    episodes = f" over {best['episodes']} episodes" if best.get("episodes") is not None else ""
+    return f"{success}return {number(best.get('return_mean'))}{episodes}, after {count(best['steps'])} steps"
 
 
 def _next_commands(settings: TrainSettings, outcome: Outcome) -> list[str]:

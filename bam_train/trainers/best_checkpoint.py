@@ -14,7 +14,7 @@ from bam_train.errors import AlteredCheckpoint, CheckpointError, OutputError
 from bam_train.settings import TrainSettings, file_stem, read_config
 from bam_train.trainers.resolve_settings import CHANGEABLE
 from bam_train.trainers.run_folder import require_room
-from bam_train.trainers.training_run import Best
+from bam_train.trainers.training_run import Scores
 
 NOTES = "bam/resume/notes.json"
 FOLDER = Path("checkpoints")
@@ -25,7 +25,7 @@ class Output:
     """Where the best checkpoint goes."""
 
     path: Path
-    best: Best | None
+    best: Scores | None
     """The evaluation of the file that is there already, if it is of the same run and will be improved."""
     notices: tuple[str, ...] = ()
     """Messages for the user."""
@@ -63,11 +63,9 @@ def choose_output(settings: TrainSettings, out: Path | None, force: bool, resume
 
 
 class _Noted(Struct):
-    """Notes of a run on its best evaluation."""
+    """Where the best checkpoint of a run is."""
 
     steps: int
-    success_rate: float | None
-    return_mean: float | None
     path: str
 
 
@@ -98,9 +96,7 @@ def _own_best(resumed: Checkpoint) -> Output | None:
         return None
     if there.steps != noted.steps or _what(there.settings) != learnt:
         return None
-    interval: Any = there.scores.get("success_interval")
-    known = noted.steps, noted.success_rate, noted.return_mean, interval and tuple(interval)
-    return Output(path.resolve(), Best(*known, there.scores.get("episodes")))
+    return Output(path.resolve(), {**there.scores, "steps": there.steps})
 
 
 def _what(settings: dict[str, Any]) -> dict[str, Any]:

@@ -47,26 +47,17 @@ class Watcher(Protocol):
         """A message for the user."""
 
 
-@dataclass(frozen=True)
-class Best:
-    """The best evaluation so far."""
+Scores = dict[str, Any]
+"""A manifest's ``scores``: an evaluation as JSON, and the ``steps`` trained when it was made."""
 
-    steps: int
-    """Steps trained when it was made."""
-    success_rate: float | None
-    return_mean: float | None
-    success_interval: tuple[float, float] | None = None
-    """Wilson's 95 % interval of the success rate."""
-    episodes: int | None = None
-    """Over how many it was made."""
 
-    def rank(self) -> tuple[float, float]:
-        """Larger is better: success first, then return; what is unknown ranks last.
+def _rank(scores: Scores) -> tuple[float, float]:
+    """Larger is better: success first, then return; what is unknown ranks last.
 
-        Success is the low end of its interval: 1 of 5 is less than 4 of 20.
-        """
-        sure = self.success_rate if self.success_interval is None else self.success_interval[0]
-        return (-math.inf if sure is None else sure), (-math.inf if self.return_mean is None else self.return_mean)
+    Success is the low end of its interval: 1 of 5 is less than 4 of 20.
+    """
+    sure, mean = (scores.get("success_interval") or [scores.get("success_rate")])[0], scores.get("return_mean")
+    return (-math.inf if sure is None else sure), (-math.inf if mean is None else mean)
 
 
 @dataclass(frozen=True)
@@ -77,18 +68,15 @@ class Outcome:
     """``steps`` (all done), ``success`` (``until_success`` reached) or ``stopped`` (asked to)."""
     steps: int
     """Steps trained since the first of the run."""
-    seconds: float
-    """Wall time of this part of the run [s]."""
-    best: Best | None
-    scores: dict[str, Any]
-    """The best policy's evaluation; {} if there was none."""
+    best: Scores | None
+    """The best evaluation."""
     checkpoint: Path | None
     """Where the best policy is."""
     last: Path | None
     """Where the newest state is that could be saved in the run's folder."""
-    last_steps: int = 0
+    last_steps: int
     """Steps of that state."""
-    failure: OutputError | None = None
+    failure: OutputError | None
     """Why something is not where it should be; None if all is."""
 
 
@@ -100,7 +88,7 @@ class TrainingRun:
         folder: Where the run's files go.
         out: Where the best checkpoint goes.
         watcher: Receives the progress.
-        best: The best evaluation of the part of this run that was trained before, whose checkpoint is at `out`.
+        best: The best evaluation before this part of the run; its checkpoint is at `out`.
         clock: Monotonic time [s].
         copies: Where every checkpoint that goes to `out` is copied to.
 
@@ -114,7 +102,7 @@ class TrainingRun:
         folder: RunFolder,
         out: Path,
         watcher: Watcher,
-        best: Best | None = None,
+        best: Scores | None = None,
         clock: Callable[[], float] = time.monotonic,
         copies: Copies | None = None,
     ) -> None:
@@ -127,8 +115,7 @@ class TrainingRun:
         self._save_pause = FIRST_SAVE
         self._stop = self._reached = False
         self._evaluated_at = trainer.steps if best else 0
-        self._report: EvaluationReport | None = None
-        self._best_scores: dict[str, Any] = {}
+        self._scores: Scores = {}  # the newest evaluation
         self._kept: Path | None = out if best else None
         self._last_steps = 0
         self._failures: dict[str, OutputError] = {}
@@ -173,9 +160,7 @@ class TrainingRun:
         return Outcome(
             reason="stopped" if self._stop else "success" if self._reached else "steps",
             steps=self.trainer.steps,
-            seconds=self._clock() - self._start,
             best=self.best,
-            scores=self._best_scores,
             checkpoint=self._kept,
             last=self.folder.last if self._last_steps else None,
             last_steps=self._last_steps,
@@ -233,18 +218,17 @@ class TrainingRun:
         with self.trainer.undisturbed(), self.trainer.evaluation_envs() as envs:
             last = steps >= self.settings.steps
             report, self._reached = evaluate_for_success(self.trainer.freeze(), self.settings, last=last, envs=envs)
-        if report.success_rate is None and self.settings.until_success is not None and self._report is None:
+        if report.success_rate is None and self.settings.until_success is not None and not self._scores:
             self.watcher.note(f"{self.settings.env} reports no is_success, so --until-success has no effect")
-        self._report = report
-        found = Best(steps, report.success_rate, report.return_mean, report.success_interval, report.episodes)
-        better = self.best is None or found.rank() > self.best.rank()
+        self._scores = {**report.to_json(), "steps": steps}
+        better = self.best is None or _rank(self._scores) > _rank(self.best)
         seconds = round(self._clock() - self._start, 3)
-        self._add({"kind": "evaluation", "steps": steps, "seconds": seconds, **report.to_json()})
+        self._add({"kind": "evaluation", "steps": steps, "seconds": seconds, **self._scores})
         numbers = {"eval/return_mean": report.return_mean, "eval/success_rate": report.success_rate}
         self.trainer.log({name: value for name, value in numbers.items() if value is not None})
         self.watcher.evaluated(steps, report, better)
         if better:
-            self._keep(found)
+            self._keep()
 
     def _add(self, record: dict[str, Any]) -> None:
         """Add a record; training does not depend on it."""
@@ -255,10 +239,9 @@ class TrainingRun:
                 self.watcher.note(f"{error}. Training goes on, and some records are missing")
             self._failures["progress"] = error
 
-    def _keep(self, found: Best) -> None:
+    def _keep(self) -> None:
         """Save the policy as the best so far; if `out` cannot be written, in the run's folder. Training continues."""
-        before = self.best, self._best_scores
-        self.best, self._best_scores = found, self._scores()
+        before, self.best = self.best, self._scores
         if self._write(self.out, self.out, "--out"):
             self._kept = self.out
             self._failures.pop("best.zip", None)
@@ -269,7 +252,7 @@ class TrainingRun:
             self._kept = rescue
             self.watcher.note(f"the best policy is in {rescue} instead")
             return
-        self.best, self._best_scores = before  # the next evaluation tries again
+        self.best = before  # the next evaluation tries again
         kept = f"the best one that is saved is {self._kept}" if self._kept else "no best policy is saved yet"
         self.watcher.note(f"the best policy could not be saved; {kept}")
 
@@ -301,10 +284,10 @@ class TrainingRun:
         """Write a checkpoint, which notes that the best one is at `kept`; whether it could be."""
         notes: dict[str, Any] = {"best": None}  # with these a resumed run keeps the best in the same file
         if (best := self.best) is not None and kept is not None:
-            noted = {"steps": best.steps, "success_rate": best.success_rate, "return_mean": best.return_mean}
+            noted = {name: best.get(name) for name in ("steps", "success_rate", "return_mean")}
             notes = {"best": {**noted, "path": str(kept.resolve())}}  # the rest is among the scores of that file
         try:
-            self.trainer.save(path, self._scores(), notes)
+            self.trainer.save(path, self._scores, notes)
         except OutputError as error:
             self._failures[path.name] = unwritable(path, error, flag)
             self.watcher.note(f"{self._failures[path.name]}{'. Training goes on' if self._goes_on else ''}")
@@ -315,10 +298,6 @@ class TrainingRun:
     @property
     def _goes_on(self) -> bool:
         return not (self._stop or self._reached) and self.trainer.steps < self.settings.steps
-
-    def _scores(self) -> dict[str, Any]:
-        """The newest evaluation and the steps at which it was made, for a manifest."""
-        return {} if self._report is None else {**self._report.to_json(), "steps": self._evaluated_at}
 
 
 EVALUATION_SEED = 2_000_000

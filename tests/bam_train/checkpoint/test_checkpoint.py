@@ -294,6 +294,7 @@ def test_a_file_that_no_run_writes_is_refused(path: Path, change: Any, error: ty
         ("signals", {"observation": ["x"]}, "Expected `object`, got `str` - at `$.signals[...][0]`"),
         ("scores", {"success_interval": 5}, "Expected `array"),
         ("scores", {"episodes": "many"}, "Expected `int | null`, got `str` - at `$.scores.episodes`"),
+        ("scores", {"return_mean": "much"}, "Expected `float | null`, got `str` - at `$.scores.return_mean`"),
         ("env_kwargs", "x", "Expected `object`, got `str` - at `$.env_kwargs`"),
         ("env_kwargs", {"env_id": "x"}, "env_kwargs.env_id says which environment it is"),
         *(("env_kwargs", {name: 123}, f"env_kwargs.{name} says where the environment runs") for name in sorted(WHERE)),

@@ -15,7 +15,7 @@ from bam_train.settings import TrainSettings
 from bam_train.trainers import training_run as run_module
 from bam_train.trainers.base import Progress, Statistics
 from bam_train.trainers.run_folder import RunFolder
-from bam_train.trainers.training_run import Best, TrainingRun
+from bam_train.trainers.training_run import TrainingRun
 
 STATISTICS = Statistics(episodes=3, return_mean=1.5, length_mean=4.0, success_rate=None, metrics={"train/loss": 0.25})
 
@@ -139,13 +139,12 @@ def test_the_best_is_by_success_then_by_return(start, results, best):
     steps = (30, 60, 90, 100)
     run, trainer, _ = start({step: report(*result) for step, result in zip(steps, results, strict=True)})
     outcome = run.run()
-    assert outcome.best.steps == best
+    assert outcome.best["steps"] == best
     assert outcome.checkpoint.read_text() == str(best)
     assert outcome.last.read_text() == "100"
     name, at_steps, scores, notes = trainer.saved[-1]
     assert (name, at_steps, scores["success_rate"], scores["steps"]) == ("last.zip", 100, results[-1][0], 100)
     assert (notes["best"]["steps"], notes["best"]["path"]) == (best, str(outcome.checkpoint))
-    assert outcome.scores["steps"] == best
 
 
 def test_a_few_episodes_are_not_better_than_many(start):
@@ -154,16 +153,17 @@ def test_a_few_episodes_are_not_better_than_many(start):
     run, _, watcher = start({30: short, 60: report(0.0, episodes=5), 90: short, 100: report(0.2, episodes=20)}, **extra)
     outcome = run.run()
     assert [row[3] for row in watcher.evaluations] == [True, False, False, True]
-    assert (outcome.best.steps, outcome.best.episodes) == (100, 20)
+    assert (outcome.best["steps"], outcome.best["episodes"]) == (100, 20)
     run, _, _ = start({30: short, 60: short, 90: short, 100: report(0.0, 10.0, episodes=20)}, **extra)
-    assert run.run().best.steps == 30
+    assert run.run().best["steps"] == 30
 
 
 def test_a_resumed_run_keeps_a_better_best(start):
-    run, _, _ = start({60: report(0.5), 90: report(0.7), 100: report(0.6)}, best=Best(20, 0.8, 3.0), begin=30)
+    best = {"steps": 20, "success_rate": 0.8, "return_mean": 3.0}
+    run, _, _ = start({60: report(0.5), 90: report(0.7), 100: report(0.6)}, best=best, begin=30)
     run.out.write_text("20")
     outcome = run.run()
-    assert (outcome.best.steps, outcome.checkpoint.read_text()) == (20, "20")
+    assert (outcome.best["steps"], outcome.checkpoint.read_text()) == (20, "20")
 
 
 def test_success_must_be_confirmed_by_fresh_episodes(start):
@@ -174,7 +174,7 @@ def test_success_must_be_confirmed_by_fresh_episodes(start):
     quarter, whole, fresh = (2_000_007, 3), (2_000_007, 10), (2_000_017, 10)
     assert start.seeds == [(30, *quarter)] + [(step, *asked) for step in (60, 90) for asked in (quarter, whole, fresh)]
     assert [row[:2] for row in watcher.evaluations] == [(30, 0.0), (60, 0.8), (90, 0.9)]
-    assert (outcome.reason, outcome.steps, outcome.best.steps) == ("success", 90, 90)
+    assert (outcome.reason, outcome.steps, outcome.best["steps"]) == ("success", 90, 90)
 
 
 def test_a_quarter_with_few_failures_is_followed_by_the_rest_and_the_last_evaluation_is_whole(start):
@@ -204,7 +204,7 @@ def test_asked_to_stop_it_saves_and_ends_without_an_evaluation(start):
     run, _, watcher = start(at(0.5))
     watcher.training = lambda progress, *rest: run.stop() if progress.steps == 50 else None
     outcome = run.run()
-    assert (outcome.reason, outcome.steps, outcome.best.steps) == ("stopped", 50, 30)
+    assert (outcome.reason, outcome.steps, outcome.best["steps"]) == ("stopped", 50, 30)
     assert outcome.last.read_text() == "50"
 
 
