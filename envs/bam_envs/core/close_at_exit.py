@@ -12,20 +12,20 @@ _open: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
 class Closable(Protocol):
-    """What can be closed, as often as one likes."""
+    """Anything with an idempotent `close`."""
 
     def close(self) -> object:
-        """Let go of everything."""
+        """Release every resource."""
 
 
 def close_at_exit(thing: Closable) -> None:
     """Close `thing` when Python ends, if it is still there.
 
-    The threads of the network run then; a ``__del__`` comes later, waits for them in vain and misses modules.
+    Network threads still run at that time; a ``__del__`` would come later, when they and some modules are gone.
     """
     if not _open:
         atexit.unregister(_close_all)
-        atexit.register(_close_all)  # last come, first served: before what the network needs is taken down
+        atexit.register(_close_all)  # run in reverse order of registration: before the network is taken down
     _open.add(thing)
 
 

@@ -1,7 +1,7 @@
 """The options of an environment, checked before it is made: names with the closest match, and kinds of values.
 
-They are the arguments of its task's constructor. A text where a flag is meant would be True whatever it says,
-``parity="false"`` too.
+They are the arguments of its task's constructor. Any text in place of a flag would count as True, even
+``parity="false"``.
 """
 
 import inspect

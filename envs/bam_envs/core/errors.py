@@ -12,10 +12,10 @@
         ├── LinkLost           the link is down: nothing was sent, nothing is kept to be sent later
         │   ├── NoServer       nobody there, or not what was expected: refused, silent, certificate, token
         │   └── StaleState     the link is there, and no fresh state came in time
-        ├── ProtocolError      the other end said what it must not: which field, expected, found
+        ├── ProtocolError      the other end broke the protocol: which field, expected, found
         ├── RemoteError        the other end refused or failed; carries its own text
         │   └── NotInCommand   another client is in command there
-        ├── NotReady           the robot says that it cannot move now: a protective stop, a paused program
+        ├── NotReady           the robot reports that it cannot move now: a protective stop, a paused program
         ├── StartNotReached    the start pose was not reached in time; carries the joints
         └── SafetyStop         a guard stopped the robot; latched until a person resumes; carries the guard
 
@@ -28,7 +28,7 @@ from bam_envs.core.wording import closest, did_you_mean
 
 
 class BamEnvsError(Exception):
-    """Root of the tree; its text is one line that says what, why and what to do."""
+    """Base class. Its text is one line: what went wrong, why, and what to do."""
 
 
 class UnknownName(BamEnvsError, ValueError):  # noqa: N818 - reads as what happened
@@ -90,7 +90,7 @@ class RobotFault(BamEnvsError, RuntimeError):  # noqa: N818
 
 
 class PhysicsDiverged(RobotFault):
-    """The simulated state is no longer finite; carries the rows in its text."""
+    """The simulated state is no longer finite; names the environments."""
 
 
 class LinkLost(RobotFault):
@@ -98,7 +98,7 @@ class LinkLost(RobotFault):
 
 
 class NoServer(LinkLost):
-    """No usable server at an address: the text says what was tried, what came back, and how to start one.
+    """No usable server at an address: the text names what was tried, what came back, and how to start one.
 
     Attributes:
         url: The address.
@@ -123,7 +123,7 @@ class StaleState(LinkLost):
 
 
 class ProtocolError(RobotFault):
-    """The other end said what it must not say: the text names topic or field, what was expected, what was found."""
+    """The other end broke the protocol: the text names the topic or field, what was expected and what was found."""
 
 
 class RemoteError(RobotFault):
@@ -135,7 +135,7 @@ class NotInCommand(RemoteError):  # noqa: N818
 
 
 class NotReady(RobotFault):
-    """The robot says of itself that it cannot move now; the text says why."""
+    """The robot reports that it cannot move now; the text gives its reason."""
 
 
 class StartNotReached(RobotFault):

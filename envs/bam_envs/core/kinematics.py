@@ -1,4 +1,4 @@
-"""Closed-form forward and inverse kinematics of Universal Robots arms, batched over rows.
+"""Closed-form forward and inverse kinematics of Universal Robots arms, batched.
 
 Six joints with the Denavit-Hartenberg structure alpha = (90, 0, 0, 90, -90, 0) degrees: joints 2, 3 and 4 have
 parallel axes, so a tool that points straight down has an exact inverse. Positions are in the ROS ``base_link`` frame

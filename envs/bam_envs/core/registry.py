@@ -1,7 +1,7 @@
-"""The one table of environments: it registers them with Gymnasium, and other learners read the same entries.
+"""The table of environments: Gymnasium registers them from it, and RLlib reads the same entries.
 
-Importing this imports neither a simulator nor a task; an entry's task and robot are strings, resolved when the
-environment is made. The file is long for its table.
+Importing this imports neither a simulator nor a task: an entry names its task and robot as text, resolved when the
+environment is made. Most of the file is the table.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from bam_envs.core.task import Task
 
 MAKE_OPTIONS = ("render_mode", "randomize", "robot", "transport", "profile", "ca_file", "token_file", "timeout")
-"""What `gymnasium.make` takes for every environment of ours, beside the options of its task."""
+"""Arguments of `gymnasium.make` for every environment here, besides the options of its task."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class EnvEntry:
     id: str
     """Gymnasium's id, with its version."""
     summary: str
-    """What the robot is asked to do, in one line."""
+    """The task, in one line."""
     task: str
     """``"module:Class"`` of the task."""
     robot: str
@@ -54,7 +54,7 @@ class EnvEntry:
 
         Raises:
             UnknownName: It has no such option.
-            InvalidValue: An option cannot be what it is.
+            InvalidValue: An option has a value of the wrong kind.
         """
         options = self.options()
         require_known(self.id, options, given, MAKE_OPTIONS)
@@ -83,7 +83,7 @@ class Alias:
     env_id: str
     """Key of `ENVIRONMENTS`."""
     variant: str = ""
-    """What the other id means where it is not quite the same environment; else empty."""
+    """How the environment of the other id differs; "" if it does not."""
 
 
 _ENTRIES = (

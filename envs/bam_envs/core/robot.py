@@ -96,7 +96,7 @@ class Initial:
 
 
 def checked_command(command: Array, shape: tuple[int, int]) -> Array:
-    """A copy of `command`, which must have `shape` and be finite; what every robot asks of a command first.
+    """A copy of `command`, which must have `shape` and be finite; which every robot requires.
 
     Raises:
         InvalidValue: It has another shape, or is not finite.
@@ -133,7 +133,7 @@ class Robot(Protocol):
         """Send `command` (n, m), SI units, and return the state one period later."""
 
     def halt(self) -> None:
-        """Stop moving and keep the link. From any thread, as often as one likes; never raises."""
+        """Stop moving and keep the link. Callable from any thread; idempotent; never raises."""
 
     def close(self) -> None:
         """Halt, then drop the link. Idempotent."""

@@ -1,6 +1,6 @@
 """A Robot and a Task joined as a Gymnasium environment: `RobotEnv` for one, `RobotVectorEnv` for n stepped together.
 
-The two stand side by side because they must agree: environment i of a `RobotVectorEnv` equals a `RobotEnv` with the
+They are in one file because they must agree: environment i of a `RobotVectorEnv` equals a `RobotEnv` with the
 same seed, bit for bit.
 """
 
@@ -34,9 +34,9 @@ def render_modes() -> list[str]:
 
 
 def describe(robot: Robot, task: Task) -> dict[str, list[dict[str, Any]]]:
-    """What every number of observation, action, state and command means: name, unit, limits; plain values.
+    """Name, unit and limits of every number of observation, action, state and command; plain values.
 
-    No limit is ``"inf"`` or ``"-inf"``, as in `bam_envs.core.spaces`: JSON has no infinities.
+    A missing limit is ``"inf"`` or ``"-inf"``, as in `bam_envs.core.spaces`: JSON has no infinities.
     """
     labels = {"observation": task.observation_labels, "action": task.action_labels}
     rows = {kind: [_described(label) for label in group] for kind, group in labels.items()}
@@ -49,7 +49,7 @@ def _described(label: Label) -> dict[str, Any]:
 
 
 class _RobotAndTask:
-    """What both environments do alike.
+    """What both environments share.
 
     Args:
         robot: A robot with as many robots as the task has environments.
@@ -71,7 +71,7 @@ class _RobotAndTask:
         return self.robot.spec.period
 
     def describe(self) -> dict[str, list[dict[str, Any]]]:
-        """What every number of observation, action, state and command means."""
+        """Name, unit and limits of every number of observation, action, state and command."""
         return describe(self.robot, self.task)
 
     def _begin(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator], options: Mapping[str, Any]) -> RobotState:
@@ -84,7 +84,7 @@ class _RobotAndTask:
         return state
 
     def _task_options(self, options: Mapping[str, Any]) -> Mapping[str, Any]:
-        """What `reset` was given for the task, all of which the task must know."""
+        """`options`, after a check that the task knows all of them."""
         known: Sequence[str] = getattr(self.task, "reset_options", ())
         for name in options:
             if name not in known:
@@ -97,7 +97,7 @@ class _RobotAndTask:
         return self.state
 
     def _draw(self) -> NDArray[np.uint8] | None:
-        """Picture of the first environment, by robots that have one."""
+        """An image of the first environment, if the robot can draw one."""
         if self.render_mode is None:
             gym.logger.warn('render() without a render_mode shows nothing. Make it with render_mode="rgb_array".')
             return None
@@ -176,13 +176,13 @@ class RobotEnv(_RobotAndTask, gym.Env[NDArray[np.float32], NDArray[np.float32]])
 
 
 def plain_info(score: Score) -> dict[str, Any]:
-    """The info of the first environment in plain Python values; an empty text says nothing."""
-    said = {key: _plain(value[0]) for key, value in score.info.items() if _says(value)[0]}
-    return {"is_success": bool(score.success[0]), **said}
+    """The info of the first environment in plain Python values, without empty texts."""
+    info = {key: _plain(value[0]) for key, value in score.info.items() if _present(value)[0]}
+    return {"is_success": bool(score.success[0]), **info}
 
 
-def _says(value: NDArray[Any]) -> NDArray[np.bool_]:
-    """Of which environments an info says something: an empty text says nothing. Shape: (n,)."""
+def _present(value: NDArray[Any]) -> NDArray[np.bool_]:
+    """Which environments have this info; an empty text stands for none. Shape: (n,)."""
     if value.dtype.kind in "US":
         return np.asarray(value != "")
     if value.dtype.kind == "O":
@@ -273,7 +273,7 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[NDArray[np.float32], ND
         truncated = self._truncated()
         infos = {"is_success": score.success, "_is_success": self._all.copy()}
         for key, value in score.info.items():
-            infos[key], infos["_" + key] = value, _says(value)
+            infos[key], infos["_" + key] = value, _present(value)
         ended = score.terminated | truncated
         if ended.any():
             observation = self._next_episodes(ended, observation, infos)
@@ -291,7 +291,7 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[NDArray[np.float32], ND
         """Move the last observation and info of ended episodes aside and begin the next ones."""
         values = {key: value for key, value in infos.items() if not key.startswith("_")}
         masks = {"_" + key: infos["_" + key] for key in values}
-        infos |= {name: mask & ~ended for name, mask in masks.items()}  # what `reset` says nothing of
+        infos |= {name: mask & ~ended for name, mask in masks.items()}  # `reset` gives no such info
         infos |= {"is_success": values["is_success"] & ~ended, "_is_success": self._all.copy()}
         infos["final_info"] = {**values, **{name: mask & ended for name, mask in masks.items()}}
         infos["final_obs"], infos["_final_obs"], infos["_final_info"] = observation, ended, ended
@@ -318,7 +318,7 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[NDArray[np.float32], ND
         self.robot.close()
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything the future depends on: physics, task memory, generators, counters; plain arrays and values."""
+        """The complete state: physics, task memory, generators, counters; plain arrays and values."""
         robot: Any = self.robot
         return {
             "robot": robot.state_dict(),

@@ -1,4 +1,4 @@
-"""Gymnasium spaces as plain JSON values and back: what a checkpoint's manifest says of observation and action.
+"""Gymnasium spaces as plain JSON values and back, as a checkpoint's manifest has them.
 
 =============  ==========================================================================
 type           fields
@@ -41,7 +41,7 @@ def space_to_json(space: Space[Any]) -> Json:
 
     Raises:
         UnknownName: Graph, OneOf, or a kind of space that is not Gymnasium's.
-        InvalidValue: A bound or key that JSON cannot say.
+        InvalidValue: A bound or key that JSON cannot represent.
     """
     if isinstance(space, spaces.Box):
         bounds = {side: _bounds_to_json(getattr(space, side), side) for side in ("low", "high")}

@@ -1,4 +1,4 @@
-"""Cubic splines through points in d dimensions, batched over rows; the ends are "not-a-knot", as SciPy's are.
+"""Cubic splines through points in d dimensions, batched; the ends are "not-a-knot", as SciPy's are.
 
 The parameter runs from 0 to 1 along the polyline of the points (chord length). With three neighbouring intervals and
 more, the first two share one cubic and so do the last two, so a spline through points of one cubic is that cubic.
@@ -23,7 +23,7 @@ class Splines:
     """Of the cubic in (u - knot) of each interval, constant first. Shape: (k, p - 1, 4, d)."""
 
     def at(self, u: Array) -> Array:
-        """Points at the parameters `u` of each row. Shape: (k, m) -> (k, m, d)."""
+        """Points at the parameters `u` of each spline. Shape: (k, m) -> (k, m, d)."""
         knots = self.knots
         interval = (u[:, :, None] >= knots[:, None, 1:-1]).sum(axis=2)
         row = np.arange(len(knots))[:, None]

@@ -17,21 +17,21 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Label:
-    """What one number of an observation or action means."""
+    """The meaning of one number of an observation or action."""
 
     name: str
     meaning: str
     unit: str
     """Of the quantity before scaling."""
     scale: str = "1"
-    """How the quantity becomes the number."""
+    """How the quantity is scaled."""
     low: float = -1.0
     high: float = 1.0
 
 
 @dataclass
 class Score:
-    """How one step went in each of n environments."""
+    """The outcome of one step in each of n environments."""
 
     reward: Array
     """Shape: (n,)."""
@@ -40,7 +40,7 @@ class Score:
     success: Flags
     """The task is done. Shape: (n,)."""
     info: dict[str, NDArray[Any]] = field(default_factory=dict)
-    """Named distances and the like, numbers, text ("" for nothing to say) or objects. Shape: (n, ...) each."""
+    """Named distances and the like, numbers, text ("" for none) or objects. Shape: (n, ...) each."""
 
 
 @runtime_checkable
@@ -75,7 +75,7 @@ class Task(Protocol):
         """What the robot is sent, SI units. Shapes: (n, a) -> (n, m)."""
 
     def score(self, state: RobotState, action: Floats) -> Score:
-        """How the step that led to `state` went."""
+        """The outcome of the step that led to `state`."""
 
     def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
         """Spheres that a picture of environment 0 shows: position (3,) [m] and colour."""

@@ -1,4 +1,4 @@
-"""The one check of values that people give: an annotated type says what fits, and msgspec compares.
+"""The check of all values that people give: an annotated type describes what fits, and msgspec compares.
 
 ::
 
@@ -120,8 +120,8 @@ def expected(kind: Any) -> str:
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is Annotated:
         metas = [one for one in arguments[1:] if isinstance(one, Meta)]
-        said = next((meta.description for meta in metas if meta.description), None)
-        return said or expected(arguments[0]) + "".join(map(_range, metas))
+        description = next((meta.description for meta in metas if meta.description), None)
+        return description or expected(arguments[0]) + "".join(map(_range, metas))
     if origin in (Union, types.UnionType):
         return " or ".join(expected(one) for one in arguments if one is not type(None))
     if origin is Literal:
@@ -155,8 +155,8 @@ def _range(meta: Meta) -> str:
     if low is not None and high is not None:
         return f" from {_number(low)} to {_number(high)}"
     limits = (("above", meta.gt), ("at least", low), ("below", meta.lt), ("at most", high))
-    said = [f"{word} {_number(limit)}" for word, limit in limits if limit is not None]
-    return f"{' of' if said[0].startswith('at') else ''} {' and '.join(said)}" if said else ""
+    texts = [f"{word} {_number(limit)}" for word, limit in limits if limit is not None]
+    return f"{' of' if texts[0].startswith('at') else ''} {' and '.join(texts)}" if texts else ""
 
 
 def _number(limit: float) -> str:
