@@ -40,16 +40,8 @@ from bam_train.policy.frozen_policy import TOLERANCE
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
 from bam_train.trainers.base import origin
-from bam_train.trainers.frozen_network import pack
-from bam_train.trainers.rllib.rllib_freezing import (
-    AnySpace,
-    FrozenModule,
-    PolicyParts,
-    clear_observations,
-    freeze,
-    golden,
-    leaf_spaces,
-)
+from bam_train.trainers.frozen_network import leaves, pack
+from bam_train.trainers.rllib.rllib_freezing import AnySpace, FrozenModule, PolicyParts, golden
 
 EXPORTED = "exported"
 """Setting of the manifest that says where an exported checkpoint comes from; a run's own has none of this name."""
@@ -147,15 +139,16 @@ def export(
     fitted = partial(_in_environment, saved, env_id, warn)
     kwargs, (parts, signals, period) = parity_if_needed(env_id, {**kwargs, **(env_kwargs or {})}, fitted, warn)
     parts = replace(parts, algorithm=_algorithm(saved, algo))
-    graph = freeze(parts)
+    module = FrozenModule(parts)
+    graph = module.onnx_file()
     if saved.module is None:  # the network in PyTorch
-        by, observations = "PyTorch", clear_observations(parts)
+        by, observations = "PyTorch", module.golden_observations()
         with torch.no_grad():
-            actions = FrozenModule(parts)(*map(torch.as_tensor, observations.values())).numpy()
+            actions = module(*map(torch.as_tensor, observations.values())).numpy()
         arrays = pack(observations, np.asarray(actions, parts.action_space.dtype))
     else:
         by = f"RLlib {metadata.version('ray')}"
-        arrays = golden(parts, saved.by_rllib((parts.observation_space, parts.action_space)))
+        arrays = golden(module, saved.by_rllib((parts.observation_space, parts.action_space)))
     frozen = FrozenPolicy.from_graph(graph, *map(space_to_json, (parts.observation_space, parts.action_space)))
     worst, _ = frozen.worst_difference(safetensors_file.parse(arrays))
     if not worst <= TOLERANCE:  # NaN too
@@ -282,7 +275,7 @@ def _guessed(saved: SavedPolicy, env_id: str, ours: AnySpace, warn: Callable[[st
     theirs = parts.observation_space
     if space_to_json(theirs) == space_to_json(ours):
         return parts
-    shape, width = theirs.shape or (), sum(spaces.flatdim(leaf) for leaf in leaf_spaces(ours).values())
+    shape, width = theirs.shape or (), sum(spaces.flatdim(leaf) for leaf in leaves(ours).values())
     text = f"its network takes observations {_space(theirs)}, and {env_id} gives {_space(ours)}"
     if not isinstance(theirs, spaces.Box) or (theirs.shape != ours.shape and shape != (width,)):
         raise CheckpointMismatch(given, f"{text}; {_NAME_IT}")

@@ -1,9 +1,14 @@
-"""Freezing a policy of any library: common layers, the ONNX file, golden observations."""
+"""Freezing a policy of any library: the layers and the file that all have in common, and golden observations.
+
+A frozen policy has the inputs ``observation`` (``observation.<key>`` of a Dict) in the environment's own dtype and
+layout, and ``state.<name>`` if it is recurrent; its outputs are ``action`` and ``next_state.<name>``. The first axis is
+the batch. Golden actions are what the trainer itself does on some observations; the graph is checked against them.
+"""
 
 import io
 import math
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,6 +18,30 @@ from numpy.typing import NDArray
 from torch import nn
 
 from bam_train.checkpoint import safetensors_file
+from bam_train.errors import PolicyError
+
+Array = NDArray[Any]
+
+KINDS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+_BUDGET = 200_000  # bytes of golden observations; images are random and do not pack
+_FAR = 1e6  # a bound beyond this says nothing about the values that occur
+_HARMLESS_WARNINGS = {
+    # The TorchScript exporter says that it will go; it is 20 times as fast as its successor and needs no onnxscript.
+    "You are using the legacy TorchScript-based ONNX export": DeprecationWarning,
+    "The feature will be removed": DeprecationWarning,
+    "Constant folding - Only steps=1 can be constant folded": UserWarning,  # about the padding of images
+    "": torch.jit.TracerWarning,  # about branches on shapes, which are the same for every observation
+}
+
+
+def leaves(space: spaces.Space[Any]) -> dict[str, Any]:
+    """The spaces in a Dict by key, in alphabetical order; any other space just by ``""``."""
+    return {key: space[key] for key in sorted(space.spaces)} if isinstance(space, spaces.Dict) else {"": space}
+
+
+def to(x: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
+    """Cast, without leaving a node in the graph where there is nothing to do."""
+    return x if x.dtype == dtype else x.to(dtype)
 
 
 class Layer(nn.Module):  # type: ignore[misc]
@@ -37,7 +66,54 @@ class OneHot(Layer):
         return (x.index_select(1, self.columns) == self.values).float()
 
 
-class Choice(Layer):
+class Normalised(Layer):
+    """clip((x - mean) / deviation, -limit, limit) in float64; without a limit nothing is clipped."""
+
+    def __init__(self, mean: Array, deviation: Array, limit: float | None) -> None:
+        super().__init__()
+        self.mean, self.deviation, self.limit = torch.as_tensor(mean), torch.as_tensor(deviation), limit
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Normalise numbers."""
+        x = (to(x, torch.float64) - self.mean) / self.deviation
+        return x.clamp(-self.limit, self.limit) if self.limit else x
+
+
+def action_head(space: spaces.Space[Any], *, tanh: bool, scale: bool, clip: bool) -> nn.Module:
+    """What turns scores, (n, k), into actions of a space; tanh, scale and clip are for a Box.
+
+    Raises:
+        PolicyError: The space is of another kind.
+    """
+    if isinstance(space, spaces.Box):
+        return _Continuous(space, tanh, scale, clip)
+    if isinstance(space, spaces.MultiBinary):
+        return _Switches()
+    if isinstance(space, spaces.Discrete) or (isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim == 1):
+        return _Choice(space)
+    raise PolicyError(f"action space {space} cannot be frozen; expected {_KINDS_TEXT}")
+
+
+class _Continuous(Layer):
+    """A Box: the tanh, then from [-1, 1] to the bounds, then clipped to them; float64 where the space is."""
+
+    def __init__(self, space: spaces.Box, tanh: bool, scale: bool, clip: bool) -> None:
+        super().__init__()
+        self.dtype = torch.float64 if space.dtype == np.float64 else torch.float32
+        self.low, self.high = (torch.as_tensor(bound).to(self.dtype) for bound in (space.low, space.high))
+        self.shape, self.tanh, self.scale, self.clip = space.shape, tanh, scale, clip
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        x = torch.tanh(x) if self.tanh else x
+        x = x if len(self.shape) == 1 else x.reshape(-1, *self.shape)
+        x = self.low + to(0.5 * (x + 1.0), self.dtype) * (self.high - self.low) if self.scale else to(x, self.dtype)
+        return torch.maximum(torch.minimum(x, self.high), self.low) if self.clip else x
+
+    def margin(self, scores: torch.Tensor) -> torch.Tensor:
+        return torch.ones(len(scores))
+
+
+class _Choice(Layer):
     """The best of each group of scores, counted from ``start``: Discrete gives (n,), MultiDiscrete (n, k)."""
 
     def __init__(self, space: spaces.Discrete[Any] | spaces.MultiDiscrete) -> None:
@@ -48,7 +124,6 @@ class Choice(Layer):
         self.starts, self.shifted = torch.as_tensor(np.asarray(space.start)), bool(np.any(space.start))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Choose."""
         if self.single:
             best = x.argmax(1)
         else:
@@ -56,67 +131,94 @@ class Choice(Layer):
         return to(best + self.starts if self.shifted else best, self.dtype)
 
     def margin(self, scores: torch.Tensor) -> torch.Tensor:
-        """How clear the choice is: the least distance of a best score from the second."""
+        """The least distance of a best score from the second."""
         gaps = [group.topk(2)[0] for group in scores.split(self.counts, dim=1) if group.shape[1] > 1]
         return torch.stack([gap[:, 0] - gap[:, 1] for gap in gaps]).amin(0) if gaps else torch.ones(len(scores))
 
 
-def zeros(observation: Mapping[str, Any], is_dict: bool) -> dict[str, torch.Tensor]:
-    """Two observations of zeros: an array for every input of the frozen policy, by name."""
-    arrays = {key: np.zeros((2, *space.shape), space.dtype) for key, space in observation.items()}
-    return {f"observation.{key}" if is_dict else "observation": torch.as_tensor(one) for key, one in arrays.items()}
+class _Switches(Layer):
+    """A MultiBinary: on where the logit is positive, which is where the probability rounds to 1."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return (x > 0).to(torch.int8)
+
+    def margin(self, scores: torch.Tensor) -> torch.Tensor:
+        return scores.abs().amin(1)
 
 
-def to(x: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
-    """Cast, without leaving a node in the graph where there is nothing to do."""
-    return x if x.dtype == dtype else x.to(dtype)
+class FrozenNetwork(Layer):
+    """A copy of a policy, on the CPU and in evaluation mode, from raw observations to actions.
 
-
-# The TorchScript exporter says that it will go; it is 20 times as fast as its successor and needs no onnxscript.
-_NOTICES = ("You are using the legacy TorchScript-based ONNX export", "The feature will be removed")
-
-
-def onnx_file(
-    module: nn.Module,
-    inputs: Mapping[str, torch.Tensor],
-    outputs: Sequence[str],
-    quiet: Mapping[str, Any] | None = None,
-) -> bytes:
-    """Trace a module on the CPU into an ONNX file; the first axis of every input and output is the batch.
-
-    Args:
-        module: The module.
-        inputs: An example of each, in the order of ``forward``, by name.
-        outputs: Their names.
-        quiet: Beginnings of warnings that say nothing here, with their categories.
+    A subclass gives `head` and `scores`, and for inputs that the policy normalises their `moments`.
     """
-    file = io.BytesIO()
-    with torch.no_grad(), warnings.catch_warnings():
-        for text, category in (dict.fromkeys(_NOTICES, DeprecationWarning) | dict(quiet or {})).items():
-            warnings.filterwarnings("ignore", text, category)
-        torch.onnx.export(
-            module,
-            tuple(inputs.values()),
-            file,
-            dynamo=False,
-            opset_version=17,
-            input_names=list(inputs),
-            output_names=list(outputs),
-            dynamic_axes={name: {0: "n"} for name in [*inputs, *outputs]},
-        )
-    return file.getvalue()
+
+    head: nn.Module
+
+    def __init__(self, observation_space: spaces.Space[Any]) -> None:
+        super().__init__()
+        self.is_dict, self.leaves = isinstance(observation_space, spaces.Dict), leaves(observation_space)
+        self.moments: dict[str, tuple[Array, Array]] = {}
+        """Mean and deviation of the values of an observation, by key."""
+        self.state: dict[str, torch.Tensor] = {}
+        """Of a recurrent policy: a batch of two zeros for every array of its state, by name."""
+        for key, leaf in self.leaves.items():
+            if not isinstance(leaf, KINDS):
+                found = type(leaf).__name__
+                raise PolicyError(f"observation {key!r}: a {found} cannot be frozen; expected {_KINDS_TEXT}")
+
+    def scores(self, *observation: torch.Tensor) -> torch.Tensor:
+        """What the action is made of, (n, k) float32: means, logits or values."""
+        raise NotImplementedError
+
+    def forward(self, *inputs: torch.Tensor) -> Any:
+        """The action, (n, ...)."""
+        return self.head(self.scores(*inputs))
+
+    def example(self) -> tuple[torch.Tensor, ...]:
+        """Two observations of zeros."""
+        arrays = (np.zeros((2, *leaf.shape), leaf.dtype) for leaf in self.leaves.values())
+        return tuple(map(torch.as_tensor, arrays))
+
+    def onnx_file(self) -> bytes:
+        """Trace the policy into an ONNX file."""
+        file, names = io.BytesIO(), [_input_name(key) for key in self.leaves] + [f"state.{name}" for name in self.state]
+        outputs = ["action", *(f"next_state.{name}" for name in self.state)]
+        with torch.no_grad(), warnings.catch_warnings():
+            for text, category in _HARMLESS_WARNINGS.items():
+                warnings.filterwarnings("ignore", text, category)
+            torch.onnx.export(
+                self,
+                (*self.example(), *self.state.values()),
+                file,
+                dynamo=False,
+                opset_version=17,
+                input_names=names,
+                output_names=outputs,
+                dynamic_axes={name: {0: "n"} for name in [*names, *outputs]},
+            )
+        return file.getvalue()
+
+    def draw(self, n: int, rng: np.random.Generator) -> dict[str, Array]:
+        """Draw n observations by key, (n, ...) each."""
+        return {key: draw_array(leaf, n, rng, self.moments.get(key)) for key, leaf in self.leaves.items()}
+
+    def golden_observations(self, n: int = 256) -> dict[str, Array]:
+        """Draw n observations by key, always the same; fewer if they are large.
+
+        They are those whose choice is clearest: where two choices tie, rounding decides, and that proves nothing.
+        """
+        size = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in self.leaves.values())
+        n, rng = min(n, max(4, _BUDGET // (size or 1))), np.random.default_rng(0)
+        if self.state:
+            return self.draw(n, rng)
+        drawn = self.draw(2 * n, rng)
+        with torch.no_grad():
+            margin = self.head.margin(self.scores(*map(torch.as_tensor, drawn.values()))).numpy()
+        keep = np.sort(np.argsort(-margin, kind="stable")[:n])
+        return {key: value[keep] for key, value in drawn.items()}
 
 
-_BUDGET = 200_000  # bytes of observations; images are random and do not pack
-_FAR = 1e6  # a bound beyond this says nothing about the values that occur
-
-Array = NDArray[Any]
-
-
-def affordable(observation: Iterable[Any], n: int) -> int:
-    """How many of `n` observations to record, of arrays in these spaces: fewer if they are large."""
-    size = sum(math.prod(leaf.shape or ()) * np.dtype(leaf.dtype).itemsize for leaf in observation)
-    return min(n, max(4, _BUDGET // (size or 1)))
+_KINDS_TEXT = "Box, Discrete, MultiDiscrete or MultiBinary"
 
 
 def draw_array(space: Any, n: int, rng: np.random.Generator, moments: tuple[Array, Array] | None) -> Array:
@@ -143,18 +245,11 @@ def draw_array(space: Any, n: int, rng: np.random.Generator, moments: tuple[Arra
     return np.asarray(np.clip(values, low, high).astype(space.dtype))
 
 
-def clearest(module: Any, observations: Mapping[str, Array], n: int) -> dict[str, Array]:
-    """The n observations whose choice is clearest: where two choices tie, rounding decides, and that proves nothing.
-
-    The module is a frozen policy with ``scores`` and ``head.margin``; the observations are (m, ...) each, by key.
-    """
-    with torch.no_grad():
-        margin = module.head.margin(module.scores(*map(torch.as_tensor, observations.values()))).numpy()
-    keep = np.sort(np.argsort(-margin, kind="stable")[:n])
-    return {key: value[keep] for key, value in observations.items()}
+def _input_name(key: str) -> str:
+    return f"observation.{key}" if key else "observation"
 
 
 def pack(observations: Mapping[str, Array], actions: Array) -> bytes:
-    """Write golden observations, by key of a Dict or just ``""``, and their actions, (n, ...) each, as safetensors."""
-    named = {f"observation.{key}" if key else "observation": value for key, value in observations.items()}
+    """Write golden observations by key and their actions, (n, ...) each, as safetensors."""
+    named = {_input_name(key): value for key, value in observations.items()}
     return safetensors_file.dump({**named, "action": actions})

@@ -2,9 +2,7 @@
 
 The graph holds what RLlib does with ``explore=False``: its connectors (one-hot codes, flattening, `MeanStdFilter`), the
 module's forward pass, which is traced, the distribution's deterministic action, and the scaling or clipping to the
-action space. Its input is ``observation`` (``observation.<key>`` of a Dict) in the environment's own dtype and layout,
-its output ``action``; the first axis is the batch. `RLlibPolicy` computes the same with RLlib's own code, and the
-actions that it gives for random observations (`golden`) are what every frozen policy is checked against.
+action space. `RLlibPolicy` computes the same with RLlib's own code.
 """
 
 from __future__ import annotations
@@ -22,18 +20,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from bam_train.errors import PolicyError, SettingsError
-from bam_train.trainers.frozen_network import (
-    Choice,
-    Layer,
-    OneHot,
-    affordable,
-    clearest,
-    draw_array,
-    onnx_file,
-    pack,
-    to,
-    zeros,
-)
+from bam_train.trainers.frozen_network import FrozenNetwork, Layer, Normalised, OneHot, action_head, pack, to
 from bam_train.trainers.rllib.state_pickles import unpacked_array
 from bam_train.trainers.zero_based_spaces import less_start, plus_start
 
@@ -52,10 +39,6 @@ _LAYOUT = frozenset(
         *("RemoveSingleTsTimeRankFromBatch", "TensorToNumpy", "UnBatchToIndividualItems"),
     }
 )
-_HARMLESS_WARNINGS = {
-    "Constant folding - Only steps=1 can be constant folded": UserWarning,  # about the padding of images
-    "": torch.jit.TracerWarning,  # about branches on shapes, which are the same for every observation
-}
 
 
 # What a policy is made of
@@ -169,53 +152,57 @@ def _filter_of(connector: Any) -> Filter:
     return Filter.of(stats[0], own["clip_by_value"], own["de_mean_to_zero"], own["de_std_to_one"])
 
 
-def leaf_spaces(space: AnySpace) -> dict[str, AnySpace]:
-    """The spaces in a Dict by key, in alphabetical order as RLlib takes them; any other space as ``""`` alone.
-
-    Raises:
-        PolicyError: A Dict in a Dict, or a Tuple.
-    """
-    leaves = {key: space[key] for key in sorted(space.spaces)} if isinstance(space, spaces.Dict) else {"": space}
-    for key, leaf in leaves.items():
-        if not isinstance(leaf, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
-            text = "expected Box, Discrete, MultiDiscrete or MultiBinary or a Dict of them"
-            raise PolicyError(f"observation {key!r}: a {type(leaf).__name__} cannot be frozen; {text}")
-    return leaves
-
-
 # The graph
 
 
-def freeze(parts: PolicyParts) -> bytes:
-    """Write a policy as an ONNX file.
+class FrozenModule(FrozenNetwork):
+    """A policy of RLlib; shares nothing with the live one.
 
     Raises:
         PolicyError: The network or a space is of a kind that cannot be frozen.
     """
-    module = FrozenModule(parts)
-    return onnx_file(module, module.inputs, ["action"], _HARMLESS_WARNINGS)
-
-
-class FrozenModule(Layer):
-    """A policy on the CPU, from raw observations to actions; a copy that shares nothing with the live one.
-
-    Attributes:
-        inputs: A batch of two zeros for every input, by name.
-    """
 
     def __init__(self, parts: PolicyParts) -> None:
-        super().__init__()
-        leaves = leaf_spaces(parts.observation_space)
-        self.inputs = zeros(leaves, isinstance(parts.observation_space, spaces.Dict))
-        self.observation = _Observation(parts, leaves)
+        super().__init__(parts.observation_space)
+        space, actions, given = parts.observation_space, parts.action_space, parts.filter
+        floats = isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating)
+        if not parts.flatten and not isinstance(space, spaces.Box):
+            raise PolicyError(f"observation: a {type(space).__name__} without FlattenObservations cannot be frozen")
+        if given is not None and (parts.filter_first or not parts.flatten) and not floats:  # would round whole numbers
+            raise PolicyError("observation: MeanStdFilter of anything but a Box of floats cannot be frozen")
+        if isinstance(actions, spaces.Box) and not (
+            len(actions.shape) == 1 and np.issubdtype(actions.dtype, np.floating)
+        ):
+            raise PolicyError(f"action space {actions} cannot be frozen; expected a Box of floats with one axis")
+        dtype = torch.float64 if parts.filter_first else torch.float32
+        self.encoders = nn.ModuleList(
+            _encoder(leaf, dtype) if parts.flatten else nn.Identity() for leaf in self.leaves.values()
+        )
+        self.normalise: nn.Module = nn.Identity()
+        if given is not None:
+            shape = (-1,) if parts.flatten else space.shape or ()
+            self.normalise = Normalised(given.offset.reshape(shape), given.divisor.reshape(shape), given.limit)
         self.network = copy.deepcopy(parts.network).cpu()
-        self.head = _head(parts)
-        self.outputs = spaces.flatdim(parts.action_space)
+        bounded = isinstance(actions, spaces.Box) and actions.is_bounded()
+        scale = parts.normalize_actions and bounded
+        clip = scale or (parts.clip_actions and not parts.normalize_actions)
+        self.head = action_head(actions, tanh=False, scale=scale, clip=clip)
+        self.outputs = spaces.flatdim(actions)
         self.eval().requires_grad_(False)
-        try:  # once: weights, observation and action space must belong together
+        self._require_fit()
+        at = 0
+        for key, leaf in self.leaves.items():
+            part = slice(at, at := at + spaces.flatdim(leaf))
+            if given is not None and isinstance(leaf, spaces.Box):
+                mean, spread = (numbers.ravel()[part] for numbers in (given.offset, given.divisor))
+                self.moments[key] = mean.reshape(leaf.shape), spread.reshape(leaf.shape)
+
+    def _require_fit(self) -> None:
+        """Weights, observation and action space must belong together."""
+        try:
             with torch.no_grad():
-                found = self.scores(*self.inputs.values()).shape[1]
-                self(*self.inputs.values())
+                found = self.scores(*self.example()).shape[1]
+                self(*self.example())
         except PolicyError:
             raise
         except (RuntimeError, ValueError, TypeError, IndexError, KeyError, AttributeError) as error:
@@ -225,16 +212,14 @@ class FrozenModule(Layer):
             raise PolicyError(f"the network has {found} outputs, expected {self.outputs} or more for the action space")
 
     def scores(self, *observation: torch.Tensor) -> torch.Tensor:
-        """Return what the action is made of, (n, k) float32: means, logits or values.
+        """What the action is made of, (n, k) float32: means, logits or values.
 
         The network of a Gaussian gives log deviations after the means: these are left out.
         """
-        scores = self.network(self.observation(observation))
+        encoded = [encoder(tensor) for encoder, tensor in zip(self.encoders, observation, strict=True)]
+        joined = encoded[0] if len(encoded) == 1 else torch.cat(encoded, 1)
+        scores = self.network(to(self.normalise(joined), torch.float32))
         return scores[:, : self.outputs] if scores.shape[1] > self.outputs else scores
-
-    def forward(self, *observation: torch.Tensor) -> Any:
-        """Return the action, (n, ...)."""
-        return self.head(self.scores(*observation))
 
 
 class _Network(Layer):
@@ -278,88 +263,19 @@ class _Network(Layer):
         return (support * logits.softmax(-1)).sum(-1)
 
 
-class _Observation(Layer):
-    """What RLlib's connectors do: one-hot, flatten, normalise in float64, float32."""
+def _encoder(space: Any, dtype: torch.dtype) -> nn.Module:
+    return OneHot(space) if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)) else _Flat(dtype)
 
-    def __init__(self, parts: PolicyParts, leaves: Mapping[str, Any]) -> None:
+
+class _Flat(Layer):
+    """A Box or MultiBinary as one vector."""
+
+    def __init__(self, dtype: torch.dtype) -> None:
         super().__init__()
-        space, flatten, shape = parts.observation_space, parts.flatten, next(iter(leaves.values())).shape or ()
-        if not flatten and not isinstance(space, spaces.Box):
-            raise PolicyError(f"observation: a {type(space).__name__} without FlattenObservations cannot be frozen")
-        early_filter = parts.filter is not None and (parts.filter_first or not flatten)  # would round whole numbers
-        if early_filter and not (isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating)):
-            raise PolicyError("observation: MeanStdFilter of anything but a Box of floats cannot be frozen")
-        self.leaves = nn.ModuleList(_encoder(leaf) if flatten else nn.Identity() for leaf in leaves.values())
-        early, late = (parts.filter, None) if parts.filter_first else (None, parts.filter)
-        self.early = nn.Identity() if early is None else _Normalised(early, shape)
-        self.late = nn.Identity() if late is None else _Normalised(late, (-1,) if flatten else shape)
-
-    def forward(self, tensors: tuple[torch.Tensor, ...]) -> torch.Tensor:
-        encoded = [leaf(self.early(tensor)) for leaf, tensor in zip(self.leaves, tensors, strict=True)]
-        return to(self.late(encoded[0] if len(encoded) == 1 else torch.cat(encoded, 1)), torch.float32)
-
-
-def _encoder(space: Any) -> nn.Module:
-    """Of a Box or MultiBinary: one vector, float32."""
-    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
-        return OneHot(space)
-    return _Numbers(len(space.shape))
-
-
-class _Numbers(Layer):
-    def __init__(self, dimensions: int) -> None:
-        super().__init__()
-        self.dimensions = dimensions
+        self.dtype = dtype
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        x = x.unsqueeze(1) if self.dimensions == 0 else x.flatten(1) if self.dimensions > 1 else x
-        return to(x, torch.float32)
-
-
-class _Normalised(Layer):
-    """clip((x - offset) / divisor, -limit, limit) in float64, then back to the type of x."""
-
-    def __init__(self, given: Filter, shape: tuple[int, ...]) -> None:
-        super().__init__()
-        self.offset, self.divisor = (torch.as_tensor(part.reshape(shape)) for part in (given.offset, given.divisor))
-        self.limit = given.limit or None
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        y = (to(x, torch.float64) - self.offset) / self.divisor
-        return to(y if self.limit is None else y.clamp(-self.limit, self.limit), x.dtype)
-
-
-def _head(parts: PolicyParts) -> nn.Module:
-    """What turns the network's output into an action of the environment's space."""
-    space = parts.action_space
-    if isinstance(space, spaces.Box) and len(space.shape) == 1 and np.issubdtype(space.dtype, np.floating):
-        return _Continuous(space, parts)
-    if isinstance(space, spaces.Discrete) or (isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim == 1):
-        return Choice(space)
-    expected = "a Box of floats with one axis, a Discrete or a MultiDiscrete"
-    raise PolicyError(f"action space {space} cannot be frozen; expected {expected}")
-
-
-class _Continuous(Layer):
-    """The mean, scaled from [-1, 1] to the bounds or clipped to them, as RLlib's connector does."""
-
-    def __init__(self, space: spaces.Box, parts: PolicyParts) -> None:
-        super().__init__()
-        self.dtype = torch.float64 if space.dtype == np.float64 else torch.float32
-        self.low, self.high = (torch.as_tensor(bound).to(self.dtype) for bound in (space.low, space.high))
-        self.half = (self.high - self.low) / 2.0
-        bounded = bool(np.isfinite(space.low).all() and np.isfinite(space.high).all())
-        self.stretch = parts.normalize_actions and bounded
-        self.clip = self.stretch or (parts.clip_actions and not parts.normalize_actions)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        if self.stretch:
-            x = self.low + to(x + 1.0, self.dtype) * self.half
-        x = to(x, self.dtype)
-        return torch.maximum(torch.minimum(x, self.high), self.low) if self.clip else x
-
-    def margin(self, scores: torch.Tensor) -> torch.Tensor:
-        return torch.ones(len(scores))
+        return to(x.unsqueeze(1) if x.ndim == 1 else x.flatten(1) if x.ndim > 2 else x, self.dtype)
 
 
 # RLlib's own actions
@@ -425,20 +341,14 @@ class RLlibPolicy:
         return np.asarray(plus_start(action_space, actions), dtype)
 
 
-def golden(parts: PolicyParts, policy: RLlibPolicy, n: int = 256, seed: int = 0) -> bytes:
+def golden(frozen: FrozenModule, policy: RLlibPolicy, n: int = 256) -> bytes:
     """Draw n observations, fewer if they are large, and record RLlib's deterministic actions for them.
 
     Returns:
         A safetensors file with ``observation`` (or ``observation.<key>``), (n, ...), and ``action``, (n, ...).
     """
-    observations = clear_observations(parts, n, seed)
+    observations = frozen.golden_observations(n)
     return pack(observations, policy.actions(one_by_one(observations)))
-
-
-def clear_observations(parts: PolicyParts, n: int = 256, seed: int = 0) -> dict[str, Array]:
-    """Draw observations; of discrete actions those whose choice is clear: ties are decided by rounding alone."""
-    n = affordable(leaf_spaces(parts.observation_space).values(), n)
-    return clearest(FrozenModule(parts), draw(parts, 2 * n, np.random.default_rng(seed)), n)
 
 
 def one_by_one(observations: Mapping[str, Array]) -> list[Any]:
@@ -446,18 +356,3 @@ def one_by_one(observations: Mapping[str, Array]) -> list[Any]:
     if "" in observations:
         return list(observations[""])
     return [dict(zip(observations, one, strict=True)) for one in zip(*observations.values(), strict=True)]
-
-
-def draw(parts: PolicyParts, n: int, rng: np.random.Generator) -> dict[str, Array]:
-    """Draw n observations; the keys are those of a Dict, or ``""`` alone.
-
-    Normalised numbers are drawn about their running mean, so that few of them end at the filter's limits.
-    """
-    drawn, at = {}, 0
-    for key, leaf in leaf_spaces(parts.observation_space).items():
-        moments, part = None, slice(at, at := at + spaces.flatdim(leaf))
-        if parts.filter is not None and isinstance(leaf, spaces.Box):
-            mean, spread = (numbers.ravel()[part] for numbers in (parts.filter.offset, parts.filter.divisor))
-            moments = mean.reshape(leaf.shape), spread.reshape(leaf.shape)
-        drawn[key] = draw_array(leaf, n, rng, moments)
-    return drawn

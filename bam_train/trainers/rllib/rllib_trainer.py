@@ -34,7 +34,7 @@ from bam_train.trainers.resolve_settings import own_settings
 from bam_train.trainers.rllib import rllib_state
 from bam_train.trainers.rllib.algorithm_config import envs_each, make_config, refusals
 from bam_train.trainers.rllib.ray_cluster import cluster
-from bam_train.trainers.rllib.rllib_freezing import RLlibPolicy, freeze, golden, parts_of
+from bam_train.trainers.rllib.rllib_freezing import FrozenModule, RLlibPolicy, golden, parts_of
 from bam_train.trainers.rllib.rllib_hyperparameters import complete, complete_normalize
 from bam_train.trainers.rllib.robot_env_runner import ENDS
 from bam_train.trainers.rllib.runner_deaths import RunnerWatch
@@ -225,10 +225,10 @@ class RLlibTrainer:
         """Write a checkpoint that can be resumed and deployed."""
         with rllib_state.undisturbed():
             module = copy.deepcopy(self._module())  # of appo and impala, a thread goes on learning
-            parts = self._of(parts_of, module)
+            frozen = FrozenModule(self._of(parts_of, module))
             members = {
-                "bam/policy.onnx": freeze(parts),
-                "bam/golden.safetensors": golden(parts, self._of(RLlibPolicy, module)),
+                "bam/policy.onnx": frozen.onnx_file(),
+                "bam/golden.safetensors": golden(frozen, self._of(RLlibPolicy, module)),
                 **rllib_state.members(self.algorithm, notes),
             }
         known = {"signals": self._signals, "period": self._period, "steps": self.steps, "scores": scores}
@@ -237,7 +237,7 @@ class RLlibTrainer:
     def freeze(self) -> FrozenPolicy:
         """The policy as it is now."""
         with rllib_state.undisturbed():
-            graph = freeze(self._of(parts_of, self._module()))
+            graph = FrozenModule(self._of(parts_of, self._module())).onnx_file()
         return FrozenPolicy.from_graph(graph, *map(space_to_json, self._spaces))
 
     def exploring(self) -> RLlibPolicy:

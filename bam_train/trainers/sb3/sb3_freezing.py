@@ -3,11 +3,6 @@
 The graph holds the whole path of ``model.predict(..., deterministic=True)``, with what lies around it: `VecNormalize`,
 `VecTransposeImage`, one-hot codes, the network, squashing, and the action space's bounds. It is traced from a copy on
 the CPU: the model is not touched and no random number is drawn.
-
-Inputs are ``observation`` (``observation.<key>`` of a Dict) in the environment's own dtype and layout, and for
-recurrent policies ``state.<name>``; outputs are ``action`` and ``next_state.<name>``; the first axis is the batch.
-
-Golden actions are what the trainer itself does on some observations; the graph is checked against them.
 """
 
 import copy
@@ -25,60 +20,45 @@ from torch import nn
 
 from bam_train.errors import PolicyError
 from bam_train.trainers.frozen_network import (
-    Choice,
+    FrozenNetwork,
     Layer,
+    Normalised,
     OneHot,
-    affordable,
-    clearest,
-    draw_array,
-    onnx_file,
+    action_head,
+    leaves,
     pack,
     to,
-    zeros,
 )
 from bam_train.trainers.zero_based_spaces import less_start, plus_start
 
-_GOLDEN = 256  # golden actions, fewer if observations are large
-_KINDS = "Box, Discrete, MultiDiscrete or MultiBinary"
-
-
-def leaves(space: spaces.Space[Any]) -> dict[str, Any]:
-    """The spaces in a Dict by key; any other space just by ``""``."""
-    return dict(space.spaces) if isinstance(space, spaces.Dict) else {"": space}
+AnySpace = spaces.Space[Any]
 
 
 class _Numbers(Layer):
     """A Box or MultiBinary: channels first, normalise in float64 as VecNormalize does, pixels to [0, 1], float32."""
 
-    def __init__(self, statistics: Any, channels_last: bool, pixels: bool) -> None:
+    def __init__(self, normalise: nn.Module, channels_last: bool, pixels: bool) -> None:
         super().__init__()
-        self.statistics, self.channels_last, self.pixels = statistics, channels_last, pixels
+        self.normalise, self.channels_last, self.pixels = normalise, channels_last, pixels
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        if self.channels_last:
-            x = x.permute(0, 3, 1, 2)
-        if self.statistics is not None:
-            mean, deviation, limit = self.statistics
-            x = ((to(x, torch.float64) - mean) / deviation).clamp(-limit, limit)
-        x = to(x, torch.float32)
+        x = to(self.normalise(x.permute(0, 3, 1, 2) if self.channels_last else x), torch.float32)
         return x / 255.0 if self.pixels else x
 
 
-def _encoder(key: str, raw: spaces.Space[Any], seen: spaces.Space[Any], statistics: Any, scale: bool) -> nn.Module:
-    """Return what turns an array of the environment's space `raw` into what the policy's feature extractor takes.
+def _encoder(key: str, raw: Any, seen: AnySpace, normalise: nn.Module, scale: bool) -> nn.Module:
+    """What turns an array of the environment's space `raw` into what the policy's feature extractor takes.
 
     The policy was built for the space `seen`: channels of an image may have been moved to the front.
     """
     if isinstance(raw, (spaces.Discrete, spaces.MultiDiscrete)):
         return OneHot(raw)
-    if not isinstance(raw, (spaces.Box, spaces.MultiBinary)):
-        raise PolicyError(f"observation {key!r}: a {type(raw).__name__} cannot be frozen; expected {_KINDS}")
     channels_last = raw.shape != seen.shape
     if channels_last and (len(raw.shape) != 3 or (raw.shape[2], *raw.shape[:2]) != seen.shape):
         raise PolicyError(
             f"observation {key!r}: the policy takes shape {seen.shape}, the environment gives {raw.shape}"
         )
-    return _Numbers(statistics, channels_last, scale and is_image_space(seen))
+    return _Numbers(normalise, channels_last, scale and is_image_space(seen))
 
 
 class _Chain(Layer):
@@ -120,7 +100,7 @@ class _Lstm(Layer):
 
 
 def _network(policy: BasePolicy) -> tuple[Any, nn.Module, nn.Module, nn.Module | None]:
-    """Return the module that owns the network, and copies of its feature extractor, its layers and its LSTM if any."""
+    """The module that owns the network, and copies of its feature extractor, its layers and its LSTM if any."""
     lstm = None
     if isinstance(policy, ActorCriticPolicy):
         owner, extractor = policy, policy.pi_features_extractor
@@ -150,66 +130,23 @@ def _mean_of_quantiles(layers: nn.Sequential, quantiles: int) -> nn.Sequential:
     return nn.Sequential(*hidden, mean)
 
 
-class _Continuous(Layer):
-    """Squash and scale, or only clip, as ``predict`` does; float64 where the space is."""
-
-    def __init__(self, space: spaces.Box, tanh: bool, scale: bool) -> None:
-        super().__init__()
-        self.dtype = torch.float64 if space.dtype == np.float64 else torch.float32
-        self.low, self.high = (torch.as_tensor(bound).to(self.dtype) for bound in (space.low, space.high))
-        self.bounded = bool(np.isfinite(space.low).any()), bool(np.isfinite(space.high).any())
-        self.shape, self.tanh, self.scale = space.shape, tanh, scale
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        x = torch.tanh(x) if self.tanh else x
-        if len(self.shape) != 1:
-            x = x.reshape(-1, *self.shape)
-        x = to(x, self.dtype)
-        if self.scale:
-            x = self.low + (0.5 * (x + 1.0) * (self.high - self.low))
-        x = torch.minimum(x, self.high) if self.bounded[1] else x  # scaled ones too: they can round past a bound
-        return torch.maximum(x, self.low) if self.bounded[0] else x
-
-    def margin(self, scores: torch.Tensor) -> torch.Tensor:
-        return torch.ones(len(scores))
-
-
-class _Switches(Layer):
-    """A MultiBinary: on where the logit is positive, which is where the probability rounds to 1."""
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return (x > 0).to(torch.int8)
-
-    def margin(self, scores: torch.Tensor) -> torch.Tensor:
-        return scores.abs().amin(1)
-
-
-def _head(space: spaces.Space[Any], policy: BasePolicy) -> nn.Module:
-    """Return what turns the network's output into an action of the environment's space."""
-    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
-        return Choice(space)
-    if isinstance(space, spaces.MultiBinary):
-        return _Switches()
+def _head(space: AnySpace, policy: BasePolicy) -> nn.Module:
+    """What turns the network's output into an action of the environment's space."""
     if not isinstance(space, spaces.Box):
-        raise PolicyError(f"action space {space}: expected {_KINDS}")
+        return action_head(space, tanh=False, scale=False, clip=False)
     if isinstance(policy, ActorCriticPolicy):
         distribution = policy.action_dist
         tanh = isinstance(distribution, StateDependentNoiseDistribution) and distribution.bijector is not None
     else:  # TD3 and DDPG have theirs among the layers of `_network`
         tanh = hasattr(policy.actor, "latent_pi")
-    return _Continuous(space, tanh, policy.squash_output)
+    return action_head(space, tanh=tanh, scale=policy.squash_output, clip=True)  # scaled ones can round past a bound
 
 
-def freeze(
-    model: BaseAlgorithm,
-    normaliser: VecNormalize | None,
-    observation_space: spaces.Space[Any],
-    action_space: spaces.Space[Any],
-) -> bytes:
-    """Write the model's deterministic policy as an ONNX file.
+class FrozenModel(FrozenNetwork):
+    """The policy of a model of any algorithm of stable-baselines3 or sb3-contrib but ARS.
 
     Args:
-        model: Of any algorithm of stable-baselines3 or sb3-contrib but ARS.
+        model: The model.
         normaliser: Normaliser of the observations, if any.
         observation_space: The environment's own, before any wrapper of SB3.
         action_space: The environment's own; its ``start`` is added to what SB3 counts from 0.
@@ -217,107 +154,75 @@ def freeze(
     Raises:
         PolicyError: The policy or a space is of a kind that cannot be frozen.
     """
-    module = FrozenModule(model, normaliser, observation_space, action_space)
-    inputs = zeros(module.raw, module.is_dict)
-    for layer, size in enumerate(module.lstm.sizes if module.lstm is not None else []):
-        inputs |= {f"state.{name}_{layer}": torch.zeros(2, size) for name in ("hidden", "cell")}
-    outputs = ["action", *(f"next_{name}" for name in inputs if name.startswith("state."))]
-    return onnx_file(module, inputs, outputs)
-
-
-class FrozenModule(Layer):
-    """A copy of a policy, on the CPU and in evaluation mode, from raw observations to actions."""
 
     def __init__(
         self,
         model: BaseAlgorithm,
         normaliser: VecNormalize | None,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Space[Any],
+        observation_space: AnySpace,
+        action_space: AnySpace,
     ) -> None:
-        super().__init__()
+        super().__init__(observation_space)
         policy = model.policy
-        self.is_dict = isinstance(observation_space, spaces.Dict)
-        self.raw, seen = leaves(observation_space), leaves(policy.observation_space)
-        if set(seen) != set(self.raw):
-            raise PolicyError(f"observation: the policy takes {sorted(seen)}, the environment gives {sorted(self.raw)}")
+        seen = leaves(policy.observation_space)
+        if set(seen) != set(self.leaves):
+            found = f"the policy takes {sorted(seen)}, the environment gives {sorted(self.leaves)}"
+            raise PolicyError(f"observation: {found}")
         owner, self.extractor, self.layers, self.lstm = _network(policy)
         self.encoders = nn.ModuleList()
-        for key, space in self.raw.items():
-            moments, statistics = _moments(normaliser, key), None
-            if normaliser is not None and moments is not None:
-                statistics = *map(torch.as_tensor, moments), float(normaliser.clip_obs)
-            self.encoders.append(_encoder(key, space, seen[key], statistics, owner.normalize_images))
+        for key, space in self.leaves.items():
+            normalise: nn.Module = nn.Identity()
+            if normaliser is not None and normaliser.norm_obs and (not key or key in normaliser.norm_obs_keys):
+                rms = normaliser.obs_rms[key] if key else normaliser.obs_rms
+                self.moments[key] = rms.mean, np.sqrt(rms.var + normaliser.epsilon)
+                normalise = Normalised(*self.moments[key], float(normaliser.clip_obs))
+            self.encoders.append(_encoder(key, space, seen[key], normalise, owner.normalize_images))
+        for layer, size in enumerate(self.lstm.sizes if self.lstm is not None else []):
+            self.state |= {f"{name}_{layer}": torch.zeros(2, size) for name in ("hidden", "cell")}
         self.head = _head(action_space, policy)
         self.eval()
 
     def scores(self, *observation: torch.Tensor) -> torch.Tensor:
-        """Return what the action is made of, (n, outputs) float32: means, logits or values; not if recurrent."""
+        """What the action is made of, (n, outputs) float32: means, logits or values; not if recurrent."""
         return self.layers(self._features(observation))
 
     def forward(self, *inputs: torch.Tensor) -> Any:
-        """Return the action, and of a recurrent policy the next state."""
+        """The action, and of a recurrent policy the next state."""
         if self.lstm is None:
             return self.head(self.scores(*inputs))
-        count = len(self.raw)
+        count = len(self.leaves)
         output, state = self.lstm(self._features(inputs[:count]), inputs[count:])
         return self.head(self.layers(output)), *state
 
     def _features(self, observation: Any) -> torch.Tensor:
         encoded = [encoder(tensor) for encoder, tensor in zip(self.encoders, observation, strict=True)]
-        return self.extractor(dict(zip(self.raw, encoded, strict=True)) if self.is_dict else encoded[0])
+        return self.extractor(dict(zip(self.leaves, encoded, strict=True)) if self.is_dict else encoded[0])
 
 
-def _moments(normaliser: VecNormalize | None, key: str) -> tuple[np.ndarray, np.ndarray] | None:
-    """Mean and standard deviation (float64) that one leaf is normalised with; None if it is not."""
-    if normaliser is None or not normaliser.norm_obs or (key and key not in normaliser.norm_obs_keys):
-        return None
-    rms = normaliser.obs_rms[key] if key else normaliser.obs_rms
-    return rms.mean, np.sqrt(rms.var + normaliser.epsilon)
+def freeze(model: BaseAlgorithm, normaliser: VecNormalize | None, observed: AnySpace, acted: AnySpace) -> bytes:
+    """Write the model's deterministic policy as an ONNX file; arguments and errors as of `FrozenModel`."""
+    return FrozenModel(model, normaliser, observed, acted).onnx_file()
 
 
-def golden(
-    model: BaseAlgorithm,
-    normaliser: VecNormalize | None,
-    observation_space: spaces.Space[Any],
-    action_space: spaces.Space[Any],
-) -> bytes:
-    """Draw observations, always the same, and record ``model.predict(..., deterministic=True)``.
-
-    The arguments are those of `freeze`. The model is left as it was, and no random number of torch, NumPy or SB3 is
-    drawn.
+def golden(model: BaseAlgorithm, normaliser: VecNormalize | None, observed: AnySpace, acted: AnySpace) -> bytes:
+    """Draw observations and record ``model.predict(..., deterministic=True)``; arguments as of `FrozenModel`.
 
     Returns:
         A safetensors file with ``observation`` (or ``observation.<key>``), (n, ...), and ``action``, (n, ...); of a
         recurrent policy the steps of one episode.
     """
-    recurrent = hasattr(model.policy, "lstm_actor")
-    n = affordable(leaves(observation_space).values(), _GOLDEN)
-    observations = draw(observation_space, n if recurrent else 2 * n, np.random.default_rng(0), normaliser)
-    if not recurrent:
-        observations = clearest(FrozenModule(model, normaliser, observation_space, action_space), observations, n)
-    actions = trainer_actions(model, normaliser, observation_space, action_space, observations)
-    return pack(observations, actions)
-
-
-def draw(
-    space: spaces.Space[Any], n: int, rng: np.random.Generator, normaliser: VecNormalize | None = None
-) -> dict[str, np.ndarray]:
-    """Draw n observations; the keys are those of a Dict, or just ``""``.
-
-    Normalised numbers are drawn about their running mean, so that few of them end at the normaliser's limits.
-    """
-    return {key: draw_array(leaf, n, rng, _moments(normaliser, key)) for key, leaf in leaves(space).items()}
+    observations = FrozenModel(model, normaliser, observed, acted).golden_observations()
+    return pack(observations, trainer_actions(model, normaliser, observed, acted, observations))
 
 
 def trainer_actions(
     model: BaseAlgorithm,
     normaliser: VecNormalize | None,
-    observation_space: spaces.Space[Any],
-    action_space: spaces.Space[Any],
+    observation_space: AnySpace,
+    action_space: AnySpace,
     observations: dict[str, np.ndarray],
 ) -> np.ndarray:
-    """Return the trainer's own actions for raw observations, in the environment's action space."""
+    """The trainer's own actions for raw observations, in the environment's action space."""
     is_dict = isinstance(observation_space, spaces.Dict)
     seen = less_start(observation_space, observations if is_dict else observations[""])
     if normaliser is not None:

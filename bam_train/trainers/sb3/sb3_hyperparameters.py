@@ -26,8 +26,8 @@ from bam_envs.core.wording import did_you_mean
 from bam_train.errors import SettingsError
 from bam_train.settings import NAMES, TrainSettings
 from bam_train.trainers.algorithms import SB3_ALGORITHMS, Algorithm
+from bam_train.trainers.frozen_network import leaves
 from bam_train.trainers.library_arguments import fit, linear_start, ranges
-from bam_train.trainers.sb3.sb3_freezing import leaves
 
 ELSEWHERE = {
     "self": None,

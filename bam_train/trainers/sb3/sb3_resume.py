@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.safetensors_file import pack, unpack
 from bam_train.errors import AlteredCheckpoint, FormatError
-from bam_train.trainers.sb3.sb3_freezing import leaves
+from bam_train.trainers.frozen_network import leaves
 
 MODEL, STATE, REPLAY, NOTES = "bam/resume/model", "bam/resume/state", "bam/resume/replay", "bam/resume/notes.json"
 _SUFFIXES = (".json", ".safetensors")

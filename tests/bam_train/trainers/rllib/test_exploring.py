@@ -9,7 +9,7 @@ from ray.rllib.algorithms.ppo import PPOConfig
 from bam_envs.core.spaces import space_to_json
 from bam_train.errors import SettingsError
 from bam_train.policy import FrozenPolicy
-from bam_train.trainers.rllib.rllib_freezing import RLlibPolicy, freeze, parts_of
+from bam_train.trainers.rllib.rllib_freezing import FrozenModule, RLlibPolicy, parts_of
 
 OBSERVED = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
 ACTED = gym.spaces.Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 4.0], np.float32))
@@ -37,7 +37,7 @@ def test_actions_are_drawn_about_the_best_one_and_stay_inside():
     assert actions.dtype == np.float32
     assert ((ACTED.low <= actions) & (actions <= ACTED.high)).all()
     assert (actions.std(axis=0) > 0.5).all()
-    graph = freeze(parts_of(module, None, config, (OBSERVED, ACTED)))
+    graph = FrozenModule(parts_of(module, None, config, (OBSERVED, ACTED))).onnx_file()
     frozen = FrozenPolicy.from_graph(graph, space_to_json(OBSERVED), space_to_json(ACTED))
     np.testing.assert_allclose(actions.mean(axis=0), frozen.act(SEEN), atol=0.4)
 

@@ -18,7 +18,7 @@ from bam_train.checkpoint import safetensors_file
 from bam_train.errors import PolicyError
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
-from bam_train.trainers.rllib.rllib_freezing import RLlibPolicy, draw, freeze, golden, one_by_one, parts_of
+from bam_train.trainers.rllib.rllib_freezing import FrozenModule, RLlibPolicy, golden, one_by_one, parts_of
 
 NUMBERS = Box(-np.array([1, 2, 3], np.float32), np.array([1, 2, 3], np.float32))
 ARM = Box(-np.array([2, 3], np.float32), np.array([1, 5], np.float32))
@@ -68,12 +68,11 @@ class Live:
                 if type(piece).__name__ in ("FlattenObservations", "MeanStdFilter"):
                     piece(rl_module=None, episodes=[episode], batch={}, explore=False, shared_data={})
 
-    @property
-    def parts(self):
-        return parts_of(self.module, self.before, self.config, self.spaces)
+    def frozen(self):
+        return FrozenModule(parts_of(self.module, self.before, self.config, self.spaces))
 
     def policy(self):
-        return FrozenPolicy.from_graph(freeze(self.parts), *map(space_to_json, self.spaces))
+        return FrozenPolicy.from_graph(self.frozen().onnx_file(), *map(space_to_json, self.spaces))
 
     @property
     def own(self):
@@ -152,7 +151,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_the_graph_acts_as_rllib(case):
     live = Live(**case)
-    observations = draw(live.parts, 60 if "conv_filters" in case else 200, np.random.default_rng(0))
+    observations = live.frozen().draw(60 if "conv_filters" in case else 200, np.random.default_rng(0))
     expected, found = live.actions(observations), live.policy().act_batch(observations.get("", observations))
     assert found.dtype == live.spaces[1].dtype
     assert len(np.unique(expected, axis=0)) > 1
@@ -171,7 +170,7 @@ def test_the_live_module_is_left_as_it_was():
     live = Live(pieces=[MeanStdFilter])
     before = {name: weight.clone() for name, weight in live.module.state_dict().items()}
     state = live.before.get_state()
-    golden(live.parts, live.own)
+    golden(live.frozen(), live.own)
     live.policy()
     assert live.before.get_state() == state
     assert all(torch.equal(weight, before[name]) for name, weight in live.module.state_dict().items())
@@ -179,7 +178,7 @@ def test_the_live_module_is_left_as_it_was():
 
 def test_golden_actions_are_rllibs():
     live = Live(pieces=[MeanStdFilter])
-    arrays = safetensors_file.parse(golden(live.parts, live.own, n=50))
+    arrays = safetensors_file.parse(golden(live.frozen(), live.own, n=50))
     assert {name: array.shape for name, array in arrays.items()} == {"observation": (50, 3), "action": (50, 2)}
     np.testing.assert_array_equal(arrays["action"], live.actions({"": arrays["observation"]}))
 
@@ -200,18 +199,21 @@ def test_other_connectors_cannot_be_frozen(pieces, message):
     live = Live()
     live.before = EnvToModulePipeline(NUMBERS, ARM, connectors=[piece() for piece in pieces])
     with pytest.raises(PolicyError, match=message):
-        _ = live.parts
+        live.frozen()
 
 
 def test_starts_of_whole_numbers():
     """RLlib counts from 0; a trainer that shifts the environment's numbers gives the environment's own spaces."""
     live = Live(seen=Discrete(4), acts=Discrete(3), pieces=[FlattenObservations])
     parts = parts_of(live.module, live.before, live.config, (Discrete(4, start=5), Discrete(3, start=-1)))
-    policy = FrozenPolicy.from_graph(freeze(parts), *map(space_to_json, (parts.observation_space, parts.action_space)))
+    frozen = FrozenModule(parts)
+    policy = FrozenPolicy.from_graph(
+        frozen.onnx_file(), *map(space_to_json, (parts.observation_space, parts.action_space))
+    )
     found = policy.act_batch(np.arange(5, 9))
     np.testing.assert_array_equal(found, live.actions({"": np.arange(4)}) - 1)
     own = RLlibPolicy(live.module, live.before, live.config, (parts.observation_space, parts.action_space))
-    arrays = safetensors_file.parse(golden(parts, own, n=50))
+    arrays = safetensors_file.parse(golden(frozen, own, n=50))
     np.testing.assert_array_equal(arrays["action"], policy.act_batch(arrays["observation"]))
 
 
@@ -219,7 +221,7 @@ def test_spaces_that_do_not_fit_the_weights():
     live = Live()
     parts = parts_of(live.module, live.before, live.config, (Box(-1, 1, (5,), np.float32), ARM))
     with pytest.raises(PolicyError, match=r"^the weights do not fit the spaces: mat1 and mat2 shapes cannot be"):
-        freeze(parts)
+        FrozenModule(parts)
 
 
 def test_a_config_of_no_algorithm():

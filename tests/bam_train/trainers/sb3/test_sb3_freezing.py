@@ -24,7 +24,7 @@ from bam_train.checkpoint import Checkpoint, safetensors_file, write_checkpoint
 from bam_train.errors import PolicyError
 from bam_train.policy import FrozenPolicy
 from bam_train.policy.onnx_session import OnnxSession
-from bam_train.trainers.sb3.sb3_freezing import FrozenModule, draw, freeze, golden, trainer_actions
+from bam_train.trainers.sb3.sb3_freezing import FrozenModel, freeze, golden, trainer_actions
 
 ROWS = 100
 VECTOR = spaces.Box(-1, 1, (6,))
@@ -110,7 +110,7 @@ def assert_parity(
     action_space: gym.Space[Any],
 ) -> None:
     policy = freeze_it(model, normaliser, observation_space, action_space)
-    drawn = shaded(draw(observation_space, ROWS, np.random.default_rng(2), normaliser))
+    drawn = shaded(FrozenModel(model, normaliser, observation_space, action_space).draw(ROWS, np.random.default_rng(2)))
     expected = trainer_actions(model, normaliser, observation_space, action_space, drawn)
     single = [policy.act(row(observation_space, drawn, k)) for k in range(ROWS)]
     batch = policy.act_batch(row(observation_space, drawn, slice(None)))
@@ -239,7 +239,7 @@ def test_recurrent_policies_carry_their_state_and_forget_it(case: Any):
     model, normaliser = make(RecurrentPPO, observation_space, action_space, normalise, **copy.deepcopy(settings))
     policy = freeze_it(model, normaliser, observation_space, action_space)
     assert policy.recurrent
-    drawn = draw(observation_space, 50, np.random.default_rng(2), normaliser)
+    drawn = FrozenModel(model, normaliser, observation_space, action_space).draw(50, np.random.default_rng(2))
     episodes = np.split(np.arange(50), [1, 30, 31])
     expected = np.concatenate(
         [
@@ -311,7 +311,11 @@ def test_the_graph_says_what_it_takes_and_nothing_of_this_machine():
             ARM,
             "observation '': a Text cannot be frozen; expected Box, Discrete, MultiDiscrete or Multi",
         ),
-        (VECTOR, spaces.Dict(a=ARM), r"action space Dict\(.*\): expected Box, Discrete, MultiDiscrete or MultiBinary"),
+        (
+            VECTOR,
+            spaces.Dict(a=ARM),
+            r"action space Dict\(.*\) cannot be frozen; expected Box, Discrete, MultiDiscrete or MultiBinary",
+        ),
     ],
 )
 def test_spaces_that_do_not_fit(observation_space: gym.Space[Any], action_space: gym.Space[Any], text: str):
@@ -361,7 +365,7 @@ def test_golden_actions_are_the_trainers(
 
 def test_golden_choices_are_clear_ones():
     model, _ = make(DQN, VECTOR, spaces.Discrete(3))
-    module = FrozenModule(model, None, VECTOR, spaces.Discrete(3))
+    module = FrozenModel(model, None, VECTOR, spaces.Discrete(3))
     observation = torch.as_tensor(
         safetensors_file.parse(golden(model, None, VECTOR, model.action_space))["observation"]
     )
