@@ -94,14 +94,6 @@ class Workspace:
                 raise _no_time(name, t) from None
             raise
 
-    def set_deferred(self, name: str, t: int, array: np.ndarray) -> None:
-        """Write the tensor of a NumPy array (B x ...) that nobody changes any more, made when somebody reads it."""
-        variable: Any = self.variables.get(name)
-        if variable is None or variable.ARRAY is np.ndarray:  # which refuses tensors
-            self.set(name, t, sys.modules["torch"].from_numpy(array))
-        else:
-            variable.set_deferred(t, array)
-
     def get(self, name: str, t: int) -> Any:
         """The value at time t, B x ...; -1 is the last.
 

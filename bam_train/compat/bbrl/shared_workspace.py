@@ -71,8 +71,7 @@ class _SharedVariable(Variable):
 
 
 class _SharedTensorVariable(_SharedVariable, TensorVariable):
-    def set_deferred(self, t: int, array: np.ndarray) -> None:
-        self.set(t, torch.from_numpy(array))
+    """The same for tensors."""
 
 
 class SharedWorkspace(Workspace):

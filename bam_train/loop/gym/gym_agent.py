@@ -193,12 +193,11 @@ class GymAgent(SeedableAgent):
             for name, array in arrays.items():
                 workspace.set(prefix + name, t, array)
             return
+        from_numpy = sys.modules["torch"].from_numpy
         ghost = self.__dict__["_parameters"]["ghost_params"]  # around nn.Module's __getattr__, which costs much
         for name, array in arrays.items():
-            if ghost.is_cpu:
-                workspace.set_deferred(prefix + name, t, array)
-            else:
-                workspace.set(prefix + name, t, sys.modules["torch"].from_numpy(array).to(ghost.device))
+            value = from_numpy(array)
+            workspace.set(prefix + name, t, value if ghost.is_cpu else value.to(ghost.device))
 
     def _written(self) -> tuple[str, ...]:
         """The names of all variables that it writes."""
