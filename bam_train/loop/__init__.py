@@ -46,7 +46,8 @@ _ON_USE = {
     ),
     "compat.bbrl.dataset_agents": ("DataLoaderAgent", "ShuffledDatasetAgent"),
     "compat.bbrl.old_gym_agents": ("AutoResetGymAgent", "NoAutoResetGymAgent"),
-    "compat.bbrl.remote_agents": ("AsynchronousAgent", "NRemoteAgent", "RemoteAgent", "RemoteAgentError"),
+    "compat.bbrl.remote_agents": ("AsynchronousAgent", "NRemoteAgent", "RemoteAgent"),
+    "errors": ("RemoteAgentError",),
 }
 """Module of `bam_train` to the names that it has."""
 _MODULES = {name: module for module, names in _ON_USE.items() for name in names}

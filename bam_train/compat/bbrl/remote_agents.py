@@ -9,7 +9,7 @@ failure in an `AsynchronousAgent` seems to run for ever:
 - Weights are in shared memory: ``load_state_dict`` on what `get_by_name` finds is seen in the process at once.
 - `seed` seeds the process's global generators as well, before and after the start. Unseeded, process k has seed k; the
   generators of a lone agent have one from torch's.
-- `close` can be called at any time; processes also end with the agent's last reference and with the parent.
+- `close` is idempotent; processes also end with the agent's last reference and with the parent.
 - A process is a daemon, which cannot start processes of its own, with one torch thread.
 """
 
@@ -22,9 +22,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from bam_train.compat.bbrl.shared_workspace import SharedWorkspace, shared_workspace
-from bam_train.compat.bbrl.worker import Worker, wait_for_any
-from bam_train.errors import LoopError, RemoteAgentError, WorkspaceError
+from bam_train.compat.bbrl.worker import Worker, close_all, wait_for
+from bam_train.errors import LoopError, WorkspaceError
 from bam_train.loop.agent import Agent, agent_name
+from bam_train.loop.agents import Agents
 from bam_train.loop.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -32,12 +33,14 @@ if TYPE_CHECKING:
 
 
 class _ProcessAgent(Agent):
-    """An agent that runs another one in a process, which starts at the first call.
+    """Runs an agent in a process, which starts at the first call, without gradients.
 
     Args:
         agent: What to run there; its weights move into shared memory.
         start_method: "spawn", "forkserver" or "fork".
     """
+
+    _worker: Worker | None = None
 
     def __init__(
         self, agent: Agent, name: str | None = None, verbose: bool = False, *, start_method: str = "spawn"
@@ -46,11 +49,6 @@ class _ProcessAgent(Agent):
         self.agent = agent
         self.start_method = start_method
         self._seed: int | None = None
-        self._worker: Worker | None = None
-
-    def get_by_name(self, n: str) -> list[Agent]:
-        """This agent and those in the agent it runs, whose weights are shared, if they have the name."""
-        return super().get_by_name(n) + self.agent.get_by_name(n)
 
     def seed(self, seed: int) -> Self:
         """Seed the agent, and the process's global generators (torch, NumPy, random), now or when it starts.
@@ -58,8 +56,8 @@ class _ProcessAgent(Agent):
         Raises:
             RemoteAgentError: The agent refuses, for instance because it is seeded already.
         """
-        self._seed = seed
         self._tell("seed", seed)
+        self._seed = seed
         return self
 
     def train(self, mode: bool = True) -> Self:
@@ -68,79 +66,60 @@ class _ProcessAgent(Agent):
         self._tell("train", mode)
         return self
 
-    def is_running(self) -> bool:
-        """Whether a call is still under way; a failure is raised here, and the process is closed."""
-        try:
-            return self._worker is not None and self._worker.poll()
-        except RemoteAgentError:
-            self.close()
-            raise
-
     def close(self) -> None:
         """End the process; at any time, and idempotent. The next call starts a new one."""
         if self._worker is not None:
             self._worker.close()
-            self._worker = None
 
-    def _running_worker(self) -> Worker:
+    def _inner(self) -> tuple[Agent, ...]:
+        return (self.agent,)
+
+    def _idle_worker(self) -> Worker:
         """The process, started if there is none."""
-        if self._worker is not None and self._worker.closed:
-            self._worker = None
-        if self._worker is None:
+        if self._worker is None or self._worker.closed:
             self._worker = Worker(self.agent, self.start_method, self._seed)
             weakref.finalize(self, self._worker.close)
         elif self._worker.poll():
-            raise _still_running(self)
+            raise LoopError(f"{agent_name(self)} is still running; wait until is_running() is False.")
         return self._worker
 
     def _tell(self, command: str, argument: Any) -> None:
-        """Give a command to the process if there is one, and wait for its end unless it is busy."""
-        worker = self.__dict__.get("_worker")
-        if worker is None or worker.closed:
-            return
-        busy = worker.poll()
-        worker.send(command, argument)
-        if not busy:
-            worker.wait()
+        """Give a command to the process if there is one."""
+        if self._worker is not None and not self._worker.closed:
+            worker = self._idle_worker()
+            worker.send(command, argument)
+            wait_for([worker])
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_worker": None}
 
 
 class RemoteAgent(_ProcessAgent):
-    """Runs an agent in another process, on a shared workspace, without gradients."""
+    """Runs an agent in another process, on a shared workspace."""
 
-    _sent: Workspace | None = None
-
-    def __call__(self, workspace: Workspace, **kwargs: Any) -> None:
-        """Run the agent on `workspace` with these keywords, and wait for it.
+    def forward(self, **kwargs: Any) -> None:
+        """Run the agent with these keywords, and wait for it.
 
         Raises:
             WorkspaceError: The workspace is not shared.
             RemoteAgentError: The agent failed, or its process ended.
         """
-        self.start(workspace, **kwargs)
-        if self._worker is not None:
-            self._worker.wait()
-
-    def start(self, workspace: Workspace, **kwargs: Any) -> None:
-        """The call without waiting; `is_running` says when it has ended."""
-        if not getattr(workspace, "is_shared", False):
+        if not self.workspace.is_shared:
             raise WorkspaceError(
                 f"{agent_name(self)} needs a shared workspace; NRemoteAgent.create makes one, or "
                 f"bam_train.compat.bbrl.shared_workspace.shared_workspace(workspace)."
             )
-        before = self._worker
-        worker = self._running_worker()
-        known = worker is before and workspace is self._sent
-        worker.send("run", None if known else workspace, kwargs)
-        self._sent = workspace
+        wait_for([self.begin(self.workspace, kwargs)])
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_sent": None}
+    def begin(self, workspace: Workspace, kwargs: dict[str, Any]) -> Worker:
+        """Begin a run in the process, which is returned; a workspace is sent there once."""
+        worker = self._idle_worker()
+        worker.send("run", None if workspace is worker.workspace else workspace, kwargs)
+        worker.workspace = workspace
+        return worker
 
 
-class NRemoteAgent(Agent):
+class NRemoteAgent(Agents):
     """Runs copies of an agent in several processes, each on its own batch columns; see `create`.
 
     Args:
@@ -149,10 +128,9 @@ class NRemoteAgent(Agent):
     """
 
     def __init__(self, agents: Sequence[RemoteAgent], batch_dims: Sequence[tuple[int, int]]) -> None:
-        super().__init__()
-        self.agents = list(agents)
+        super().__init__(*agents)
         self.batch_dims = list(batch_dims)
-        self._split: tuple[Workspace, list[SharedWorkspace]] | None = None
+        self._split: tuple[Workspace | None, list[SharedWorkspace]] = (None, [])
 
     @staticmethod
     def create(
@@ -194,78 +172,42 @@ class NRemoteAgent(Agent):
             trial.close()
         size = workspace.batch_size() or 0
         shared = shared_workspace(workspace, max(1, num_processes), time_size)
-        copies = [copy.deepcopy(agent) for _ in range(max(1, num_processes))]
         if num_processes == 0:
-            return copies[0], shared
-        remotes = [RemoteAgent(one, start_method=start_method) for one in copies]
+            return copy.deepcopy(agent), shared
+        remotes = [RemoteAgent(copy.deepcopy(agent), start_method=start_method) for _ in range(num_processes)]
         columns = [(k * size, (k + 1) * size) for k in range(num_processes)]
         return NRemoteAgent(remotes, columns).seed(0), shared
 
-    def __call__(self, workspace: Workspace, **kwargs: Any) -> None:
-        """Run all copies at once, each on its columns of `workspace`, and wait for them.
+    def forward(self, **kwargs: Any) -> None:
+        """Run all copies at once, each on its columns of the workspace, and wait for them.
 
         Raises:
             WorkspaceError: The workspace is not shared, or not as wide as all copies together.
             RemoteAgentError: A copy failed, or its process ended; all are closed.
         """
-        self.start(workspace, **kwargs)
+        parts = self._columns()
         try:
-            while running := [agent for agent in self.agents if agent.is_running()]:
-                wait_for_any([agent._worker for agent in running if agent._worker is not None])
+            wait_for([agent.begin(part, kwargs) for agent, part in zip(self, parts, strict=True)])
         except BaseException:
             self.close()
             raise
-
-    def start(self, workspace: Workspace, **kwargs: Any) -> None:
-        """The call without waiting; `is_running` says when it has ended."""
-        if self.is_running():
-            raise _still_running(self)
-        parts = self._columns(workspace)
-        try:
-            for agent, columns in zip(self.agents, parts, strict=True):
-                agent.start(columns, **kwargs)
-        except BaseException:
-            self.close()
-            raise
-
-    def is_running(self) -> bool:
-        """Whether a call that did not wait is still under way in a process; if a copy failed, all are closed."""
-        try:
-            return bool([agent for agent in self.agents if agent.is_running()])  # looks at all: one may have failed
-        except RemoteAgentError:
-            self.close()
-            raise
-
-    def get_by_name(self, n: str) -> list[Agent]:
-        """The agents of that name: this one, then those in each process, whose weights are shared."""
-        return super().get_by_name(n) + [one for agent in self.agents for one in agent.get_by_name(n)]
 
     def seed(self, seed: int, inc: int = 1) -> Self:
         """Seed copy k with seed + k * inc; itself is returned."""
-        for k, agent in enumerate(self.agents):
+        for k, agent in enumerate(self):
             agent.seed(seed + k * inc)
-        return self
-
-    def train(self, mode: bool = True) -> Self:
-        """Set the mode in all processes; `eval` is ``train(False)``."""
-        super().train(mode)
-        for agent in self.agents:
-            agent.train(mode)
         return self
 
     def close(self) -> None:
         """End all processes; at any time, and idempotent. The next call starts new ones."""
-        for agent in self.agents:
-            if agent._worker is not None:
-                agent._worker.ask_to_end()  # so that they end at the same time
-        for agent in self.agents:
-            agent.close()
+        close_all([agent._worker for agent in self if agent._worker is not None])
 
-    def _columns(self, workspace: Workspace) -> list[SharedWorkspace]:
-        """Each copy's part of a workspace; the same objects as long as the workspace is."""
+    def _columns(self) -> list[SharedWorkspace]:
+        """Each copy's part of the workspace; the same objects as long as the workspace is."""
+        workspace = self.workspace
         if not isinstance(workspace, SharedWorkspace):
             raise WorkspaceError(f"{agent_name(self)} needs the shared workspace that NRemoteAgent.create made for it.")
-        if self._split is None or self._split[0] is not workspace:
+        if self._split[0] is not workspace:
             width = self.batch_dims[-1][1]
             if workspace.batch_size() != width:
                 raise WorkspaceError(f"Expected a shared workspace of {width} columns, found {workspace.batch_size()}.")
@@ -273,11 +215,11 @@ class NRemoteAgent(Agent):
         return self._split[1]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_split": None}
+        return {**super().__getstate__(), "_split": (None, [])}
 
 
 class AsynchronousAgent(_ProcessAgent):
-    """Starts an agent in another process, without gradients, and gives its workspace when it has ended.
+    """Starts an agent in another process and gives its workspace when it has ended.
 
     ::
 
@@ -293,16 +235,15 @@ class AsynchronousAgent(_ProcessAgent):
 
     def __call__(self, **kwargs: Any) -> None:  # type: ignore[override]  # it has its own workspace
         """Start the agent on a new workspace with these keywords, without waiting; refused while one is running."""
-        if self.is_running():
-            raise _still_running(self)
-        self._running_worker().send("run_alone", kwargs)
-        self._last = None
+        worker = self._idle_worker()
+        worker.result = self._last = None
+        worker.send("run", Workspace(), kwargs)
 
     def is_running(self) -> bool:
-        """Whether the last call is still under way; a failure is raised here."""
-        if super().is_running():
-            return True
-        if self._worker is not None and self._worker.result is not None:
+        """Whether the last call is still under way; a failure is raised here, and the process is closed."""
+        if self._worker is None or self._worker.poll():
+            return self._worker is not None
+        if self._worker.result is not None:
             self._last = Workspace()
             for name, value in pickle.loads(self._worker.result).items():
                 self._last.set_full(name, value)
@@ -312,7 +253,3 @@ class AsynchronousAgent(_ProcessAgent):
     def get_workspace(self) -> Workspace | None:
         """The workspace of the last call; None while it is under way, and before the first."""
         return None if self.is_running() else self._last
-
-
-def _still_running(agent: Agent) -> LoopError:
-    return LoopError(f"{agent_name(agent)} is still running; wait until is_running() is False.")

@@ -15,17 +15,12 @@ import torch
 
 from bam_train.errors import WorkspaceError
 from bam_train.loop.tensors.tensor_variable import TensorVariable
-from bam_train.loop.variables import Variable, mismatch
+from bam_train.loop.variables import Variable
 from bam_train.loop.workspace import Workspace
 
 
 class _SharedVariable(Variable):
-    """One variable, T x B x ..., in shared memory.
-
-    Args:
-        name: For error messages.
-        memory: The shared tensor.
-    """
+    """One variable of NumPy arrays in the shared tensor `memory`, T x B x ...."""
 
     COPIES = False  # `_store` and `set_full` do
 
@@ -37,26 +32,22 @@ class _SharedVariable(Variable):
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.name, self.memory)
 
+    def set(self, t: int, value: Any) -> None:
+        """Copy `value` (B x ...) to time t, from any device."""
+        super().set(t, value.detach().to(self.device) if isinstance(value, torch.Tensor) else value)
+
     def _store(self, t: int, value: Any) -> None:
         if t < -len(self.memory):
             raise self._not_written(t)
         self._require_length(t)
         self._whole[t] = value
 
-    def set(self, t: int, value: Any) -> None:
-        """Copy `value` (B x ...) to time t, from any device."""
-        super().set(t, value.detach().to(self.device) if isinstance(value, torch.Tensor) else value)
-
     def set_full(self, value: Any) -> None:
         """Copy T x B x ... onto the first T times; later ones stay."""
         self._check_full(value)
-        for what, ours, theirs in (
-            ("shape of one time", tuple(self.shape), tuple(value.shape[1:])),
-            ("dtype", self.dtype, value.dtype),
-        ):
-            if ours != theirs:
-                raise mismatch(self.name, "all times", what, ours, theirs)
         self._require_length(len(value) - 1)
+        if len(value):
+            self._check(value[0], "all times")
         self._whole[: len(value)] = value.detach() if isinstance(value, torch.Tensor) else value
 
     def detach(self) -> None:
@@ -71,15 +62,11 @@ class _SharedVariable(Variable):
 
 
 class _SharedTensorVariable(_SharedVariable, TensorVariable):
-    """The same for tensors."""
+    """The same of tensors."""
 
 
 class SharedWorkspace(Workspace):
-    """Named variables in shared memory; `bam_train.loop.NRemoteAgent.create` and `shared_workspace` make them.
-
-    Args:
-        variables: The variables by name.
-    """
+    """Named variables in shared memory; `bam_train.loop.NRemoteAgent.create` and `shared_workspace` make them."""
 
     is_shared = True
 
@@ -121,24 +108,20 @@ def shared_workspace(workspace: Workspace, n_repeat: int = 1, time_size: int | N
     Raises:
         WorkspaceError: `workspace` is empty, has arrays that torch does not know, or a number is less than 1.
     """
-    for name, number in (("n_repeat", n_repeat), ("time_size", 1 if time_size is None else time_size)):
+    for what, number in (("n_repeat", n_repeat), ("time_size", 1 if time_size is None else time_size)):
         if number < 1:
-            raise WorkspaceError(f"{name}: expected at least 1, found {number}.")
+            raise WorkspaceError(f"{what}: expected at least 1, found {number}.")
     if not workspace.variables:
         raise WorkspaceError("The workspace is empty: there is nothing to share; run the agent on it first.")
-    return SharedWorkspace(
-        {name: _shared(name, one.full(), n_repeat, time_size) for name, one in workspace.variables.items()}
-    )
-
-
-def _shared(name: str, value: Any, n_repeat: int, time_size: int | None) -> _SharedVariable:
-    """One variable of the copy."""
-    try:
-        tensor = torch.as_tensor(value).detach()
-    except TypeError as error:
-        raise WorkspaceError(f"{name!r} cannot be shared: {error}") from error
-    times, columns = tensor.shape[:2]
-    memory = tensor.new_zeros((time_size or times, n_repeat * columns, *tensor.shape[2:])).share_memory_()
-    if time_size is None:
-        memory.copy_(torch.cat([tensor] * n_repeat, dim=1))
-    return (_SharedVariable if isinstance(value, np.ndarray) else _SharedTensorVariable)(name, memory)
+    variables = {}
+    for name, one in workspace.variables.items():
+        value = one.full()
+        try:
+            tensor = torch.cat([torch.as_tensor(value).detach()] * n_repeat, dim=1)
+        except TypeError as error:
+            raise WorkspaceError(f"{name!r} cannot be shared: {error}") from error
+        if time_size is not None:
+            tensor = tensor.new_zeros((time_size, *tensor.shape[1:]))
+        kind = _SharedVariable if isinstance(value, np.ndarray) else _SharedTensorVariable
+        variables[name] = kind(name, tensor.clone().share_memory_())
+    return SharedWorkspace(variables)

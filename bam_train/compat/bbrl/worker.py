@@ -1,8 +1,7 @@
 """A process that runs one agent for another process, and never outlives it.
 
-The two ends talk through one pipe: a command there, an answer back. A wait for the answer ends when the process does.
-What goes wrong there is raised here, with the traceback. Weights (parameters and buffers) are in shared memory;
-everything else of an agent is a copy.
+The two ends talk through one pipe, a command there and an answer back, one at a time. What goes wrong there is raised
+here, with the traceback. Weights (parameters and buffers) are in shared memory; everything else of an agent is a copy.
 """
 
 import multiprocessing
@@ -12,7 +11,7 @@ import random
 import signal
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from multiprocessing.reduction import ForkingPickler
@@ -24,13 +23,10 @@ import torch.multiprocessing  # teaches pickle to share tensors
 
 from bam_train.errors import LoopError, RemoteAgentError
 from bam_train.loop.agent import Agent, agent_name
-from bam_train.loop.workspace import Workspace
 from bam_train.signals import drop_handlers
 
 PATIENCE = 5.0
 """Seconds that an idle process has to end by itself."""
-
-_LOOK_AGAIN = 1.0  # seconds between two looks at whether the other process is alive
 
 
 class _ChildTraceback(Exception):  # noqa: N818 - the cause of a RemoteAgentError, as Python prints it
@@ -49,16 +45,18 @@ class Worker:
         seed: For the agent and for the global generators; None seeds the generators only, from torch's here.
 
     Attributes:
+        busy: Whether a command is under way, as far as `poll` has seen.
         closed: Whether the process has been ended.
         result: What the last command that had a result gave.
+        workspace: The one that the process runs on.
     """
 
     def __init__(self, agent: Agent, start_method: str, seed: int | None) -> None:
         self.name = agent_name(agent)
-        self.closed = False
+        self.busy = self.closed = False
         self.result: Any = None
-        self._owner = os.getpid()
-        self._started = False
+        self.workspace: Any = None
+        self._owner, self._has_answered = os.getpid(), False
         if isinstance(agent, torch.nn.Module):
             agent.share_memory()
         # A forked process has the agent already, and need not be able to pickle it.
@@ -70,82 +68,69 @@ class Worker:
         with _signals_blocked(start_method == "fork"):
             self._process.start()
         there.close()
-        self._pending = 1  # it says when it is ready
 
     def send(self, command: str, *arguments: Any) -> None:
-        """Begin a command; `wait` or `poll` for its end."""
+        """Begin a command, a method of `_Runner`; `poll` or `wait_for` its end."""
         data = self._pickled((command, *arguments))
+        self.busy = True
         with suppress(OSError):  # it has ended: the answer says so
             self._connection.send_bytes(data)
-        self._pending += 1
-
-    def wait(self) -> None:
-        """Wait for the end of all commands; when one fails, or the process ends, it is closed."""
-        while self._pending:
-            self._take_if_ready(_LOOK_AGAIN)
 
     def poll(self) -> bool:
-        """Whether a command other than the start is still under way; does not wait."""
-        while self._pending and self._take_if_ready(0):
-            pass
-        return self._pending > (0 if self._started else 1)
-
-    def ask_to_end(self) -> None:
-        """Ask an idle process to close its agent and end, without waiting; only `close` may follow."""
-        if not (self._pending or self.closed) and self._owner == os.getpid():
-            with suppress(OSError):  # it has ended, or was asked before
-                self._connection.send_bytes(self._pickled(("exit",)))
-
-    def close(self) -> None:
-        """End the process, at once if it is busy; in any state, and idempotent."""
-        if self.closed or self._owner != os.getpid():  # a forked process has copies of its siblings' ends
-            return
-        self.ask_to_end()
-        if not self._pending:
-            self._process.join(PATIENCE)
-        for end in (self._process.terminate, self._process.kill):
-            if self._process.is_alive():
-                end()
-                self._process.join(PATIENCE)
-        self.closed, self._pending = True, 0
-        self._connection.close()
-
-    def _take_if_ready(self, seconds: float) -> bool:
-        """Take one answer if it comes in time; closes the process on whatever goes wrong, Ctrl-C too."""
+        """Whether a command is still under way. If it failed, or the process ended, that is raised and it is closed."""
+        if not self.busy or not wait(self.ends(), 0):
+            return self.busy
         try:
-            if not self._connection.poll(seconds):
-                if self._process.is_alive() or self._connection.poll(0):
-                    return False
-                raise self._ended()
-            try:
-                failed, answer = self._connection.recv()
-            except (EOFError, OSError):
-                raise self._ended() from None
-            self._pending -= 1
+            failed, answer = self._receive()
             if failed:
                 text, trace = answer
                 raise RemoteAgentError(f"{self.name} failed in its process: {text}", trace) from _ChildTraceback(trace)
         except BaseException:
             self.close()
             raise
-        self._started = True
+        self.busy, self._has_answered = False, True
         self.result = self.result if answer is None else answer
-        return True
+        return False
 
-    def _ended(self) -> RemoteAgentError:
-        """The error for a process that is no more."""
+    def ends(self) -> list[Any]:
+        """What becomes ready when it answers or ends."""
+        return [self._connection, self._process.sentinel]
+
+    def ask_to_end(self) -> None:
+        """Ask an idle process to close its agent and end, without waiting; only `close` may follow."""
+        if not (self.busy or self.closed) and self._owner == os.getpid():
+            with suppress(OSError):  # it has ended, or was asked before
+                self._connection.send_bytes(b"")
+
+    def close(self) -> None:
+        """End the process, at once if it is busy; in any state, and idempotent."""
+        if self.closed or self._owner != os.getpid():  # a forked process has copies of its siblings' ends
+            return
+        self.ask_to_end()
+        if not self.busy:
+            self._process.join(PATIENCE)
+        for end in (self._process.terminate, self._process.kill):
+            if self._process.is_alive():
+                end()
+                self._process.join(PATIENCE)
+        self.closed, self.busy = True, False
+        self._connection.close()
+
+    def _receive(self) -> tuple[bool, Any]:
+        """Its answer; the error of a process that is no more."""
+        with suppress(EOFError, OSError):
+            if self._connection.poll():
+                answer: tuple[bool, Any] = self._connection.recv()
+                return answer
         self._process.join(PATIENCE)
         code = self._process.exitcode
-        if code and code < 0:
-            how = f"was ended by {signal.Signals(-code).name}"
-        elif self._started:
-            how = f"ended with exit code {code}"
-        else:
-            how = (
-                f"ended with exit code {code} before it was ready; a script that starts processes needs "
-                f'`if __name__ == "__main__":` around what it does, or start_method="fork"'
+        how = f"was ended by {signal.Signals(-code).name}" if code and code < 0 else f"ended with exit code {code}"
+        if code == 1 and not self._has_answered:
+            how += (
+                " before it gave an answer; a script that starts processes needs "
+                '`if __name__ == "__main__":` around what it does, or start_method="fork"'
             )
-        return RemoteAgentError(f"The process of {self.name} {how}.", exit_code=code)
+        raise RemoteAgentError(f"The process of {self.name} {how}.", exit_code=code)
 
     def _pickled(self, what: Any) -> bytes:
         try:
@@ -157,9 +142,22 @@ class Worker:
             ) from error
 
 
-def wait_for_any(workers: Sequence[Worker]) -> None:
-    """Wait until one of them answers or ends, or a second has passed."""
-    wait([worker._connection for worker in workers], _LOOK_AGAIN)
+def wait_for(workers: Sequence[Worker]) -> None:
+    """Wait for the end of all commands; when one fails, a process ends, or Ctrl-C comes, all are closed."""
+    try:
+        while running := [worker for worker in workers if worker.poll()]:
+            wait([end for worker in running for end in worker.ends()])
+    except BaseException:
+        close_all(workers)
+        raise
+
+
+def close_all(workers: Sequence[Worker]) -> None:
+    """End the processes, all at the same time."""
+    for worker in workers:
+        worker.ask_to_end()
+    for worker in workers:
+        worker.close()
 
 
 @contextmanager
@@ -180,41 +178,32 @@ def _signals_blocked(blocked: bool) -> Iterator[None]:
 
 
 def _serve(connection: Connection, payload: Any, seed: int | None, noise: int) -> None:
-    """Answer commands until told to exit, or until the parent is gone."""
+    """Answer commands with (False, result) or (True, (error, traceback)), until told to end or the parent is gone."""
     drop_handlers()
     threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
     torch.set_num_threads(1)  # as many processes as cores; and OpenMP's threads do not survive a fork
-    server = _Server()
-    _answer(connection, lambda: server.start(payload, seed, noise))
-    while not server.finished:
-        try:
-            data = connection.recv_bytes()
-        except (EOFError, OSError):
-            return
-        _answer(connection, lambda data=data: server.obey(*pickle.loads(data)))  # type: ignore[misc]
+    runner: _Runner | None = None
+    with suppress(EOFError, OSError):  # the parent is gone
+        while data := connection.recv_bytes():
+            answer: tuple[bool, Any]
+            try:
+                runner = runner or _Runner(payload, seed, noise)
+                command, *arguments = pickle.loads(data)
+                answer = False, getattr(runner, command)(*arguments)
+            except Exception as error:  # whatever the agent raises is the parent's to handle
+                answer = True, (f"{type(error).__name__}: {error}", traceback.format_exc())
+            connection.send(answer)
+    if runner is not None:
+        runner.agent.close()
 
 
-def _answer(connection: Connection, work: Callable[[], Any]) -> None:
-    """Do it, and send (False, result) or (True, (error, traceback))."""
-    try:
-        answer: tuple[bool, Any] = (False, work())
-    except Exception as error:  # whatever the agent raises is the parent's to handle
-        answer = (True, (f"{type(error).__name__}: {error}", traceback.format_exc()))
-    with suppress(OSError):
-        connection.send(answer)
-
-
-class _Server:
+class _Runner:
     """The agent in its process; a method for each command."""
 
-    def __init__(self) -> None:
-        self.agent: Any = None
+    def __init__(self, payload: Any, seed: int | None, noise: int) -> None:
         self.workspace: Any = None
-        self.finished = False
-
-    def start(self, payload: Any, seed: int | None, noise: int) -> None:
         try:
-            self.agent = pickle.loads(payload) if isinstance(payload, bytes) else payload
+            self.agent: Any = pickle.loads(payload) if isinstance(payload, bytes) else payload
         except (AttributeError, ImportError) as error:  # its class is not where this process can import it
             raise LoopError(
                 f"{error}; define what the agent is made of in a module that can be imported, or give "
@@ -224,20 +213,14 @@ class _Server:
         if seed is not None:
             self.agent.seed(seed)
 
-    def obey(self, command: str, *arguments: Any) -> Any:
-        return getattr(self, command)(*arguments)
-
-    def run(self, workspace: Any, kwargs: dict[str, Any]) -> None:
-        # No workspace: that of the last time.
+    def run(self, workspace: Any, kwargs: dict[str, Any]) -> bytes | None:
+        """Run on `workspace`, None for that of the last time; gives the values of one that is not shared."""
         self.workspace = self.workspace if workspace is None else workspace
         with torch.no_grad():
             self.agent(self.workspace, **kwargs)
-
-    def run_alone(self, kwargs: dict[str, Any]) -> bytes:
-        workspace = Workspace()
-        with torch.no_grad():
-            self.agent(workspace, **kwargs)
-        return pickle.dumps({name: one.full() for name, one in workspace.to("cpu").variables.items()})
+        if self.workspace.is_shared:
+            return None
+        return pickle.dumps({name: one.full() for name, one in self.workspace.to("cpu").variables.items()})
 
     def seed(self, seed: int) -> None:
         _seed_generators(seed)
@@ -246,11 +229,6 @@ class _Server:
     def train(self, mode: bool) -> None:
         if isinstance(self.agent, torch.nn.Module):
             self.agent.train(mode)
-
-    def exit(self) -> None:
-        self.finished = True
-        if self.agent is not None:
-            self.agent.close()
 
 
 def _seed_generators(seed: int) -> None:
@@ -262,6 +240,6 @@ def _seed_generators(seed: int) -> None:
 def _end_with_parent(parent: int) -> None:
     """End this process, whatever it is doing, when its parent is gone."""
     source = multiprocessing.parent_process()
-    while source is not None and os.getppid() == parent and not wait([source.sentinel], _LOOK_AGAIN):
+    while source is not None and os.getppid() == parent and not wait([source.sentinel], 1.0):
         pass
     os._exit(1)

@@ -5,8 +5,8 @@ import pytest
 import torch
 from remote_test_agents import Trouble, Walker
 
-from bam_train.compat.bbrl.remote_agents import AsynchronousAgent, RemoteAgentError
-from bam_train.errors import LoopError
+from bam_train.compat.bbrl.remote_agents import AsynchronousAgent
+from bam_train.errors import LoopError, RemoteAgentError
 from bam_train.loop import Agent, Agents, TemporalAgent, Workspace
 
 pytestmark = [
@@ -62,8 +62,13 @@ def test_each_call_has_a_new_workspace(started):
     assert first["x"][:, 0, 1].tolist() == [1, 2]
     assert second["x"][:, 0, 1].tolist() == [3]
     assert second["x"][0, 0, 5] == 3
+    agent(t=0, n_steps=3)
+    while agent.is_running():
+        pass
+    agent.train(False)
+    assert agent.get_workspace()["x"][:, 0, 2].tolist() == [1, 1, 1]
     agent.close()
-    assert agent.get_workspace() is second
+    assert agent.get_workspace().time_size() == 3
 
 
 def test_while_it_is_running(started):
@@ -73,6 +78,8 @@ def test_while_it_is_running(started):
     assert agent.get_workspace() is None
     with pytest.raises(LoopError, match=r"^AsynchronousAgent is still running; wait until is_running\(\) is False\.$"):
         agent(t=0, n_steps=1)
+    with pytest.raises(LoopError, match="is still running"):
+        agent.seed(1)
     agent.close()
     agent.close()
     assert (agent.is_running(), agent.get_workspace()) == (False, None)
@@ -84,7 +91,10 @@ def test_failures(started, what):
     agent = started(Trouble())
     agent(t=0, n_steps=2)
     result(agent)
-    agent(t=0, n_steps=2, at=1, what=what)
+    agent(t=0, n_steps=2)
+    while agent.is_running():
+        pass
+    agent(t=0, n_steps=2, at=1, what=what)  # nobody asked for the workspace before
     with pytest.raises(RemoteAgentError, match=r"no such joint|was ended by SIGKILL"):
         result(agent)
     assert (agent.is_running(), agent.get_workspace()) == (False, None)

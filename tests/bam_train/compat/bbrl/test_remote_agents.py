@@ -15,9 +15,9 @@ import pytest
 import torch
 from remote_test_agents import Trouble, Walker
 
-from bam_train.compat.bbrl.remote_agents import NRemoteAgent, RemoteAgent, RemoteAgentError
+from bam_train.compat.bbrl.remote_agents import NRemoteAgent, RemoteAgent
 from bam_train.compat.bbrl.shared_workspace import shared_workspace
-from bam_train.errors import LoopError, WorkspaceError
+from bam_train.errors import LoopError, RemoteAgentError, WorkspaceError
 from bam_train.loop import Agent, Agents, ParallelGymAgent, SeedableAgent, TemporalAgent, Workspace, make_env
 
 pytestmark = [
@@ -153,16 +153,6 @@ def test_seeds_modes_and_weights_reach_running_processes(created):
     for policy in remote.get_by_name("policy"):
         policy.load_state_dict({"weight": torch.tensor([2.5])})
     assert written()[:, 5].tolist() == [2.5, 2.5]
-
-
-def test_one_call_at_a_time(started):
-    remote, workspace = started(loop(Trouble()))
-    remote.start(workspace, **STEPS, at=0, what="hang")
-    with pytest.raises(LoopError, match=r"^RemoteAgent is still running; wait until is_running\(\) is False\.$"):
-        remote(workspace, **STEPS)
-    assert remote.is_running()
-    remote.close()
-    assert not remote.is_running()
 
 
 def test_numpy_variables(created):
@@ -407,13 +397,13 @@ def run_program(*arguments):
 SCRIPT = """
 import os, signal
 from remote_test_agents import Trouble
-from bam_train.loop import NRemoteAgent
+from bam_train.loop import AsynchronousAgent, NRemoteAgent
 
 if __name__ == "__main__":
     idle, workspace = NRemoteAgent.create(Trouble(), 1, start_method="fork", t=0)
     idle(workspace, t=0)
-    busy, workspace = NRemoteAgent.create(Trouble(), 1, start_method="fork", t=0)
-    busy.start(workspace, t=0, at=0, what="hang")
+    busy = AsynchronousAgent(Trouble(), start_method="fork")
+    busy(t=0, at=0, what="hang")
     print(busy.is_running(), flush=True)
     if {killed}:
         os.kill(os.getpid(), signal.SIGKILL)
@@ -462,4 +452,4 @@ def test_a_script_without_main_guard(tmp_path):
     )
     run = run_program(str(script))
     assert run.returncode == 1
-    assert "ended with exit code 1 before it was ready; a script that starts processes needs `if __name__" in run.stderr
+    assert "ended with exit code 1 before it gave an answer; a script that starts processes needs" in run.stderr

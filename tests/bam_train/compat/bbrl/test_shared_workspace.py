@@ -123,7 +123,7 @@ def test_what_is_made_from_it_is_an_ordinary_workspace(array):
         (
             lambda shared, x: shared.set_full("x", shared["x"][:, :1]),
             ValueMismatch,
-            "'x' at all times: expected shape of one time (2,), found (1,).",
+            "'x' at all times: expected shape (2,), found (1,).",
         ),
         (lambda shared, x: shared.clear(), WorkspaceError, "A shared workspace cannot be cleared"),
         (lambda shared, x: shared.remove_variable("x"), WorkspaceError, "'x' cannot be removed from a shared"),
