@@ -323,11 +323,10 @@ def robo_gym() -> str:
 
 def presets() -> str:
     """The settings of every preset."""
-    from bam_train.trainers import presets as package
+    from bam_train.trainers.resolve_settings import PRESETS
 
-    folder = Path(str(package.__file__)).parent
-    blocks = [f"`{name}`\n\n```toml\n{(folder / name).read_text().strip()}\n```" for name in package.list_presets()]
-    return "\n\n".join(blocks)
+    files = sorted(PRESETS.glob("*.toml"))
+    return "\n\n".join(f"`{file.name}`\n\n```toml\n{file.read_text().strip()}\n```" for file in files)
 
 
 def run_folder() -> str:

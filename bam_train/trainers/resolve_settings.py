@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 from bam_envs.core.errors import UnknownName
@@ -10,9 +11,12 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import require_no_place
 from bam_train.environments import environment_of, require_env_kwargs
 from bam_train.errors import CheckpointMismatch, SettingsError
-from bam_train.settings import TrainSettings, check_names, differences, merge
+from bam_train.settings import TrainSettings, check_names, differences, file_stem, merge, parse_config
 from bam_train.trainers import load_trainer, require_algorithm
-from bam_train.trainers.presets import read_preset
+
+PRESETS = Path(__file__).parent / "presets"
+"""Tuned settings, laid out like a ``--config`` file: ``<environment>-<algorithm>.toml`` is for sb3,
+``<environment>-<trainer>-<algorithm>.toml`` for any other trainer."""
 
 CHANGEABLE = frozenset(
     {"steps", "until_success", "eval_every", "eval_episodes", "device", "threads", "transport", "ca_file", "token_file"}
@@ -26,6 +30,12 @@ OF_RLLIB = ("num_env_runners", "num_learners", "num_gpus", "address", "data")
 
 NOWHERE: dict[str, Any] = {"transport": [], "ca_file": None, "token_file": None, "address": None}
 """Settings that say where a run computes, as they are where it computes here."""
+
+
+def read_preset(env: str, algo: str, trainer: str = "sb3") -> dict[str, Any]:
+    """The tuned settings of an environment and an algorithm of a trainer; {} if there are none."""
+    path = PRESETS / f"{file_stem(env, algo, trainer)}.toml"
+    return parse_config(path.name, path.read_text(encoding="utf-8")) if path.is_file() else {}
 
 
 def resolve(given: Mapping[str, Any]) -> TrainSettings:

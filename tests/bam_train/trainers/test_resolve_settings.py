@@ -19,8 +19,7 @@ from bam_train.settings import file_stem
 from bam_train.trainers import load_trainer, require_algorithm
 from bam_train.trainers.algorithms import ALGORITHMS
 from bam_train.trainers.best_checkpoint import choose_output
-from bam_train.trainers.presets import list_presets, read_preset
-from bam_train.trainers.resolve_settings import resolve, resolve_resumed
+from bam_train.trainers.resolve_settings import PRESETS, read_preset, resolve, resolve_resumed
 
 
 def test_later_layers_win():
@@ -91,7 +90,7 @@ def test_the_table_of_trainers():
     assert load_trainer("sb3").__name__ == "SB3Trainer"
 
 
-@pytest.mark.parametrize("name", list_presets())
+@pytest.mark.parametrize("name", sorted(path.name for path in PRESETS.iterdir()))
 def test_every_preset_is_complete_and_of_an_environment_of_ours(name):
     runs = [(trainer, algo) for trainer, table in ALGORITHMS.items() for algo in table]
     found = [(env, *run) for env in ENVIRONMENTS for run in runs if f"{file_stem(env, run[1], run[0])}.toml" == name]
