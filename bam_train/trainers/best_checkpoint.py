@@ -39,9 +39,6 @@ def choose_output(settings: TrainSettings, out: Path | None, force: bool, resume
         out: The path that the user gave, if any.
         force: Overwrite what is there.
         resumed: The checkpoint that the run continues from; its own best keeps its place.
-
-    Raises:
-        OutputError: It cannot be written there.
     """
     own = None if resumed is None else _own_best(resumed)
     usual = FOLDER / f"{file_stem(settings.env, settings.algo, settings.trainer)}.zip"
@@ -63,8 +60,6 @@ def choose_output(settings: TrainSettings, out: Path | None, force: bool, resume
 
 
 class _Noted(Struct):
-    """Where the best checkpoint of a run is."""
-
     steps: int
     path: str
 
@@ -74,11 +69,7 @@ class _Notes(Struct):
 
 
 def _own_best(resumed: Checkpoint) -> Output | None:
-    """The best checkpoint of the same run, if it is still there and this computer made it.
-
-    Raises:
-        AlteredCheckpoint: The notes are not as they are written.
-    """
+    """The best checkpoint of the same run, if it is still there and this computer made it."""
     try:
         noted = msgspec.convert(resumed.json(NOTES), _Notes).best if resumed.has(NOTES) else None
     except msgspec.ValidationError as error:

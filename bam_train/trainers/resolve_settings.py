@@ -41,19 +41,13 @@ def read_preset(env: str, algo: str, trainer: str = "sb3") -> dict[str, Any]:
 def resolve(given: Mapping[str, Any]) -> TrainSettings:
     """Complete settings of a new run: the trainer's defaults, below the preset, below what was given.
 
-    Raises:
-        UnknownName: No such environment.
-        SettingsError: No such algorithm or setting, or one that does not fit.
+    Raises UnknownName for an environment, SettingsError for any other setting that is unknown or does not fit.
     """
-    check_names(given, "settings")
-    for name in ("env", "algo"):
-        if given.get(name) is None:
-            raise SettingsError(f"{name}: expected a name, found nothing. Give --{name} NAME")
-    env = _resolve_env(given["env"], elsewhere=bool(given.get("transport")))
-    trainer = given.get("trainer") or "sb3"
-    require_algorithm(trainer, given["algo"])
+    asked = TrainSettings.from_mapping(given)
+    env = _resolve_env(asked.env, elsewhere=bool(asked.transport))
+    require_algorithm(asked.trainer, asked.algo)
     entry = entry_of(env)
-    preset = read_preset(env if entry is None else entry.id, given["algo"], trainer)  # robo-gym's ids are names of ours
+    preset = read_preset(env if entry is None else entry.id, asked.algo, asked.trainer)  # robo-gym's ids are names of ours
     settings = TrainSettings.from_mapping(merge(preset, given, {"env": env}))
     _require_of_trainer(settings)
     require_env_kwargs(env, settings.env_kwargs)
@@ -67,7 +61,7 @@ def resolve(given: Mapping[str, Any]) -> TrainSettings:
             "give its arguments to bam-serve there"
         )
     completed = load_trainer(settings.trainer).complete(settings)
-    if given.get("num_envs") not in (None, completed.num_envs):
+    if given.get("num_envs", completed.num_envs) != completed.num_envs:
         there = f"there are {completed.num_envs} at {settings.place.text}"
         raise SettingsError(f"num_envs: {settings.num_envs} were asked for, and {there}; leave it out")
     return completed
@@ -99,9 +93,7 @@ def own_settings(checkpoint: Checkpoint, env: str | None = None, *, elsewhere: b
 def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSettings:
     """Complete settings of a run that continues from a checkpoint: its own, but for what may change.
 
-    Raises:
-        CheckpointMismatch: Something else was asked for than the checkpoint has; names it and both values.
-        SettingsError: An unknown setting, or the run has all its steps already.
+    Raises CheckpointMismatch where another is asked for, SettingsError if the run has all its steps already.
     """
     check_names(given, "settings")
     saved = checkpoint.manifest.settings

@@ -13,6 +13,7 @@ And copies of its best checkpoint at an fsspec address, such as a bucket, which 
 
 import contextlib
 import importlib
+import itertools
 import json
 import posixpath
 import shutil
@@ -29,35 +30,23 @@ LEAST_FREE = 20_000_000
 
 
 class RunFolder:
-    """The folder of one run; made new, and what killed runs of the same name left half written is removed.
+    """The folder ``root/name`` of one run, or ``root/name-2``, ``-3``, … while the name is taken.
 
-    Args:
-        root: The folder that runs are kept in.
-        name: Name of the run; ``-2``, ``-3``, … is added while the name is taken, also by another process.
-
-    Attributes:
-        path: The folder.
-
-    Raises:
-        OutputError: From the constructor and every method: it cannot be written.
+    It is made new, and what killed runs of the same name left half written is removed. The constructor and every
+    method raise OutputError where they cannot write.
     """
 
     def __init__(self, root: Path, name: str) -> None:
         with _writing(root):
             root.mkdir(parents=True, exist_ok=True)
-        self.path, number = root / name, 1
-        while True:
-            try:
-                with _writing(self.path):
+            for number in itertools.count(1):
+                self.path = root / (name if number == 1 else f"{name}-{number}")
+                try:
                     self.path.mkdir()
-                break
-            except OutputError as error:
-                if not isinstance(error.__cause__, FileExistsError):
-                    raise
-            for checkpoint in ("last.zip", "best.zip"):
-                remove_orphans(self.path / checkpoint)
-            number += 1
-            self.path = root / f"{name}-{number}"
+                    break
+                except FileExistsError:
+                    for checkpoint in ("last.zip", "best.zip"):
+                        remove_orphans(self.path / checkpoint)
         self.last = self.path / "last.zip"
         self.tensorboard = self.path / "tensorboard"
         self.curve = self.path / "learning-curve.png"
@@ -97,7 +86,7 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def unwritable(path: Path, error: Exception, flag: str) -> OutputError:
-    """The error for a file that cannot be written because of `error`; `flag` chooses another place."""
+    """The error of `path`, which `flag` chose and which cannot be written because of `error`."""
     cause = error.__cause__ if isinstance(error.__cause__, OSError) else error
     why = getattr(cause, "strerror", None) or cause
     if isinstance(cause, (NotADirectoryError, FileExistsError)):
@@ -107,11 +96,7 @@ def unwritable(path: Path, error: Exception, flag: str) -> OutputError:
 
 
 def require_room(path: Path, flag: str = "--runs", folder: Path | None = None) -> None:
-    """Find out before training whether `path`, which `flag` chose, can be written in its folder; nothing is left there.
-
-    Raises:
-        OutputError: Its folder cannot be written to, or the disk is full.
-    """
+    """Refuse a place that cannot be written, or a full disk, before training; nothing is left there."""
     folder = path if folder is None else folder
     there = next(one for one in (folder, *folder.absolute().parents) if one.exists())
     try:
@@ -127,13 +112,7 @@ def require_room(path: Path, flag: str = "--runs", folder: Path | None = None) -
 
 
 def draw_curve(records: Sequence[dict[str, Any]], title: str, path: Path) -> None:
-    """Draw return (and success, if the environment knows it) over steps into a PNG at `path`.
-
-    The records are those of ``progress.jsonl``; "training" ones make thin lines, "evaluation" ones dots.
-
-    Raises:
-        OutputError: It cannot be written.
-    """
+    """Draw return, and success if it is known, over steps into a PNG: training as lines, evaluations as dots."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -143,10 +122,12 @@ def draw_curve(records: Sequence[dict[str, Any]], title: str, path: Path) -> Non
     figure = Figure(figsize=(8, 2.6 * len(names) + 0.8), layout="constrained")
     FigureCanvasAgg(figure)
     plots = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
-    lines: dict[str, Any] = {"linewidth": 1, "alpha": 0.7}
-    dots: dict[str, Any] = {"marker": "o", "markersize": 4}
+    styles: dict[str, dict[str, Any]] = {
+        "training": {"linewidth": 1, "alpha": 0.7},
+        "evaluation": {"marker": "o", "markersize": 4},
+    }
     for axes, name in zip(plots, names, strict=True):
-        for kind, style in (("training", lines), ("evaluation", dots)):
+        for kind, style in styles.items():
             known = [record for record in records if record["kind"] == kind and record.get(name) is not None]
             if known:
                 axes.plot([one["steps"] for one in known], [one[name] for one in known], label=kind, **style)
@@ -169,10 +150,7 @@ class Copies:
 
     Args:
         url: An fsspec address, such as ``s3://bucket/runs/`` or ``file:///mnt/share/pick.zip``. One that ends in
-            ``.zip`` is the copy's own; any other is a folder.
-
-    Raises:
-        OutputError: It is no address, there is no such kind of address, or a package that it needs is missing.
+            ``.zip`` is the copy's own; any other is a folder. Raises OutputError if it cannot be one.
     """
 
     def __init__(self, url: str) -> None:
@@ -189,11 +167,7 @@ class Copies:
             raise OutputError(f"{url}: cannot be copied to: {' '.join(str(error).split())}") from error
 
     def copy(self, checkpoint: Path) -> None:
-        """Copy a checkpoint there, over an earlier copy.
-
-        Raises:
-            OutputError: It could not be copied.
-        """
+        """Copy a checkpoint there, over an earlier copy; raises OutputError if that fails."""
         target = self._path if self._path.endswith(".zip") else posixpath.join(self._path, checkpoint.name)
         try:
             if "file" not in self._files.protocol:

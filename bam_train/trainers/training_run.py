@@ -2,14 +2,14 @@
 
     train ─▶ between two updates: stop asked for? ─ evaluation due? ─ save due? ─ record ─▶ train …
 
-The best policy by evaluation (success, ties by return) goes to ``out``, the newest state to ``last.zip``. The file
-is long because each of these steps may fail in ways that must not end the run, and says what it does then.
+The best policy by evaluation (success, ties by return) goes to ``out``, the newest state to ``last.zip``. What cannot
+be written does not end the run.
 """
 
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -33,15 +33,15 @@ RECORD_EVERY = 0.1
 
 
 class Watcher(Protocol):
-    """Receives the progress of a run; a display, for example."""
+    """Receives the progress of a run, such as a display; times are in seconds."""
 
     def training(
         self, progress: Progress, statistics: Statistics, steps_per_second: float, seconds_left: float | None
     ) -> None:
-        """An update was done."""
+        """An update is done."""
 
     def evaluated(self, steps: int, report: EvaluationReport, best: bool) -> None:
-        """The policy was evaluated."""
+        """The policy is evaluated, and is the best so far or not."""
 
     def note(self, text: str) -> None:
         """A message for the user."""
@@ -85,15 +85,12 @@ class TrainingRun:
 
     Args:
         trainer: Set up and ready.
-        folder: Where the run's files go.
-        out: Where the best checkpoint goes.
+        folder: Of the run's files.
+        out: The best checkpoint's place.
         watcher: Receives the progress.
         best: The best evaluation before this part of the run; its checkpoint is at `out`.
         clock: Monotonic time [s].
         copies: Where every checkpoint that goes to `out` is copied to.
-
-    Attributes:
-        done: Whether everything is saved.
     """
 
     def __init__(
@@ -108,7 +105,7 @@ class TrainingRun:
     ) -> None:
         self.trainer, self.folder, self.out, self.watcher, self.best = trainer, folder, out, watcher, best
         self.settings: TrainSettings = trainer.settings
-        self.done = False
+        self.done = False  # whether everything is saved
         self._clock, self._copies = clock, copies
         self._start = self._recorded = self._saved = clock()
         self._first_step = trainer.steps
@@ -131,12 +128,7 @@ class TrainingRun:
         return next((path for path in (self.folder.last, self._kept) if path is not None and path.exists()), None)
 
     def run(self) -> Outcome:
-        """Train to the end.
-
-        Raises:
-            TrainingFailed: The loss, a weight or what the environment gave is not finite, or the robot or its link
-                failed; its text names the last good checkpoint.
-        """
+        """Train to the end; raises TrainingFailed, whose text names the last good checkpoint."""
         try:
             self.trainer.train(self.settings.steps, self._between)
             if not self._stop and self._evaluated_at < self.trainer.steps:
@@ -152,7 +144,7 @@ class TrainingRun:
             raise TrainingFailed(f"{where}{error}; {good}") from error
         self._save_last()
         if self._stop and self._kept is None and not self.out.exists():
-            self._kept = self.out if self._write(self.out, None, "--out") else None  # the newest: none was evaluated
+            self._kept = self.out if self._write(self.out, None, "--out") else None  # none was evaluated
             self._copy()
         if "copy" in self._failures:
             self._copy()  # the cause of the failure may be gone
@@ -199,17 +191,9 @@ class TrainingRun:
         statistics = progress.statistics()
         rate = (progress.steps - self._first_step) / max(now - self._start, 1e-9)
         left = (progress.total - progress.steps) / rate if rate > 0 else None
-        record = {
-            "kind": "training",
-            "steps": progress.steps,
-            "seconds": round(now - self._start, 3),
-            "steps_per_second": round(rate, 1),
-            "episodes": statistics.episodes,
-            "return_mean": statistics.return_mean,
-            "length_mean": statistics.length_mean,
-            "success_rate": statistics.success_rate,
-        }
-        self._add({**record, **statistics.metrics})
+        figures = asdict(statistics)
+        metrics = figures.pop("metrics")
+        self._add("training", progress.steps, {"steps_per_second": round(rate, 1), **figures, **metrics})
         self.watcher.training(progress, statistics, rate, left)
 
     def _evaluate(self) -> None:
@@ -222,25 +206,25 @@ class TrainingRun:
             self.watcher.note(f"{self.settings.env} reports no is_success, so --until-success has no effect")
         self._scores = {**report.to_json(), "steps": steps}
         better = self.best is None or _rank(self._scores) > _rank(self.best)
-        seconds = round(self._clock() - self._start, 3)
-        self._add({"kind": "evaluation", "steps": steps, "seconds": seconds, **self._scores})
+        self._add("evaluation", steps, self._scores)
         numbers = {"eval/return_mean": report.return_mean, "eval/success_rate": report.success_rate}
         self.trainer.log({name: value for name, value in numbers.items() if value is not None})
         self.watcher.evaluated(steps, report, better)
         if better:
             self._keep()
 
-    def _add(self, record: dict[str, Any]) -> None:
+    def _add(self, kind: str, steps: int, figures: Scores) -> None:
         """Add a record; training does not depend on it."""
         try:
-            self.folder.add(record)
+            seconds = round(self._clock() - self._start, 3)
+            self.folder.add({"kind": kind, "steps": steps, "seconds": seconds, **figures})
         except OutputError as error:
             if "progress" not in self._failures:
                 self.watcher.note(f"{error}. Training goes on, and some records are missing")
             self._failures["progress"] = error
 
     def _keep(self) -> None:
-        """Save the policy as the best so far; if `out` cannot be written, in the run's folder. Training continues."""
+        """Save the policy as the best so far; if `out` cannot be written, in the run's folder."""
         before, self.best = self.best, self._scores
         if self._write(self.out, self.out, "--out"):
             self._kept = self.out
@@ -285,7 +269,7 @@ class TrainingRun:
         notes: dict[str, Any] = {"best": None}  # with these a resumed run keeps the best in the same file
         if (best := self.best) is not None and kept is not None:
             noted = {name: best.get(name) for name in ("steps", "success_rate", "return_mean")}
-            notes = {"best": {**noted, "path": str(kept.resolve())}}  # the rest is among the scores of that file
+            notes = {"best": {**noted, "path": str(kept.resolve())}}
         try:
             self.trainer.save(path, self._scores, notes)
         except OutputError as error:
@@ -301,23 +285,17 @@ class TrainingRun:
 
 
 EVALUATION_SEED = 2_000_000
-"""Where these seeds start: apart from training's small ones and from bam-eval's, whose episodes must be fresh."""
+"""First of these seeds, far from training's small ones and from bam-eval's."""
 
 
 def evaluate_for_success(
-    policy: BatchPolicy,
-    settings: TrainSettings,
-    last: bool = False,
-    envs: VectorEnv[Any, Any, Any] | None = None,
+    policy: BatchPolicy, settings: TrainSettings, *, last: bool, envs: VectorEnv[Any, Any, Any] | None
 ) -> tuple[EvaluationReport, bool]:
-    """Evaluate a policy; towards ``until_success`` in up to three parts. Episode k has EVALUATION_SEED + seed + k.
+    """Evaluate a policy; returns the report (the worse of two), and whether ``until_success`` was reached.
 
     First a quarter of the episodes, which spares early, hopeless policies a long evaluation; then all, if that may
     reach it; then, if it did, as many fresh ones, which must reach it too. The last evaluation of a run is never cut
-    short. Environments that are given stay open; by default some are made.
-
-    Returns:
-        The report (the worse of two), and whether ``until_success`` was reached.
+    short. Episode k has EVALUATION_SEED + seed + k; environments that are given stay open.
     """
 
     def play(first: int, count: int) -> EvaluationReport:
