@@ -8,8 +8,8 @@
     bam/golden.safetensors    observations and the trainer's own actions for them
     bam/resume/...            everything needed to go on exactly
 
-A checkpoint is whole or absent: it is written to a temporary file in the same folder, flushed to the disk, then moved
-into place. Reading needs the standard library and NumPy, and never unpickles.
+It is whole or absent: written to a temporary file in the same folder, flushed to the disk, then moved into place.
+Reading never unpickles.
 """
 
 from __future__ import annotations
@@ -50,16 +50,11 @@ class Checkpoint:
     """A checkpoint.zip; what deployment uses was verified when it was opened, the rest is when it is read."""
 
     path: Path
-    """The file."""
     manifest: Manifest
-    """Its description."""
 
     @classmethod
     def open(cls, path: str | Path) -> Checkpoint:
         """Verify the manifest, the list of members, and every member but those below ``bam/resume/``.
-
-        Args:
-            path: The file; ``~`` is expanded.
 
         Raises:
             NotACheckpoint: No such file, not a zip, truncated, too large, or no manifest in it.
@@ -111,11 +106,7 @@ class Checkpoint:
             raise AlteredCheckpoint(self.path, member, f"{member} is not JSON: {error}") from error
 
     def requires_env(self, env_id: str) -> None:
-        """Refuse to be used with another environment than its own; robo-gym's names of one of ours are no other.
-
-        Raises:
-            CheckpointMismatch: Names both environments.
-        """
+        """Refuse another environment than its own (CheckpointMismatch); robo-gym's names of one of ours are no other."""
         from bam_envs.core.registry import are_same
 
         if not are_same(env_id, self.manifest.env):
@@ -128,7 +119,7 @@ def write_checkpoint(path: str | Path, manifest_fields: Mapping[str, Any], membe
     """Write a checkpoint, whole or not at all; an existing file is replaced in one step.
 
     Args:
-        path: The file; ``~`` is expanded, a link is followed, missing folders are made.
+        path: A link is followed, missing folders are made.
         manifest_fields: The fields of `Manifest` but for ``format`` and ``sha256``.
         members: Name to bytes.
 

@@ -1,7 +1,4 @@
-"""`bam/manifest.json`: what a checkpoint is, and the sha256 of every other member.
-
-It is read against one schema before anything is done with it: a checkpoint may be untrusted.
-"""
+"""`bam/manifest.json`: what a checkpoint is; read against one schema, for a checkpoint may be untrusted."""
 
 from __future__ import annotations
 
@@ -135,7 +132,7 @@ def parse_manifest(path: Path, data: bytes) -> Manifest:
 
     Raises:
         NewerFormat: Written by a newer bam-train.
-        AlteredCheckpoint: Not JSON, or a field is missing, of the wrong type or not to be had from a file.
+        AlteredCheckpoint: A field is missing, of the wrong type or not to be had from a file.
     """
     try:
         manifest = _parse(path, data)
@@ -150,11 +147,7 @@ def parse_manifest(path: Path, data: bytes) -> Manifest:
 
 
 def manifest_bytes(path: Path, values: Mapping[str, Any]) -> bytes:
-    """Write the manifest of the checkpoint at `path` from every field of `Manifest` but for ``format``.
-
-    Raises:
-        CheckpointError: A field is missing, unknown, of the wrong type or not JSON.
-    """
+    """Write the manifest of the checkpoint at `path` from every field of `Manifest` but for ``format``."""
     known = [field.name for field in fields(Manifest)]
     values = {"format": FORMAT, **values}
     try:
@@ -169,11 +162,7 @@ def manifest_bytes(path: Path, values: Mapping[str, Any]) -> bytes:
 
 
 def require_no_place(env_kwargs: Mapping[str, Any]) -> None:
-    """Refuse arguments that say where an environment runs, or which one it is.
-
-    Raises:
-        ValueError: Names the first.
-    """
+    """Refuse arguments that say where an environment runs, or which one it is (ValueError)."""
     for name in sorted(env_kwargs.keys() & (WHERE | {"env_id", "id"})):
         what = "where the environment runs" if name in WHERE else "which environment it is"
         raise ValueError(f"env_kwargs.{name} says {what}: flags such as --robot say that, never a file")

@@ -1,8 +1,7 @@
-"""Weights, statistics, golden actions and states as safetensors and JSON: formats in which nothing can be executed.
+"""Arrays (`dump`, `parse`) and nested states (`pack`, `unpack`) in formats in which nothing can be executed.
 
-`dump` and `parse` are for arrays. `pack` and `unpack` are for any nested state, as a JSON skeleton and the arrays that
-it names; exact both ways: ints of any size, floats to the last bit (NaN and infinities too), arrays and torch tensors
-with dtype and shape, tuples, and mappings with keys other than text.
+A state is a JSON skeleton and the safetensors file that it names arrays of. It is exact both ways: ints of any size,
+floats to the last bit, arrays and torch tensors with dtype and shape, tuples, and mappings with keys other than text.
 """
 
 import json
@@ -22,11 +21,7 @@ _MARKS = {"$array", "$scalar", "$tensor", "$tuple", "$items", "$float"}
 
 
 def dump(arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Write arrays of bool, (u)int8-64 and float16-64 as one safetensors file.
-
-    Raises:
-        FormatError: An array's dtype cannot be stored.
-    """
+    """Write arrays of bool, (u)int8-64 and float16-64 as one safetensors file; others are a FormatError."""
     for name, array in arrays.items():
         if np.asarray(array).dtype.kind not in "biuf":
             expected = "expected bool, an integer or a float type"
@@ -36,11 +31,7 @@ def dump(arrays: Mapping[str, np.ndarray]) -> bytes:
 
 
 def parse(data: bytes) -> dict[str, np.ndarray]:
-    """Read a safetensors file; every array is a writable copy.
-
-    Raises:
-        FormatError: Not safetensors, truncated, or arrays that do not fill the file exactly.
-    """
+    """Read a safetensors file; every array is a writable copy. Raises FormatError if it is damaged."""
     size = int.from_bytes(data[:8], "little")
     if len(data) < 8 or size > min(MOST_HEADER, len(data) - 8):
         raise FormatError(f"not a safetensors file: {len(data)} bytes, too short for its header")
@@ -55,18 +46,15 @@ def parse(data: bytes) -> dict[str, np.ndarray]:
 def pack(tree: Any) -> tuple[bytes, bytes]:
     """Turn a tree into (JSON skeleton, safetensors).
 
-    Args:
-        tree: None, bool, int, float, str, NumPy scalars and arrays, torch tensors; lists, tuples, mappings of these.
-
-    Raises:
-        FormatError: Something else is in it; names where.
+    It may have None, bool, int, float, str, NumPy scalars and arrays, torch tensors; lists, tuples and mappings of
+    these. Anything else is a FormatError that names where.
     """
     arrays: dict[str, np.ndarray] = {}
 
     def keep(mark: str, array: np.ndarray, path: str) -> dict[str, str]:
         name = path or "/"
-        if name in arrays:
-            raise FormatError(f"{name}: two entries of a saved state have this name")
+        while name in arrays:  # "a/b", and "b" in "a"
+            name += "'"
         arrays[name] = array
         return {mark: name}
 
@@ -96,10 +84,9 @@ def pack(tree: Any) -> tuple[bytes, bytes]:
 
 
 def unpack(skeleton: bytes, arrays: bytes, to_tensor: Callable[[np.ndarray], Any] | None = None) -> Any:
-    """Turn what `pack` wrote into the tree again; tensors become arrays without `to_tensor`, which makes them.
+    """Turn what `pack` wrote into the tree again; `to_tensor` makes tensors, which else become arrays.
 
-    Raises:
-        FormatError: The two do not belong together, or are not as `pack` writes them.
+    Raises FormatError if the two do not belong together, or are not as `pack` writes them.
     """
 
     def get(value: Any) -> Any:
