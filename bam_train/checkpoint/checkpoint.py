@@ -106,7 +106,7 @@ class Checkpoint:
             raise AlteredCheckpoint(self.path, member, f"{member} is not JSON: {error}") from error
 
     def requires_env(self, env_id: str) -> None:
-        """Refuse another environment than its own (CheckpointMismatch); robo-gym's names of one of ours are no other."""
+        """Refuse another environment than its own (CheckpointMismatch); a name of robo-gym for it is no other."""
         from bam_envs.core.registry import are_same
 
         if not are_same(env_id, self.manifest.env):
