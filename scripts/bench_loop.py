@@ -381,7 +381,7 @@ class Watch:
         if self.ticks == SETTLED:
             self.settled = memory()
 
-    def ended(self, record: Any, pacer: Any) -> None:
+    def ended(self, record: Any) -> None:
         """Nothing."""
 
 

@@ -10,8 +10,8 @@ import json as json_module
 import math
 import os
 import sys
-from collections.abc import Sequence
 from contextlib import nullcontext
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.console import guards_of, is_terminal, make_console, plan_lines, require_consent, say, tell
@@ -29,28 +29,22 @@ if TYPE_CHECKING:
 
 def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     """The program, with its arguments read; a signal that came and was lost ends it before the robot moves."""
-    from bam_train.deploy.journal import Journal, Startup
-
-    startup = Startup()
-    startup.mark("python and arguments")
     place = _checked_place(config)
     from bam_envs.core.timing import Pacer
     from bam_train.checkpoint import Checkpoint
     from bam_train.deploy.deployment import Deployment
+    from bam_train.deploy.journal import Journal
     from bam_train.environments import environment_of, make_env, require_fit
     from bam_train.policy import FrozenPolicy
 
-    startup.mark("imports")
     signals.raise_again()
     checkpoint = Checkpoint.open(config.checkpoint)
     policy = FrozenPolicy.from_checkpoint(checkpoint)
-    startup.mark("policy")
     env_id, env_kwargs = environment_of(checkpoint, config.env, elsewhere=bool(place.transport))
     env = make_env(env_id, env_kwargs, render_mode="human" if config.render else None, place=place)
     try:
         require_fit(checkpoint, env, place)
-        pacer = Pacer(_period(config, checkpoint, env))
-        deployment = Deployment(env, policy, pacer, Journal(config.episodes, startup))
+        deployment = Deployment(env, policy, Pacer(_period(config, checkpoint, env)), Journal(config.episodes))
         signals.raise_again()
         deployment.connect()
         signals.raise_again()
@@ -59,7 +53,6 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     except BaseException:
         env.close()  # type: ignore[no-untyped-call]
         raise
-    startup.mark("environment")
     return _run(config, checkpoint, place, deployment, signals)
 
 
@@ -68,19 +61,18 @@ def _run(
 ) -> int:
     """Run the deployment and report it, also after a signal; returns the exit status."""
     from bam_train.cli.deploy_display import PlainDisplay, live_display
-    from bam_train.deploy.deployment import stop_signals
     from bam_train.deploy.journal import DeployReport
 
     env, journal, pacer = deployment.env, deployment.journal, deployment.pacer
     title = f"{checkpoint.path} on {checkpoint.manifest.env}{place.text and f' at {place.text}'}"
-    with stop_signals() as switch:  # a second Ctrl-C must not lose the report
-        switch.waiting += signals.came  # one that was lost: the deployment ends before it begins
+    with deployment.handles_signals():  # a second Ctrl-C must not lose the report
+        deployment.switch.came += signals.came  # one that was lost: the deployment ends before it begins
         plain = nullcontext(PlainDisplay(journal, say))
         with live_display(make_console(), env, title, journal) if is_terminal() else plain as watcher:
-            journal.startup.mark("display")
-            ending = deployment.run(watcher, seed=config.seed, switch=switch)
+            ending = deployment.run(watcher, seed=config.seed)
         if ending.status:
-            say(f"bam-deploy: {ending.reason}")
+            halted = ending.reason == "interrupted" and hasattr(env.unwrapped, "robot")
+            say(f"bam-deploy: {ending.reason}{'; the robot was halted' if halted else ''}")
         where = place.text or "simulated here"
         report = DeployReport(checkpoint, config.seed, ending, journal, pacer, where, guards_of(env))
         for warning in report.warnings():
@@ -144,10 +136,7 @@ def _period(config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, Any]
     return own if config.rate is None else 1 / config.rate
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of the console script."""
-    run_program("bam-deploy", "bam_train.cli.flags:DeployConfig", deploy_checkpoint, arguments)
-
+main = partial(run_program, "bam-deploy", "bam_train.cli.flags:DeployConfig", deploy_checkpoint)
 
 if __name__ == "__main__":
     main()

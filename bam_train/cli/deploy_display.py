@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
 
 _MOST_NUMBERS = 16
 """Numbers of an action or a state signal that are shown; the rest (of an image, say) is left out."""
-_BAR = 20
-"""Characters of a bar."""
 
 
 class PlainDisplay:
@@ -39,13 +38,16 @@ class PlainDisplay:
     def ticked(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> None:
         """Nothing: a line for each tick is too many."""
 
-    def ended(self, record: EpisodeRecord, pacer: Pacer) -> None:
-        """Write how the episode went."""
-        self._write(episode_line(self._journal.begun, self._journal.wanted, record))
+    def ended(self, record: EpisodeRecord) -> None:
+        """Write such as ``episode 2/5 (seed 8): success after 47 steps, return 12.31``."""
+        how = {True: "success", False: "no success", None: record.end}[record.success]
+        steps = f"{record.length} step{'' if record.length == 1 else 's'}"
+        which = f"episode {self._journal.begun}/{self._journal.wanted} (seed {record.seed})"
+        self._write(f"{which}: {how} after {steps}, return {record.total:.2f}")
 
 
-class LiveDisplay:
-    """A panel redrawn at most ten times a second, and only when the next deadline leaves time for it.
+class LiveDisplay(PlainDisplay):
+    """A panel below those lines, redrawn ten times a second at most, and only when there is time until a deadline.
 
     Args:
         live: Rich's live area, without a thread of its own.
@@ -68,8 +70,8 @@ class LiveDisplay:
         journal: Journal,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._live, self._env, self._title, self._journal, self._now = live, env, title, journal, now
-        self._labels = action_labels(env)
+        super().__init__(journal, lambda line: live.console.print(rich_text(line)))
+        self._live, self._env, self._title, self._now = live, env, title, now
         self._drawn = -math.inf
 
     def ticked(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> None:
@@ -81,68 +83,39 @@ class LiveDisplay:
         from rich.console import Group
         from rich.table import Table
 
+        successes = self._journal.successes
+        succeeded = "" if successes is None else f", {successes} succeeded"
+        rows = {
+            "episode": f"{self._journal.begun} of {self._journal.wanted}{succeeded}",
+            "step": f"{record.length}, return {record.total:.2f}",
+            "loop": rate_text(pacer),
+            **({} if pacer.period is None else {"lateness": lateness_text(pacer)}),
+            **numbers_of(self._env, action),
+        }
         table = Table.grid(padding=(0, 2))
-        for name, text in self._lines(record, action, pacer):
+        for name, text in rows.items():
             table.add_row(rich_text(name, "dim"), rich_text(text, no_wrap=True, overflow="ellipsis"))
         self._live.update(Group(rich_text(self._title, "bold"), table), refresh=True)
 
-    def ended(self, record: EpisodeRecord, pacer: Pacer) -> None:
-        """Write how the episode went above the panel."""
-        line = episode_line(self._journal.begun, self._journal.wanted, record)
-        self._live.console.print(rich_text(line))
 
-    def _lines(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> Iterator[tuple[str, str]]:
-        """What the panel says, line by line: a name and a text; few enough for a screen of 24 lines."""
-        successes = self._journal.successes
-        succeeded = "" if successes is None else f", {successes} succeeded"
-        yield "episode", f"{self._journal.begun} of {self._journal.wanted}{succeeded}"
-        yield "step", f"{record.length}, return {record.total:.2f}"
-        yield "loop", rate_text(pacer)
-        if pacer.period is not None:
-            yield "lateness", lateness_text(pacer)
-        yield from action_lines(self._labels, action)
-        yield from state_lines(self._env)
-
-
-def _bar(value: float) -> str:
-    """A number of [-1, 1] as a mark on a line whose middle is 0; what is outside is at the end."""
-    place = round((min(max(value, -1.0), 1.0) + 1) / 2 * _BAR)
-    return "".join("#" if i == place else "|" if i == _BAR // 2 else "." for i in range(_BAR + 1))
-
-
-def episode_line(number: int, wanted: int, record: EpisodeRecord) -> str:
-    """Such as ``episode 2/5 (seed 8): success after 47 steps, return 12.31``."""
-    how = {True: "success", False: "no success", None: record.end}[record.success]
-    steps = f"{record.length} step{'' if record.length == 1 else 's'}"
-    return f"episode {number}/{wanted} (seed {record.seed}): {how} after {steps}, return {record.total:.2f}"
-
-
-def action_labels(env: gym.Env[Any, Any]) -> tuple[str, ...]:
-    """Names of the action's numbers, if the environment has any."""
+def numbers_of(env: gym.Env[Any, Any], action: Any) -> dict[str, str]:
+    """The action, and each signal that the robot of a `RobotEnv` measured last, as rows of the panel."""
     describe = getattr(env.unwrapped, "describe", None)
-    return () if describe is None else tuple(str(one["name"]) for one in describe()["action"])
-
-
-def action_lines(labels: tuple[str, ...], action: Any) -> Iterator[tuple[str, str]]:
-    """One line for each number of the action, with a bar if it is not a choice."""
-    numbers = np.ravel(action)
-    width = max((len(label) for label in labels), default=1)
-    for i, number in enumerate(numbers[:_MOST_NUMBERS]):
-        label = (labels[i] if i < len(labels) else str(i) if len(numbers) > 1 else "").ljust(width)
-        text = f"{_bar(float(number))} {number:+.3f}" if numbers.dtype.kind == "f" else str(number)
-        yield "action" if i == 0 else "", f"{label} {text}".lstrip()
-
-
-def state_lines(env: gym.Env[Any, Any]) -> Iterator[tuple[str, str]]:
-    """One line for each signal that the robot measured last; none if the environment is no `RobotEnv`."""
-    signals = getattr(getattr(env.unwrapped, "state", None), "signals", None)
-    if signals is None:
-        return
-    for spec in env.unwrapped.robot.spec.signals:  # type: ignore[attr-defined]
+    labels = [] if describe is None else [str(one["name"]) for one in describe()["action"]]
+    rows = {"action": _text(action, labels)}
+    signals = getattr(getattr(env.unwrapped, "state", None), "signals", {})
+    for spec in env.unwrapped.robot.spec.signals if signals else ():  # type: ignore[attr-defined]
         if spec.name in signals:
-            numbers = " ".join(f"{number:+.3f}" for number in np.ravel(signals[spec.name][0])[:_MOST_NUMBERS])
             unit = spec.units[0] if len(set(spec.units)) == 1 and spec.units[0] != "1" else ""
-            yield spec.name.replace("_", " "), f"{numbers} {unit}".rstrip()
+            rows[spec.name.replace("_", " ")] = f"{_text(signals[spec.name][0])} {unit}".rstrip()
+    return rows
+
+
+def _text(values: Any, labels: Sequence[str] = ()) -> str:
+    """Such as ``dx +0.500 dy -1.000``; a number without a label alone."""
+    numbers = np.ravel(values)[:_MOST_NUMBERS]
+    texts = [f"{number:+.3f}" if numbers.dtype.kind == "f" else str(number) for number in numbers]
+    return " ".join(f"{label} {text}".lstrip() for label, text in zip_longest(labels, texts, fillvalue=""))
 
 
 @contextmanager

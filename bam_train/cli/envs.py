@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json as json_module
-from collections.abc import Sequence
+from functools import partial
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
@@ -116,10 +116,7 @@ def folded(signals: list[dict[str, Any]], most: int = 16) -> list[dict[str, Any]
     return shown
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of the console script."""
-    run_program("bam-envs", "bam_train.cli.flags:EnvsConfig", lambda config, _: show_environments(config), arguments)
-
+main = partial(run_program, "bam-envs", "bam_train.cli.flags:EnvsConfig", lambda config, _: show_environments(config))
 
 if __name__ == "__main__":
     main()

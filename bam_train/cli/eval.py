@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json as json_module
-from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -151,10 +150,7 @@ def _record(config: EvalConfig, subject: _Subject, path: Path) -> None:
     say(f"bam-eval: {path}: {episodes} episode{'' if episodes == 1 else 's'}, {count} pictures")
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of the console script."""
-    run_program("bam-eval", "bam_train.cli.flags:EvalConfig", lambda config, _: evaluate_checkpoint(config), arguments)
-
+main = partial(run_program, "bam-eval", "bam_train.cli.flags:EvalConfig", lambda config, _: evaluate_checkpoint(config))
 
 if __name__ == "__main__":
     main()

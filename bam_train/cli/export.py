@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 from bam_train.cli.console import say, tell
@@ -47,10 +47,9 @@ def export_directory(config: ExportConfig) -> None:
     )
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of the console script."""
-    run_program("bam-export", "bam_train.cli.flags:ExportConfig", lambda config, _: export_directory(config), arguments)
-
+main = partial(
+    run_program, "bam-export", "bam_train.cli.flags:ExportConfig", lambda config, _: export_directory(config)
+)
 
 if __name__ == "__main__":
     main()

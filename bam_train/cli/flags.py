@@ -7,7 +7,7 @@ whose import registers the environments with Gymnasium and takes longer than ``-
 import sys
 from dataclasses import dataclass, make_dataclass
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import tyro
 from msgspec import Meta
@@ -46,14 +46,12 @@ _METAVARS = {
 def _settings_flags() -> Any:
     """`TrainSettings` with flags for fields: None is not given, and comes from ``--config``, the preset or a default.
 
-    Ranges are checked when all of them are together, and the tables are no flags: ``--set`` reaches into them.
+    The tables are no flags: ``--set`` reaches into them.
     """
     flags: list[tuple[str, Any, None]] = []
-    for name, hint in get_type_hints(TrainSettings).items():
-        kind = hint if isinstance(hint, type) else next((one for one in get_args(hint) if one is not type(None)), str)
-        kind = kind if kind in (int, float) else str
-        metavar = _METAVARS.get(name, "N" if kind is int else "NAME")
-        hidden = Annotated[None, tyro.conf.Suppress]
+    for name, hint in get_type_hints(TrainSettings, include_extras=True).items():
+        metavar = _METAVARS.get(name, "N" if "int" in repr(hint) else "NAME")
+        hidden, kind = Annotated[None, tyro.conf.Suppress], str if name == "transport" else hint
         flags.append((name, hidden if name in TABLES else Annotated[kind | None, _unset(metavar)], None))
     return make_dataclass("SettingsFlags", flags, bases=(TrainSettings,), frozen=True)
 

@@ -13,7 +13,7 @@ import re
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 from bam_train.cli.console import say, show_logs_and_tracebacks
 from bam_train.signals import SignalMemory, Terminated
@@ -49,25 +49,19 @@ def run_program(
         flags: Its configuration, ``"module:Class"``; imported once signals are handled.
         main: Takes the configuration and the signals that have come; returns an exit status (None for 0).
         arguments: Instead of those of the process.
-
-    Raises:
-        SystemExit: Always.
     """
     sys.path.append(os.getcwd())  # --env my_module:Env-v0, as with python -m; last, so that it hides nothing
     show_logs_and_tracebacks()
-    sys.exit(_status(lambda signals: main(parse(pkgutil.resolve_name(flags), prog, arguments), signals), prog))
+    signals = SignalMemory()
+    sys.exit(guarded(lambda: main(parse(pkgutil.resolve_name(flags), prog, arguments), signals), prog, signals))
 
 
-def guarded(main: Callable[[], int | None], prog: str) -> int:
+def guarded(main: Callable[[], int | None], prog: str, signals: SignalMemory | None = None) -> int:
     """Run `main`; what is expected to go wrong becomes one line on standard error and a status other than 0."""
-    return _status(lambda _: main(), prog)
-
-
-def _status(main: Callable[[SignalMemory], int | None], prog: str) -> int:
     try:
-        with SignalMemory() as signals:
+        with signals or SignalMemory() as signals:
             try:
-                return main(signals) or 0
+                return main() or 0
             except KeyboardInterrupt as error:
                 if not isinstance(error, Terminated) and signals.came[:1] != [signal.SIGINT]:
                     signals.raise_again()  # of SIGTERM, of which Ray raises a plain KeyboardInterrupt
@@ -120,10 +114,6 @@ def parse(config: type[Config], prog: str, arguments: Sequence[str] | None = Non
         config: A frozen dataclass; one field is one flag, its docstring the description.
         prog: The program's name.
         arguments: Instead of those of the process.
-
-    Raises:
-        SystemExit: After ``--help`` (0), or a command line that cannot be read (2).
-        SettingsError: A value is outside the range of its field.
     """
     import tyro
 
@@ -136,11 +126,15 @@ def parse(config: type[Config], prog: str, arguments: Sequence[str] | None = Non
         if stop.code:
             _complain(prog, f"{usage_error(box.getvalue(), config)} Run {prog} --help")
         raise
+    from bam_envs.core.errors import InvalidValue
     from bam_envs.core.validation import check_fields
     from bam_envs.core.wording import as_flag
-    from bam_train.errors import SettingsError
 
-    check_fields(parsed, as_flag, SettingsError)
+    try:
+        check_fields(parsed, as_flag)
+    except InvalidValue as error:
+        _complain(prog, f"{error}. Run {prog} --help")
+        raise SystemExit(2) from error
     return parsed
 
 
@@ -149,15 +143,25 @@ def usage_error(box: str, config: type[Any]) -> str:
 
     Examples: ``unknown option --enb, did you mean --env?``, ``--steps: expected a whole number, found 'x'.``
     """
+    import tyro
+
+    from bam_envs.core.validation import expected, type_hints
+    from bam_envs.core.wording import as_flag, closest
+
     text = " ".join(re.sub(r"[─│╭╮╰╯]+|-{4,}|(?<!\S)[|+](?!\S)", " ", box).split())  # drawn in ASCII where it must be
     text = re.split(r" For full helptext| Argument helptext", text)[0]
-    if match := re.search(r"Unrecognized options: (.*?)(?: Perhaps you meant: .*?(--[\w-]+).*)?$", text):
-        return f"unknown option {match[1].split(',')[0]}{f', did you mean {match[2]}?' if match[2] else '.'}"
+    hints, (_, positional) = type_hints(config), get_args(tyro.conf.Positional[str])
+    if match := re.search(r"Unrecognized options: ([^\s,]+)", text):
+        if not match[1].startswith("-"):
+            return f"unexpected argument {match[1]}."
+        named = [name for name, hint in hints.items() if positional not in get_args(hint)]
+        flags = [*map(as_flag, named), "--help"]
+        close = closest(match[1].partition("=")[0], flags)
+        choice = f"; there are {' and '.join(flags)}." if len(flags) < 3 else "."
+        return f"unknown option {match[1]}{f', did you mean {close}?' if close else choice}"
     if match := re.search(r"Error parsing (\S+?):? .*(?:from \[|: )'(.*?)'", text):
-        from bam_envs.core.validation import expected, type_hints
-
         flag, found = match.groups()
-        kind = type_hints(config).get(flag.lstrip("-").replace("-", "_"))
+        kind = hints.get(flag.lstrip("-").replace("-", "_"))
         if kind is None:
             return f"{flag} cannot be {found!r}."
         wanted, remedy = expected(kind), "."

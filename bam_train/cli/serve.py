@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.console import ShownFormatter, require_consent, say
@@ -87,10 +88,7 @@ def _env_kwargs(assignments: Sequence[str]) -> dict[str, Any]:
     return kwargs
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of the console script."""
-    run_program("bam-serve", "bam_train.cli.flags:ServeConfig", serve, arguments)
-
+main = partial(run_program, "bam-serve", "bam_train.cli.flags:ServeConfig", serve)
 
 if __name__ == "__main__":
     main()

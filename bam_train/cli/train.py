@@ -8,7 +8,8 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from functools import partial
 from typing import TYPE_CHECKING
 
 from bam_train.cli.console import count, tell
@@ -117,10 +118,7 @@ def _stopped_by_signals(run: TrainingRun) -> Iterator[list[int]]:
             _KEPT.append(handlers.pop_all())  # the handlers of before return as soon as this is collected
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of the console script."""
-    run_program("bam-train", "bam_train.cli.flags:TrainConfig", lambda config, _: train(config), arguments)
-
+main = partial(run_program, "bam-train", "bam_train.cli.flags:TrainConfig", lambda config, _: train(config))
 
 if __name__ == "__main__":
     main()

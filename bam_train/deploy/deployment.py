@@ -9,9 +9,8 @@ before anything is reported.
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -36,15 +35,12 @@ class Watcher(Protocol):
     def ticked(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> None:
         """A step was taken."""
 
-    def ended(self, record: EpisodeRecord, pacer: Pacer) -> None:
+    def ended(self, record: EpisodeRecord) -> None:
         """An episode ended."""
 
 
 class Deployment:
-    """A frozen policy and a robot in one loop.
-
-    Memory stays flat however long it runs: the workspace keeps the last `window` ticks at least, and gives older ones
-    to `sink` as they leave.
+    """A frozen policy and a robot in one loop, which runs once; memory stays flat however long.
 
     Args:
         env: The environment, already checked to fit the policy.
@@ -72,14 +68,15 @@ class Deployment:
         sink: Sink | None = None,
     ) -> None:
         self.env, self.pacer, self.journal = env, pacer, journal
-        self._robot = _DeployedRobot(env)
+        self.switch = StopSwitch()
+        """What SIGINT and SIGTERM do."""
+        self._robot = _DeployedRobot(env, self.switch)
         self._workspace = Workspace(window=window, sink=None if sink is None else _silent_once_broken(sink))
         own = (
-            _Calls(lambda: self._robot.switch.raise_again()),  # a lost signal: the robot is sent nothing more
+            _StopAgent(self.switch),
             self._robot,
             _JournalAgent(journal, pacer),
             PolicyAgent(policy, self._robot.observation_names, single=True),
-            _Calls(lambda: journal.startup.finish("reset and first action")),
         )
         self._loop = TemporalAgent(Agents(*own, *agents))
 
@@ -87,30 +84,29 @@ class Deployment:
         """Open the link to the robot, if there is one, without moving it: a missing robot shows before the loop."""
         self._robot.connect()
 
-    def run(self, watcher: Watcher, *, seed: int, switch: StopSwitch | None = None) -> Ending:
-        """Run ``journal.wanted`` episodes; episode k gets ``seed + k``. Never raises for what happens in them.
+    def handles_signals(self) -> AbstractContextManager[None]:
+        """Within this, SIGINT and SIGTERM go to the switch, also where they are ignored; `run` handles them itself."""
+        return handled(self.switch, (signal.SIGINT, signal.SIGTERM), ignored_too=True)
 
-        Args:
-            watcher: Shows it.
-            seed: Seed of the first episode.
-            switch: Of the `stop_signals` around this call; None: signals are handled during this call.
-        """
-        if switch is None:
-            with stop_signals() as own:
-                return self.run(watcher, seed=seed, switch=own)
-        self._robot.switch = switch
+    def run(self, watcher: Watcher, *, seed: int) -> Ending:
+        """Run ``journal.wanted`` episodes; episode k gets ``seed + k``. Never raises for what happens in them."""
+        with self.handles_signals():
+            return self._run(watcher, seed)
+
+    def _run(self, watcher: Watcher, seed: int) -> Ending:
         try:
             try:
-                switch.arm()
+                self.switch.armed = True
+                self.switch.raise_again()  # one that came before
                 for k in range(self.journal.wanted):
                     self._loop(self._workspace, t=0, stop_variable="env/done", seed=seed + k, watcher=watcher)
                     self._robot.halt()  # a sink may take its time, and so may the next reset
                     self._workspace.flush()
             finally:  # inside the outer try: a signal that comes before this line is still caught
-                switch.armed = False
+                self.switch.armed = False
             ending = Ending("episodes done", 0)
-        except Stopped as stopped:
-            ending = Ending("interrupted", 128 + stopped.signal)
+        except Stopped:
+            ending = Ending("interrupted", 128 + self.switch.came[0])
         except Exception as error:  # whatever went wrong: the robot has to be halted and the report made
             ending = _ending_of(error)
         except BaseException:
@@ -136,8 +132,8 @@ def _unless_it_fails(ending: Ending, what: str, end: Callable[[], None]) -> Endi
     try:
         end()
     except Exception as error:  # of the environment or the sink; the report comes all the same
-        if ending.status == 0:
-            return replace(ending, reason=f"fault: {what} failed: {fault_text(error)}", status=1)
+        if ending.reason in ("episodes done", "interrupted"):
+            return Ending(f"fault: {what} failed: {fault_text(error)}", 1)
     return ending
 
 
@@ -165,28 +161,31 @@ def fault_text(error: Exception) -> str:
 # ---- the agents beside robot and policy
 
 
-class _Calls(Agent):
-    """Calls something at every time."""
+class _StopAgent(Agent):
+    """Stands before the robot, which is sent nothing more after a signal whose exception was lost."""
 
     reads = ()
     writes = ()
 
-    def __init__(self, call: Callable[[], None]) -> None:
+    def __init__(self, switch: StopSwitch) -> None:
         super().__init__()
-        self._tell = call
+        self._switch = switch
 
     def forward(self, **kwargs: Any) -> None:
-        self._tell()
+        self._switch.raise_again()
 
 
 class _DeployedRobot(RobotAgent):
     """The robot; once the loop begins to close it, no signal interrupts that."""
 
-    switch: StopSwitch
     closing = False
 
+    def __init__(self, env: gym.Env[Any, Any], switch: StopSwitch) -> None:
+        super().__init__(env)
+        self._switch = switch
+
     def close(self) -> None:
-        self.closing, self.switch.armed = True, False
+        self.closing, self._switch.armed = True, False
         super().close()
 
 
@@ -212,7 +211,7 @@ class _JournalAgent(Agent):
             record.end = next((end for end in _ENDS if self.get((f"env/{end}", t))[0]), "stopped")
             watcher.ticked(record, self.get(("action", t - 1))[0], self._pacer)
             if record.complete:
-                watcher.ended(record, self._pacer)
+                watcher.ended(record)
         if not self.get(("env/done", t))[0]:
             self._pacer.wait()
 
@@ -221,65 +220,31 @@ class _JournalAgent(Agent):
 
 
 class Stopped(BaseException):
-    """A signal asked for the end.
-
-    Attributes:
-        signal: Its number.
-    """
-
-    def __init__(self, number: int) -> None:
-        self.signal = number
-        super().__init__(f"stopped by {signal.Signals(number).name}")
+    """A signal asked for the end."""
 
 
 class StopSwitch:
-    """What a signal does: it raises `Stopped` while armed; otherwise the first waits, the second interrupts.
+    """Handles signals: while armed, one raises `Stopped`; otherwise it waits, as the robot may be being halted.
 
-    The first one waits because the robot may be being halted; the second raises KeyboardInterrupt, for a halt that
-    hangs.
+    The third one raises KeyboardInterrupt, for a halt that hangs.
     """
 
     def __init__(self) -> None:
         self.armed = False
         """Whether a signal may interrupt what runs now."""
-        self.waiting: list[int] = []
-        """Signals that came while not armed."""
-        self._raised: int | None = None
-
-    def arm(self) -> None:
-        """From now on a signal interrupts.
-
-        Raises:
-            Stopped: One came before.
-        """
-        self.armed = True
-        if self.waiting:
-            self.armed, number = False, self.waiting[0]
-            self.waiting.clear()
-            raise Stopped(number)
+        self.came: list[int] = []
+        """The signals so far."""
 
     def raise_again(self) -> None:
-        """Called in every tick: Python discards an exception in a callback of its own, such as a ``__del__``.
-
-        Raises:
-            Stopped: One was raised and discarded.
-        """
-        if self._raised is not None:
-            raise Stopped(self._raised)
+        """Raise `Stopped` if a signal came: Python discards an exception in a callback, such as a ``__del__``."""
+        if self.came:
+            raise Stopped
 
     def __call__(self, number: int) -> None:
         """Handle a signal, in the main thread, between two of its instructions."""
-        if self.armed:
-            self.armed, self._raised = False, number
-            raise Stopped(number)
-        self.waiting.append(number)
-        if len(self.waiting) > 1:
+        self.came.append(number)
+        if len(self.came) > 2:
             raise KeyboardInterrupt
-
-
-@contextmanager
-def stop_signals() -> Iterator[StopSwitch]:
-    """Within this, SIGINT and SIGTERM go to the switch (not armed yet); afterwards to the handlers of before."""
-    switch = StopSwitch()
-    with handled(switch, (signal.SIGINT, signal.SIGTERM), ignored_too=True):
-        yield switch
+        if self.armed:
+            self.armed = False
+            raise Stopped

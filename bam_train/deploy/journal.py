@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -45,52 +45,28 @@ class EpisodeRecord:
         return {"seed": self.seed, "length": self.length, "return": total, "success": self.success, "end": self.end}
 
 
-@dataclass
-class Startup:
-    """CPU time of this process from its start to the first action, stage by stage."""
-
-    clock: Callable[[], float] = time.process_time
-    """CPU time of the process [s]; counts the interpreter's own start."""
-    stages: dict[str, float] = field(default_factory=dict)
-    """CPU seconds of each stage, in order."""
-    finished: bool = False
-    """Whether the first action has been reached."""
-
-    def mark(self, stage: str) -> None:
-        """Assign the CPU time since the previous mark to `stage`."""
-        self.stages[stage] = self.clock() - self.total
-
-    def finish(self, stage: str) -> None:
-        """The first action is decided; later calls change nothing."""
-        if not self.finished:
-            self.mark(stage)
-            self.finished = True
-
-    @property
-    def total(self) -> float:
-        """CPU seconds so far."""
-        return sum(self.stages.values())
-
-
 KEPT = 1000
 """Episodes whose records are kept; older ones are only counted, so that memory stays flat."""
 
 
 @dataclass
 class Journal:
-    """The episodes of one deployment, and what its start cost."""
+    """The episodes of one deployment."""
 
     wanted: int
     """Episodes asked for."""
-    startup: Startup = field(default_factory=Startup)
     records: deque[EpisodeRecord] = field(default_factory=lambda: deque(maxlen=KEPT))
     """The last `KEPT` episodes."""
     begun: int = 0
     """Episodes begun."""
+    startup: float | None = None
+    """CPU time of this process from its start to the first observation [s]; None before it."""
     _earlier: Counter[str] = field(default_factory=Counter)  # of all episodes but the last one
 
     def begin(self, seed: int) -> EpisodeRecord:
         """A new episode, appended and returned; the one before does not change any more."""
+        if self.startup is None:
+            self.startup = time.process_time()
         self._earlier = self._counts()
         self.records.append(EpisodeRecord(seed))
         self.begun += 1
@@ -146,8 +122,7 @@ class DeployReport:
 
     def to_json(self) -> dict[str, Any]:
         """Plain values; times in the unit that their name says."""
-        journal, manifest, startup = self.journal, self.checkpoint.manifest, self.journal.startup
-        stages = {"total": startup.total, **startup.stages} if startup.finished else {}
+        journal, manifest = self.journal, self.checkpoint.manifest
         return {
             "stop_reason": self.ending.reason,
             "episodes": journal.completed,
@@ -158,7 +133,7 @@ class DeployReport:
             "lateness_ms": _milliseconds(self.pacer.lateness),
             "missed_ticks": self.pacer.missed,
             "warnings": self.warnings(),
-            "startup_cpu_s": {name: round(seconds, 3) for name, seconds in stages.items()} or None,
+            "startup_cpu_s": None if journal.startup is None else {"total": round(journal.startup, 3)},
             "seed": self.seed,
             "env": manifest.env,
             "algorithm": manifest.algorithm,
@@ -184,22 +159,16 @@ class DeployReport:
         ]
 
     def lines(self) -> list[str]:
-        """The same for people, a few lines."""
-        reason, ticks, startup = self.ending.reason.rstrip("."), f"{self.pacer.ticks} ticks", self.journal.startup
-        stages = ", ".join(f"{name} {seconds:.2f}" for name, seconds in startup.stages.items())
+        """The same for people, a few lines; the details of a fault have been shown when it happened."""
+        journal, reason = self.journal, self.ending.reason.partition(":")[0]
+        successes = journal.successes
+        succeeded = "" if successes is None else f", {successes} success{'' if successes == 1 else 'es'}"
+        episodes = f"{journal.completed} of {journal.wanted} episodes{succeeded}"
         return [
-            f"{reason}: {episodes_text(self.journal)}, {ticks}, {rate_text(self.pacer)}",
+            f"{reason}: {episodes}, {self.pacer.ticks} ticks, {rate_text(self.pacer)}",
             *([f"lateness {lateness_text(self.pacer)}"] if self.pacer.period is not None else []),
             *([guards_text(self.guards)] if self.guards else []),
-            *([f"first action after {startup.total:.2f} s of CPU time: {stages}"] if startup.finished else []),
         ]
-
-
-def episodes_text(journal: Journal) -> str:
-    """Such as ``5 of 5 episodes, 4 successes``."""
-    successes = journal.successes
-    text = f"{journal.completed} of {journal.wanted} episodes"
-    return text if successes is None else f"{text}, {successes} success{'' if successes == 1 else 'es'}"
 
 
 def rate_text(pacer: Pacer) -> str:
@@ -209,10 +178,10 @@ def rate_text(pacer: Pacer) -> str:
 
 
 def lateness_text(pacer: Pacer) -> str:
-    """Such as ``p50 0.08 ms, p99 0.30 ms, max 1.20 ms, 0 missed``."""
+    """Such as ``p50 0.08 ms, p99 0.30 ms, max 1.20 ms, no deadline missed``."""
     late = _milliseconds(pacer.lateness)
     figures = [f"{name} {value:.2f} ms" for name, value in late.items()] if late else ["none yet"]
-    return ", ".join([*figures, f"{pacer.missed} missed"])
+    return ", ".join([*figures, f"{pacer.missed or 'no'} deadline{'s' if pacer.missed > 1 else ''} missed"])
 
 
 def guards_text(guards: Mapping[str, Mapping[str, Any]]) -> str:

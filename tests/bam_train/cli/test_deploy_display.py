@@ -6,14 +6,7 @@ import pytest
 from rich.console import Console
 
 from bam_envs.core.timing import Pacer
-from bam_train.cli.deploy_display import (
-    LiveDisplay,
-    PlainDisplay,
-    action_labels,
-    action_lines,
-    live_display,
-    state_lines,
-)
+from bam_train.cli.deploy_display import LiveDisplay, PlainDisplay, live_display, numbers_of
 from bam_train.deploy.journal import Journal
 
 
@@ -50,7 +43,7 @@ def test_plain_display_writes_a_line_an_episode(success, end, length, line):
     display.ticked(record, 1, pacer)
     assert lines == []
     record.total, record.length, record.success, record.end = 12.3123, length, success, end
-    display.ended(record, pacer)
+    display.ended(record)
     assert lines == [f"episode 1/5 (seed 8): {line}"]
 
 
@@ -66,43 +59,25 @@ def test_redraws_are_rare_and_only_when_there_is_time(corridor):
     assert drawn == [1, 1, 2, 2, 3, 3]
 
 
-@pytest.mark.parametrize(
-    ("value", "bar"),
-    [
-        (-1.0, "#.........|.........."),
-        (0.0, "..........#.........."),
-        (0.5, "..........|....#....."),
-        (7.0, "..........|.........#"),
-    ],
-)
-def test_numbers_of_an_action(value, bar):
-    action = np.array([value, -1.0], np.float32)
-    assert list(action_lines(("dx", "grip"), action)) == [
-        ("action", f"dx   {bar} {value:+.3f}"),
-        ("", "grip #.........|.......... -1.000"),
-    ]
-
-
-def test_choices_and_long_actions():
-    assert list(action_lines((), np.int64(3))) == [("action", "3")]
-    assert list(action_lines((), np.array([1, 0]))) == [("action", "0 1"), ("", "1 0")]
-    assert len(list(action_lines((), np.zeros(100)))) == 16
-
-
-def test_signals_of_a_robot():
+def test_numbers_of_an_action_and_of_a_robot():
     env = gym.make("bam/pick-v0")
-    assert list(state_lines(env)) == []
+    action = np.array([0.5, 0.0, -1.0, 0.0, 1.0], np.float32)
+    assert numbers_of(env, action) == {"action": "dx +0.500 dy +0.000 dz -1.000 dyaw +0.000 grip +1.000"}
     env.reset(seed=0)
-    lines = dict(state_lines(env))
-    assert list(lines) == ["joint position", "joint velocity", "gripper width", "object position", "object quaternion"]
-    assert lines["joint velocity"].endswith(" rad/s")
-    assert len(lines["joint position"].split()) == 7
-    assert len(lines["object quaternion"].split()) == 4
-    assert action_labels(env) == ("dx", "dy", "dz", "dyaw", "grip")
+    rows = numbers_of(env, action)
+    signals = ["joint position", "joint velocity", "gripper width", "object position", "object quaternion"]
+    assert list(rows) == ["action", *signals]
+    assert rows["joint velocity"].endswith(" rad/s")
+    assert len(rows["joint position"].split()) == 7
+    assert len(rows["object quaternion"].split()) == 4
     env.close()
-    other = gym.make("CartPole-v1")
-    other.reset(seed=0)
-    assert (list(state_lines(other)), action_labels(other)) == ([], ())
+
+
+@pytest.mark.parametrize(("action", "text"), [(np.int64(3), "3"), (np.array([1, 0]), "1 0"), (np.zeros(100), None)])
+def test_choices_and_long_actions_of_an_environment_that_describes_nothing(action, text):
+    env = gym.make("CartPole-v1")
+    env.reset(seed=0)
+    assert numbers_of(env, action) == {"action": text or " ".join(["+0.000"] * 16)}
 
 
 def test_panel_fits_a_screen_and_says_it_all():
@@ -122,5 +97,5 @@ def test_panel_fits_a_screen_and_says_it_all():
     assert any(line.startswith("episode") and line.endswith("1 of 2, 0 succeeded") for line in lines)
     assert any(line.startswith("step") and line.endswith("1, return 0.25") for line in lines)
     assert any(line.startswith("loop") and line.endswith("no rate yet of 20") for line in lines)
-    assert any("p50 0.00 ms, p99 0.00 ms, max 0.00 ms, 0 missed" in line for line in lines)
+    assert any("p50 0.00 ms, p99 0.00 ms, max 0.00 ms, no deadline missed" in line for line in lines)
     assert not any(line.strip() == "..." for line in lines)

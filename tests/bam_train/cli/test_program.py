@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from bam_envs.core.errors import MissingExtra, UnknownName
-from bam_train.cli import console
+from bam_train.cli import console, deploy, envs, serve, train
 from bam_train.cli.console import count, duration, number, percent, rich_text, shown
 from bam_train.cli.program import guarded, run_program, usage_error
 from bam_train.errors import OutputError, SettingsError
@@ -63,7 +63,7 @@ def test_help(capsys):
         (["--steps", "many"], "prog: --steps: expected a whole number, found 'many'. Run prog --help\n"),
         (["--steps", "1e5"], "prog: --steps: expected a whole number, found '1e5'; write 100000. Run prog --help\n"),
         (["--steps"], "prog: --steps needs a value. Run prog --help\n"),
-        (["stray"], "prog: unknown option stray. Run prog --help\n"),
+        (["stray"], "prog: unexpected argument stray. Run prog --help\n"),
     ],
 )
 def test_a_command_line_that_cannot_be_read_is_one_line(arguments, line, capsys):
@@ -247,6 +247,26 @@ def test_what_goes_wrong_after_ctrl_c_is_reported(capsys):
 
     assert guarded(main, "prog") == 1
     assert capsys.readouterr().err == "prog: The robot could not be halted.\n"
+
+
+OUT_OF_RANGE = [
+    (deploy, ["a.zip", "--episodes", "-1"], "--episodes: expected a whole number of at least 1, found -1"),
+    (deploy, ["a.zip", "--seed", "-1"], "--seed: expected a whole number of at least 0, found -1"),
+    (deploy, ["a.zip", "--rate", "nan"], "--rate: expected a number above 0, found nan"),
+    (deploy, ["a.zip", "--timeout", "0"], "--timeout: expected a number above 0, found 0.0"),
+    (serve, ["--num-envs", "0"], "--num-envs: expected a whole number of at least 1, found 0"),
+    (serve, ["--port", "99999"], "--port: expected a whole number from 0 to 65535, found 99999"),
+    (serve, ["--port", "abc"], "--port: expected a whole number from 0 to 65535, found 'abc'"),
+    (train, ["--steps", "0"], "--steps: expected a whole number from 1 to 1000000000000000, found 0"),
+    (envs, ["--lst"], "unknown option --lst; there are --json and --help"),
+    (envs, ["a", "b"], "unexpected argument b"),
+]
+
+
+@pytest.mark.parametrize(("program", "arguments", "text"), OUT_OF_RANGE)
+def test_a_flag_that_cannot_be_has_one_status(run, program, arguments, text):
+    name = f"bam-{program.__name__.rpartition('.')[2]}"
+    assert run(program.main, *arguments) == (2, "", f"{name}: {text}. Run {name} --help\n")
 
 
 def test_the_box_of_a_terminal_without_unicode_is_one_line_too():

@@ -71,7 +71,6 @@ def test_it_says_who_is_in_command_and_one_line_for_each_way_in(start):
         (["--set", "robot=ws://127.0.0.1:1", "--set", "randomise=1"], "env_kwargs: unknown setting 'randomise'"),
         (["--set", "robot=ws://127.0.0.1:1"], "ws://127.0.0.1:1: refused: nothing listens there."),
         (["--fast", "--realtime"], "--realtime and --fast exclude each other; give one of the two."),
-        (["--num-envs", "0"], "--num-envs: expected a whole number of at least 1, found 0"),
         (["--env", "CartPole-v1", "--token-file", "/no/such"], "The token file /no/such cannot be read: No such file"),
         (
             ["--env", "CartPole-v1", "--cert", "/no/such", "--port", "0"],

@@ -48,7 +48,7 @@ class Silent:
     def ticked(self, record, action, pacer):
         self.ticks += 1
 
-    def ended(self, record, pacer):
+    def ended(self, record):
         self.episodes.append(record.seed)
 
 
@@ -232,14 +232,16 @@ def test_a_signal_while_closing_changes_nothing(corridor):
     assert ending == DONE
 
 
-def test_a_failing_close_is_a_fault(corridor):
+@pytest.mark.parametrize(("at", "completed"), [(0, 3), (1, 0)], ids=["at the end", "after a signal"])
+def test_a_failing_close_is_a_fault(corridor, at, completed):
     class Stuck(gym.Wrapper):
         def close(self):
             raise OSError("stuck")
 
-    ending, journal, _ = run(Stuck(gym.make(corridor)))
+    env = Driven(Stuck(gym.make(corridor)), lambda: os.kill(os.getpid(), signal.SIGINT), at)
+    ending, journal, _ = run(env)
     assert ending == Ending("fault: closing failed: OSError: stuck", 1)
-    assert journal.completed == 3
+    assert journal.completed == completed
 
 
 def test_an_action_that_is_not_finite_never_reaches_the_robot(corridor):

@@ -8,8 +8,6 @@ from bam_train.deploy.journal import (
     DeployReport,
     Ending,
     Journal,
-    Startup,
-    episodes_text,
     guards_text,
     lateness_text,
     rate_text,
@@ -39,10 +37,7 @@ def driven_pacer(period):
 
 
 def journal():
-    times = iter([0.5, 0.75])
-    journal = Journal(3, Startup(clock=lambda: next(times)))
-    journal.startup.mark("python")
-    journal.startup.finish("first action")
+    journal = Journal(3, startup=0.75)
     for success, end in ((True, "terminated"), (False, "truncated"), (False, "stopped")):
         record = journal.begin(len(journal.records))
         record.add(1.5, success)
@@ -63,7 +58,7 @@ def test_everything_is_in_the_report(corridor_checkpoint):
         "faster computer, or stop what else runs on it"
     ]
     assert values["lateness_ms"] == {"p50": 1.0, "p99": 117.4, "max": 121.0}
-    assert values["startup_cpu_s"] == {"total": 0.75, "python": 0.5, "first action": 0.25}
+    assert values["startup_cpu_s"] == {"total": 0.75}
     assert values["per_episode"][2] == {"seed": 2, "length": 1, "return": 1.5, "success": False, "end": "stopped"}
 
 
@@ -84,13 +79,10 @@ def test_a_limit_that_is_off_is_null(corridor_checkpoint):
 
 def test_lines(corridor_checkpoint):
     checkpoint = Checkpoint.open(corridor_checkpoint())
-    first, second, third = DeployReport(
-        checkpoint, 0, Ending("episodes done", 0), journal(), driven_pacer(0.05)
-    ).lines()
+    first, second = DeployReport(checkpoint, 0, Ending("episodes done", 0), journal(), driven_pacer(0.05)).lines()
     assert first == "episodes done: 2 of 3 episodes, 1 success, 4 ticks, 11.03 Hz of 20"
     assert second.startswith("lateness p50 1.00 ms, p99 ")
-    assert second.endswith(" ms, max 121.00 ms, 2 missed")
-    assert third == "first action after 0.75 s of CPU time: python 0.50, first action 0.25"
+    assert second.endswith(" ms, max 121.00 ms, 2 deadlines missed")
 
 
 def test_before_the_first_tick(corridor_checkpoint):
@@ -98,8 +90,8 @@ def test_before_the_first_tick(corridor_checkpoint):
         Checkpoint.open(corridor_checkpoint()), 0, Ending("link lost: no answer.", 4), Journal(2), Pacer(0.05)
     )
     assert report.lines() == [
-        "link lost: no answer: 0 of 2 episodes, 0 successes, 0 ticks, no rate yet of 20",
-        "lateness none yet, 0 missed",
+        "link lost: 0 of 2 episodes, 0 successes, 0 ticks, no rate yet of 20",
+        "lateness none yet, no deadline missed",
     ]
     values = report.to_json()
     assert (values["rate_hz"], values["lateness_ms"], values["startup_cpu_s"]) == (None, None, None)
@@ -108,8 +100,7 @@ def test_before_the_first_tick(corridor_checkpoint):
 def test_running_free():
     pacer = driven_pacer(None)
     assert rate_text(pacer) == "15.79 Hz, no waiting"
-    assert lateness_text(pacer) == "none yet, 0 missed"
-    assert episodes_text(Journal(1)) == "0 of 1 episodes, 0 successes"
+    assert lateness_text(pacer) == "none yet, no deadline missed"
 
 
 def test_what_the_guards_did():
@@ -120,15 +111,12 @@ def test_what_the_guards_did():
     assert guards_text({"finite": finite}) == "no guard changed a command"
 
 
-def test_startup_stages_add_up():
-    clock = iter([0.25, 0.75, 1.0, 9.0])
-    startup = Startup(clock=lambda: next(clock))
-    startup.mark("python")
-    startup.mark("policy")
-    startup.finish("first action")
-    startup.finish("first action")
-    assert startup.stages == {"python": 0.25, "policy": 0.5, "first action": 0.25}
-    assert startup.total == 1.0
+def test_the_start_is_measured_once():
+    journal = Journal(2)
+    journal.begin(0)
+    first = journal.startup
+    journal.begin(1)
+    assert journal.startup == first > 0
 
 
 def test_old_records_are_counted_and_forgotten():
