@@ -12,28 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.robot import RobotSpec
-from bam_envs.safety.guard import (
-    Guard,
-    Limits,
-    Tick,
-    ToolPosition,
-    clip,
-    columns_in,
-    joint_columns,
-    max_rate,
-    position_range,
-)
+from bam_envs.safety.guard import Guard, Limits, Tick, ToolPosition, clip, columns_in, max_rate, position_range
 
 Array = NDArray[np.float64]
 ROUNDING = 1 + 1e-9
 """A step that is exactly as long as its limit must not exceed it by floating point rounding."""
+_ROUNDS = 8
+"""How often a step is shortened until the tool is slow enough."""
 JUMP = 0.05
 """A joint may be measured this much farther away than it can have turned [rad]."""
 
 
 def fastest_joints(spec: RobotSpec, limits: Limits) -> Array:
     """Maximum speed of each joint [rad/s]: of the limits and of the data sheet."""
-    fastest: Array = np.minimum(limits.joint_speed, max_rate(spec.command)[joint_columns(spec)])
+    fastest: Array = np.minimum(limits.joint_speed, max_rate(spec.command)[columns_in(spec.command, "rad")])
     return fastest
 
 
@@ -63,7 +55,7 @@ class JointSpeed(Guard):
     number, name, unit = "G8", "joint speed", "rad/s"
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
-        self._joints, self._fastest = joint_columns(spec), fastest_joints(spec, limits)
+        self._joints, self._fastest = columns_in(spec.command, "rad"), fastest_joints(spec, limits)
         self.limit_value = float(self._fastest.max())
 
     def limit(self, tick: Tick) -> bool:
@@ -77,7 +69,7 @@ class RampIn(Guard):
     number, name, unit = "G14", "ramp-in speed", "rad/s"
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
-        self.limit_value, self._joints = limits.reset_speed, joint_columns(spec)
+        self.limit_value, self._joints = limits.reset_speed, columns_in(spec.command, "rad")
         fastest = fastest_joints(spec, limits)
         # If nothing limited a joint's speed, a first step of any length would count as near.
         free = np.where(np.isfinite(fastest), fastest, limits.reset_speed)
@@ -105,39 +97,16 @@ class ToolSpeed(Guard):
     """The tool is never faster than the limit, along a straight line from command to command."""
 
     number, name, unit = "G10", "tool speed", "m/s"
-    _ROUNDS = 8
 
     def __init__(self, spec: RobotSpec, limits: Limits, tool_position: ToolPosition) -> None:
-        self.limit_value = limits.tool_speed
-        self._joints = joint_columns(spec)
-        self._tool = tool_position
-        self._known: dict[bytes, Array] = {}
+        self.limit_value, self._tool = limits.tool_speed, tool_position
+        self._joints = columns_in(spec.command, "rad")
 
     def limit(self, tick: Tick) -> bool:
         """Shorten the step of all joints."""
-        last = tick.last[self._joints]
-        step, share = tick.command[self._joints] - last, 1.0
-        here, reach = self._position(last), self.limit_value * tick.period
-        for _ in range(self._ROUNDS):
-            travel = math.dist(here, self._position(last + share * step))
-            if travel <= reach * ROUNDING:
-                break
-            share *= 0.999 * reach / travel
-        else:
-            share = 0.0
-        if share == 1.0:
-            return False
-        tick.command[self._joints] = last + share * step
-        return True
-
-    def _position(self, joints: Array) -> Array:
-        """Position of the tool [m]. Cached: kinematics cost the most of a tick, and each command is the next `last`."""
-        key = joints.tobytes()
-        if key not in self._known:
-            if len(self._known) >= 2 * self._ROUNDS:
-                self._known.clear()
-            self._known[key] = self._tool(joints[None])[0]
-        return self._known[key]
+        last, wanted = tick.last[self._joints], tick.command[self._joints]
+        tick.command[self._joints] = slowed = within_reach(self._tool, last, wanted, self.limit_value * tick.period)
+        return slowed is not wanted
 
 
 class JointAcceleration(Guard):
@@ -152,7 +121,7 @@ class JointAcceleration(Guard):
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self.limit_value = limits.joint_acceleration
-        self._joints = joint_columns(spec)
+        self._joints = columns_in(spec.command, "rad")
         self._period = spec.period
 
     def limit(self, tick: Tick) -> bool:
@@ -205,7 +174,7 @@ class MeasuredJump(Guard):
     number, name, unit = "G7", "measured jump", "rad"
 
     def __init__(self, spec: RobotSpec) -> None:
-        self.limit_value, self._joints = JUMP, joint_columns(spec)
+        self.limit_value, self._joints = JUMP, columns_in(spec.command, "rad")
         self._fastest = max_rate(spec.command)[self._joints]
         self._labels = np.array(spec.command.labels)[self._joints]
 
@@ -221,6 +190,22 @@ class MeasuredJump(Guard):
             f"{self._labels[at]} was measured {turned[at]:.3f} rad from where it was a tick before, and it turns "
             f"{most[at]:.3f} rad at most in that time: look at what publishes its position"
         )
+
+
+def tool_travel(tool_position: ToolPosition, here: Array, there: Array) -> float:
+    """How far the tool is at the joints `there` from where it is at `here` [m]."""
+    return math.dist(*tool_position(np.stack([here, there])))
+
+
+def within_reach(tool_position: ToolPosition, here: Array, there: Array, reach: float) -> Array:
+    """The joints `there`, or so much nearer to `here` that the tool goes `reach` [m] at most."""
+    near = there
+    for _ in range(_ROUNDS):
+        travel = tool_travel(tool_position, here, near)
+        if travel <= reach * ROUNDING:
+            return near
+        near = here + (near - here) * (0.999 * reach / travel)
+    return here
 
 
 def longest_step(distance: Array, change: float) -> Array:

@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.robot import RobotSpec
-from bam_envs.safety.arm_guards import fastest_joints
-from bam_envs.safety.guard import Guard, Limits, Tick, ToolPosition, clip, columns_in, joint_columns, max_rate, ticks_of
+from bam_envs.safety.arm_guards import fastest_joints, tool_travel, within_reach
+from bam_envs.safety.guard import Guard, Limits, Tick, ToolPosition, clip, columns_in, max_rate, ticks_of
 
 Array = NDArray[np.float64]
-_ROUNDS = 8
 SHARE = 0.75
 """The gap that is allowed, as a share of how far the robot may go in a period."""
 STRIKES = 3
@@ -45,7 +44,6 @@ class Following(Guard):
 
     def forgive(self) -> None:
         """An episode begins, or a person resumed the robot."""
-        self.restart()
         self._strikes = self._good = 0
 
     def off(self, sent: Array, measured: Array) -> Array:
@@ -74,7 +72,7 @@ class JointFollowing(Following):
 
     def __init__(self, spec: RobotSpec, limits: Limits, tool_position: ToolPosition | None) -> None:
         super().__init__(spec, limits)
-        self._joints, self._period = joint_columns(spec), spec.period
+        self._joints, self._period = columns_in(spec.command, "rad"), spec.period
         self._tool, self._tool_reach = tool_position, limits.tool_speed * spec.period
         self._labels = np.array(spec.command.labels)[self._joints]
         fastest = fastest_joints(spec, limits)
@@ -94,8 +92,8 @@ class JointFollowing(Following):
         sent, measured = tick.last[self._joints], tick.measured[self._joints]
         off, allowed = self.off(sent, measured), SHARE * self._reach(tick)
         over = bool((np.abs(off) > allowed).any())  # NaN: it is not measured
-        if not over and (np.abs(off) > self._tolerance).any():
-            over = self._travel(measured, measured + off) > SHARE * self._tool_reach
+        if not over and self._tool is not None and (np.abs(off) > self._tolerance).any():
+            over = tool_travel(self._tool, measured, measured + off) > SHARE * self._tool_reach
         if not self.is_struck(over):
             return None
         at = int(np.argmax(np.abs(off) / allowed))
@@ -119,20 +117,13 @@ class JointFollowing(Following):
         jump = np.abs(wanted - explained)
         reach = self._reach(tick)
         near = np.clip(wanted, explained - reach, explained + reach)
-        if (jump > np.abs(wanted - tick.last[self._joints]) + self._tolerance).any():
-            for _ in range(_ROUNDS):  # only as far from there as the tool may go in a period
-                travel = self._travel(explained, near)
-                if travel <= self._tool_reach:
-                    break
-                near = explained + (near - explained) * (0.999 * self._tool_reach / travel)
+        farther = (jump > np.abs(wanted - tick.last[self._joints]) + self._tolerance).any()
+        if farther and self._tool is not None:  # only as far from there as the tool may go in a period
+            near = within_reach(self._tool, explained, near, self._tool_reach)
         if (near == wanted).all():
             return False
         tick.command[self._joints] = self._near(tick, near)
         return True
-
-    def _travel(self, here: Array, there: Array) -> float:
-        """Distance that the tool goes [m]; 0 if its kinematics are not known."""
-        return 0.0 if self._tool is None else math.dist(*self._tool(np.stack([here, there])))
 
     def _near(self, tick: Tick, wanted: Array) -> Array:
         """`wanted`, at most one step from the last command: what is measured may be wrong."""

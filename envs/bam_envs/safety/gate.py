@@ -1,8 +1,7 @@
 """SafeRobot: the one gate through which commands reach a live robot.
 
-Every command passes the guards of `bam_envs.safety`. If a command or state cannot be used, the robot holds at once: an
-arm is sent its last command again, a base zero. Several such ticks in a row, or a measurement beyond the data sheet,
-stop the robot until a person calls `resume`.
+If a command or state cannot be used, the robot holds at once: an arm is sent its last command again, a base zero.
+Several such ticks in a row, or a measurement beyond the data sheet, stop the robot until a person calls `resume`.
 
 Longer than most files here: the gate stands beside the seal of what it lets through, so that nobody else can make one.
 """
@@ -30,7 +29,6 @@ from bam_envs.safety.guard import (
     ToolPosition,
     columns_in,
     is_base,
-    joint_columns,
     measured_places,
     position_range,
     require_bounded,
@@ -50,10 +48,7 @@ FRESH_LOOKS, FRESH_PAUSE = 50, 0.005
 
 @final
 class ClearedCommand(metaclass=Sealed):
-    """A command that passed the guards, for one robot and one tick. Only a `SafeRobot` makes one.
-
-    It has no attribute that could be set: its content is kept outside of it.
-    """
+    """A command that passed the guards, for one robot and one tick; a `SafeRobot` makes it, and keeps its content."""
 
     __slots__ = ("__weakref__",)
 
@@ -66,32 +61,20 @@ class ClearedCommand(metaclass=Sealed):
     def __reduce_ex__(self, protocol: Any) -> NoReturn:
         raise InvalidValue("A cleared command cannot be copied: it is good for one tick.")
 
-    @property
-    def command(self) -> Array:
-        """What to send; read-only. Shape: (1, m).
-
-        Raises:
-            InvalidValue: Its tick is over, or it was never cleared.
-        """
-        return self._entry()[1]
-
     def for_robot(self, robot: object) -> Array:
-        """`command`, if it was cleared for `robot`.
+        """What to send to `robot`; read-only. Shape: (1, m).
 
         Raises:
-            InvalidValue: As of `command`, or it was cleared for another robot.
+            InvalidValue: Its tick is over, it was never cleared, or it was cleared for another robot.
         """
-        cleared_for, command = self._entry()
-        if cleared_for is not robot:
-            raise InvalidValue("The command was cleared for another robot, with that one's limits.")
-        return command
-
-    def _entry(self) -> tuple[object, Array]:
         if self not in _CLEARED:
             raise InvalidValue(
                 "The tick that this command was cleared for is over. Give the next one to the SafeRobot."
             )
-        return _CLEARED[self]
+        cleared_for, command = _CLEARED[self]
+        if cleared_for is not robot:
+            raise InvalidValue("The command was cleared for another robot, with that one's limits.")
+        return command
 
 
 _CLEARED: weakref.WeakKeyDictionary[ClearedCommand, tuple[object, Array]] = weakref.WeakKeyDictionary()
@@ -99,9 +82,8 @@ _GUARDED: weakref.WeakKeyDictionary[Any, weakref.ref[SafeRobot]] = weakref.WeakK
 
 
 def _clear(robot: object, command: Array) -> ClearedCommand:
-    """`command` (1, m) for `robot`, until it is taken out of `_CLEARED`."""
-    cleared = object.__new__(ClearedCommand)
-    kept = command.copy()
+    """A copy of `command` (1, m) for `robot`, until it is taken out of `_CLEARED`."""
+    cleared, kept = object.__new__(ClearedCommand), command.copy()
     kept.flags.writeable = False
     _CLEARED[cleared] = robot, kept
     return cleared
@@ -109,13 +91,11 @@ def _clear(robot: object, command: Array) -> ClearedCommand:
 
 @final
 class SafeRobot(metaclass=Sealed):
-    """One robot behind guards: a `Robot` around a `Robot`.
+    """One robot behind the guards of `default_guards`: a `Robot` around a `Robot`.
 
     A live robot (one whose ``needs_clearance`` is true) is handed a `ClearedCommand`, any other a plain array. It has
     ``measure()``, the newest state; ``age()``, the age of that state [s]; and, if it answers commands, ``waiting()``,
     how long it has owed the answer to one [s]. Its ``reset`` moves nothing: it measures.
-
-    The guards are those of `default_guards`, always; no attribute changes them.
 
     Args:
         robot: One robot, simulated or live.
@@ -134,7 +114,6 @@ class SafeRobot(metaclass=Sealed):
         "_bad",
         "_before",
         "_clock",
-        "_counts",
         "_further",
         "_guards",
         "_halts",
@@ -143,6 +122,7 @@ class SafeRobot(metaclass=Sealed):
         "_limits",
         "_live",
         "_places",
+        "_report",
         "_robot",
         "_sent",
         "_sent_at",
@@ -174,16 +154,17 @@ class SafeRobot(metaclass=Sealed):
         self._further = tuple(guards)
         self._guards = tuple(default_guards(robot.spec, self._limits, tool_position=tool_position))
         self._robot: Any = robot
-        self._clock = clock
-        self._is_base, self._places = is_base(robot.spec), measured_places(robot.spec, robot.spec.command.units)
-        unmeasured = {*range(len(robot.spec.command.labels))} - {place for place, _, _ in self._places}
-        missing = [robot.spec.command.labels[at] for at in sorted(unmeasured) if robot.spec.command.units[at] == "rad"]
-        if missing:  # the guards could not know where the arm is
-            names = ", ".join(missing)
+        self._clock, self._is_base, command = clock, is_base(robot.spec), robot.spec.command
+        self._places = measured_places(robot.spec, command.units)
+        self._speeds = measured_places(robot.spec, [f"{unit}/s" for unit in command.units])
+        unmeasured = {*columns_in(command, "rad").tolist()} - {place for place, _, _ in self._places}
+        if unmeasured:  # the guards could not know where the arm is
+            names = ", ".join(command.labels[at] for at in sorted(unmeasured))
             raise InvalidValue(f"The guards need {names} of {robot.spec.name} measured in rad; no signal has it.")
-        self._speeds = measured_places(robot.spec, [f"{unit}/s" for unit in robot.spec.command.units])
-        every = (*self._further, *self._guards)
-        self._counts = {guard.name: {"altered": 0, "held": 0, "stopped": 0} for guard in every}
+        self._report: dict[str, dict[str, Any]] = {}
+        for one in (*self._further, *self._guards):
+            facts = {"number": one.number, "limit": one.limit_value, "unit": one.unit}
+            self._report[one.name] = {**facts, "altered": 0, "held": 0, "stopped": 0}
         self._stopped: tuple[str, str] | None = None
         self._bad, self._halts, self._status = 0, 0, ""
         self._sent_at: float | None = None
@@ -250,9 +231,7 @@ class SafeRobot(metaclass=Sealed):
 
         Commands that were altered on the way to a start pose are not counted.
         """
-        every = (*self._further, *self._guards)
-        facts = {one.name: {"number": one.number, "limit": one.limit_value, "unit": one.unit} for one in every}
-        return {name: {**fact, **self._counts[name]} for name, fact in facts.items()}
+        return {name: dict(row) for name, row in self._report.items()}
 
     def connect(self) -> None:
         """Connect the robot. Moves nothing."""
@@ -288,14 +267,9 @@ class SafeRobot(metaclass=Sealed):
     def _tick(self, goal: Array, approach: bool) -> Tick:
         pause = self._pause()
         last = self._begin_at(pause)
-        measured, period = self._measured(), self.spec.period
+        measured, speeds, period = self._measured(self._places), self._measured(self._speeds), self.spec.period
         before = np.full_like(measured, np.nan) if self._before is None else self._before
         self._before = measured
-        # The rate of each number: measured, else from tick to tick.
-        velocity: Array = (measured - before) / period
-        if self._state is not None:
-            for place, name, column in self._speeds:
-                velocity[place] = self._state.signals[name][0, column]
         time_passed = min(period, pause or period)
         waiting = getattr(self._live, "waiting", None)
         return Tick(
@@ -305,7 +279,7 @@ class SafeRobot(metaclass=Sealed):
             last_step=self._speed * time_passed,
             measured=measured,
             before=before,
-            velocity=velocity,
+            velocity=np.where(np.isnan(speeds), (measured - before) / period, speeds),
             age=self.age(),
             period=time_passed,
             pause=pause,
@@ -331,33 +305,32 @@ class SafeRobot(metaclass=Sealed):
             return last
         if self._live is not None and self._state is not None:
             self._state = self._fresh_state()
-        measured, command = self._measured(), self.spec.command
+        measured, command = self._measured(self._places), self.spec.command
         if self._is_base:
             last = np.zeros_like(measured)
         elif self._sent is None:
             # A gripper that is not measured is taken as open; fingers may be measured a little beyond their range.
             last = np.clip(np.where(np.isfinite(measured), measured, command.high), command.low, command.high)
         else:  # the gripper goes on holding
-            last, joints = self._sent.copy(), joint_columns(self.spec)
+            last, joints = self._sent.copy(), columns_in(command, "rad")
             last[joints] = measured[joints]
         self._last, self._speed, self._before = last, np.zeros_like(last), None
-        self._restart_guards()
+        self._restart()
         return last
 
-    def _measured(self) -> Array:
-        """The measured value of each number of the command; NaN where nothing is measured. Shape: (m,)."""
+    def _measured(self, places: list[tuple[int, str, int]]) -> Array:
+        """What is measured at `places`, for each number of the command; NaN where nothing is. Shape: (m,)."""
         if self._state is None:
             raise ResetNeeded("Nothing is known of the robot yet. Call reset() first.")
         measured = np.full(len(self.spec.command.labels), np.nan)
-        for place, name, column in self._places:
+        for place, name, column in places:
             measured[place] = self._state.signals[name][0, column]
         return measured
 
     def _fresh_state(self) -> RobotState:
-        """The newest state. An old one is waited out briefly: after a pause of this process newer ones lie unread.
+        """The newest state, or `StaleState`: even holding where the robot was some time ago would be a motion.
 
-        Raises:
-            StaleState: None came. An old state is no place to begin at: even holding there would be a motion.
+        An old one is waited out briefly: after a pause of this process newer ones lie unread.
         """
         limit = next(guard.limit_value for guard in self._guards if isinstance(guard, Freshness))
         for _ in range(FRESH_LOOKS):
@@ -373,13 +346,10 @@ class SafeRobot(metaclass=Sealed):
             limit,
         )
 
-    def _restart_guards(self) -> None:
+    def _restart(self, *, forgive: bool = False) -> None:
         for guard in (*self._further, *self._guards):
             guard.restart()
-
-    def _forgive(self) -> None:
-        for guard in self._guards:
-            if isinstance(guard, Following):
+            if forgive and isinstance(guard, Following):
                 guard.forgive()
 
     def _fault(self, tick: Tick) -> tuple[Guard, str] | None:
@@ -405,7 +375,7 @@ class SafeRobot(metaclass=Sealed):
 
     def _note(self, guard: Guard, what: str) -> None:
         self._status = guard.title
-        self._counts[guard.name][what] += 1
+        self._report[guard.name][what] += 1
 
     def _hold(self, tick: Tick, guard: Guard, reason: str) -> None:
         """Send what leaves the robot where it is; stop the robot if that has happened too often."""
@@ -419,7 +389,7 @@ class SafeRobot(metaclass=Sealed):
     def _send(self, tick: Tick, halts: int) -> RobotState:
         """Hand the command over; if anything goes wrong, the robot is halted."""
         cleared = _clear(self._robot, tick.command[None])
-        handed: Any = cleared.command if self._live is None else cleared
+        handed: Any = tick.command[None].copy() if self._live is None else cleared
         done, self._sent_at = False, self._clock()
         try:
             self._state = self._robot.step(handed)
@@ -442,7 +412,7 @@ class SafeRobot(metaclass=Sealed):
     def _stop(self, guard: Guard, reason: str) -> NoReturn:
         """Halt, and refuse commands until a person resumes."""
         self.halt()
-        self._counts[guard.name]["stopped"] += 1
+        self._report[guard.name]["stopped"] += 1
         why = self.not_ready()
         said = "" if why is None else f"not ready: {why}: "
         self._stopped = guard.name, f"{guard.title}: {said}{reason}"
@@ -459,7 +429,7 @@ class SafeRobot(metaclass=Sealed):
     def resume(self) -> None:
         """Let a stopped robot move again, from where it is. A person decides this, never a program."""
         self._stopped, self._bad, self._last, self._sent_at, self._before = None, 0, None, None, None
-        self._forgive()
+        self._restart(forgive=True)
 
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
         """Bring the robot to `initial`; a live arm opens its gripper and goes to its start pose slowly.
@@ -475,13 +445,12 @@ class SafeRobot(metaclass=Sealed):
             self._forget()
         else:
             self.halt()
-        self._forgive()
+        self._restart(forgive=True)
         state = self._take(self._robot.reset(env_ids, initial))
         if start is not None and (self._joints_off(start) or not self._is_open()):
             self._approach(start)
             state = self._take(self._robot.reset(env_ids, initial))  # put back what the arm may have pushed
-            self._forgive()
-        self._restart_guards()
+        self._restart(forgive=True)
         begin = self._begin_at(self._pause())
         self._sent_at = None  # the first command may take its time
         return replace(_copied(state), command=begin[None].copy())
@@ -509,13 +478,13 @@ class SafeRobot(metaclass=Sealed):
 
     def _joints_off(self, start: Array) -> dict[str, float]:
         """The joints that are not measured at `start` (m,), with how far they have to go [rad]."""
-        far, near = start - self._measured(), self.limits.reset_tolerance
+        far, near = start - self._measured(self._places), self.limits.reset_tolerance
         columns = columns_in(self.spec.command, "rad")
         return {self.spec.command.labels[at]: float(far[at]) for at in columns if not abs(far[at]) <= near}
 
     def _is_open(self) -> bool:
         """Whether the gripper is measured open; one that is not measured (NaN) is not waited for."""
-        far = np.array(self.spec.command.high) - self._measured()
+        far = np.array(self.spec.command.high) - self._measured(self._places)
         return not (np.abs(far)[columns_in(self.spec.command, "m")] > GRIPPER_NEAR).any()
 
     def _approach(self, start: Array) -> None:
@@ -528,8 +497,12 @@ class SafeRobot(metaclass=Sealed):
 
         opened = self._begin_at(0.0).copy()
         opened[grippers] = start[grippers]
-        self._go(opened, GRIPPER_TIME, self._is_open)
-        self._go(start, self.limits.reset_timeout, is_reached)
+        goals = (opened, GRIPPER_TIME, self._is_open), (start, self.limits.reset_timeout, is_reached)
+        for goal, longest, done in goals:
+            for _ in range(math.ceil(longest / self.spec.period)):
+                if done():
+                    break
+                self._advance(goal, approach=True)
         if not is_reached():
             self.halt()
             off, why = self._joints_off(start), self.not_ready()
@@ -540,13 +513,6 @@ class SafeRobot(metaclass=Sealed):
                 "Look for what holds it, or raise the limit reset_timeout.",
                 off,
             )
-
-    def _go(self, goal: Array, longest: float, done: Callable[[], bool]) -> None:
-        """Tick towards `goal` until `done`, at most for `longest` [s]."""
-        for _ in range(math.ceil(longest / self.spec.period)):
-            if done():
-                return
-            self._advance(goal, approach=True)
 
     def halt(self) -> None:
         """Stop moving and keep the link; the next command begins where the robot is. From any thread; never raises."""

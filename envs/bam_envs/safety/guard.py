@@ -116,8 +116,7 @@ class Limits:
 BOUNDS: Mapping[str, tuple[float, float, str]] = MappingProxyType(
     {one.name: one.metadata["bounds"] for one in fields(Limits)}
 )
-"""Minimum and maximum of each limit of a live robot, with its unit. They hold whoever sets the limit: no typing error
-opens a guard."""
+"""Minimum and maximum of each limit of a live robot, with its unit, whoever sets it: no typing error opens a guard."""
 
 
 def require_bounded(limits: Limits, spec: RobotSpec) -> None:
@@ -173,7 +172,7 @@ class Tick:
 
 
 class Sealed(type):
-    """A class whose attributes cannot be replaced, so that no assignment opens a guard."""
+    """A class whose attributes cannot be replaced."""
 
     def __setattr__(cls, name: str, value: object) -> None:
         raise AttributeError(f"{cls.__name__}.{name} cannot be replaced: it keeps a robot safe.")
@@ -232,14 +231,6 @@ def columns_in(signal: SignalSpec, unit: str) -> NDArray[np.int64]:
     return np.flatnonzero([one == unit for one in signal.units])
 
 
-def joint_columns(spec: RobotSpec) -> Any:
-    """Indices of the joints in a command: a slice if they are side by side, which is quicker."""
-    columns = columns_in(spec.command, "rad")
-    if len(columns) and columns[-1] - columns[0] + 1 == len(columns):
-        return slice(int(columns[0]), int(columns[-1]) + 1)
-    return columns
-
-
 def is_base(spec: RobotSpec) -> bool:
     """Whether commands are speeds of a base; else they are positions of an arm's joints."""
     return "m/s" in spec.command.units
@@ -270,10 +261,7 @@ def position_range(spec: RobotSpec, limits: Limits) -> tuple[Array, Array]:
 
 
 def measured_places(spec: RobotSpec, units: Sequence[str]) -> list[tuple[int, str, int]]:
-    """Where the numbers of a command are measured, in `units`: index in the command, signal, column of the signal.
-
-    A number is measured by the first signal that has one with the same label and that unit.
-    """
+    """Index in the command, signal, and column of the first signal that has the same label in that one of `units`."""
     measured = {
         pair: (signal.name, column)
         for signal in reversed(spec.signals)

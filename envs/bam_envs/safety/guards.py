@@ -1,11 +1,5 @@
 """The guards between a live robot and its commands, in one list: `default_guards`.
 
-Each guard has a number, a name, a limit and a unit, and acts by one of three methods:
-
-* `Guard.fault`: the command is not executed at all, the robot holds;
-* `Guard.limit`: the command goes as far as the limit and no farther;
-* `Guard.trip`: a measurement is beyond what the robot may ever do, the robot is stopped.
-
 All of them look at one robot and at the last command that was *sent*; speeds and accelerations hold over the real time
 since then.
 """
@@ -19,28 +13,9 @@ from numpy.typing import NDArray
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS
 from bam_envs.core.robot import RobotSpec, RobotState
-from bam_envs.safety.arm_guards import (
-    GripperSpeed,
-    JointAcceleration,
-    JointSpeed,
-    MeasuredJump,
-    PositionLimits,
-    RampIn,
-    ToolSpeed,
-)
+from bam_envs.safety import arm_guards as arm
 from bam_envs.safety.following import BaseFollowing, JointFollowing
-from bam_envs.safety.guard import (
-    Guard,
-    Limits,
-    Tick,
-    ToolPosition,
-    clip,
-    columns_in,
-    is_base,
-    joint_columns,
-    max_rate,
-    ticks_of,
-)
+from bam_envs.safety.guard import Guard, Limits, Tick, ToolPosition, clip, columns_in, is_base, max_rate, ticks_of
 
 Array = NDArray[np.float64]
 LATE = 2.0
@@ -52,7 +27,6 @@ MEASURED_MARGIN = 1.3
 """A measured speed may be this many times its limit: commands keep the limit, and controllers overshoot a little."""
 MEASURED_PATIENCE = 3
 """Ticks: a network that bunches commands up has them executed within one, and a robot that is held slows down."""
-_MOMENT = 1e-3
 
 
 class Shape(Guard):
@@ -64,11 +38,7 @@ class Shape(Guard):
         self.limit_value = len(spec.command.labels)
 
     def numbers(self, command: Array) -> Array:
-        """`command` (1, m) as numbers (m,); a copy.
-
-        Raises:
-            InvalidValue: It has another shape, or is not made of numbers.
-        """
+        """A copy of `command` (1, m) as numbers (m,); `InvalidValue` for another shape, and for what are no numbers."""
         try:
             array = np.array(command, dtype=np.float64)
         except (TypeError, ValueError) as error:
@@ -244,7 +214,7 @@ def default_guards(
     """Every guard that a robot of `spec` has, in the order in which they are asked.
 
     Args:
-        spec: Of the robot; an arm is commanded in rad, a base in m/s and rad/s.
+        spec: An arm is commanded in rad, a base in m/s and rad/s.
         limits: How far they let it go.
         tool_position: Forward kinematics; those of a UR5e are known.
 
@@ -266,35 +236,30 @@ def default_guards(
 
 def _arm_guards(spec: RobotSpec, limits: Limits, tool_position: ToolPosition | None) -> list[Guard]:
     position = None if math.isinf(limits.tool_speed) else _kinematics(spec, tool_position)
-    joints = joint_columns(spec)
-    measured: list[Guard] = [MeasuredJump(spec)]
+    joints = columns_in(spec.command, "rad")
+    measured: list[Guard] = [arm.MeasuredJump(spec)]
     if math.isfinite(limits.joint_speed):
         measured.append(MeasuredSpeed("G8", "joint speed", "rad/s", limits.joint_speed, lambda t: t.velocity[joints]))
     tool: list[Guard] = []
     if position is not None:
 
         def tool_speed(tick: Tick) -> Array:
-            here = tick.measured[joints]
-            ends = position(np.stack([here, here + tick.velocity[joints] * _MOMENT]))
-            return np.array([math.dist(*ends) / _MOMENT])
+            here, moment = tick.measured[joints], 1e-3
+            return np.array([arm.tool_travel(position, here, here + tick.velocity[joints] * moment) / moment])
 
         measured.append(MeasuredSpeed("G10", "tool speed", "m/s", limits.tool_speed, tool_speed))
-        tool.append(ToolSpeed(spec, limits, position))
-    gripper = [GripperSpeed(spec)] if "m" in spec.command.units else []
-    smooth = [JointAcceleration(spec, limits)] if math.isfinite(limits.joint_acceleration) else []
-    speed = [JointSpeed(spec, limits), RampIn(spec, limits), *tool]
+        tool.append(arm.ToolSpeed(spec, limits, position))
+    gripper = [arm.GripperSpeed(spec)] if "m" in spec.command.units else []
+    smooth = [arm.JointAcceleration(spec, limits)] if math.isfinite(limits.joint_acceleration) else []
+    speed = [arm.JointSpeed(spec, limits), arm.RampIn(spec, limits), *tool]
     # The tool's speed is limited twice: joints that change their speed one by one can speed the tool up.
     last = [*smooth, *tool, JointFollowing(spec, limits, position)]
-    return [*measured, PositionLimits(spec, limits), *gripper, *speed, *last]
+    return [*measured, arm.PositionLimits(spec, limits), *gripper, *speed, *last]
 
 
 def _kinematics(spec: RobotSpec, tool_position: ToolPosition | None) -> ToolPosition:
-    """Forward kinematics.
-
-    Raises:
-        InvalidValue: They are not known, or the tool stays where it is when the joints turn.
-    """
-    joints = joint_columns(spec)
+    """Forward kinematics; `InvalidValue` if they are not known, or say that the tool stays when the joints turn."""
+    joints = columns_in(spec.command, "rad")
     if tool_position is None:
         if tuple(np.array(spec.command.labels)[joints]) == UR_JOINTS:
             return UR5E_GRIPPER.tool_position
