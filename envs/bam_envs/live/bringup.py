@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, ProtocolError, RemoteError, StaleState
 from bam_envs.core.timing import Deadline
 from bam_envs.live.state import LiveState, Mailbox
-from bam_envs.ros.codec import INFO_SERVICE, RobotInfo, has_room, read_info
+from bam_envs.ros.codec import RobotInfo, has_room
 from bam_envs.ros.freshness import Tagger
 from bam_envs.ros.messages import bare_type, same_type
 from bam_envs.ros.profile_tables import Readiness, RobotProfile, Sink
@@ -39,30 +39,20 @@ _ACTIVE = ("active", "running")
 """The states of a controller that takes commands, in ROS 2 and in ROS 1."""
 
 
-def ask_info(link: RosbridgeLink) -> RobotInfo | None:
-    """What the robot says of itself; None if it does not describe itself, like robots that are not served by us."""
-    service = link.namespace + INFO_SERVICE
-    answer = ask(link, service)
-    return None if answer is None else read_info(answer.get("message"), service)
-
-
-def ask(link: RosbridgeLink, service: str, timeout: float = TIMEOUT, tries: int = _TRIES) -> dict[str, Any] | None:
-    """The answer of `service`, which takes no arguments; None if there is no such service.
+def ask(link: RosbridgeLink, service: str, tries: int = _TRIES) -> dict[str, Any] | None:
+    """The answer of `service`, which takes no arguments; None if there is no such service, `LinkLost` without answer.
 
     It is called several times: a ROS 2 bridge creates a client for each call, and loses an answer that comes before
     client and service have discovered each other.
-
-    Raises:
-        LinkLost: No answer.
     """
     try:
-        return link.call(service, "", {}, timeout / _TRIES)
+        return link.call(service, "", {}, TIMEOUT / _TRIES)
     except RemoteError:  # there is no such service
         return None
     except LinkLost:
         if tries == 1 or not link.is_up:
             raise
-        return ask(link, service, timeout, tries - 1)
+        return ask(link, service, tries - 1)
 
 
 def info_by_profile(url: str, profile: RobotProfile, unknown: Iterable[str] = ()) -> RobotInfo:
@@ -74,11 +64,7 @@ def info_by_profile(url: str, profile: RobotProfile, unknown: Iterable[str] = ()
 
 
 def tagged_sinks(profile: RobotProfile, mode: str | None, info: RobotInfo) -> tuple[Sink, ...]:
-    """The sinks whose messages have room for a tag, if the profile has such a mode of sending commands.
-
-    Raises:
-        InvalidValue: The robot answers each command, and commands sent in this mode cannot be told apart.
-    """
+    """The sinks whose messages have room for a tag, if the profile has such a mode; lockstep requires one."""
     modes = list(profile.commands) if mode is None else [mode]
     for one in modes:
         sinks = profile.sinks(one)
@@ -93,23 +79,13 @@ def tagged_sinks(profile: RobotProfile, mode: str | None, info: RobotInfo) -> tu
 
 
 class TopicTypes:
-    """Asks a server for the types of its topics, if it offers rosapi.
-
-    Args:
-        link: To the server.
-        profile: Its name is in error messages.
-        timeout: Longest wait for an answer, and for a listener [s].
-    """
+    """Asks a server for the types of its topics, if it offers rosapi; waits `timeout` [s] for each at most."""
 
     def __init__(self, link: RosbridgeLink, profile: RobotProfile, timeout: float) -> None:
         self._link, self._profile, self._timeout, self._answers = link, profile, timeout, True
 
     def check(self, topic: str, expected: str) -> str:
-        """The type to use for `topic`: the server's, or `expected` if the server does not know.
-
-        Raises:
-            ProtocolError: `topic` has another type there.
-        """
+        """The type to use for `topic`, `expected` if the server does not know; `ProtocolError` if it has another."""
         found = self._found(topic)
         if found and not same_type(found, expected):
             raise self._misfit(topic, expected, found)
@@ -121,11 +97,7 @@ class TopicTypes:
         return same_type(found, kind) if found else not self._answers
 
     def check_listened(self, topic: str, sink: Sink) -> str:
-        """As `check`, for the `topic` of `sink`, which somebody must listen to, with or without stamp as expected.
-
-        Raises:
-            ProtocolError: `topic` has another type there, or nobody knows it.
-        """
+        """As `check`, for the `topic` of `sink`, which somebody must listen to, with or without stamp as expected."""
         deadline, expected = Deadline(self._timeout), sink.type
         while not self._found(topic) and self._answers:
             if deadline.passed:
@@ -160,12 +132,7 @@ class TopicTypes:
 
 
 def await_first(link: RosbridgeLink, state: LiveState, profile: RobotProfile, timeout: float) -> None:
-    """Wait until every source has sent a message, at most `timeout` [s].
-
-    Raises:
-        LinkLost: The link dropped.
-        StaleState: A source is silent; names its topic, its type, and the last status of the server.
-    """
+    """Wait until every source has sent a message; `StaleState` names those that are silent after `timeout` [s]."""
     wanted = {source.signal: f"{link.namespace}{source.topic} ({source.type})" for source in state.sources}
     arrived = state.mailbox.wait_for(lambda slots: wanted.keys() <= slots.keys() or not link.is_up, timeout)
     if not link.is_up:
@@ -185,11 +152,6 @@ class LiveReadiness:
     """What a robot says of being ready to move: the topics in `profile.readiness`, and the controllers of `sinks`.
 
     All of it is optional: a robot that does not say something is driven without, and `unknown` names it.
-
-    Args:
-        profile: The robot.
-        sinks: Where its commands go.
-        types: Tells which topics the server may have.
     """
 
     def __init__(self, profile: RobotProfile, sinks: tuple[Sink, ...], types: TopicTypes) -> None:
@@ -223,8 +185,7 @@ class LiveReadiness:
     def fault(self, *, moving: bool) -> str | None:
         """Why the robot is not ready, by the newest messages; None if nothing says so. Any thread.
 
-        Args:
-            moving: Leave out measured numbers (`at_least`), which may dip while the robot moves.
+        While it is `moving`, measured numbers (`at_least`) are left out, for they may dip.
         """
         letters = self.mailbox.newest()
         for one in self._heard:
@@ -275,9 +236,9 @@ class LiveReadiness:
 
 
 class DrivingSession:
-    """The session of a client: opened by a service call, kept alive while it drives, left at the end.
+    """The session of a client: opened by a service call, left at the end.
 
-    Signs commands, and renews the lease in a thread of its own: a slow driver must not lose it.
+    While it drives, a thread of its own renews the lease: a slow driver must not lose it.
     """
 
     def __init__(self) -> None:
@@ -288,17 +249,17 @@ class DrivingSession:
         self._left = threading.Event()
 
     def open(self, link: RosbridgeLink) -> None:
-        """Leave the session that is open, and open a new one on `link` if the robot's side has sessions.
-
-        Raises:
-            LinkLost: No answer.
-            ProtocolError: The answer is malformed.
-        """
+        """Leave the session that is open, and open a new one on `link` if the robot's side has sessions."""
         link.advertise(link.namespace + LEASE_TOPIC, "std_msgs/String")
         self.leave()
         answer = ask(link, link.namespace + SESSION_SERVICE)
         if answer is not None:
             self.tagger, self._link = read_session(answer, SESSION_SERVICE), link
+
+    @property
+    def is_driving(self) -> bool:
+        """Whether the lease is renewed."""
+        return self._thread is not None
 
     def drive(self) -> None:
         """Renew the lease from now on."""

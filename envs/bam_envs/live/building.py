@@ -12,8 +12,6 @@ from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.safety.guard import Limits, ToolPosition
 
-DEFAULT_PROFILE = "ur5e"
-
 
 def live_robot(
     url: str,
@@ -31,8 +29,7 @@ def live_robot(
     Args:
         url: ``ws://host:port`` or ``wss://host:port``, with a namespace behind it if its topics have one.
         spec: What the task needs of it, such as the spec of its simulated robot; None: everything it measures.
-        profile: Its topics: a shipped name or a file. None: the shipped one that takes the commands of `spec`; topics
-            that take other commands are left alone.
+        profile: Its topics: a shipped name or a file. None: the shipped one that takes the commands of `spec`.
         limits: How far the guards let it go; None: those of the profile.
         tool_position: Forward kinematics of an arm other than a UR5e, (n, k) [rad] to (n, 3) [m].
         command: Command mode, such as ``"trajectory"``; None: the profile's default.
@@ -46,10 +43,10 @@ def live_robot(
     """
     require_robot_address(url)
     endpoint = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file)
-    if profile is None:
-        chosen = load_profile(DEFAULT_PROFILE) if spec is None else profile_for(spec)
+    if profile is None and spec is not None:
+        chosen = profile_for(spec)
     else:
-        chosen = profile if isinstance(profile, RobotProfile) else load_profile(profile)
+        chosen = profile if isinstance(profile, RobotProfile) else load_profile(profile or "ur5e")
     robot = RosbridgeRobot(endpoint, chosen, spec=spec, command=command)
     return SafeRobot(robot, limits=limits or profile_limits(chosen), tool_position=tool_position)
 
@@ -61,12 +58,8 @@ def profile_limits(profile: RobotProfile) -> Limits:
 
 
 def require_robot_address(url: str) -> None:
-    """Check the form of a live robot's address.
-
-    Raises:
-        InvalidValue: Says what was expected.
-    """
-    scheme, separator, _ = url.partition("://")
+    """Check the form of a live robot's address: `InvalidValue` says what was expected."""
+    scheme, separator, rest = url.partition("://")
     if separator and scheme in ("ws", "wss"):
         return
     expected = "A live robot's address is ws://host:port or wss://host:port"
@@ -74,7 +67,7 @@ def require_robot_address(url: str) -> None:
         raise InvalidValue(
             f"{expected}; {url!r} is that of a whole environment. Give it as transport={url!r} (--transport)."
         )
-    address = url.partition("://")[2] if separator else url
+    address = rest if separator else url
     if not address:
         raise InvalidValue(f"{expected}, such as ws://10.0.0.5:9090, not {url!r}.")
     raise InvalidValue(f"{expected}, not {url!r}. Did you mean {f'ws://{address}'!r}?")

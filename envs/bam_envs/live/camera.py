@@ -23,16 +23,16 @@ Pixels = NDArray[Any]
 FIRST_IMAGE = 3.0
 """Longest wait for a first image, if the endpoint says nothing else [s]."""
 _SLOT = "image"
-_COLOURS: dict[str, tuple[int, list[int]]] = {
-    "rgb8": (3, [0, 1, 2]),
-    "bgr8": (3, [2, 1, 0]),
-    "rgba8": (4, [0, 1, 2, 3]),
-    "bgra8": (4, [2, 1, 0, 3]),
-    "mono8": (1, [0]),
-    "8UC1": (1, [0]),
-    "8UC3": (3, [2, 1, 0]),
+_COLOURS = {
+    "rgb8": [0, 1, 2],
+    "bgr8": [2, 1, 0],
+    "rgba8": [0, 1, 2, 3],
+    "bgra8": [2, 1, 0, 3],
+    "mono8": [0],
+    "8UC1": [0],
+    "8UC3": [2, 1, 0],
 }
-"""Encodings of raw images: bytes per pixel, and their order as RGB."""
+"""Encodings of raw images: which byte of a pixel is red, green, blue and alpha."""
 _DEPTHS = ("16UC1", "mono16", "32FC1")
 
 
@@ -126,11 +126,7 @@ class LiveCamera:
 
 
 def decode_pixels(message: Mapping[str, Any], where: str) -> Pixels:
-    """The pixels of a CompressedImage or a raw Image; see `CameraImage`.
-
-    Raises:
-        ProtocolError: It is neither; `where` names it.
-    """
+    """The pixels of a CompressedImage or a raw Image, see `CameraImage`; `ProtocolError` for anything else."""
     try:
         pixels = _raw(message) if "encoding" in message else read_color_message(message)
     except ProtocolError as error:
@@ -146,10 +142,10 @@ def _raw(message: Mapping[str, Any]) -> Pixels | None:
         return read_depth_message(message)
     if encoding not in _COLOURS:
         raise ProtocolError(f"encoding must be one of {', '.join([*_COLOURS, *_DEPTHS])}, not {encoding!r}.")
-    channels, order = _COLOURS[encoding]
+    order = _COLOURS[encoding]
     try:
         rows = np.frombuffer(message_bytes(message), np.uint8).reshape(message["height"], -1)
-        pixels = rows[:, : message["width"] * channels].reshape(message["height"], message["width"], channels)
+        pixels = rows[:, : message["width"] * len(order)].reshape(message["height"], message["width"], len(order))
     except (KeyError, TypeError, ValueError) as error:
-        raise ProtocolError(f"data must be height x width pixels of {channels} bytes: {error}.") from error
-    return np.ascontiguousarray(pixels[:, :, 0] if channels == 1 else pixels[:, :, order])
+        raise ProtocolError(f"data must be height x width pixels of {len(order)} bytes: {error}.") from error
+    return np.ascontiguousarray(pixels[:, :, 0 if len(order) == 1 else order])

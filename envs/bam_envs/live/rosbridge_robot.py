@@ -2,7 +2,6 @@
 
 It has two connections: one carries states and commands, the other one only the halt, because a ROS 2 bridge holds back
 everything behind a service call that is running. While a connection is down, nothing is sent and nothing is kept.
-
 Longer than other modules because it is one object with one lifecycle: connect, reset, step, halt, close.
 """
 
@@ -34,13 +33,13 @@ from bam_envs.live.bringup import (
     DrivingSession,
     LiveReadiness,
     TopicTypes,
-    ask_info,
+    ask,
     await_first,
     info_by_profile,
     tagged_sinks,
 )
 from bam_envs.live.state import Letter, LiveState
-from bam_envs.ros.codec import HALT_TOPIC, SCENE_TOPIC, RobotInfo, encode_sink, has_room
+from bam_envs.ros.codec import HALT_TOPIC, INFO_SERVICE, SCENE_TOPIC, RobotInfo, encode_sink, has_room, read_info
 from bam_envs.ros.freshness import Tag
 from bam_envs.ros.profile_tables import RobotProfile, Sink
 from bam_envs.rosbridge.client import RosbridgeLink
@@ -119,7 +118,6 @@ class RosbridgeRobot:
         self._sending, self._halts = threading.Lock(), 0
         self._halt_failed = False  # and that was reported
         self._commanded = False  # since `connect`
-        self._drove = False  # since the session was opened
         self._session_over = False  # as the robot's side said
         self._refusals: list[BamEnvsError] = []
         self._sent: Array | None = None
@@ -168,7 +166,9 @@ class RosbridgeRobot:
         control.on_status(self._on_status)
         control.connect()
         halting.connect()
-        said = ask_info(control)
+        service = self.namespace + INFO_SERVICE
+        answer = ask(control, service)
+        said = None if answer is None else read_info(answer.get("message"), service)
         self._describes_itself, self._info = said is not None, said or info_by_profile(self.url, self.profile)
         if said is not None:
             self._sinks = tagged_sinks(self.profile, self._mode, said)
@@ -221,7 +221,7 @@ class RosbridgeRobot:
         """From now on commands are signed for a new session, if the robot's side has sessions."""
         if self._describes_itself:
             self._session.open(control)
-        self._drove = self._session_over = False
+        self._session_over = False
 
     def _on_down(self, error: LinkLost) -> None:
         self._cut.set()
@@ -259,7 +259,7 @@ class RosbridgeRobot:
         control.wait_up(_RESET_TIMEOUT)
         if control.epoch != self._epoch or self._cut.is_set():
             self._begin(control)
-        elif self._session_over or (self._drove and self._state.echo()[0] != self._session.tagger.session):
+        elif self._session_over or (self._session.is_driving and self._state.echo()[0] != self._session.tagger.session):
             self._open_session(control)  # the robot's side began anew, and does not know the old one
         self._refusals.clear()
         self._require_ready(self.not_ready())
@@ -272,7 +272,7 @@ class RosbridgeRobot:
     def _set_scene(self, control: RosbridgeLink, initial: Initial) -> None:
         pose = initial.signals.get("object_pose")
         scene = {"object_pose": None if pose is None else pose.tolist(), "seeds": np.asarray(initial.seeds).tolist()}
-        self._drive()
+        self._session.drive()
         rpc = StringRpc(control, self.namespace + SCENE_TOPIC, self._session.tagger)
         try:
             rpc.call(scene, _RESET_TIMEOUT)
@@ -316,7 +316,9 @@ class RosbridgeRobot:
         self._send(control, values, tag, halts)
         if not lockstep:
             self._cut.wait(max(0.0, self._pacer.slack))
-        elif not self._state.await_answer(tag.echo, self._is_interrupted, self._answer_timeout):
+        elif not self._state.await_answer(
+            tag.echo, lambda: self._cut.is_set() or bool(self._refusals), self._answer_timeout
+        ):
             raise StaleState(
                 f"{self.url}: no state answered the command in {self._answer_timeout:g} s. Does the simulation run?",
                 self.age(),
@@ -333,18 +335,11 @@ class RosbridgeRobot:
         with self._sending:
             if self._halts == halts:
                 self._commanded = True
-                self._drive()
+                self._session.drive()
                 control.publish_all([(self.namespace + topic, message) for topic, _, message in envelopes])
                 self._sent, self._sent_at = command.copy(), self._clock()
                 if self._answers:
                     self._owed[tag.sequence] = self._sent_at
-
-    def _drive(self) -> None:
-        self._drove = True
-        self._session.drive()
-
-    def _is_interrupted(self) -> bool:
-        return self._cut.is_set() or bool(self._refusals)
 
     def measure(self) -> RobotState:
         """The newest state, with the command that was sent last.
@@ -402,7 +397,7 @@ class RosbridgeRobot:
         """Send a robot that hears no halts what it holds with; what is not known is not commanded."""
         try:
             # Going back to where the robot was some time ago would be a motion.
-            signals = self._state.signals() if self._state.age() <= self.profile.max_age else {}
+            signals = self._state.read()[0] if self._state.age() <= self.profile.max_age else {}
         except BamEnvsError:  # the measurement cannot be read: hold what was sent
             signals = {}
         hold, sent = self._at_rest(signals), self._sent

@@ -45,11 +45,7 @@ class Letter:
 
 
 class Mailbox:
-    """The newest message of each signal, by name, for threads that look or wait.
-
-    Args:
-        clock: Monotonic clock [s].
-    """
+    """The newest message of each signal, by name, for threads that look or wait; `clock` is monotonic [s]."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._changed = clock, threading.Condition()
@@ -89,8 +85,7 @@ class Mailbox:
 class SourceAge:
     """The newest message of one topic: its stamp, its tag, and how old it is.
 
-    Args:
-        wall_ahead: Our wall clock minus our monotonic one [s].
+    `wall_ahead` is our wall clock minus our monotonic one [s].
     """
 
     def __init__(self, wall_ahead: float) -> None:
@@ -102,15 +97,9 @@ class SourceAge:
         self._number, self._newest, self._measured = 0, -math.inf, -math.inf
 
     def look(self, letter: Letter, where: str, server_offset: float | None) -> None:
-        """Read stamp and tag of a message, if it is new.
+        """Read stamp and tag of a message of the topic `where`, if it is new; `ProtocolError` for a wrong stamp.
 
-        Args:
-            letter: The message.
-            where: Its topic.
-            server_offset: Our wall clock minus the server's [s]; None if it is not known.
-
-        Raises:
-            ProtocolError: The stamp cannot be read.
+        `server_offset` is our wall clock minus the server's [s]; None if it is not known.
         """
         if letter.number == self._number:
             return
@@ -134,16 +123,7 @@ class SourceAge:
 
 
 class LiveState:
-    """Listens to the sources of a robot's signals, and decodes in the calling thread.
-
-    One thread may call it; `signals` may be called from any.
-
-    Args:
-        profile: The robot.
-        spec: The signals to measure.
-        clock: Monotonic clock [s].
-        wall: Wall clock [s].
-    """
+    """Listens to the sources of the signals in `spec`, and decodes in the calling thread."""
 
     def __init__(
         self,
@@ -189,28 +169,23 @@ class LiveState:
     def read(self) -> tuple[dict[str, Array], float]:
         """The newest values [SI] of each signal, shape (1, k), and the stamp of the first source that has one [s].
 
-        Without any stamp it is when the newest message arrived.
-
-        Raises:
-            StaleState: A signal has no message.
-            ProtocolError: A message is not what the profile says.
+        Without any stamp it is when the newest message arrived. `StaleState` if a signal has no message.
         """
-        letters = self._letters()
+        letters = self.mailbox.newest()
+        for source in self.sources:
+            if source.signal not in letters:
+                raise StaleState(f"{source.topic} ({source.type}): nothing came yet.")
         self._look(letters)
+        signals = {
+            source.signal: decode_source(source, letters[source.signal].message, self._sizes[source.signal])[None]
+            for source in self.sources
+        }
         stamps = [self._ages[head.signal].stamp for head in self._heads.values()]
         arrived = max(letter.arrived for letter in letters.values())
-        return self._decode(letters), next((stamp for stamp in stamps if stamp is not None), arrived)
-
-    def signals(self) -> dict[str, Array]:
-        """As `read`, without the stamp. Any thread."""
-        return self._decode(self._letters())
+        return signals, next((stamp for stamp in stamps if stamp is not None), arrived)
 
     def age(self) -> float:
-        """Age of the state [s]: of its oldest source, less the extra age that the profile allows that source.
-
-        Raises:
-            ProtocolError: A stamp cannot be read.
-        """
+        """Age of the state [s]: of its oldest source, less the extra age that the profile allows that source."""
         letters, now = self.mailbox.newest(), self._clock()
         if len(letters) < len(self.sources):
             return math.inf
@@ -225,8 +200,7 @@ class LiveState:
     def await_answer(self, tag: str, stop: Callable[[], bool], timeout: float) -> bool:
         """Wait until the command with the echo `tag` is answered, and no source is older than the answer.
 
-        Returns:
-            Whether that happened within `timeout` [s], or `stop` became true; `Mailbox.wake` has it checked.
+        Whether that happened within `timeout` [s], or `stop` became true; `Mailbox.wake` has it checked.
         """
 
         def is_answered(letters: Mapping[str, Letter]) -> bool:
@@ -240,19 +214,6 @@ class LiveState:
             return bool(answers) and all(stamp >= answers[0] for stamp in stamps)
 
         return self.mailbox.wait_for(is_answered, timeout)
-
-    def _letters(self) -> dict[str, Letter]:
-        letters = self.mailbox.newest()
-        for source in self.sources:
-            if source.signal not in letters:
-                raise StaleState(f"{source.topic} ({source.type}): nothing came yet.")
-        return letters
-
-    def _decode(self, letters: Mapping[str, Letter]) -> dict[str, Array]:
-        return {
-            source.signal: decode_source(source, letters[source.signal].message, self._sizes[source.signal])[None]
-            for source in self.sources
-        }
 
     def _look(self, letters: Mapping[str, Letter]) -> None:
         for source in self._heads.values():

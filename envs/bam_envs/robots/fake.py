@@ -19,10 +19,6 @@ class FakeRobot:
     """Arms with the signals of a UR5e, moved exactly; the object, if there is one, stays where it is.
 
     A command is cut to the limits and the `max_rate` of the spec, and reached within the period.
-
-    Args:
-        num_robots: How many are stepped together.
-        with_object: Whether there is an object, seen by a tracker.
     """
 
     def __init__(self, num_robots: int = 1, *, with_object: bool = True) -> None:
@@ -95,21 +91,12 @@ class FakeRobot:
             yield self.measure()
 
     def measure(self) -> RobotState:
-        """The state now.
-
-        Raises:
-            ResetNeeded: Not connected.
-        """
+        """The state now; `ResetNeeded` if it is not connected."""
         self._require_link()
         position, place = self._now["position"], self._now["object"]
-        signals = {"joint_position": position[:, :6], "joint_velocity": self._now["velocity"]}
-        signals |= {
-            "gripper_width": position[:, 6:],
-            "object_position": place[:, :3],
-            "object_quaternion": place[:, 3:],
-        }
-        measured = {signal.name: signals[signal.name] for signal in self.spec.signals}
-        return RobotState(measured, self._now["stamp"], self._now["command"])
+        values = [position[:, :6], self._now["velocity"], position[:, 6:], place[:, :3], place[:, 3:]]
+        names = [signal.name for signal in self.spec.signals]  # without an object the last two are not measured
+        return RobotState(dict(zip(names, values, strict=False)), self._now["stamp"], self._now["command"])
 
     def _require_link(self) -> None:
         if not self._connected:

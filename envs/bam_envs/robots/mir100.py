@@ -5,6 +5,7 @@ scanners at opposite corners); SICK S300 data sheet (541 rays, 270 degrees, 0.05
 """
 
 import math
+from dataclasses import replace
 
 from bam_envs.core.robot import RobotSpec, SignalSpec
 
@@ -33,31 +34,17 @@ BACK_RAYS = SCAN_RAYS - sum(BACK_MASKED)
 FRONT_MOUNT, BACK_MOUNT = (0.4288, 0.2358, math.radians(45.0)), (-0.3548, -0.2352, math.radians(-135.0))
 """Where the scanners are in the base's frame: x, y [m], yaw [rad]."""
 
-_FAR = 1000.0
-_VELOCITY_LABELS, _VELOCITY_UNITS = ("linear_velocity", "angular_velocity"), ("m/s", "rad/s")
-
 
 def _scan(name: str, rays: int) -> SignalSpec:
     labels = tuple(f"{name}_{ray}" for ray in range(rays))
     return SignalSpec(name, labels, ("m",) * rays, (0.0,) * rays, (SCAN_RANGE[1],) * rays)
 
 
-_POSE = SignalSpec(
-    "base_pose",
-    ("base_x", "base_y", "base_yaw"),
-    ("m", "m", "rad"),
-    (-_FAR, -_FAR, -math.pi),
-    (_FAR, _FAR, math.pi),
-)
-_VELOCITY = SignalSpec("base_velocity", _VELOCITY_LABELS, _VELOCITY_UNITS, (-MAX_SPEED[0], -MAX_SPEED[1]), MAX_SPEED)
-COMMAND = SignalSpec(
-    "command",
-    _VELOCITY_LABELS,
-    _VELOCITY_UNITS,
-    (-MAX_SPEED[0], -MAX_SPEED[1]),
-    MAX_SPEED,
-    MAX_ACCELERATION,
-)
+_LOW, _HIGH = (-1000.0, -1000.0, -math.pi), (1000.0, 1000.0, math.pi)
+_POSE = SignalSpec("base_pose", ("base_x", "base_y", "base_yaw"), ("m", "m", "rad"), _LOW, _HIGH)
+_SPEEDS = ("linear_velocity", "angular_velocity")
+_VELOCITY = SignalSpec("base_velocity", _SPEEDS, ("m/s", "rad/s"), (-MAX_SPEED[0], -MAX_SPEED[1]), MAX_SPEED)
+COMMAND = replace(_VELOCITY, name="command", max_rate=MAX_ACCELERATION)
 
 
 def base_spec(name: str = "mir100", *, with_scans: bool = True) -> RobotSpec:

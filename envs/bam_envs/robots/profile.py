@@ -99,10 +99,7 @@ def profile_for(spec: RobotSpec) -> RobotProfile:
         InvalidValue: There is none, or it would be sent a part of a message.
     """
     labels, shipped = spec.command.labels, [load_profile(name) for name in shipped_profiles()]
-    for profile in shipped:
-        if profile.command.labels == labels:
-            return profile
-    for profile in shipped:
+    for profile in sorted(shipped, key=lambda one: one.command.labels != labels):
         if labels and set(labels) <= set(profile.command.labels):
             return profile.narrowed(labels)
     raise InvalidValue(f"No shipped profile takes the commands of {spec.name}. Give its file: profile='my_robot.toml'.")
@@ -110,8 +107,7 @@ def profile_for(spec: RobotSpec) -> RobotProfile:
 
 def shipped_profiles() -> list[str]:
     """Names of the profiles that are shipped, sorted."""
-    names = [entry.name for entry in _SHIPPED.iterdir()]
-    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
+    return sorted(entry.name.removesuffix(".toml") for entry in _SHIPPED.iterdir() if entry.name.endswith(".toml"))
 
 
 def _read_file(name: str) -> tuple[str, Table]:

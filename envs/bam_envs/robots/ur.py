@@ -85,16 +85,12 @@ _MODELS = [
     _model("ur10e", kinematics.UR10E, (120, 180), (1.3, 0.3), ArmOutline(0.1762, 0.0393, *_LARGE)),
     _model("ur16e", kinematics.UR16E, (120, 180), (0.8, 0.3), ArmOutline(0.1760, 0.0390, *_LARGE)),
 ]
-UR_MODELS: dict[str, UrModel] = {model.name: model for model in _MODELS}
+UR_MODELS = {model.name: model for model in _MODELS}
 """Name to model."""
 
 
 def ur_model(name: str) -> UrModel:
-    """The model called `name`.
-
-    Raises:
-        UnknownName: There is no such model; carries the closest match.
-    """
+    """The model called `name`; `UnknownName` carries the closest match if there is none."""
     if name not in UR_MODELS:
         raise UnknownName("ur_model", str(name), UR_MODELS, examples=UR_MODELS, similar=0.85)  # ur7 is not ur5
     return UR_MODELS[name]
