@@ -19,7 +19,7 @@ from bam_train.trainers.rllib.mean_std_filter import MeanStdFilter
 from bam_train.trainers.rllib.ray_resources import learners
 from bam_train.trainers.rllib.rllib_hyperparameters import training_arguments
 from bam_train.trainers.rllib.rllib_registration import register_foreign
-from bam_train.trainers.rllib.robot_env_runner import End, RobotEnvRunner, log_end
+from bam_train.trainers.rllib.robot_env_runner import RobotEnvRunner, log_end
 from bam_train.trainers.rllib.runner_deaths import (
     PROBE_TIMEOUT,
     RESTART_DELAY,
@@ -110,7 +110,7 @@ def refusals(settings: TrainSettings) -> Iterator[None]:
 
 
 class NotesEnds(RLlibCallback):  # type: ignore[misc]
-    """Notes how each episode of RLlib's own runner went, which keeps means alone, and knows nothing of success."""
+    """Notes how each episode of RLlib's own runner went, which keeps means alone and no success."""
 
     def on_episode_end(
         self, *, episode: Any, prev_episode_chunks: Any = (), metrics_logger: Any, **kwargs: Any
@@ -118,5 +118,5 @@ class NotesEnds(RLlibCallback):  # type: ignore[misc]
         """Note one."""
         success = episode.get_infos(-1).get("is_success")
         total = sum(piece.get_return() for piece in (*prev_episode_chunks, episode))
-        length = episode.t  # PPO's learner has lengthened the earlier pieces by a step without a reward
-        log_end(metrics_logger, End(length, float(total), None if success is None else bool(success)))
+        # PPO's learner has lengthened the earlier pieces by a step without a reward: `t` counts the real ones.
+        log_end(metrics_logger, episode.t, float(total), None if success is None else bool(success))

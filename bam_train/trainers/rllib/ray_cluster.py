@@ -1,8 +1,8 @@
 """Ray for one training run: a quiet one of its own on this computer, or a cluster that is there already.
 
-The own one listens on the loopback device only, asks for a token that nobody else has, keeps its files in a folder of
-its own, and is gone when the run ends, however it ends. A cluster is joined and left as it was. Ray tries a silent
-address for minutes and may end the whole process; so a socket, then another process, tries it first.
+The own one listens on the loopback device only, asks for a token that nobody else has, and is gone when the run ends,
+however it ends. A cluster is joined and left as it was. Ray tries a silent address for minutes and may end the whole
+process; so a socket, then another process, tries it first.
 """
 
 import contextlib
@@ -20,7 +20,6 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import ray
@@ -30,11 +29,6 @@ from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.settings import TrainSettings
 from bam_train.signals import at_quit, interrupt, waiting
 from bam_train.trainers.rllib.ray_resources import cores, gpus, require_resources
-
-try:
-    import fcntl
-except ImportError:  # Windows: folders that were left stay
-    fcntl = None  # type: ignore[assignment]
 
 psutil: Any = importlib.import_module("psutil")  # Ray has it in a folder of its own
 
@@ -53,7 +47,6 @@ REACH_TIMEOUT = 13.0
 _TOKEN = secrets.token_hex(32)
 _LOGGERS = ("ray", "ray.rllib", "ray.tune", "ray.train", "ray.data")
 _MODE, _TOKENS = "RAY_AUTH_MODE", ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
-_PREFIX, _LOCK, _NEW = "bam-ray-", "in-use", "new"
 
 
 @contextlib.contextmanager
@@ -87,7 +80,12 @@ def cluster(settings: TrainSettings) -> Iterator[None]:
 @contextlib.contextmanager
 def _own(settings: TrainSettings) -> Iterator[None]:
     before = set(psutil.Process().children())
-    with own_folder() as folder, at_quit(lambda: _abandon(before, folder)), _private_token():
+    root = "/tmp" if os.path.isdir("/tmp") else None  # paths of Ray's sockets must be short
+    with (
+        tempfile.TemporaryDirectory(prefix="bam-ray-", dir=root, ignore_cleanup_errors=True) as folder,
+        at_quit(lambda: _abandon(before, folder)),
+        _private_token(),
+    ):
         try:
             try:
                 with _starting(), loopback_only(), _out_of_the_group():
@@ -99,7 +97,7 @@ def _own(settings: TrainSettings) -> Iterator[None]:
                         include_dashboard=False,
                         log_to_driver=False,
                         configure_logging=False,
-                        _temp_dir=str(folder),
+                        _temp_dir=folder,
                     )
             except Exception as error:  # Ray has no one error for what may go wrong with its processes
                 why = str(error).strip().partition("\n")[0].rstrip(".")
@@ -134,51 +132,10 @@ def _kill(processes: list[Any]) -> None:
             process.kill()
 
 
-def _abandon(before: set[Any], folder: Path) -> None:
+def _abandon(before: set[Any], folder: str) -> None:
     """What `_own` does at its end, without waiting for anything; two of Ray's processes would go on for a minute."""
     _kill(_started_since(before))
     shutil.rmtree(folder, ignore_errors=True)
-
-
-@contextlib.contextmanager
-def own_folder(root: str | None = None) -> Iterator[Path]:
-    """A new folder, within this; those of runs that were killed are removed first.
-
-    A process that is killed removes nothing. A file in the folder is locked for as long as its process lives, so the
-    next run knows which folders are nobody's, whichever number their process had.
-
-    Args:
-        root: Folder to make it in, with a short name, as Ray's sockets in it need; None for the usual one.
-    """
-    root = root or ("/tmp" if os.path.isdir("/tmp") else tempfile.gettempdir())
-    for path in Path(root).glob(f"{_PREFIX}*/{_LOCK}"):
-        with contextlib.suppress(OSError):  # somebody else's
-            lock = os.open(path, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
-            try:
-                if _locked(lock):
-                    shutil.rmtree(path.parent, ignore_errors=True)
-            finally:
-                os.close(lock)
-    folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=root))
-    lock = os.open(folder / _NEW, os.O_CREAT | os.O_RDWR, 0o600)
-    try:
-        if _locked(lock):
-            os.rename(folder / _NEW, folder / _LOCK)  # under this name others try it, and it is locked by now
-        yield folder
-    finally:
-        os.close(lock)
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def _locked(lock: int) -> bool:
-    """Whether the file could be locked: nobody has it."""
-    if fcntl is None:
-        return False
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True
 
 
 @contextlib.contextmanager
@@ -189,8 +146,7 @@ def _private_token() -> Iterator[None]:
         return
     raylet: Any = importlib.import_module("ray._raylet")
 
-    def read_again() -> None:
-        """Ray reads mode and token once, when it is imported."""
+    def read_again() -> None:  # Ray reads mode and token once, when it is imported
         raylet.Config.initialize("")
         raylet.AuthenticationTokenLoader.instance().reset_cache()
 
@@ -221,9 +177,8 @@ def _environment(**variables: str) -> Iterator[None]:
 def loopback_only() -> Iterator[None]:
     """Ray started within this takes 127.0.0.1 for its computer's address, and its servers bind to nothing else.
 
-    `ray.init(_node_ip_address="127.0.0.1")` would not do: Ray puts an address that others can reach in its place,
-    except where clusters are not enabled. It reads that from the environment when it is imported, so its constant is
-    set here: there is no public way to it, and other computers must not reach this Ray.
+    There is no public way to it: Ray puts an address that others can reach in the place of
+    `ray.init(_node_ip_address="127.0.0.1")`, unless this constant, which it reads when it is imported, is unset.
     """
     from ray._private import ray_constants
 
@@ -238,11 +193,10 @@ def loopback_only() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _out_of_the_group() -> Iterator[None]:
-    """Ray started within this has sessions of its own: what a whole process group is sent does not reach it.
+    """Ray started within this has sessions of its own, and ends with this process as before, as Linux kills it then.
 
-    ``timeout``, batch systems and terminals send their signal to the group; Ray's processes would be gone before the
-    update is finished and saved, and Ray has no public way to start them elsewhere. They end with this process as
-    before, as Linux kills them then. On other systems Ray itself kills the group for that, so they stay in it.
+    ``timeout``, batch systems and terminals signal the whole process group: Ray's processes would be gone before the
+    update is finished and saved, and Ray has no public way to start them elsewhere. On other systems they stay in it.
     """
     from ray._private import services, utils
 
@@ -274,7 +228,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _hush() -> None:
-    """Take their handlers from the loggers of Ray; `ray.init` does that too, and leaves none."""
+    """Silence the loggers of Ray; `ray.init` changes them."""
     for name in _LOGGERS:
         logger = logging.getLogger(name)
         logger.handlers[:], logger.propagate = [logging.NullHandler()], False
@@ -317,10 +271,7 @@ def _shut_down(**given: bool) -> None:
 
 
 def find(address: str) -> str:
-    """The ``host:port`` of a cluster.
-
-    Args:
-        address: ``auto``, or ``host:port``; as Ray has it, RAY_ADDRESS is what ``auto`` means if it is set.
+    """The ``host:port`` of a cluster from ``auto`` or ``host:port``; RAY_ADDRESS is what ``auto`` means if it is set.
 
     Raises:
         SettingsError: It is no address of a cluster.

@@ -31,14 +31,14 @@ POLICY_ID = "default_policy"
 """RLlib's name of the one policy of a run that did not name any."""
 
 _SMALL_NUMBER = 1e-6  # ray.rllib.utils.numpy.SMALL_NUMBER, which MeanStdFilter adds to the deviation
-# What RLlib adds to every pipeline: these connectors change the layout of observations and actions, not their values.
-_LAYOUT = frozenset(
+LAYOUT_CONNECTORS = frozenset(
     {
         *("AddObservationsFromEpisodesToBatch", "AddStatesFromEpisodesToBatch", "AddTimeDimToBatchAndZeroPad"),
         *("BatchIndividualItems", "NumpyToTensor", "GetActions", "ListifyDataForVectorEnv", "ModuleToAgentUnmapping"),
         *("RemoveSingleTsTimeRankFromBatch", "TensorToNumpy", "UnBatchToIndividualItems"),
     }
 )
+"""What RLlib adds to every pipeline: these change the layout of observations and actions, not their values."""
 
 
 # What a policy is made of
@@ -138,7 +138,7 @@ def _preprocessing(connectors: list[Any]) -> dict[str, Any]:
 def require_layout_only(piece: Any, known: Sequence[str] = ()) -> None:
     """Refuse a connector that changes values in another way than the `known` ones."""
     name = type(piece).__name__
-    if name not in _LAYOUT and name not in known:
+    if name not in LAYOUT_CONNECTORS and name not in known:
         raise PolicyError(f"connector {name} cannot be frozen; expected FlattenObservations or MeanStdFilter")
 
 

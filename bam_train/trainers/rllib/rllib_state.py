@@ -9,7 +9,6 @@ adapt themselves.
 
 import functools
 import json
-import random
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -150,18 +149,6 @@ def require_version(checkpoint: Checkpoint) -> None:
             f"was trained with Ray {theirs}, and this is Ray {ray.__version__}, whose states differ. "
             f'Run: pip install "ray[rllib]=={theirs}" to go on; bam-eval and bam-deploy need no Ray',
         )
-
-
-@contextmanager
-def undisturbed() -> Iterator[None]:
-    """Do something between two iterations that leaves the random numbers of this process as they were."""
-    before = random.getstate(), np.random.get_state(), torch.get_rng_state()
-    try:
-        yield
-    finally:
-        random.setstate(before[0])
-        np.random.set_state(before[1])
-        torch.set_rng_state(before[2])
 
 
 Extras = dict[str, dict[str, float]]

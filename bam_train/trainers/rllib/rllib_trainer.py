@@ -1,7 +1,4 @@
-"""`RLlibTrainer`: a run of an algorithm of RLlib that can be stopped, saved and resumed between two iterations.
-
-Configuration, states, freezing and the cluster have modules of their own.
-"""
+"""`RLlibTrainer`: a run of an algorithm of RLlib that can be stopped, saved and resumed between two iterations."""
 
 from __future__ import annotations
 
@@ -10,6 +7,7 @@ import copy
 import dataclasses
 import logging
 import math
+import random
 import warnings
 from collections import deque
 from collections.abc import Iterator, Mapping
@@ -56,7 +54,7 @@ class RLlibTrainer:
         self._ends = {name: deque[float](maxlen=_EPISODES) for name in ("return", "length", "success")}
         self._result: dict[str, Any] = {}
         self._steps = 0
-        self._tensorboard: TensorBoard | None = None
+        self._tensorboard: Any = None
         self._spare: Any = None
         runners, each = settings.num_env_runners, envs_each(settings)
         if runners and each * runners != settings.num_envs:
@@ -142,7 +140,9 @@ class RLlibTrainer:
 
     def log_to(self, folder: Path) -> None:
         """Write TensorBoard files into a folder from now on."""
-        self._tensorboard = TensorBoard(folder)
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._tensorboard = SummaryWriter(str(folder))
 
     @property
     def steps(self) -> int:
@@ -223,7 +223,7 @@ class RLlibTrainer:
 
     def save(self, path: Path, scores: Mapping[str, Any], notes: Mapping[str, Any]) -> Checkpoint:
         """Write a checkpoint that can be resumed and deployed."""
-        with rllib_state.undisturbed():
+        with self.undisturbed():
             module = copy.deepcopy(self._module())  # of appo and impala, a thread goes on learning
             frozen = FrozenModule(self._of(parts_of, module))
             members = {
@@ -236,21 +236,26 @@ class RLlibTrainer:
 
     def freeze(self) -> FrozenPolicy:
         """The policy as it is now."""
-        with rllib_state.undisturbed():
+        with self.undisturbed():
             graph = FrozenModule(self._of(parts_of, self._module())).onnx_file()
         return FrozenPolicy.from_graph(graph, *map(space_to_json, self._spaces))
 
     def exploring(self) -> RLlibPolicy:
         """The policy as it is now, drawing its actions as in training."""
-        with rllib_state.undisturbed():
+        with self.undisturbed():
             policy: RLlibPolicy = self._of(RLlibPolicy, self._module(), explore=True)
             return policy
 
     @contextlib.contextmanager
     def undisturbed(self) -> Iterator[None]:
         """Do something between two iterations that leaves training's random numbers as they were."""
-        with rllib_state.undisturbed():
+        before = random.getstate(), np.random.get_state(), torch.get_rng_state()
+        try:
             yield
+        finally:
+            random.setstate(before[0])
+            np.random.set_state(before[1])
+            torch.set_rng_state(before[2])
 
     @contextlib.contextmanager
     def evaluation_envs(self) -> Iterator[VectorEnv[Any, Any, Any] | None]:
@@ -259,13 +264,15 @@ class RLlibTrainer:
 
     def log(self, metrics: Mapping[str, float]) -> None:
         """Put numbers next to the trainer's own in TensorBoard."""
-        if self._tensorboard is not None:
-            self._tensorboard.write(metrics, self.steps)
+        with contextlib.suppress(OSError):  # a full disk ends these files, not the run
+            for name, value in metrics.items() if self._tensorboard is not None else ():
+                self._tensorboard.add_scalar(name, value, self.steps)
 
     def close(self) -> None:
         """Let go of environments, log files and Ray."""
         if self._tensorboard is not None:
-            self._tensorboard.close()
+            with contextlib.suppress(OSError):
+                self._tensorboard.close()
         self._open.close()
 
 
@@ -298,33 +305,3 @@ def _require_fitting(settings: TrainSettings) -> None:
         raise SettingsError(f"num_env_runners: {settings.algo} learns from recorded episodes alone; leave it out")
     if offline and settings.normalize:
         raise SettingsError(f"normalize: {settings.algo} takes recorded observations as they are; leave it out")
-
-
-class TensorBoard:
-    """Writes event files into a folder until it cannot.
-
-    Args:
-        folder: Where they go.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        from torch.utils.tensorboard import SummaryWriter
-
-        self._writer: Any = SummaryWriter(str(folder))
-
-    def write(self, numbers: Mapping[str, float], step: int) -> None:
-        """Write numbers at a step."""
-        if self._writer is None:
-            return
-        try:
-            for name, value in numbers.items():
-                self._writer.add_scalar(name, value, step)
-        except OSError:
-            self.close()
-
-    def close(self) -> None:
-        """Let go of the files."""
-        writer, self._writer = self._writer, None
-        if writer is not None:
-            with contextlib.suppress(OSError):
-                writer.close()

@@ -3,11 +3,7 @@
 RLlib's own `SingleAgentEnvRunner` appends to n Python episodes at every step, and runs its connectors over each. Here a
 step of n environments is one pass of the module, one batched action and one `RobotVectorEnv.step`. What comes out is
 the same: a list of `SingleAgentEpisode`, the ones that ended with what they observed last, the running ones in pieces.
-
-The file is long because each method of its one large class stands in for one of RLlib's.
 """
-
-from __future__ import annotations
 
 import contextlib
 import itertools
@@ -35,12 +31,30 @@ from bam_train.environments import is_batched, make_vector_env
 from bam_train.errors import SettingsError
 from bam_train.finite_envs import FiniteVectorEnv
 from bam_train.trainers.rllib.mean_std_filter import MeanStdFilter
+from bam_train.trainers.rllib.rllib_freezing import LAYOUT_CONNECTORS
 from bam_train.trainers.rllib.runner_deaths import FaultReporting
 
 Array = NDArray[Any]
 
 ENDS = "ends"
 """Metric beside RLlib's own: return, length and success of every episode that ended, one after the other."""
+
+
+def log_end(metrics: Any, length: int, total: float, success: bool | None) -> None:
+    """Note how an episode went: its steps, its undiscounted return, and whether it succeeded if that is known."""
+    metrics.log_value((ENDS, "return"), total, reduce="item_series")
+    metrics.log_value((ENDS, "length"), length, reduce="item_series")
+    if success is not None:
+        metrics.log_value((ENDS, "success"), float(success), reduce="item_series")
+
+
+@dataclass
+class _Running:
+    """The running episode of an environment: its name, its steps so far, and what it has earned."""
+
+    id: str = field(default_factory=lambda: uuid.uuid4().hex)
+    length: int = 0
+    total: float = 0.0
 
 
 class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc]
@@ -57,13 +71,12 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
         super().__init__(config=config, **kwargs)
         self._observation: Array = np.empty(0)
         """What the module sees next, (n, ...)."""
-        self._running = [Running() for _ in range(self.num_envs)]
-        self._ended: list[End] = []
+        self._running = [_Running() for _ in range(self.num_envs)]
         pieces = list(self._env_to_module.connectors)
         filters = [piece for piece in pieces if type(piece).__module__ == MeanStdFilter.__module__]
         self._filter: MeanStdFilter | None = filters[0] if filters else None
         others = [type(piece).__name__ for piece in pieces if piece not in filters]
-        found = ", ".join(name for name in others if name not in _DEFAULT_PIECES)
+        found = ", ".join(name for name in others if name not in LAYOUT_CONNECTORS)
         if found or config._module_to_env_connector is not None:
             raise SettingsError(
                 "RobotEnvRunner: expected the MeanStdFilter of bam_train.trainers.rllib.mean_std_filter or no "
@@ -124,7 +137,7 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
             seed = int(self._seed - index + max(0, index - 1) * self.num_envs)
         observations, _ = self._try_env_reset(seed=seed, options=None)
         self._observation = self._filtered(observations)
-        self._running = [Running() for _ in range(self.num_envs)]
+        self._running = [_Running() for _ in range(self.num_envs)]
 
     def _filtered(self, observations: Array) -> Array:
         """Observations as the module sees them: a copy, for the environment may write into its own."""
@@ -154,9 +167,8 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
         """
         seen: list[Array] = [self._observation]
         taken: list[dict[str, Array]] = []
-        finals: dict[
-            tuple[int, int], tuple[Array, bool | None]
-        ] = {}  # of (environment, step): last observation, success
+        finals: dict[tuple[int, int], tuple[Array, bool | None]] = {}
+        """Of (environment, step): last observation, success."""
         for t in range(steps):
             if random_actions:
                 actions = self.env.action_space.sample()
@@ -217,8 +229,9 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
                     open_.append(episode)
                     continue
                 ended.append(episode)
-                self._ended.append(End(running.length, running.total, success))
-                running = self._running[env_id] = Running()
+                self._log_episode_metrics(running.length, running.total, running.length * self.env.period)
+                log_end(self.metrics, running.length, running.total, success)
+                running = self._running[env_id] = _Running()
         return ended + open_
 
     def _act(self, step: int, explore: bool) -> tuple[dict[str, Array], Array]:
@@ -248,22 +261,6 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
             actions = clip_action(actions, space)
         return columns, np.asarray(actions, space.dtype)
 
-    def get_metrics(self) -> Any:
-        """RLlib's metrics of the episodes that ended since the last call, and how each of them went."""
-        for end in self._ended:
-            self._log_episode_metrics(end.length, end.total, end.length * self.env.period)
-            log_end(self.metrics, end)
-        self._ended.clear()
-        return super().get_metrics()
-
-
-def log_end(metrics: Any, end: End) -> None:
-    """Note how an episode went."""
-    metrics.log_value((ENDS, "return"), end.total, reduce="item_series")
-    metrics.log_value((ENDS, "length"), end.length, reduce="item_series")
-    if end.success is not None:
-        metrics.log_value((ENDS, "success"), float(end.success), reduce="item_series")
-
 
 @contextlib.contextmanager
 def _cores(count: float | None) -> Iterator[None]:
@@ -277,36 +274,3 @@ def _cores(count: float | None) -> Iterator[None]:
         yield
     finally:
         os.sched_setaffinity(0, all_of_them)
-
-
-_DEFAULT_PIECES = frozenset(
-    {
-        "AddObservationsFromEpisodesToBatch",
-        "AddTimeDimToBatchAndZeroPad",
-        "AddStatesFromEpisodesToBatch",
-        "AgentToModuleMapping",
-        "BatchIndividualItems",
-        "NumpyToTensor",
-    }
-)
-
-
-@dataclass(frozen=True)
-class End:
-    """How an episode went that ended."""
-
-    length: int
-    """Its steps."""
-    total: float
-    """Undiscounted sum of its rewards."""
-    success: bool | None
-    """None if the environment does not say."""
-
-
-@dataclass
-class Running:
-    """The running episode of an environment: its name, its steps so far, and what it has earned."""
-
-    id: str = field(default_factory=lambda: uuid.uuid4().hex)
-    length: int = 0
-    total: float = 0.0

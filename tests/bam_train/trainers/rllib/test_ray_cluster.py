@@ -20,7 +20,7 @@ import ray
 from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.settings import TrainSettings
 from bam_train.signals import Terminated
-from bam_train.trainers.rllib.ray_cluster import cluster, own_folder, reach
+from bam_train.trainers.rllib.ray_cluster import cluster, reach
 from bam_train.trainers.rllib.ray_resources import cores
 
 pytestmark = pytest.mark.slow
@@ -172,32 +172,6 @@ def test_a_ray_that_does_not_start(monkeypatch):
     too_much = cluster(settings(num_env_runners=1000))  # refused before anything is started
     with pytest.raises(SettingsError, match="1000 env runners ask for 1000 CPUs"), too_much:
         pass
-
-
-def test_a_folder_goes_away_and_takes_those_that_were_left_with_it(tmp_path):
-    left, other = tmp_path / "bam-ray-left", tmp_path / "bam-ray-without-a-lock"
-    for folder in (left, other):
-        (folder / "session").mkdir(parents=True)
-    (left / "in-use").touch()
-    with own_folder(str(tmp_path)) as first:
-        assert sorted(tmp_path.iterdir()) == sorted([other, first])
-        with own_folder(str(tmp_path)) as second:
-            assert first.is_dir()
-            assert second.is_dir()
-        assert sorted(tmp_path.iterdir()) == sorted([other, first])
-    assert list(tmp_path.iterdir()) == [other]
-
-
-@pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning")  # the child does nothing but end
-def test_the_lock_of_a_folder_ends_with_its_process(tmp_path):
-    child = os.fork()
-    if not child:
-        with own_folder(str(tmp_path)):
-            os._exit(9)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
-    (left,) = tmp_path.iterdir()
-    with own_folder(str(tmp_path)):
-        assert not left.exists()
 
 
 CLUSTER = """
