@@ -5,13 +5,13 @@ Everything stays within JSON: settings can be written and read back. A schedule 
 
 import types
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Annotated, Any
 
 import msgspec
 
 from bam_envs.core.validation import expected
-from bam_envs.core.wording import brief
+from bam_envs.core.wording import brief, did_you_mean
 from bam_train.errors import SettingsError
 
 Schedule = Annotated[
@@ -59,6 +59,30 @@ def as_written(hint: Any) -> Any:
     if Callable in (hint, origin):
         return Schedule
     return str if origin is type else hint
+
+
+def require_known(
+    given: Iterable[str],
+    known: Collection[str],
+    what: str,
+    elsewhere: Mapping[str, str],
+    others: Iterable[str] = (),
+) -> None:
+    """Refuse names that are not known.
+
+    Args:
+        given: The names.
+        known: What may be given.
+        what: The kind of name, for the message.
+        elsewhere: Names of the library that are none here, and why or what to do instead.
+        others: More names to look for the closest match in.
+    """
+    for name in given:
+        if name in known:
+            continue
+        if name not in elsewhere:
+            raise SettingsError(f"Unknown {what} {name!r}. {did_you_mean(name, [*known, *others])}")
+        raise SettingsError(f"{name} is not a hyperparameter here: {elsewhere[name]}")
 
 
 def ranges(kinds: Mapping[Any, Iterable[str]]) -> dict[str, Any]:

@@ -1,18 +1,16 @@
 """Hyperparameters: checked against RLlib's own ``training()`` arguments, completed, written as JSON.
 
-Beside these there are ``model_config`` (RLlib's `DefaultModelConfig`: fcnet_hiddens, fcnet_activation, …; initialisers
-by the name they have in ``torch.nn.init``), ``rollout_fragment_length``, how many steps each row takes before a runner
-hands over what it has, and two on where actions start: ``log_std_init``, of their standard deviation if it does not
-depend on the observation (``model_config.free_log_std``), and ``action_init_scale``, what the weights of the last layer
-are multiplied by: with 0.01 the first actions are about 0 and not biased. A schedule is a list of steps and values:
-``lr=[[0, 3e-4], [1000000, 0.0]]``. The file is long for its tables of names.
+Beside these there are ``model_config`` (RLlib's `DefaultModelConfig`; initialisers by their name in ``torch.nn.init``),
+``rollout_fragment_length``, the steps of each environment before a runner hands over what it has, ``log_std_init`` of a
+free standard deviation (``model_config.free_log_std``), and ``action_init_scale``, which multiplies the weights of the
+last layer: with 0.01 the first actions are about 0. A schedule is a list: ``lr=[[0, 3e-4], [1000000, 0.0]]``.
 """
 
 import dataclasses
 import inspect
 import json
 import typing
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from ray.rllib.connectors.env_to_module.mean_std_filter import MeanStdFilter
@@ -20,57 +18,51 @@ from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.utils.replay_buffers import EpisodeReplayBuffer, PrioritizedEpisodeReplayBuffer
 
 from bam_envs.core.validation import Finite, Fraction, NonNegative, Positive, PositiveInt, check
-from bam_envs.core.wording import brief, did_you_mean
+from bam_envs.core.wording import brief
 from bam_train.errors import SettingsError
 from bam_train.settings import NAMES
 from bam_train.trainers.algorithms import Algorithm
-from bam_train.trainers.library_arguments import fit, fits, ranges
+from bam_train.trainers.library_arguments import fit, fits, require_known
 
+_GPUS, _CPUS = "env runners use no GPU, and --num-gpus is for the learners", "each env runner has one CPU"
+_ENVS = "use --num-envs, which is of all runners together"
 ELSEWHERE = {
-    "train_batch_size": "train_batch_size_per_learner",
-    "num_sgd_iter": "num_epochs",
-    "lr_schedule": "lr, which takes a schedule too",
-    "entropy_coeff_schedule": "entropy_coeff, which takes a schedule too",
-    "model": "model_config",
-    "vf_share_layers": "model_config.vf_share_layers",
-    "policy_model_config": "model_config",
-    "q_model_config": "model_config",
-    "hiddens": "model_config.head_fcnet_hiddens",
-    "optimization_config": "actor_lr, critic_lr and alpha_lr",
-    "learning_rate": "lr",
-    "observation_filter": "normalize=true",
-    "num_workers": "--num-env-runners",
-    "num_rollout_workers": "--num-env-runners",
-    "num_envs_per_worker": "--num-envs, which is of all runners together",
-    "num_envs_per_env_runner": "--num-envs, which is of all runners together",
-    "seed": "--seed",
-}
-"""Arguments of RLlib's old stack, or of other methods, and what to use instead."""
-
-_NONE_HERE = {
-    "num_gpus_per_worker": "env runners use no GPU, and --num-gpus is for the learners",
-    "num_gpus_per_env_runner": "env runners use no GPU, and --num-gpus is for the learners",
-    "num_cpus_per_worker": "each env runner has one CPU",
-    "num_cpus_per_env_runner": "each env runner has one CPU",
+    "train_batch_size": "use train_batch_size_per_learner",
+    "num_sgd_iter": "use num_epochs",
+    "lr_schedule": "use lr, which takes a schedule too",
+    "entropy_coeff_schedule": "use entropy_coeff, which takes a schedule too",
+    "model": "use model_config",
+    "vf_share_layers": "use model_config.vf_share_layers",
+    "policy_model_config": "use model_config",
+    "q_model_config": "use model_config",
+    "hiddens": "use model_config.head_fcnet_hiddens",
+    "optimization_config": "use actor_lr, critic_lr and alpha_lr",
+    "learning_rate": "use lr",
+    "observation_filter": "use normalize=true",
+    **dict.fromkeys(("num_workers", "num_rollout_workers"), "use --num-env-runners"),
+    **dict.fromkeys(("num_envs_per_worker", "num_envs_per_env_runner"), _ENVS),
+    "seed": "use --seed",
+    **dict.fromkeys(("num_gpus_per_worker", "num_gpus_per_env_runner"), _GPUS),
+    **dict.fromkeys(("num_cpus_per_worker", "num_cpus_per_env_runner"), _CPUS),
     "log_level": "RLlib's log is off",
-    "horizon": "the environment ends its episodes",
-    "soft_horizon": "the environment ends its episodes",
+    **dict.fromkeys(("horizon", "soft_horizon"), "the environment ends its episodes"),
     "framework": "RLlib has nothing but torch any more",
+    **dict.fromkeys(
+        (
+            *("optimizer", "learner_class", "learner_connector", "add_default_connectors_to_learner_pipeline"),
+            *("learner_config_dict", "num_aggregator_actors_per_learner", "store_buffer_in_checkpoints", "decay"),
+            *("max_requests_in_flight_per_aggregator_actor", "max_requests_in_flight_per_aggregator_worker"),
+            *("max_requests_in_flight_per_sampler_worker", "num_aggregation_workers", "before_learn_on_batch"),
+            *("categorical_distribution_temperature", "num_gpu_loader_threads", "num_multi_gpu_tower_stacks"),
+            *("minibatch_buffer_size", "replay_proportion", "replay_buffer_num_slots", "learner_queue_size"),
+            *("learner_queue_timeout", "timeout_s_sampler_manager", "timeout_s_aggregator_manager", "opt_type"),
+            *("momentum", "target_update_frequency", "training_intensity", "bc_iters"),
+        ),
+        "it belongs to RLlib's old API stack, or bam-train takes care of it",
+    ),
 }
-"""Settings of RLlib that are not needed, and why."""
+"""Arguments of RLlib that are no hyperparameters here, many of its old API stack, and what to do instead."""
 
-_OF_THE_OLD_STACK = frozenset(
-    {
-        *("optimizer", "learner_class", "learner_connector", "add_default_connectors_to_learner_pipeline"),
-        *("learner_config_dict", "num_aggregator_actors_per_learner", "max_requests_in_flight_per_aggregator_actor"),
-        *("max_requests_in_flight_per_sampler_worker", "max_requests_in_flight_per_aggregator_worker"),
-        *("num_aggregation_workers", "store_buffer_in_checkpoints", "before_learn_on_batch"),
-        *("categorical_distribution_temperature", "num_gpu_loader_threads", "num_multi_gpu_tower_stacks"),
-        *("minibatch_buffer_size", "replay_proportion", "replay_buffer_num_slots", "learner_queue_size"),
-        *("learner_queue_timeout", "timeout_s_sampler_manager", "timeout_s_aggregator_manager", "opt_type", "decay"),
-        *("momentum", "target_update_frequency", "training_intensity", "bc_iters"),
-    }
-)
 _OLD_HERE = {"impala": {"epsilon"}, "appo": {"epsilon", "use_critic"}}
 """Names that are old in one algorithm and current in another."""
 
@@ -88,7 +80,7 @@ def complete(algorithm: Algorithm, given: Mapping[str, Any]) -> dict[str, Any]:
     """
     config = algorithm.load()()
     defaults = _defaults(algorithm, config)
-    _require_known(given, [*defaults, "model_config"], f"{algorithm.name} hyperparameter", NAMES)
+    require_known(given, [*defaults, "model_config"], f"{algorithm.name} hyperparameter", ELSEWHERE, NAMES)
     values = {
         name: _fit(name, given[name], _hint(name, hint, default)) if name in given else _plain(default)
         for name, (hint, default) in defaults.items()
@@ -106,7 +98,8 @@ def complete_normalize(given: bool | Mapping[str, Any]) -> bool | dict[str, Any]
     """Check the arguments of `MeanStdFilter`."""
     if isinstance(given, bool):
         return given
-    _require_known(given, inspect.signature(MeanStdFilter).parameters.keys() - _OF_CONNECTORS, "normalize argument")
+    known = inspect.signature(MeanStdFilter).parameters.keys() - _OF_CONNECTORS
+    require_known(given, known, "normalize argument", ELSEWHERE)
     return {
         name: fit(f"normalize.{name}", value, float if name == "clip_by_value" else bool)
         for name, value in given.items()
@@ -124,7 +117,7 @@ def training_arguments(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def _defaults(algorithm: Algorithm, config: Any) -> dict[str, tuple[Any, Any]]:
     """Name of every hyperparameter to its annotation and its default."""
-    left_out = _OF_THE_OLD_STACK | ELSEWHERE.keys() | _OLD_HERE.get(algorithm.name, set())
+    left_out = ELSEWHERE.keys() | _OLD_HERE.get(algorithm.name, set())
     found: dict[str, tuple[Any, Any]] = {}
     for owner in type(config).__mro__:
         method = vars(owner).get("training")
@@ -189,11 +182,9 @@ def _complete_buffer(config: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     if buffer is None:
         raise SettingsError(f"replay_buffer_config.type: expected {' or '.join(_BUFFERS)}, found {values['type']!r}")
     known = {*inspect.signature(buffer).parameters, *default} - _OF_CONNECTORS
-    _require_known(given, known, "replay_buffer_config argument")
-    capacity = fit("replay_buffer_config.capacity", values["capacity"], int)
-    if capacity < 1:
-        raise SettingsError(f"replay_buffer_config.capacity: expected at least 1, found {capacity}")
-    return {**values, "capacity": capacity}
+    require_known(given, known, "replay_buffer_config argument", ELSEWHERE)
+    name = "replay_buffer_config.capacity"
+    return {**values, "capacity": check(fit(name, values["capacity"], int), PositiveInt, name, SettingsError)}
 
 
 def _complete_model(config: Any, given: Any) -> dict[str, Any]:
@@ -202,7 +193,7 @@ def _complete_model(config: Any, given: Any) -> dict[str, Any]:
     hints = typing.get_type_hints(DefaultModelConfig)
     hints |= {name: typing.Optional[str] for name in hints if name.endswith("_initializer")}  # noqa: UP045 - no function
     own = dataclasses.asdict(DefaultModelConfig()) | config._model_config_auto_includes
-    _require_known(given, hints, "model_config argument")
+    require_known(given, hints, "model_config argument", ELSEWHERE)
     return {
         name: fit(f"model_config.{name}", given[name], _hint(name, hints[name], own[name]))
         if name in given
@@ -211,43 +202,27 @@ def _complete_model(config: Any, given: Any) -> dict[str, Any]:
     }
 
 
-def _require_known(given: Iterable[str], known: Collection[str], what: str, others: Iterable[str] = ()) -> None:
-    for name in given:
-        if name in known:
-            continue
-        if name in ELSEWHERE:
-            raise SettingsError(f"{name} is not a hyperparameter here: use {ELSEWHERE[name]}")
-        if name in _NONE_HERE:
-            raise SettingsError(f"{name}: there is none here; {_NONE_HERE[name]}. Leave it out")
-        if name in _OF_THE_OLD_STACK:
-            text = "it belongs to RLlib's old API stack, or bam-train takes care of it"
-            raise SettingsError(f"{name} cannot be set: {text}")
-        raise SettingsError(f"Unknown {what} {name!r}. {did_you_mean(name, [*known, *others])}")
-
-
 # Numbers, schedules and layers that no algorithm can learn with; some of them RLlib takes, and then hangs
 
-_RANGES = ranges(
-    {
-        Fraction: ("gamma", "lambda_", "tau", "expectile", "epsilon"),
-        Positive: (
-            *("lr", "actor_lr", "critic_lr", "alpha_lr", "value_lr", "adam_epsilon"),
-            *("grad_clip", "clip_param", "vf_clip_param", "kl_target", "initial_alpha", "temperature"),
-        ),
-        PositiveInt: (
-            *("train_batch_size_per_learner", "minibatch_size", "num_epochs", "rollout_fragment_length", "n_step"),
-            *("num_atoms", "n_quantiles", "n_critics", "num_actions", "broadcast_interval", "simple_queue_size"),
-            *("circular_buffer_num_batches", "circular_buffer_iterations_per_batch"),
-        ),
-        NonNegative: (
-            *("action_init_scale", "entropy_coeff", "vf_loss_coeff", "vf_coeff", "kl_coeff", "beta", "sigma0"),
-            *("num_steps_sampled_before_learning_starts", "target_network_update_freq"),
-            "top_quantiles_to_drop_per_net",
-        ),
-    }
+_RATES = (
+    *("lr", "actor_lr", "critic_lr", "alpha_lr", "value_lr", "adam_epsilon"),
+    *("grad_clip", "clip_param", "vf_clip_param", "kl_target", "initial_alpha", "temperature"),
 )
-_LAST = {name: NonNegative if kind is Positive else kind for name, kind in _RANGES.items() if kind is not PositiveInt}
+_COUNTS = (
+    *("train_batch_size_per_learner", "minibatch_size", "num_epochs", "rollout_fragment_length", "n_step"),
+    *("num_atoms", "n_quantiles", "n_critics", "num_actions", "broadcast_interval", "simple_queue_size"),
+    *("circular_buffer_num_batches", "circular_buffer_iterations_per_batch"),
+)
+_WEIGHTS = (
+    *("action_init_scale", "entropy_coeff", "vf_loss_coeff", "vf_coeff", "kl_coeff", "beta", "sigma0"),
+    *("num_steps_sampled_before_learning_starts", "target_network_update_freq", "top_quantiles_to_drop_per_net"),
+)
+_LAST: dict[str, Any] = {
+    **dict.fromkeys(("gamma", "lambda_", "tau", "expectile", "epsilon"), Fraction),
+    **dict.fromkeys((*_RATES, *_WEIGHTS), NonNegative),
+}
 """What a schedule may come to: a rate of 0 ends learning, and does no harm at its end."""
+_RANGES = _LAST | dict.fromkeys(_RATES, Positive) | dict.fromkeys(_COUNTS, PositiveInt)
 
 
 def _require_ranges(values: Mapping[str, Any]) -> None:

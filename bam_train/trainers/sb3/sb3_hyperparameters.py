@@ -11,7 +11,7 @@ import operator
 import re
 import typing
 import warnings
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Container, Mapping
 from typing import Any
 
 import numpy as np
@@ -27,21 +27,20 @@ from bam_train.errors import SettingsError
 from bam_train.settings import NAMES, TrainSettings
 from bam_train.trainers.algorithms import SB3_ALGORITHMS, Algorithm
 from bam_train.trainers.frozen_network import leaves
-from bam_train.trainers.library_arguments import fit, linear_start, ranges
+from bam_train.trainers.library_arguments import fit, linear_start, ranges, require_known
 
 ELSEWHERE = {
-    "self": None,
-    "env": None,
-    "seed": "--seed",
-    "device": "--device",
-    "tensorboard_log": None,
-    "verbose": None,
-    "_init_setup_model": None,
-    "rollout_buffer_class": None,
-    "rollout_buffer_kwargs": None,
-    "replay_buffer_class": None,
+    "seed": "use --seed",
+    "device": "use --device",
+    **dict.fromkeys(
+        (
+            *("self", "env", "tensorboard_log", "verbose", "_init_setup_model"),
+            *("rollout_buffer_class", "rollout_buffer_kwargs", "replay_buffer_class"),
+        ),
+        "bam-train takes care of it",
+    ),
 }
-"""Constructor arguments that are not hyperparameters, and the flag that sets them if there is one."""
+"""Constructor arguments that are not hyperparameters, and why or what to do instead."""
 
 _POLICY_ELSEWHERE = frozenset({"self", "observation_space", "action_space", "lr_schedule", "use_sde"})
 
@@ -82,8 +81,7 @@ def complete(algorithm: Algorithm, given: Mapping[str, Any], observation_space: 
         SettingsError: An unknown name (with the closest match) or a wrong type.
     """
     parameters = _parameters(algorithm.load(), ELSEWHERE)
-    for name in given:
-        _require_known(name, parameters, f"{algorithm.name} hyperparameter", NAMES)
+    require_known(given, parameters, f"{algorithm.name} hyperparameter", ELSEWHERE, NAMES)
     values: dict[str, Any] = {"policy": default_policy(algorithm, observation_space)}
     for name, parameter in parameters.items():
         if name in given:
@@ -116,8 +114,7 @@ def complete_normalize(given: bool | Mapping[str, Any], gamma: float) -> bool | 
     if isinstance(given, bool):
         return {"gamma": gamma} if given else False
     known = _parameters(VecNormalize, ("self", "venv", "training"))
-    for name in given:
-        _require_known(name, known, "normalize argument")
+    require_known(given, known, "normalize argument", ELSEWHERE)
     fitted = {name: fit(f"normalize.{name}", value, known[name].annotation) for name, value in given.items()}
     _check_ranges(fitted)
     return {"gamma": gamma, **fitted}
@@ -159,16 +156,6 @@ def _parameters(kind: Any, but: Container[str]) -> dict[str, inspect.Parameter]:
     return {name: parameter for name, parameter in parameters.items() if name not in but}
 
 
-def _require_known(name: str, parameters: Mapping[str, Any], what: str, others: Iterable[str] = ()) -> None:
-    if name in parameters:
-        return
-    if ELSEWHERE.get(name) is not None:
-        raise SettingsError(f"{name} is not a hyperparameter here: use {ELSEWHERE[name]}")
-    if name in ELSEWHERE:
-        raise SettingsError(f"{name} cannot be set: bam-train takes care of it")
-    raise SettingsError(f"Unknown {what} {name!r}. {did_you_mean(name, [*parameters, *others])}")
-
-
 def _written(hint: Any) -> Any:
     """The annotation of a value as it is written in settings: action noise is text too."""
     parts = [str if one is noise.ActionNoise else one for one in typing.get_args(hint)]
@@ -186,8 +173,8 @@ def _check_ranges(values: Mapping[str, Any]) -> None:
 
 def _checked_policy(policy: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     parameters, values = _parameters(policy, _POLICY_ELSEWHERE), {}
+    require_known(given, parameters, "policy_kwargs argument", ELSEWHERE)
     for name, value in given.items():
-        _require_known(name, parameters, "policy_kwargs argument")
         values[name] = fit(f"policy_kwargs.{name}", value, _written(parameters[name].annotation))
         if name in CLASSES and values[name].lower() not in CLASSES[name]:
             close = did_you_mean(value.lower(), CLASSES[name])

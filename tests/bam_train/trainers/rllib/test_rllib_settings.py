@@ -29,7 +29,7 @@ WRONG = [
     ("ppo", "train_batch_size", 9, "train_batch_size is not a hyperparameter here: use train_batch_size_per_learner"),
     ("ppo", "num_workers", 1, "num_workers is not a hyperparameter here: use --num-env-runners"),
     ("ppo", "learning_rate", 1, "learning_rate is not a hyperparameter here: use lr"),
-    ("ppo", "horizon", 1, "horizon: there is none here; the environment ends its episodes"),
+    ("ppo", "horizon", 1, "horizon is not a hyperparameter here: the environment ends its episodes"),
     ("ppo", "lr", "fast", "lr: expected a number or a schedule [[step, value], ...], found 'fast'"),
     ("ppo", "lr", -1, "lr: expected a number above 0, found -1"),
     ("ppo", "lr", [], SCHEDULE.format("lr")),
@@ -50,7 +50,7 @@ WRONG = [
     ("sac", "target_entropy", "x", "target_entropy: expected a number or 'auto', found"),
     ("sac", "initial_alpha", -1, "initial_alpha: expected a number above 0, found -1"),
     ("sac", "replay_buffer_config", {"capacty": 9}, "argument 'capacty'. Did you mean 'capacity'?"),
-    ("sac", "replay_buffer_config", {"capacity": 0}, "replay_buffer_config.capacity: expected at least 1, found 0"),
+    ("sac", "replay_buffer_config", {"capacity": 0}, "capacity: expected a whole number of at least 1, found 0"),
     ("sac", "replay_buffer_config", {"type": "Foo"}, "expected EpisodeReplayBuffer or PrioritizedEpisodeReplayBuffer,"),
 ]
 
