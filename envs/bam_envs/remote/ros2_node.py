@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost
-from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Bus, Handler, Listener, Message, refusal_of
+from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Bus, Handler, Listener, Message, deliver
 
 _log = logging.getLogger(__name__)
 _DEPTH = 10
@@ -130,16 +130,9 @@ class RclpyBus(Bus):
 
         def receive(message: Any) -> None:
             nonlocal logged
-            refusal = ""
-            try:
-                listener(to_dict(message), UNKNOWN_CALLER)
-            except BamEnvsError as error:
-                refusal = str(error)
-            except Exception as error:  # it must not end the thread of every topic, among them the one that halts
-                _log.exception("a listener failed")
-                refusal = f"{type(error).__name__}: {error}"
+            refusal = deliver(listener, to_dict(message), UNKNOWN_CALLER, topic)
             if refusal and refusal != logged:
-                _log.warning("%s", refusal_of(topic, refusal))
+                _log.warning("%s", refusal)
             logged = refusal
 
         def stop() -> None:

@@ -205,7 +205,8 @@ def read_stamp(message: Message, where: str) -> float | None:
 
 def write_stamp(seconds: float, *, ros1: bool = False) -> dict[str, int]:
     """A stamp as ROS 2 spells it, or ROS 1."""
-    whole, nano = divmod(round(seconds * _NANO), _NANO)
+    whole = math.floor(seconds)
+    nano = min(round((seconds - whole) * _NANO), _NANO - 1)
     return {"secs": whole, "nsecs": nano} if ros1 else {"sec": whole, "nanosec": nano}
 
 

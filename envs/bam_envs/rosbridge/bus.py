@@ -1,9 +1,7 @@
-"""The Bus protocol: topics and services, over any carrier.
+"""Topics and services over any carrier: the embedded server, a link to a server, a ROS 2 node.
 
-Three carry them: the embedded server inside its own process (`bam_envs.rosbridge.server`), a link to a rosbridge
-server (`bam_envs.rosbridge.client`), and a native ROS 2 node (`bam_envs.remote.ros2_node`). Messages are plain
-dicts in the JSON form of rosbridge; a byte array is `bytes`. Types are written ``pkg/Type``; ``pkg/msg/Type`` and
-``pkg/srv/Type`` are taken too.
+Messages are plain dicts in the JSON form of rosbridge; a byte array is `bytes`. Types are written ``pkg/Type``;
+``pkg/msg/Type`` and ``pkg/srv/Type`` are taken too.
 """
 
 import logging
@@ -12,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, TypeVar
 
-from bam_envs.core.errors import LinkLost, RemoteError
+from bam_envs.core.errors import BamEnvsError, LinkLost, RemoteError
 from bam_envs.core.wording import listed
 
 T = TypeVar("T")
@@ -25,7 +23,7 @@ class Caller:
     """Who published a message, or calls a service."""
 
     name: str
-    """Unique among the callers of a bus; the same as long as the connection lives."""
+    """Unique among the callers of a bus."""
     address: str = ""
     """Where it is, for people."""
     session: str = ""
@@ -64,11 +62,30 @@ def tell(callback: Callable[[T], object], news: T) -> None:
         _log.exception("a callback failed")
 
 
-def refusal_of(topic: str, reason: object) -> str:
-    """Why a listener refuses a message on `topic`, with its name once: listeners may say it, without a namespace."""
-    head, colon, rest = str(reason).partition(": ")
-    named = bool(colon) and head.startswith("/") and topic.endswith(head)
-    return f"{topic}: {rest if named else reason}"
+def deliver(listener: Listener, message: Message, caller: Caller, topic: str) -> str:
+    """Give a listener a message; why it refuses it, empty if it does not. Foreign errors are logged."""
+    try:
+        listener(message, caller)
+        return ""
+    except BamEnvsError as error:
+        head, colon, rest = str(error).partition(": ")
+        named = bool(colon) and head.startswith("/") and topic.endswith(head)  # perhaps without a namespace
+        return f"{topic}: {rest if named else error}"
+    except Exception:
+        _log.exception("%s: a listener failed", topic)
+        return f"{topic}: The receiver failed; its log says more."
+
+
+def answer(handler: Handler, request: Message, caller: Caller, name: str) -> Message:
+    """The response of the handler of `name`; a foreign error of it is logged, and raised as a `RemoteError`."""
+    try:
+        return handler(request, caller)
+    except BamEnvsError:
+        raise
+    except Exception as error:
+        _log.exception("%s: the handler failed", name)
+        line = " ".join(f"{type(error).__name__}: {error}".split())
+        raise RemoteError(f"{name} failed: {line}") from error
 
 
 class Bus(Protocol):

@@ -1,8 +1,7 @@
 """A link to a rosbridge server, for a robot: what is sent is sent now or not at all.
 
 A thread of its own connects, reads and writes, so that a slow listener of one link never delays the halt on another.
-While the link is down, publishing and calling raise at once, and nothing is kept: after a cut the server gets the
-declarations (topics, subscriptions, services) again and no message from before it.
+After a cut the server gets the declarations (topics, subscriptions, services) again and no message from before it.
 """
 
 import asyncio
@@ -23,8 +22,8 @@ from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NoServer,
 from bam_envs.core.wording import brief
 from bam_envs.ros.interfaces import normal_name
 from bam_envs.ros.messages import write_stamp
-from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Handler, Message, tell
-from bam_envs.rosbridge.client_connection import Connection, ServerClock, bare_reason
+from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Handler, Message, answer, tell
+from bam_envs.rosbridge.client_connection import Connection, bare_reason
 from bam_envs.rosbridge.declarations import Declarations
 from bam_envs.rosbridge.encoding import dump_json
 from bam_envs.rosbridge.endpoint import Endpoint
@@ -48,8 +47,8 @@ class RosbridgeLink(Declarations):
     Args:
         endpoint: The server; the text of a URL stands for `Endpoint(url)`.
         name: What it is for; in the names of its threads.
-        lost_after: The link drops when the server answers no WebSocket ping for so long [s]; a bridge does also while
-            it holds everything else back for a call. Infinite: only when the network reports it.
+        lost_after: The link drops when the server answers no WebSocket ping for so long [s]. Infinite: only when the
+            network reports it.
         max_message: Largest message, in either direction [bytes].
 
     Raises:
@@ -71,19 +70,21 @@ class RosbridgeLink(Declarations):
         """The last `status` messages of the server."""
         self.epoch = 0
         """Counts the connections; 0 before the first."""
+        self.ros: str | None = None
+        """``"ros1"`` or ``"ros2"``, by how the server spells a time; None until it has shown that."""
+        self.clock_offset: float | None = None
+        """Our wall clock minus the server's [s]; None where it tells no time."""
         if not lost_after > 0.0:
             raise InvalidValue(f"lost_after: expected a time above 0 s, found {lost_after!r}.")
         self._lost_after, self._max_message = lost_after, max_message
         self._up: Connection | None = None
         self._why = "not connected yet: call connect()"
-        self._server = ServerClock()
-        self._seen_ros: str | None = None
         self._down_callbacks: list[Callable[[LinkLost], None]] = []
         self._status_callbacks: list[Callable[[Mapping[str, Any]], None]] = []
         self._numbers = itertools.count(1)
         self._workers = Workers(_MOST_ANSWERING, f"bam-link-{name}-service")
         self._may_answer = threading.Semaphore(_MOST_ANSWERING)
-        self._thread = LoopThread(f"bam-link-{name}")
+        self._thread = LoopThread(f"bam-link-{name}", self.url)
         self._main_task: asyncio.Task[None] | None = None
         self._connecting, self._changed = threading.Lock(), threading.Condition()
         self._closed = False
@@ -108,7 +109,7 @@ class RosbridgeLink(Declarations):
                 self._thread.start(self._main)
             except BaseException:  # also Ctrl-C: a connection that opened later would have no owner
                 self._thread.post(self._stop)
-                self._thread = LoopThread(f"bam-link-{self.name}")
+                self._thread = LoopThread(f"bam-link-{self.name}", self.url)
                 raise
 
     def close(self) -> None:
@@ -142,23 +143,11 @@ class RosbridgeLink(Declarations):
         """Call `callback` with the reason on the network thread each time the link drops, but not when it is closed."""
         self._down_callbacks.append(callback)
 
-    # ---- the server's time
-
-    @property
-    def ros(self) -> str | None:
-        """``"ros1"`` or ``"ros2"``, by how the server spells a time; None until it has shown that."""
-        return self._server.ros or self._seen_ros
-
-    @property
-    def clock_offset(self) -> float | None:
-        """Our wall clock minus the server's [s]; None where it tells no time."""
-        return self._server.offset
-
     def stamp(self, t: float) -> dict[str, int]:
         """A time [s] as the server spells it; as ROS 2 does where that is not known."""
         return write_stamp(t, ros1=self.ros == "ros1")
 
-    # ---- topics
+    # ---- topics and services
 
     def publish_all(self, messages: Sequence[tuple[str, Message]]) -> None:
         """Send several messages now or not at all: on return they have been written to the socket. See `Bus`."""
@@ -166,13 +155,12 @@ class RosbridgeLink(Declarations):
         for topic, _ in messages:
             if topic not in self._topics:
                 raise InvalidValue(f"Topic {topic!r} was not advertised: call advertise(topic, type) before publish.")
-        self._send(connection, *(dump_json({"op": "publish", "topic": one, "msg": msg}) for one, msg in messages))
+        frames = [dump_json({"op": "publish", "topic": one, "msg": msg}) for one, msg in messages]
+        self._thread.do(lambda: connection.send(*frames), _SEND_WITHIN)
 
     def on_status(self, callback: Callable[[Mapping[str, Any]], None]) -> None:
         """Call `callback` with each `status` message; on the network thread."""
         self._status_callbacks.append(callback)
-
-    # ---- services
 
     def call(self, service: str, kind: str, args: Message, timeout: float) -> dict[str, Any]:
         """Ask `service` of type `kind`, and wait for its response.
@@ -195,21 +183,20 @@ class RosbridgeLink(Declarations):
         # Servers that know the field `timeout` end the call then, and not after a shorter time of their own.
         request = {"op": "call_service", "id": identity, "service": service, "args": args, "timeout": timeout}
         frame = dump_json({**request, "type": normal_name(kind)} if kind else request)
-        answer: Future[dict[str, Any]] = Future()
+        response: Future[dict[str, Any]] = Future()
         try:
-            self._post(answer, lambda: connection.ask(identity, frame, answer))
-            said = answer.result(timeout)
+            self._thread.do(lambda: connection.ask(identity, frame, response), timeout)
+            said = response.result(begun + timeout - time.monotonic())
         except NoResultYet as error:
-            self._require_taken(answer, timeout)
             self._thread.post(lambda: connection.forget(identity))
             raise LinkLost(f"{self.url}: {service} did not answer in {timeout:g} s; it may still be at it.") from error
         finally:
-            answer.cancel()
+            response.cancel()
         return self._response(service, said, time.monotonic() - begun, timeout)
 
-    def _response(self, service: str, answer: Mapping[str, Any], waited: float, timeout: float) -> dict[str, Any]:
-        values = answer.get("values")
-        if answer.get("result") is False and _ENDED in str(values):
+    def _response(self, service: str, said: Mapping[str, Any], waited: float, timeout: float) -> dict[str, Any]:
+        values = said.get("values")
+        if said.get("result") is False and _ENDED in str(values):
             if waited > _NEARLY * timeout:
                 raise LinkLost(f"{self.url}: {service} did not answer in {timeout:g} s; it may still be at it.")
             raise LinkLost(
@@ -217,7 +204,7 @@ class RosbridgeLink(Declarations):
                 f"may still be at it. Start the bridge with default_call_service_timeout:={timeout:.1f}, or use a pair "
                 'of topics instead of the service (channel="topics").'
             )
-        if answer.get("result") is False:
+        if said.get("result") is False:
             raise RemoteError(values if isinstance(values, str) and values else f"{service} failed: {values!r}.")
         if values is None:
             return {}
@@ -225,48 +212,7 @@ class RosbridgeLink(Declarations):
             raise ProtocolError(f"{service}: expected a response with fields, found {values!r}.")
         return values
 
-    # ---- any thread: sending
-
-    def _send(self, connection: Connection, *frames: str) -> None:
-        """Write frames to the socket now, or not at all: what waited too long is taken back."""
-        if self._thread.is_current:
-            connection.send(*frames)
-            return
-        done: Future[None] = Future()
-
-        def send() -> None:
-            connection.send(*frames)
-            done.set_result(None)
-
-        try:
-            self._post(done, send)
-            done.result(_SEND_WITHIN)
-        except NoResultYet:
-            self._require_taken(done, _SEND_WITHIN)
-            done.result()  # it is being written
-        finally:
-            done.cancel()  # also after Ctrl-C: what was not sent by now is not to be sent any more
-
-    def _post(self, done: Future[Any], work: Callable[[], None]) -> None:
-        """Run `work` on the network thread, unless `done` is cancelled before; what it raises goes to `done`."""
-
-        def run() -> None:
-            if done.set_running_or_notify_cancel():
-                try:
-                    work()
-                except BaseException as error:
-                    done.set_exception(error)
-
-        if not self._thread.post(run):
-            raise LinkLost(f"{self.url}: the link is down ({self._why}). Nothing was sent, and nothing is kept.")
-
-    def _require_taken(self, done: Future[Any], waited: float) -> None:
-        """Take the work of `done` back, or see that it has begun."""
-        if done.cancel():
-            raise LinkLost(
-                f"{self.url}: the network thread took nothing for {waited:g} s; nothing was sent. "
-                "A listener must return at once: do work in another thread."
-            )
+    # ---- what any thread may ask for
 
     def _announce(self, request: dict[str, Any]) -> None:
         # In the lock of the declarations: they reach the network thread in the order in which they were made.
@@ -355,7 +301,7 @@ class RosbridgeLink(Declarations):
         except BamEnvsError as error:
             connection.drop(error)
             raise
-        self.epoch, self._server = connection.epoch, connection.clock
+        self.epoch, self.ros, self.clock_offset = connection.epoch, connection.ros or self.ros, connection.clock_offset
         with self._changed:
             self._up = connection
             self._changed.notify_all()
@@ -398,7 +344,7 @@ class RosbridgeLink(Declarations):
             header = content.get("header") if self.ros is None else None
             stamp = header.get("stamp") if isinstance(header, Mapping) else None
             if isinstance(stamp, Mapping):
-                self._seen_ros = "ros2" if "sec" in stamp else "ros1" if "secs" in stamp else None
+                self.ros = "ros2" if "sec" in stamp else "ros1" if "secs" in stamp else None
             self._deliver(topic, content)
         elif operation == "call_service":
             self._answer(connection, message)
@@ -426,17 +372,15 @@ class RosbridgeLink(Declarations):
     def _run_handler(
         self, connection: Connection, handler: Handler, request: dict[str, Any], response: dict[str, Any]
     ) -> None:
-        args = request.get("args")
+        args, service = request.get("args"), str(response["service"])
+        asked = args if isinstance(args, Mapping) else {}
         try:
-            values = dict(handler(args if isinstance(args, Mapping) else {}, UNKNOWN_CALLER))
+            values = answer(lambda *given: dict(handler(*given)), asked, UNKNOWN_CALLER, service)
             frame = dump_json({**response, "values": values, "result": True})
         except BamEnvsError as error:
             frame = dump_json({**response, "values": str(error), "result": False})
-        except Exception as error:  # handlers are foreign code, and the caller waits for an answer in every case
-            _LOG.exception("%s: the handler failed", response["service"])
-            frame = dump_json({**response, "values": f"{type(error).__name__}: {error}", "result": False})
         self._may_answer.release()
         try:
-            self._send(connection, frame)
+            self._thread.do(lambda: connection.send(frame), _SEND_WITHIN)
         except BamEnvsError as gone:
-            _LOG.warning("%s: the response could not be sent: %s", response["service"], gone)
+            _LOG.warning("%s: the response could not be sent: %s", service, gone)

@@ -15,7 +15,6 @@ import ssl
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass
 from typing import Any
 
 from websockets.asyncio.client import ClientConnection, connect
@@ -47,15 +46,6 @@ def bare_reason(url: str, error: BamEnvsError) -> str:
     return str(error).removeprefix(f"{url}: ").rstrip(".")
 
 
-@dataclass(frozen=True)
-class ServerClock:
-    """What a server says of itself and its time."""
-
-    ros: str | None = None  # ``"ros1"`` or ``"ros2"``, by how it spells a time; None where it tells none
-    offset: float | None = None
-    """Our wall clock minus the server's [s], to within half the round trip; None where it tells none."""
-
-
 class Connection:
     """One connection.
 
@@ -81,7 +71,8 @@ class Connection:
         self.error: BamEnvsError | None = None  # why it ended; None before
         self.ended = asyncio.Event()
         self.announced: dict[str, str] = {}  # what has been declared on it: id of the declaration -> its frame
-        self.clock = ServerClock()  # known once it is open
+        self.ros: str | None = None  # as of `RosbridgeLink`, known once it is open, to within half a round trip
+        self.clock_offset: float | None = None
         self._endpoint, self._max_message, self._lost_after = endpoint, max_message, lost_after
         self._on_message, self._on_end = on_message, on_end
         self._heard_at = time.monotonic()  # when the server last gave a sign of life [s]
@@ -108,7 +99,7 @@ class Connection:
         loop = asyncio.get_running_loop()
         self._tasks = [loop.create_task(work(self._socket)) for work in (self._read, self._watch)]
         try:
-            self.clock = await asyncio.wait_for(self._first_answer(), deadline - time.monotonic())
+            await asyncio.wait_for(self._see_answers(), deadline - time.monotonic())
             self._ready = True
         except asyncio.TimeoutError as error:
             raise NoServer(
@@ -120,21 +111,20 @@ class Connection:
             if not self._ready:
                 self.drop(LinkLost(f"{self.url}: no answer."))
 
-    async def _first_answer(self) -> ServerClock:
-        best, best_trip = ServerClock(), math.inf
+    async def _see_answers(self) -> None:
+        best = math.inf
         for probe in range(_CLOCK_PROBES):
             asked = time.time()
             found = await self._ask_time(f"ready:{self.epoch}:{probe}")
             trip = time.time() - asked
-            if found is None:
-                break
             for ros, seconds, nanoseconds in (("ros2", "sec", "nanosec"), ("ros1", "secs", "nsecs")):
                 whole, rest = found.get(seconds), found.get(nanoseconds)
-                if isinstance(whole, int) and isinstance(rest, int) and trip < best_trip:
-                    best_trip, best = trip, ServerClock(ros, asked + trip / 2 - whole - rest * 1e-9)
-        return best
+                if isinstance(whole, int) and isinstance(rest, int) and trip < best:
+                    best, self.ros, self.clock_offset = trip, ros, asked + trip / 2 - whole - rest * 1e-9
+            if self.ros is None:
+                return
 
-    async def _ask_time(self, identity: str) -> Mapping[str, Any] | None:
+    async def _ask_time(self, identity: str) -> Mapping[str, Any]:
         # Any answer will do, also that there is no such service: it comes from the part that does the work.
         request = {"op": "call_service", "id": identity, "service": "/rosapi/get_time", "type": "rosapi/GetTime"}
         answer: Future[dict[str, Any]] = Future()
@@ -142,7 +132,7 @@ class Connection:
             self.ask(identity, dump_json({**request, "args": {}}), answer)
             values = (await asyncio.wrap_future(answer)).get("values")
         except RemoteError:
-            return None
+            return {}
         except NoServer:
             raise
         except LinkLost as error:
@@ -152,7 +142,7 @@ class Connection:
             text = f"its ROS node has ended and its socket has not ({values}). Restart the bridge."
             raise NoServer(self.url, text)
         found = values.get("time") if isinstance(values, Mapping) else None
-        return found if isinstance(found, Mapping) else None
+        return found if isinstance(found, Mapping) else {}
 
     # ---- sending
 

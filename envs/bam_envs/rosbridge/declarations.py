@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from bam_envs.core.errors import BamEnvsError, InvalidValue
+from bam_envs.core.errors import InvalidValue
 from bam_envs.ros.interfaces import normal_name
-from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Bus, Handler, Listener, refusal_of
+from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Bus, Handler, Listener, deliver
 
 _LOG = logging.getLogger(__name__)
 
@@ -63,11 +63,11 @@ class Declarations(Bus):
         Args:
             topic: Its name.
             kind: Its type.
-            listener: Must return at once. Other listeners of the topic are independent of it.
+            listener: Must return at once.
             throttle_ms: Least time between two messages [ms], the lowest of all listeners; the server drops the others.
             queue_length: How many messages the server keeps while they are throttled, the newest; 0: none.
-            compression: ``"none"`` for JSON, or ``"cbor"`` for images and large arrays, which JSON makes seven times
-                slower; their typed arrays come as NumPy arrays, byte arrays as `bytes`.
+            compression: ``"none"`` for JSON, or ``"cbor"``, seven times as fast for images and large arrays; its typed
+                arrays come as NumPy arrays, byte arrays as `bytes`.
 
         Raises:
             InvalidValue: The topic has another type here already, or a number is not whole.
@@ -103,7 +103,7 @@ class Declarations(Bus):
                 self._announce({"op": "unsubscribe", "id": f"subscribe:{topic}", "topic": topic})
 
     def serve(self, service: str, kind: str, handler: Handler) -> None:
-        """Answer `service` of type `kind` through the server: always, also when the handler fails."""
+        """Answer `service` of type `kind` through the server."""
         self._require_process()
         request = {"op": "advertise_service", "id": f"serve:{service}", "service": service, "type": normal_name(kind)}
         with self._lock:
@@ -124,15 +124,11 @@ class Declarations(Bus):
             )
 
     def _deliver(self, topic: str, message: Mapping[str, Any]) -> None:
-        """Give a message to each listener of `topic`. What one of them raises is logged, and the others still hear."""
+        """Give a message to each listener of `topic`."""
         entry = self._subscriptions.get(topic)
         for listener in () if entry is None else entry.listeners.values():
-            try:
-                listener(message, UNKNOWN_CALLER)
-            except BamEnvsError as error:  # noqa: PERF203 - each listener has its own
-                _LOG.info("a message was refused: %s", refusal_of(topic, error))
-            except Exception:  # listeners are foreign code
-                _LOG.exception("%s: a listener failed", topic)
+            if refusal := deliver(listener, message, UNKNOWN_CALLER, topic):
+                _LOG.info("a message was refused: %s", refusal)
 
     def _greeting(self) -> list[dict[str, Any]]:
         """Everything, for a server that knows nothing yet."""

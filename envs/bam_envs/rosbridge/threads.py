@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Coroutine
 from concurrent.futures import Future
-from concurrent.futures import TimeoutError as FutureTimeoutError
+from concurrent.futures import TimeoutError as NoResultYet
 from typing import Any, TypeVar
 
 from bam_envs.core.errors import LinkLost
@@ -16,10 +16,10 @@ _PATIENCE = 10.0
 
 
 class LoopThread:
-    """Runs one coroutine to its end in an asyncio loop of its own."""
+    """Runs one coroutine to its end in an asyncio loop of its own; errors name its `owner`."""
 
-    def __init__(self, name: str) -> None:
-        self._name = name
+    def __init__(self, name: str, owner: str = "this server") -> None:
+        self._name, self._owner = name, owner
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread: threading.Thread | None = None
 
@@ -60,22 +60,34 @@ class LoopThread:
             return False
         return True
 
-    def do(self, work: Callable[[], T]) -> T:
-        """Run `work` in the thread, in the caller's where the loop does not run, and return its result."""
+    def do(self, work: Callable[[], T], within: float = _PATIENCE) -> T:
+        """Run `work` in the thread, in the caller's where the loop does not run, and return its result.
+
+        Raises:
+            LinkLost: It had not begun after `within` [s], and never will.
+        """
         done: Future[T] = Future()
 
-        def settle() -> None:
-            try:
-                done.set_result(work())
-            except Exception as error:  # it is raised where the result is waited for
-                done.set_exception(error)
+        def run() -> None:
+            if done.set_running_or_notify_cancel():
+                try:
+                    done.set_result(work())
+                except BaseException as error:  # it is raised where the result is waited for
+                    done.set_exception(error)
 
-        if self.is_current or not self.post(settle):
+        if self.is_current or not self.post(run):
             return work()
         try:
-            return done.result(timeout=_PATIENCE)
-        except FutureTimeoutError:
-            raise LinkLost(f"{self._name}: ended meanwhile.") from None
+            return done.result(within)
+        except NoResultYet:
+            if done.cancel():
+                raise LinkLost(
+                    f"{self._owner}: the network thread took nothing for {within:g} s; nothing was sent. "
+                    "A listener must return at once: do work in another thread."
+                ) from None
+            return done.result()  # it is being done
+        finally:
+            done.cancel()  # also after Ctrl-C: what has not begun by now is not wanted any more
 
     async def _run(self, main: Callable[[Future[None]], Coroutine[Any, Any, None]], ready: Future[None]) -> None:
         self._loop = asyncio.get_running_loop()
@@ -90,10 +102,9 @@ class LoopThread:
 
 
 class Workers:
-    """A pool of daemon threads.
+    """A pool of at most `most` daemon threads, each started when the others are busy.
 
     A `ThreadPoolExecutor` joins its threads when the interpreter exits: one handler that hangs would keep the program.
-    There are at most `most`; each is started when the others are busy. `name` is the prefix of their names.
     """
 
     def __init__(self, most: int, name: str) -> None:

@@ -49,9 +49,9 @@ def not_now(request, caller):
     ("handler", "text"),
     [
         (not_now, "not now"),
-        (lambda request, caller: {}["seed"], "KeyError: 'seed'"),
+        (lambda request, caller: {}["seed"], "/act failed: KeyError: 'seed'"),
         (lambda request, caller: {"x": float("nan")}, "message.values.x: expected a finite number, found nan."),
-        (lambda request, caller: 3, "TypeError: 'int' object is not iterable"),
+        (lambda request, caller: 3, "/act failed: TypeError: 'int' object is not iterable"),
     ],
 )
 def test_a_handler_that_fails_is_an_answer(scripted, link, caplog, handler, text):

@@ -10,13 +10,14 @@ import contextlib
 import logging
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, ProtocolError
 from bam_envs.core.wording import brief
 from bam_envs.ros.interfaces import complete, normal_name, request_type, response_type
-from bam_envs.rosbridge.bus import Caller, Handler, Listener, Message, refusal_of, tell
+from bam_envs.ros.messages import write_stamp
+from bam_envs.rosbridge.bus import Caller, Handler, Listener, Message, deliver, tell
 from bam_envs.rosbridge.encoding import Id, decode_frame, read_id
 from bam_envs.rosbridge.server.client_session import (
     LEVELS,
@@ -30,36 +31,34 @@ from bam_envs.rosbridge.server.client_session import (
     read_name,
     read_number,
     read_text,
-    read_wire,
+    read_wish,
 )
 from bam_envs.rosbridge.server.services import Request, Service, Services, checked, packed_response
-from bam_envs.rosbridge.server.topics import Stream, Topic, Topics, Wish
-
-T = TypeVar("T")
+from bam_envs.rosbridge.server.topics import Stream, Topic, Topics
 
 _logger = logging.getLogger(__name__)
 _PROCESS = Caller("this process")
-_LONGEST_QUEUE = 100
+_OPERATIONS = (
+    *("advertise", "unadvertise", "publish", "subscribe", "unsubscribe", "call_service", "advertise_service"),
+    *("unadvertise_service", "service_response", "set_level", "send_action_goal"),
+)
 _NO_ACTIONS = "Actions are not supported by this server; use a service, or a pair of topics."
 _NO_AUTH = "The op auth is for the first message of a web page; this client has been let in already."
 
 
-@dataclass(frozen=True)
-class Incoming:
-    """A frame of a client, read; what it carries (a message, arguments, a response) is checked."""
+class Incoming(NamedTuple):
+    """A frame of a client, read."""
 
     message: Mapping[str, Any]
-    error: ProtocolError | None = None  # why it says nothing
-    kind: str = ""  # the type that its content was checked for; empty where there was nothing to check
-    content: Any = None
-    wrong: BamEnvsError | None = None  # why there is no content
+    kind: str  # the type that its content was checked for; empty where there was nothing to check
+    content: Any  # what it carries (a message, arguments, a response), complete, or the error why not
 
     def content_of(self, kind: str) -> Any:
         """The content, or the error that it does not fit, or should be of another type by now."""
         if self.kind != kind:
             raise ProtocolError(f"Expected a {kind}, found a {self.kind}: the type was another one a moment ago.")
-        if self.wrong is not None:
-            raise self.wrong
+        if isinstance(self.content, BamEnvsError):
+            raise self.content
         return self.content
 
 
@@ -73,23 +72,19 @@ class Bridge:
         self.services = Services(self._events.append)
         self._fragmented: set[Session] = set()
         self._leave: list[Callable[[Caller], None]] = []
-        self._operations: dict[str, Callable[[Session, Incoming, float], None]] = {
-            "advertise": self._advertise,
-            "unadvertise": self._unadvertise,
-            "publish": self._publish,
-            "subscribe": self._subscribe,
-            "unsubscribe": self._unsubscribe,
-            "call_service": self._call_service,
-            "advertise_service": self._advertise_service,
-            "unadvertise_service": self._unadvertise_service,
-            "service_response": lambda session, said, now: self.services.respond(
-                session, said.message, said.content_of
+        rosapi: dict[str, tuple[str, Handler]] = {
+            "get_time": ("GetTime", lambda *_: {"time": _time_of_day(clock())}),
+            "topics": (
+                "Topics",
+                lambda *_: {"topics": [*self.topics], "types": self.topics.kinds},
             ),
-            "set_level": self._set_level,
-            "send_action_goal": self._send_action_goal,
+            "topic_type": ("TopicType", lambda request, _: _type_of(self.topics, request, "topic")),
+            "services": ("Services", lambda *_: {"services": [*self.services]}),
+            "service_type": ("ServiceType", lambda request, _: _type_of(self.services, request, "service")),
         }
-        for name, (kind, handler) in self._rosapi(clock).items():
-            self.services.offer(Service(name, kind, name, handler=handler, inline=True))
+        for name, (kind, handler) in rosapi.items():
+            path = f"/rosapi/{name}"
+            self.services.offer(Service(path, f"rosapi/{kind}", path, handler=handler, inline=True))
 
     # ---- clients
 
@@ -105,27 +100,23 @@ class Bridge:
         for callback in self._leave:
             tell(callback, session.caller)
 
-    def read(self, frame: str | bytes, *, joined: bool = False) -> Incoming:
+    def read(self, frame: str | bytes, *, joined: bool = False) -> Incoming | ProtocolError:
         """What a frame, or the text `joined` from fragments, says, for `take`: maybe long work, in any thread."""
         try:
             message = decode_frame(frame)
             if joined and message.get("op") == "fragment":
                 raise ProtocolError("A fragment must not hold fragments.")
         except ProtocolError as error:
-            return Incoming({}, error)
-        found = None
-        with contextlib.suppress(ProtocolError):  # it has no such name, as `take` will say
-            found = self._content(message)
-        if found is None:
-            return Incoming(message)
-        kind, check = found
+            return error
+        kind = ""
         try:
-            return Incoming(message, None, kind, check())
+            kind, check = self._carried(message)
+            return Incoming(message, kind, check())
         except BamEnvsError as error:
-            return Incoming(message, None, kind, wrong=error)
+            return Incoming(message, kind, error)
 
-    def _content(self, message: Mapping[str, Any]) -> tuple[str, Callable[[], Any]] | None:
-        """The type of what a message carries, and what checks it; None where nothing is to be checked."""
+    def _carried(self, message: Mapping[str, Any]) -> tuple[str, Callable[[], Any]]:
+        """The type of what a message carries, empty where it carries nothing, and what completes it."""
         operation = message.get("op")
         if operation == "publish":
             topic = self.topics.get(read_name(message, "topic"))
@@ -140,22 +131,22 @@ class Bridge:
             if call is not None:
                 kind = call.service.kind
                 return response_type(kind), lambda: checked(kind, response_type, message.get("values"))
-        return None
+        return "", lambda: None
 
-    def take(self, session: Session, incoming: Incoming, now: float) -> str | None:
+    def take(self, session: Session, incoming: Incoming | ProtocolError, now: float) -> str | None:
         """Do what a frame says, at `now` [s, steady]; returns the text of a message whose last fragment it was."""
+        if isinstance(incoming, ProtocolError):
+            self._status(session, str(incoming))
+            return None
         message = incoming.message
         try:
-            if incoming.error is not None:
-                self._status(session, str(incoming.error))
-            elif message.get("op") == "fragment":
+            name = read_text(message, "op")
+            if name == "fragment":
                 return self._add_fragment(session, message, now)
-            else:
-                name = read_text(message, "op")
-                if name not in self._operations:
-                    unknown = f"Unknown op {name!r:.40}; expected one of {', '.join(self._operations)}, fragment."
-                    raise ProtocolError(_NO_ACTIONS if "action" in name else _NO_AUTH if name == "auth" else unknown)
-                self._operations[name](session, incoming, now)
+            if name not in _OPERATIONS:
+                unknown = f"Unknown op {name!r:.40}; expected one of {', '.join(_OPERATIONS)}, fragment."
+                raise ProtocolError(_NO_ACTIONS if "action" in name else _NO_AUTH if name == "auth" else unknown)
+            getattr(self, f"_{name}")(session, incoming, now)
         except BamEnvsError as error:
             number: Id = None
             with contextlib.suppress(ProtocolError):
@@ -188,18 +179,14 @@ class Bridge:
 
     def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
         """This process publishes `topic`."""
-        found = _own(lambda: self.topics.require(canonical(topic), kind))
+        found = self.topics.require(canonical(topic), kind)
         found.publishers.add(None)
         if latch:
             found.latching.add(None)
 
     def publication(self, topic: str, message: Message) -> Publication:
         """A message of this process, checked; from any thread. For `publish`."""
-        name = _own(lambda: canonical(topic))
-        found = self.topics.get(name)
-        if found is None:
-            raise InvalidValue(f"Topic {name} does not exist; advertise it with its type first.")
-        return _publication(found, message)
+        return _publication(self._existing(canonical(topic)), message)
 
     def publish(self, publication: Publication, now: float, publisher: Session | None = None) -> None:
         """Send a message, of this process unless a client is its `publisher`, to all who want it."""
@@ -212,7 +199,7 @@ class Bridge:
 
     def subscribe(self, topic: str, kind: str, listener: Listener) -> Callable[[], None]:
         """Call `listener` for each message of `topic`, the latched one at once, until what is returned is called."""
-        found = _own(lambda: self.topics.require(canonical(topic), kind))
+        found = self.topics.require(canonical(topic), kind)
         found.listeners.append(listener)
         if found.latched is not None:
             publisher, publication = found.latched
@@ -227,7 +214,7 @@ class Bridge:
 
     def serve(self, service: str, kind: str, handler: Handler) -> None:
         """Answer `service` with `handler`; the events `Invoke` say when."""
-        _own(lambda: self.services.offer(Service(canonical(service), normal_name(kind), service, handler=handler)))
+        self.services.offer(Service(canonical(service), normal_name(kind), service, handler=handler))
 
     def on_leave(self, callback: Callable[[Caller], None]) -> None:
         """Call `callback` when a client's connection ends."""
@@ -261,22 +248,14 @@ class Bridge:
             self.topics.retire(topic, session)
 
     def _publish(self, session: Session, incoming: Incoming, now: float) -> None:
-        name = read_name(incoming.message, "topic")
-        topic = self.topics.get(name)
-        if topic is None:
-            raise ProtocolError(f"Topic {name} does not exist; advertise it with its type first.")
+        topic = self._existing(read_name(incoming.message, "topic"))
         _require_not_ours(topic)
         self.publish(incoming.content_of(topic.kind), now, session)
 
     def _subscribe(self, session: Session, incoming: Incoming, now: float) -> None:
         message = incoming.message
         name, number = read_name(message, "topic"), read_id(message)
-        kind = message.get("type")
-        wish = Wish(
-            read_number(message, "throttle_rate", 0) / 1000,
-            int(min(read_number(message, "queue_length", 0), _LONGEST_QUEUE)),
-            read_wire(message),
-        )
+        kind, wish = message.get("type"), read_wish(message)
         _require_room(sum(len(one.wishes) for one in session.streams.values()), session.options.topics, "subscriptions")
         topic = self.topics.require(name, None if kind is None else read_text(message, "type"))
         stream = session.streams.get(name)
@@ -308,7 +287,7 @@ class Bridge:
                 raise ProtocolError(f"Service {name} does not exist")
             limit = read_number(message, "timeout", 0) or None
             values = incoming.content_of(request_type(service.kind))
-            self.services.call(service, replace(request, wire=read_wire(message), timeout=limit), values, now)
+            self.services.call(service, replace(request, wish=read_wish(message), timeout=limit), values, now)
         except BamEnvsError as error:
             self._events.append(Send(session, packed_response(request, str(error), False)))
 
@@ -327,6 +306,9 @@ class Bridge:
             raise ProtocolError(f"Service {name} is not offered by this client.")
         self.services.withdraw(service)
 
+    def _service_response(self, session: Session, incoming: Incoming, now: float) -> None:
+        self.services.respond(session, incoming.message, incoming.content_of)
+
     def _set_level(self, session: Session, incoming: Incoming, now: float) -> None:
         level = incoming.message.get("level")
         if level not in LEVELS:
@@ -338,36 +320,13 @@ class Bridge:
         result = {"op": "action_result", "action": action, "values": _NO_ACTIONS, "status": aborted, "result": False}
         self._events.append(Send(session, pack({**result, "id": read_id(incoming.message)})))
 
-    # ---- rosapi: what time it is, which topics and services there are
-
-    def _rosapi(self, clock: Callable[[], float]) -> dict[str, tuple[str, Handler]]:
-        """Type and handler of each service, by name."""
-
-        def time_of_day(request: Message, caller: Caller) -> dict[str, Any]:
-            now = clock()
-            seconds, nanoseconds = int(now), int(now % 1 * 1e9)
-            # Both spellings: clients of ROS 1 read the one, clients of ROS 2 the other.
-            return {"time": {"sec": seconds, "nanosec": nanoseconds, "secs": seconds, "nsecs": nanoseconds}}
-
-        def type_of(table: Topics | Services, field: str) -> Handler:
-            def answer(request: Message, caller: Caller) -> dict[str, Any]:
-                found = table.get(read_name(request, field))
-                return {"type": found.kind if found else ""}
-
-            return answer
-
-        def all_topics(request: Message, caller: Caller) -> dict[str, Any]:
-            return {"topics": list(self.topics), "types": [one.kind for one in self.topics.values()]}
-
-        return {
-            "/rosapi/get_time": ("rosapi/GetTime", time_of_day),
-            "/rosapi/topics": ("rosapi/Topics", all_topics),
-            "/rosapi/topic_type": ("rosapi/TopicType", type_of(self.topics, "topic")),
-            "/rosapi/services": ("rosapi/Services", lambda *_: {"services": list(self.services)}),
-            "/rosapi/service_type": ("rosapi/ServiceType", type_of(self.services, "service")),
-        }
-
     # ---- inside
+
+    def _existing(self, name: str) -> Topic:
+        topic = self.topics.get(name)
+        if topic is None:
+            raise InvalidValue(f"Topic {name} does not exist; advertise it with its type first.")
+        return topic
 
     def _add_fragment(self, session: Session, message: Mapping[str, Any], now: float) -> str | None:
         try:
@@ -384,15 +343,12 @@ class Bridge:
         (self._fragmented.add if session.fragments.size else self._fragmented.discard)(session)
 
     def _deliver(self, listener: Listener, publication: Publication, publisher: Session | None) -> None:
-        try:
-            listener(publication.message, publisher.caller if publisher is not None else _PROCESS)
-            return
-        except BamEnvsError as error:
-            text = refusal_of(publication.topic, error)
         # One listener's mistake must not end the connection of the client that published, nor silence other listeners.
-        except Exception:
-            _logger.exception("A listener of %s failed.", publication.topic)
-            text = refusal_of(publication.topic, "The receiver failed; its log says more.")
+        text = deliver(
+            listener, publication.message, publisher.caller if publisher is not None else _PROCESS, publication.topic
+        )
+        if not text:
+            return
         if publisher is None:
             _logger.warning("%s", text)
         else:
@@ -410,7 +366,7 @@ def _publication(topic: Topic, content: Any) -> Publication:
     publication = Publication(topic.name, topic.kind, complete(topic.kind, {} if content is None else content))
     for stream in list(topic.streams.values()):
         if stream.wish.throttle == 0.0:  # packed here, in any thread: the network thread need not
-            publication.packet(stream.name, stream.wish.wire)
+            publication.packet(stream.name, stream.wish)
     return publication
 
 
@@ -425,12 +381,14 @@ def _require_room(used: int, most: int, what: str) -> None:
         raise ProtocolError(f"A client may have at most {most} {what}.")
 
 
-def _own(work: Callable[[], T]) -> T:
-    """Do something for this process, whose mistakes are its own values, not a client's protocol."""
-    try:
-        return work()
-    except ProtocolError as error:
-        raise InvalidValue(str(error)) from None
+def _time_of_day(now: float) -> dict[str, int]:
+    """`now` in both spellings: clients of ROS 1 read the one, clients of ROS 2 the other."""
+    return {**write_stamp(now), **write_stamp(now, ros1=True)}
+
+
+def _type_of(table: Topics | Services, request: Message, field: str) -> dict[str, str]:
+    found = table.get(read_name(request, field))
+    return {"type": found.kind if found else ""}
 
 
 def _title(message: Mapping[str, Any], said: str) -> str:

@@ -22,7 +22,7 @@ from websockets.asyncio.server import Server, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.protocol import State
 
-from bam_envs.core.errors import InvalidValue, LinkLost
+from bam_envs.core.errors import InvalidValue, LinkLost, ProtocolError
 from bam_envs.rosbridge.bus import Bus, Caller, Handler, Listener, Message
 from bam_envs.rosbridge.server.admission import Admission, listening_error, tls_context
 from bam_envs.rosbridge.server.bridge import Bridge, Incoming
@@ -243,11 +243,11 @@ class BridgeServer(Bus):
             if number % _TURN == 0:
                 await asyncio.sleep(0)
 
-    async def _incoming(self, text: bytes | str, joined: bool) -> Incoming:
+    async def _incoming(self, text: bytes | str, joined: bool) -> Incoming | ProtocolError:
         """What a frame says; a long one is read in another thread, and its client's next one waits for it."""
         if len(text) <= _SHORT:
             return self._bridge.read(text, joined=joined)
-        done: asyncio.Future[Incoming] = asyncio.get_running_loop().create_future()
+        done: asyncio.Future[Incoming | ProtocolError] = asyncio.get_running_loop().create_future()
 
         def read() -> None:
             incoming = self._bridge.read(text, joined=joined)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-from bam_envs.core.errors import ProtocolError
+from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.core.wording import brief
 from bam_envs.rosbridge.bus import Caller, Handler, Message
 from bam_envs.rosbridge.encoding import COMPRESSIONS, Fragments, Id, dump_json, encode_cbor, encode_png, split
@@ -25,57 +25,42 @@ _NUMBERS = itertools.count(1)
 _NAME = re.compile(r"/?[A-Za-z_~][\w~]*(?:/[\w~]+)*", re.ASCII)
 _LONGEST = 256
 _LARGEST = 2**53
+_LONGEST_QUEUE = 100
 
 
 @dataclass(frozen=True)
 class ServerOptions:
     """What clients of a `BridgeServer` may use: beyond it one is told so, and the others do not notice."""
 
-    max_clients: int = 256
-    """Most clients at the same time; the next one is told 503."""
-    service_timeout: float = 30.0
-    """A client that offers a service must have answered by then [s], if the caller names no other time."""
-    handler_timeout: float = 300.0
-    """The same for services offered inside this process [s]: a robot's motion may take its time."""
-    max_message: int = 64 * 2**20
-    """Largest answer to a client [bytes]."""
-    max_incoming: int = 16 * 2**20
-    """Largest message from a client [bytes], and most that its unfinished fragments may hold together."""
+    max_clients: int = 256  # the next one is told 503
+    service_timeout: float = 30.0  # for the answer of a client's service [s], if the caller names no other time
+    handler_timeout: float = 300.0  # the same for services of this process [s]: a robot's motion may take its time
+    max_message: int = 64 * 2**20  # largest answer to a client [bytes]
+    max_incoming: int = 16 * 2**20  # largest message of a client, and most of its unfinished fragments together [bytes]
+    # Unfinished fragments of all clients, and unfinished frames [bytes]: the client that holds most loses its own.
     unfinished: int = 64 * 2**20
-    """Most that the unfinished fragments of all clients may hold together, and their unfinished frames [bytes]: the
-    client that holds most loses its own."""
-    topics: int = 1024
-    """Most subscriptions, and most advertisements, of a client."""
-    services: int = 256
-    """Most services that a client offers."""
-    calls: int = 256
-    """Most unanswered calls of a client."""
-    at_once: int = 4
-    """Most calls of a client that handlers of this process work on at the same time; the others wait their turn."""
-    fragment_lifetime: float = 10.0
-    """A message that comes in fragments must be whole by then [s]."""
-    outbox_size: int = 8 * 2**20
-    """Most bytes that wait for a client that reads slowly."""
-    outbox_of_a_topic: int = 100
-    """Most messages of one topic that wait for it, unless it asked for fewer."""
-    open_timeout: float = 5.0
-    """A socket must have become a WebSocket by then [s]."""
-    token_timeout: float = 2.0
-    """A web page must have shown its token by then [s]."""
-    ping_interval: float = 1.0
-    """How often a client is asked whether it is still there [s]: who drives and does not answer loses command soon."""
-    ping_timeout: float = 20.0
-    """How long its answer may take [s]."""
-    close_timeout: float = 1.0
-    """How long a client may take for the closing handshake [s]."""
+    topics: int = 1024  # most subscriptions, and most advertisements, of a client
+    services: int = 256  # most services that a client offers
+    calls: int = 256  # most unanswered calls of a client
+    at_once: int = 4  # of which so many are with handlers of this process; the others wait their turn
+    fragment_lifetime: float = 10.0  # within which a message that comes in fragments must be whole [s]
+    outbox_size: int = 8 * 2**20  # most that waits for a client that reads slowly [bytes]
+    outbox_of_a_topic: int = 100  # most messages of one topic that wait for it, unless it asked for fewer
+    open_timeout: float = 5.0  # within which a socket must have become a WebSocket [s]
+    token_timeout: float = 2.0  # within which a web page must have shown its token [s]
+    ping_interval: float = 1.0  # between two pings [s]: who drives and does not answer loses command soon
+    ping_timeout: float = 20.0  # for their answer [s]
+    close_timeout: float = 1.0  # for the closing handshake [s]
 
 
 @dataclass(frozen=True)
-class Wire:
-    """How a client wants a message packed."""
+class Wish:
+    """How a client wants messages to be sent."""
 
     compression: str = "none"  # one of `encoding.COMPRESSIONS`
     fragment_size: int = _NEVER_SPLIT  # most characters of a message in one frame; CBOR is never split
+    throttle: float = 0.0  # least time between two messages of a topic [s]
+    queue_length: int = 0  # how many messages of a topic may wait; 0: no limit of its own
 
 
 @dataclass(frozen=True)
@@ -94,16 +79,16 @@ class Packet:
 
 
 def pack(
-    message: Mapping[str, Any], wire: Wire | None = None, *, stream: str | None = None, kind: str | None = None
+    message: Mapping[str, Any], wish: Wish | None = None, *, stream: str | None = None, kind: str | None = None
 ) -> Packet:
     """A protocol message as frames; `kind` is the type of its field ``msg``, for the typed arrays of CBOR."""
-    wire = wire or Wire()
-    if wire.compression == "cbor":
+    wish = wish or Wish()
+    if wish.compression == "cbor":
         return Packet((encode_cbor(message, kind),), text=False, stream=stream)
     text = dump_json(message)
-    if wire.compression == "png":
+    if wish.compression == "png":
         text = dump_json({"op": "png", "data": encode_png(text)})
-    parts = split(text, wire.fragment_size, f"fragment:{next(_NUMBERS)}")
+    parts = split(text, wish.fragment_size, f"fragment:{next(_NUMBERS)}")
     return Packet(tuple(part.encode("ascii") for part in parts), text=True, stream=stream)
 
 
@@ -114,13 +99,13 @@ class Publication:
         self.topic, self.kind, self.message = topic, kind, message
         self._packets: dict[tuple[str, str, int], Packet] = {}
 
-    def packet(self, name: str, wire: Wire) -> Packet:
-        """Packed for those who call the topic `name` and want it like `wire`; made once for all of them."""
-        key = (name, wire.compression, wire.fragment_size)  # not `wire`: its hash is made in Python
+    def packet(self, name: str, wish: Wish) -> Packet:
+        """Packed for those who call the topic `name` and want it like `wish`; made once for all of them."""
+        key = (name, wish.compression, wish.fragment_size)
         packet = self._packets.get(key)
         if packet is None:
             message = {"op": "publish", "topic": name, "msg": self.message}
-            packet = self._packets[key] = pack(message, wire, stream=self.topic, kind=self.kind)
+            packet = self._packets[key] = pack(message, wish, stream=self.topic, kind=self.kind)
         return packet
 
 
@@ -167,9 +152,9 @@ class Session:
 
 @lru_cache(maxsize=1024)
 def canonical(name: str) -> str:
-    """The name of a topic or service with its leading slash; `ProtocolError` for what is no such name."""
+    """The name of a topic or service with its leading slash; `InvalidValue` for what is no such name."""
     if len(name) > _LONGEST or not _NAME.fullmatch(name):
-        raise ProtocolError(f"Name: expected one such as '/joint_states', found {brief(name)}.")
+        raise InvalidValue(f"Name: expected one such as '/joint_states', found {brief(name)}.")
     return name if name.startswith("/") else f"/{name}"
 
 
@@ -196,8 +181,10 @@ def read_number(message: Mapping[str, Any], name: str, otherwise: float) -> floa
     return value
 
 
-def read_wire(message: Mapping[str, Any]) -> Wire:
-    """How the client wants what it asks for packed."""
+def read_wish(message: Mapping[str, Any]) -> Wish:
+    """How the client wants what it asks for."""
+    throttle = read_number(message, "throttle_rate", 0) / 1000
+    queue_length = int(min(read_number(message, "queue_length", 0), _LONGEST_QUEUE))
     compression = message.get("compression") or "none"
     if compression not in COMPRESSIONS:
         expected = ", ".join(COMPRESSIONS)
@@ -205,4 +192,4 @@ def read_wire(message: Mapping[str, Any]) -> Wire:
     size = read_number(message, "fragment_size", _NEVER_SPLIT)
     if size < 1:
         raise ProtocolError(f"fragment_size: expected an integer >= 1, found {brief(size)}.")
-    return Wire(compression, min(int(size), _NEVER_SPLIT))
+    return Wish(compression, min(int(size), _NEVER_SPLIT), throttle, queue_length)

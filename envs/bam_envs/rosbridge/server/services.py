@@ -4,23 +4,21 @@ Every end that a call can have is in this file, which shows that none is missing
 """
 
 import itertools
-import logging
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from bam_envs.core.errors import BamEnvsError, ProtocolError
+from bam_envs.core.errors import BamEnvsError, InvalidValue, ProtocolError
 from bam_envs.core.wording import brief
 from bam_envs.ros.interfaces import complete, complete_known, request_type, response_type, variants
-from bam_envs.rosbridge.bus import Handler
+from bam_envs.rosbridge.bus import Handler, answer
 from bam_envs.rosbridge.encoding import Id
-from bam_envs.rosbridge.server.client_session import Event, Invoke, Packet, Send, Session, Wire, pack
+from bam_envs.rosbridge.server.client_session import Event, Invoke, Packet, Send, Session, Wish, pack
 
 _LENIENT = ("bam_msgs/GymAPI",)
 """Types that are still growing: fields of a newer version are ignored, as every transport does."""
 _LONGEST_NUMBER = 20  # digits of the number of a call
-_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -42,7 +40,7 @@ class Request:
     session: Session
     id: Id
     name: str  # of the service, as the client spells it
-    wire: Wire = field(default_factory=Wire)
+    wish: Wish = field(default_factory=Wish)
     timeout: float | None = None  # how long it waits [s]; None for the usual time
 
 
@@ -73,7 +71,7 @@ class Services(dict[str, Service]):
         before = self.get(service.name)
         if before is not None:
             if before.provider is None:
-                raise ProtocolError(f"Service {service.name} is offered by this server already.")
+                raise InvalidValue(f"Service {service.name} is offered by this server already.")
             self.withdraw(before)
         self[service.name] = service
         if service.provider is not None:
@@ -133,17 +131,12 @@ class Services(dict[str, Service]):
         if call is None:
             return None
         try:
-            values = invoke.handler(invoke.request, invoke.session.caller)
+            values = answer(invoke.handler, invoke.request, invoke.session.caller, f"Service {call.service.name}")
             if not call.service.inline:  # what /rosapi/get_time answers spells the time for ROS 1 and for ROS 2
                 values = checked(call.service.kind, response_type, values)
             return _packed(call, values, True)
         except BamEnvsError as error:
             return _packed(call, str(error), False)
-        # A caller always gets an answer; the handler is foreign code and may raise anything.
-        except Exception as error:
-            _logger.exception("The handler of %s failed.", call.service.name)
-            line = " ".join(f"{type(error).__name__}: {error}".split())
-            return _packed(call, f"Service {call.service.name} failed: {line}", False)
 
     def finish(self, invoke: Invoke, packet: Packet | None) -> None:
         """Send what `packed_answer` returned, if the call is still unanswered; the next call's turn."""
@@ -204,7 +197,7 @@ def _packed(call: Call, values: Any, result: bool) -> Packet:
 def packed_response(request: Request, values: Any, result: bool) -> Packet:
     """A message ``service_response``; of a failed one, `values` is the reason."""
     message = {"op": "service_response", "service": request.name, "values": values, "result": result}
-    return pack(message if request.id is None else {**message, "id": request.id}, request.wire)
+    return pack(message if request.id is None else {**message, "id": request.id}, request.wish)
 
 
 def checked(kind: str, part: Callable[[str], str], values: Any) -> dict[str, Any]:

@@ -5,21 +5,12 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from bam_envs.core.errors import ProtocolError
+from bam_envs.core.errors import InvalidValue
 from bam_envs.core.wording import brief
 from bam_envs.ros.interfaces import normal_name
 from bam_envs.rosbridge.bus import Listener
 from bam_envs.rosbridge.encoding import COMPRESSIONS, Id
-from bam_envs.rosbridge.server.client_session import Publication, Send, Session, Wire
-
-
-@dataclass(frozen=True)
-class Wish:
-    """What one subscription asks for."""
-
-    throttle: float = 0.0  # least time between two messages [s]
-    queue_length: int = 0  # how many messages may wait; 0: no limit of its own
-    wire: Wire = field(default_factory=Wire)
+from bam_envs.rosbridge.server.client_session import Publication, Send, Session, Wish
 
 
 class Stream:
@@ -40,11 +31,9 @@ class Stream:
             self.wishes[name] = wish
         wishes = self.wishes.values()
         if wishes:
-            compression = max((one.wire.compression for one in wishes), key=COMPRESSIONS.index)
             self.wish = Wish(
-                min(one.throttle for one in wishes),
-                min(one.queue_length for one in wishes),
-                Wire(compression, min(one.wire.fragment_size for one in wishes)),
+                max((one.compression for one in wishes), key=COMPRESSIONS.index),
+                *(min(getattr(one, name) for one in wishes) for name in ("fragment_size", "throttle", "queue_length")),
             )
             self._waiting = deque(self._waiting, maxlen=max(1, self.wish.queue_length))
 
@@ -70,7 +59,7 @@ class Stream:
         return self._send(self._waiting.popleft())
 
     def _send(self, publication: Publication) -> Send:
-        return Send(self.session, publication.packet(self.name, self.wish.wire), self.wish.queue_length)
+        return Send(self.session, publication.packet(self.name, self.wish), self.wish.queue_length)
 
 
 @dataclass(eq=False)
@@ -95,15 +84,20 @@ class Topics(dict[str, Topic]):
         self._emit = emit
         self._delayed: set[Stream] = set()
 
+    @property
+    def kinds(self) -> list[str]:
+        """Their types."""
+        return [topic.kind for topic in self.values()]
+
     def require(self, name: str, kind: str | None) -> Topic:
-        """The topic `name`; a new one if there is none. `ProtocolError` if it has another type, or needs one."""
+        """The topic `name`; a new one if there is none. `InvalidValue` if it has another type, or needs one."""
         topic = self.get(name)
         if topic is None and kind is None:
-            raise ProtocolError(f"Topic {name} does not exist yet; its type is needed.")
+            raise InvalidValue(f"Topic {name} does not exist yet; its type is needed.")
         if topic is None:
             topic = self[name] = Topic(name, normal_name(kind or ""))
         if kind is not None and normal_name(kind) != topic.kind:
-            raise ProtocolError(f"Topic {name} is of type {topic.kind}, found {brief(kind)}.")
+            raise InvalidValue(f"Topic {name} is of type {topic.kind}, found {brief(kind)}.")
         return topic
 
     def subscribe(self, stream: Stream, topic: Topic, now: float) -> None:
