@@ -20,7 +20,7 @@ from bam_envs.remote.gymapi_versions import JUNE_22, Version, version_of_respons
 from bam_envs.remote.transport import Info, Seed
 from bam_envs.remote.values import plain_info, tree_from_json, tree_to_json
 from bam_envs.ros.freshness import Tag, read_tag
-from bam_envs.ros.interfaces import complete, complete_known, request_type, response_type
+from bam_envs.ros.interfaces import complete, request_type, response_type
 from bam_envs.rosbridge.encoding import dump_json, load_json
 
 KIND = "bam_msgs/GymAPI"
@@ -164,7 +164,7 @@ def read_request(message: object) -> GymRequest:
         InvalidValue: A field is of the wrong kind.
         ProtocolError: The text in ``prefix`` cannot be read.
     """
-    whole = complete_known(request_type(KIND), message)
+    whole = complete(request_type(KIND), message, lenient=True)
     header = whole["header"]
     if header["request_type"] not in list(RequestType):
         known = ", ".join(f"{one.value} {one.name}" for one in RequestType)
@@ -243,7 +243,7 @@ def read_response(message: object) -> GymResponse:
     received = received if isinstance(received, (list, tuple)) else ()
     given = {**message, "feedback": [_without_nulls(one) for one in received]} if received else message  # type: ignore[dict-item]
     try:
-        whole = complete_known(response_type(KIND), given)
+        whole = complete(response_type(KIND), given, lenient=True)
     except InvalidValue as error:
         raise ProtocolError(str(error)) from error
     # NaN in place of each null: no space takes that.

@@ -7,7 +7,12 @@ a package is in the package of its line; ``time`` and ``duration`` are the built
 ``Type[?]`` is one or a list of them; ``type field=1`` has a default other than zero.
 """
 
-DEFINITIONS = """
+_NUMBERS = ("Int8", "Int16", "Int32", "Int64", "UInt8", "UInt16", "UInt32", "UInt64", "Float32", "Float64")
+_OF_NUMBERS = "".join(
+    f"std_msgs/{name}: {name.lower()} data\nstd_msgs/{name}MultiArray: MultiArrayLayout layout; {name.lower()}[] data\n"
+    for name in _NUMBERS
+)
+DEFINITIONS = f"""{_OF_NUMBERS}
 builtin_interfaces/Time: int32 sec; uint32 nanosec | uint32 secs; uint32 nsecs
 builtin_interfaces/Duration: int32 sec; uint32 nanosec | int32 secs; int32 nsecs
 
@@ -16,16 +21,6 @@ std_msgs/Bool: bool data
 std_msgs/String: string data
 std_msgs/Byte: byte data
 std_msgs/Char: char data
-std_msgs/Int8: int8 data
-std_msgs/Int16: int16 data
-std_msgs/Int32: int32 data
-std_msgs/Int64: int64 data
-std_msgs/UInt8: uint8 data
-std_msgs/UInt16: uint16 data
-std_msgs/UInt32: uint32 data
-std_msgs/UInt64: uint64 data
-std_msgs/Float32: float32 data
-std_msgs/Float64: float64 data
 std_msgs/Time: time data
 std_msgs/Duration: duration data
 std_msgs/Header: time stamp; string frame_id | uint32 seq; time stamp; string frame_id
@@ -33,16 +28,6 @@ std_msgs/ColorRGBA: float32 r; float32 g; float32 b; float32 a
 std_msgs/MultiArrayDimension: string label; uint32 size; uint32 stride
 std_msgs/MultiArrayLayout: MultiArrayDimension[] dim; uint32 data_offset
 std_msgs/ByteMultiArray: MultiArrayLayout layout; byte[] data
-std_msgs/Int8MultiArray: MultiArrayLayout layout; int8[] data
-std_msgs/Int16MultiArray: MultiArrayLayout layout; int16[] data
-std_msgs/Int32MultiArray: MultiArrayLayout layout; int32[] data
-std_msgs/Int64MultiArray: MultiArrayLayout layout; int64[] data
-std_msgs/UInt8MultiArray: MultiArrayLayout layout; uint8[] data
-std_msgs/UInt16MultiArray: MultiArrayLayout layout; uint16[] data
-std_msgs/UInt32MultiArray: MultiArrayLayout layout; uint32[] data
-std_msgs/UInt64MultiArray: MultiArrayLayout layout; uint64[] data
-std_msgs/Float32MultiArray: MultiArrayLayout layout; float32[] data
-std_msgs/Float64MultiArray: MultiArrayLayout layout; float64[] data
 
 geometry_msgs/Vector3: float64 x; float64 y; float64 z
 geometry_msgs/Vector3Stamped: std_msgs/Header header; Vector3 vector

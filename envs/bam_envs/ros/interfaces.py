@@ -87,10 +87,11 @@ def variants(kind: str) -> tuple[tuple[Field, ...], ...]:
     return _table().get(kind, ())
 
 
-def complete(kind: str, message: object) -> dict[str, Any]:
+def complete(kind: str, message: object, *, lenient: bool = False) -> dict[str, Any]:
     """A message of type `kind` with every field there: a new dict, byte arrays as `bytes`. Read it, do not change it.
 
-    Byte arrays of `message` may be base64, as JSON has them, `bytes`, or lists of integers.
+    Byte arrays of `message` may be base64, as JSON has them, `bytes`, or lists of integers. A `lenient` check ignores
+    fields that the type does not have: they may be of a newer version of it.
 
     Raises:
         InvalidValue: It does not fit: the text names type, field, expected and found.
@@ -98,30 +99,11 @@ def complete(kind: str, message: object) -> dict[str, Any]:
     name = kind if isinstance(kind, str) and kind in _table() else normal_name(kind)
     try:
         # Unknown types are not kept: a client could name any number of them.
-        check = _check(name, None) if name in _table() else _any
+        check = _check(name, None, 0, lenient) if name in _table() else _any
         checked: dict[str, Any] = check(_object(message), 0)
     except _Misfit as misfit:
         raise misfit.error(name) from None
     return checked
-
-
-def complete_known(kind: str, message: object) -> dict[str, Any]:
-    """The same, and fields that the type does not have are ignored: they may be of a newer version of it."""
-    try:
-        return complete(kind, message)
-    except InvalidValue:  # perhaps only because of a field too many
-        return complete(kind, _known_fields(kind, message))
-
-
-def _known_fields(kind: str, value: Any) -> Any:
-    """A message, or a list of them, without the fields that `kind` does not have."""
-    if isinstance(value, (list, tuple)):
-        return [_known_fields(kind, one) for one in value]
-    spellings = variants(kind)
-    if not spellings or not isinstance(value, Mapping):
-        return value
-    fields = max(spellings, key=lambda one: len({field.name for field in one} & value.keys()))
-    return {field.name: _known_fields(field.type, value[field.name]) for field in fields if field.name in value}
 
 
 def require_plain(value: object, place: str = "value") -> None:
@@ -162,22 +144,24 @@ def _table() -> dict[str, tuple[tuple[Field, ...], ...]]:
 
 
 @cache
-def _check(kind: str, array: str | None, first: float = 0) -> Check:
+def _check(kind: str, array: str | None, first: float, lenient: bool) -> Check:
     """The check of a value of type `kind`, or of an array of it; `first` is the default of a number."""
     others: dict[str, Check] = {"bool": _bool, "string": _string, "any": _any}
     numeric = kind in FLOATS or kind in INTEGERS
-    one = _number(kind, first) if numeric else others.get(kind) or _message(kind)
+    one = _number(kind, first) if numeric else others.get(kind) or _message(kind, lenient)
     if array is None:
         return one
     if array == "?":
-        many = _check(kind, "")
+        many = _check(kind, "", first, lenient)
         return lambda value, depth: (many if isinstance(value, (list, tuple)) else one)(value, depth)
     size = int(array) if array else None
     return (lambda value, depth: _byte_array(value, size)) if kind in _BYTES else _array(kind, one, size)
 
 
-def _message(kind: str) -> Check:
-    plans = [{one.name: _check(one.type, one.array, one.default) for one in fields} for fields in _table()[kind]]
+def _message(kind: str, lenient: bool) -> Check:
+    plans = [
+        {one.name: _check(one.type, one.array, one.default, lenient) for one in fields} for fields in _table()[kind]
+    ]
     usual = plans[0]
     left_out = {name: one(_MISSING, 0) for name, one in usual.items()}
 
@@ -186,6 +170,8 @@ def _message(kind: str) -> Check:
             return left_out
         given = _object(value)
         plan = next((one for one in plans if given.keys() <= one.keys()), None)
+        if plan is None and lenient:
+            plan = max(plans, key=lambda one: len(given.keys() & one.keys()))
         if plan is None:
             extra = next(name for name in given if name not in usual)
             raise _Misfit(f"only the fields {', '.join(usual)}" if usual else "no fields", extra)

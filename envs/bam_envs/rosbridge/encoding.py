@@ -33,24 +33,17 @@ _MOST_UNFINISHED = 16  # messages of one connection of which fragments may be mi
 Id = str | int | None
 """What a client calls an interaction; None if it does not."""
 
-# Tags of typed arrays by type, and what they hold: little-endian numbers.
-_TYPED = {
-    kind: (tag, np.dtype(kind).newbyteorder("<"))
-    for kind, tag in (
-        *(("int8", 72), ("int16", 77), ("int32", 78), ("int64", 79), ("uint16", 69), ("uint32", 70), ("uint64", 71)),
-        *(("float32", 85), ("float64", 86)),
-    )
-}
-# All tags: 64-71 unsigned, 72-79 signed, 80-86 floating point; of each first the big-endian ones, by size. 68 is
-# "clamped" bytes, 76 is reserved, and 83 and 87 are quadruple precision, which NumPy does not have everywhere.
-_DTYPES = {
-    tag: np.dtype(name)
-    for tag, name in (
-        *zip(range(64, 72), ("u1", ">u2", ">u4", ">u8", "u1", "<u2", "<u4", "<u8"), strict=True),
-        *zip((72, 73, 74, 75, 77, 78, 79), ("i1", ">i2", ">i4", ">i8", "<i2", "<i4", "<i8"), strict=True),
-        *zip((80, 81, 82, 84, 85, 86), (">f2", ">f4", ">f8", "<f2", "<f4", "<f8"), strict=True),
-    )
-}
+
+def _dtype(tag: int) -> np.dtype[Any]:
+    """What a typed array of RFC 8746 holds; its tag has bits for floating point, signed, little-endian and size."""
+    kind = "f" if tag & 16 else "i" if tag & 8 else "u"
+    size = (2 if tag & 16 else 1) << (tag & 3)
+    return np.dtype(f"{'<' if tag & 4 else '>'}{kind}{size}")
+
+
+# 76 is reserved; 83 and 87 are quadruple precision, which NumPy does not have everywhere.
+_DTYPES = {tag: _dtype(tag) for tag in range(64, 88) if tag not in (76, 83, 87)}
+_TYPED = {_DTYPES[tag].name: (tag, _DTYPES[tag]) for tag in (69, 70, 71, 72, 77, 78, 79, 85, 86)}
 
 # ---- decoding
 

@@ -2,8 +2,7 @@
 
 A client that wants to drive calls the service `SESSION_SERVICE` (std_srvs/Trigger). The answer, which only this client
 gets, has a public name and a secret key. Every command is signed with the key, over its tag (number, deadline), its
-topic and its numbers. Whoever reads the topics learns the name and the signatures, and cannot make another one; a
-command that is repeated is refused. Where the server knows connections, a session belongs to the one that opened it.
+topic and its numbers. Where the server knows connections, a session belongs to the one that opened it.
 """
 
 import hmac
@@ -74,10 +73,6 @@ class Sessions:
         if not anywhere and session.caller != caller.name:
             raise RemoteError(f"session {tag.session} {_ELSEWHERE}")
         return session.fresh
-
-    def require(self, tag: Tag, channel: str, content: bytes, caller: Caller, *, anywhere: bool = False) -> None:
-        """`prove`, then `Freshness.require`: raises as both."""
-        self.prove(tag, channel, content, caller, anywhere=anywhere).require(tag, channel)
 
     def left(self, caller: Caller) -> list[str]:
         """Close the sessions of `caller`, whose connection ended; their names."""

@@ -12,15 +12,15 @@ import logging
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NoAnswer  # not the builtin before Python 3.11
 from dataclasses import replace
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, ProtocolError, RemoteError
 from bam_envs.ros.freshness import FreshnessCheck, Tagger, read_tag
-from bam_envs.rosbridge.bus import Bus, Caller, Handler, Message
+from bam_envs.rosbridge.bus import Bus, Caller, Handler, Message, answer
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.encoding import MOST_ITEMS, dump_json, load_json
 from bam_envs.rosbridge.sessions import Sessions
@@ -32,26 +32,7 @@ _RESEND = 0.5
 the two ends of a topic found each other. The service executes one id once."""
 _MOST_WAITING = 64  # requests that a service executes or keeps waiting at once
 _WORKERS = 8
-
-Answer = TypeVar("Answer")
-
-
-class RecentAnswers(Generic[Answer]):
-    """The newest answers by the key of their request: one that comes twice is executed once. Any thread."""
-
-    def __init__(self, size: int = 32) -> None:
-        self._size, self._lock = size, threading.Lock()
-        self._futures: OrderedDict[Hashable, Future[Answer]] = OrderedDict()
-
-    def claim(self, key: Hashable) -> tuple[Future[Answer], bool]:
-        """The future with the answer to `key`, and whether the caller is the one to make it."""
-        with self._lock:
-            if key in self._futures:
-                return self._futures[key], False
-            future = self._futures[key] = Future()
-            if len(self._futures) > self._size:
-                self._futures.popitem(last=False)
-            return future, True
+_ANSWERS_KEPT = 32  # the newest, by the key of their request: one that comes twice is executed once
 
 
 class StringRpc:
@@ -145,7 +126,8 @@ class StringRpcService:
     def __init__(self, bus: Bus, name: str, handler: Handler, sessions: Sessions | None = None) -> None:
         self.name = name
         self._bus, self._handler, self._sessions = bus, handler, sessions
-        self._freshness, self._answers = FreshnessCheck(), RecentAnswers[str]()
+        self._freshness, self._lock = FreshnessCheck(), threading.Lock()
+        self._answers: OrderedDict[tuple[str, str], Future[str]] = OrderedDict()
         self._workers = ThreadPoolExecutor(_WORKERS, thread_name_prefix=f"rpc{name.replace('/', '-')}")
         self._room = threading.BoundedSemaphore(_MOST_WAITING)
         self._unsubscribe: Callable[[], None] | None = None
@@ -196,7 +178,12 @@ class StringRpcService:
 
     def _answer(self, request: dict[str, Any], caller: Caller, refused: str, arrived: float) -> None:
         try:
-            future, new = self._answers.claim((caller.session, request["id"]))
+            with self._lock:
+                key = (caller.session, request["id"])
+                new = key not in self._answers
+                future = self._answers.setdefault(key, Future())
+                if len(self._answers) > _ANSWERS_KEPT:
+                    self._answers.popitem(last=False)
             if new:
                 future.set_result(self._reply(request, caller, refused, arrived))
             if new or future.done():  # while the first one is being answered, nothing
@@ -216,10 +203,6 @@ class StringRpcService:
                 raise ProtocolError(f"{self.name}/request: payload must be an object, not {type(payload).__name__}.")
             if tag is not None and (waited := time.monotonic() - arrived) > tag.deadline - tag.sent:
                 raise RemoteError(f"expired: it waited {waited:.3f} s for others")
-            return dump_json({"id": identity, "payload": self._handler(payload, caller)}, what)
+            return dump_json({"id": identity, "payload": answer(self._handler, payload, caller, self.name)}, what)
         except BamEnvsError as error:
-            kind, text = type(error).__name__, str(error)
-        except Exception as error:  # a service always answers, whatever its handler does
-            _log.exception("%s: the handler failed", self.name)
-            kind, text = "RemoteError", f"{type(error).__name__}: {error}"
-        return dump_json({"id": identity, "error": text, "kind": kind}, what)
+            return dump_json({"id": identity, "error": str(error), "kind": type(error).__name__}, what)

@@ -20,7 +20,7 @@ def say(sessions, tagger, caller=A, content=b"1.0", **options):
     """A signed message; the refusal, or None."""
     tag = read_tag(tagger.sign(tagger.next(1, 0.1), "/go", content))
     try:
-        sessions.require(tag, "/go", content, caller, **options)
+        sessions.prove(tag, "/go", content, caller, **options).require(tag, "/go")
     except RemoteError as error:
         return str(error)
     return None

@@ -110,7 +110,7 @@ def fail(payload):
     [
         (lambda payload: fail({"error": RemoteError}), RemoteError, "no cube there"),
         (lambda payload: fail({"error": NotInCommand}), NotInCommand, "no cube there"),
-        (lambda payload: 1 / 0, RemoteError, "ZeroDivisionError: division by zero"),
+        (lambda payload: 1 / 0, RemoteError, "/bam/scene failed: ZeroDivisionError: division by zero"),
         (
             lambda payload: {"x": float("nan")},
             RemoteError,

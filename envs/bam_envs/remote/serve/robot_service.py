@@ -169,7 +169,7 @@ class RobotService:
         if self._robot.fault is not None:
             raise RemoteError(f"{self._profile.name} failed, and needs a reset: {self._robot.fault}")
         if tag is not None:
-            self._sessions.require(tag, topic, content, caller)
+            self._sessions.prove(tag, topic, content, caller).require(tag, topic)
             caller = replace(caller, session=tag.session)
         self._lease.take(caller.client, shown=caller.shown, silence=caller.silence)
         echo, complete = "" if tag is None else tag.echo, topic in self._completing
@@ -183,7 +183,8 @@ class RobotService:
         tag = read_tag(text)
         if tag is None or word not in (RENEW, LEAVE):
             raise ProtocolError(f"{LEASE_TOPIC}: expected {RENEW} or {LEAVE} and a signed tag.")
-        self._sessions.require(tag, LEASE_TOPIC, word.encode(), caller, anywhere=word == LEAVE)
+        fresh = self._sessions.prove(tag, LEASE_TOPIC, word.encode(), caller, anywhere=word == LEAVE)
+        fresh.require(tag, LEASE_TOPIC)
         client = replace(caller, session=tag.session).client
         if word == RENEW:
             self._lease.renew(client)

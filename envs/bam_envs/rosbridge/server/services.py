@@ -11,7 +11,7 @@ from typing import Any
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, ProtocolError
 from bam_envs.core.wording import brief
-from bam_envs.ros.interfaces import complete, complete_known, request_type, response_type, variants
+from bam_envs.ros.interfaces import complete, request_type, response_type, variants
 from bam_envs.rosbridge.bus import Handler, answer
 from bam_envs.rosbridge.encoding import Id
 from bam_envs.rosbridge.server.client_session import Event, Invoke, Packet, Send, Session, Wish, pack
@@ -208,4 +208,4 @@ def checked(kind: str, part: Callable[[str], str], values: Any) -> dict[str, Any
         if not fields or len(values) > len(fields[0]):
             raise ProtocolError(f"args: expected an object, found {brief(values)}.")
         values = {one.name: value for one, value in zip(fields[0], values, strict=False)}
-    return (complete_known if kind in _LENIENT else complete)(name, {} if values is None else values)
+    return complete(name, {} if values is None else values, lenient=kind in _LENIENT)
