@@ -38,14 +38,14 @@ def describe(robot: Robot, task: Task) -> dict[str, list[dict[str, Any]]]:
 
     A missing limit is ``"inf"`` or ``"-inf"``, as in `bam_envs.core.spaces`: JSON has no infinities.
     """
+
+    def described(label: Label) -> dict[str, Any]:
+        row = asdict(label)
+        return row | {side: str(row[side]) for side in ("low", "high") if math.isinf(row[side])}
+
     labels = {"observation": task.observation_labels, "action": task.action_labels}
-    rows = {kind: [_described(label) for label in group] for kind, group in labels.items()}
+    rows = {kind: [described(label) for label in group] for kind, group in labels.items()}
     return {**rows, **robot.spec.describe()}
-
-
-def _described(label: Label) -> dict[str, Any]:
-    row = asdict(label)
-    return row | {side: str(row[side]) for side in ("low", "high") if math.isinf(row[side])}
 
 
 class _RobotAndTask:
@@ -83,13 +83,15 @@ class _RobotAndTask:
         self.task.on_reset(env_ids, state)
         return state
 
-    def _task_options(self, options: Mapping[str, Any]) -> Mapping[str, Any]:
-        """`options`, after a check that the task knows all of them."""
-        known: Sequence[str] = getattr(self.task, "reset_options", ())
-        for name in options:
-            if name not in known:
+    def _reset_options(self, options: object, own: str | None = None) -> dict[str, Any]:
+        """A copy of the options of `reset`, all of which the task must know but for the environment's `own`."""
+        if options is not None and not isinstance(options, Mapping):
+            raise InvalidValue(f"options= of reset must be a dict of names and values, not {brief(options)}.")
+        given, known = dict(options or {}), getattr(self.task, "reset_options", ())
+        for name in given:
+            if name not in known and name != own:
                 raise UnknownName("reset option", name, known)
-        return options
+        return given
 
     def _running(self) -> RobotState:
         if self.state is None:
@@ -106,13 +108,6 @@ class _RobotAndTask:
             raise InvalidValue(f"The robot {self.robot.spec.name!r} has no picture; use render_mode=None.")
         image: NDArray[np.uint8] | None = draw(self.render_mode, self.task.marks())
         return image
-
-
-def _table(options: object) -> dict[str, Any]:
-    """The options of `reset`, as a dict of their own."""
-    if options is not None and not isinstance(options, Mapping):
-        raise InvalidValue(f"options= of reset must be a dict of names and values, not {brief(options)}.")
-    return dict(options or {})
 
 
 class RobotEnv(_RobotAndTask, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -138,7 +133,7 @@ class RobotEnv(_RobotAndTask, gym.Env[NDArray[np.float32], NDArray[np.float32]])
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Begin an episode; a live robot goes to its start pose slowly."""
         gym.Env.reset(self, seed=seed)
-        given = self._task_options(_table(options))
+        given = self._reset_options(options)
         self.state = self.last_state = self._begin(self._first, [self.np_random], given)
         if self.render_mode == "human":
             self.render()
@@ -236,9 +231,8 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[NDArray[np.float32], ND
             seed: Environment i is seeded with ``seed + i``, or with ``seed[i]``.
             options: ``reset_mask``, and what the task's ``reset_options`` names, for every environment alike.
         """
-        given = _table(options)
+        given = self._reset_options(options, "reset_mask")
         mask = np.asarray(given.pop("reset_mask", self._all), dtype=bool)
-        given = dict(self._task_options(given))
         if mask.shape != self._all.shape:
             raise InvalidValue(f"reset_mask must have shape {self._all.shape}, not {mask.shape}.")
         for i, one in enumerate(self._seeds(seed)):
@@ -270,7 +264,8 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[NDArray[np.float32], ND
         score = self.task.score(self.state, actions)
         observation = self.task.observe(self.state)
         self.elapsed += 1
-        truncated = self._truncated()
+        limit = self.max_episode_steps
+        truncated = np.zeros(self.num_envs, dtype=bool) if limit is None else self.elapsed >= limit
         infos = {"is_success": score.success, "_is_success": self._all.copy()}
         for key, value in score.info.items():
             infos[key], infos["_" + key] = value, _present(value)
@@ -278,12 +273,6 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[NDArray[np.float32], ND
         if ended.any():
             observation = self._next_episodes(ended, observation, infos)
         return observation, score.reward, score.terminated, truncated, infos
-
-    def _truncated(self) -> NDArray[np.bool_]:
-        if self.max_episode_steps is None:
-            return np.zeros(self.num_envs, dtype=bool)
-        truncated: NDArray[np.bool_] = self.elapsed >= self.max_episode_steps
-        return truncated
 
     def _next_episodes(
         self, ended: NDArray[np.bool_], observation: NDArray[np.float32], infos: dict[str, Any]

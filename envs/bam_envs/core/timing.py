@@ -101,15 +101,12 @@ class Pacer:
         missed = math.ceil(late / self.period - 0.5 - 1e-9)
         self.missed += missed
         self._due = (now if missed or due - now > self.period / 2 else due) + self.period
-        self._note(late)
-        return late
-
-    def _note(self, late: float) -> None:
         self._latest = max(self._latest, late)
         if len(self._late) < KEPT:
             self._late.append(late)
         else:
             self._late[self.ticks % KEPT] = late
+        return late
 
     @property
     def slack(self) -> float:
