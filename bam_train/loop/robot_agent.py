@@ -8,7 +8,7 @@ import numpy as np
 
 from bam_train.errors import LoopError, PolicyError
 from bam_train.loop.agent import Agent
-from bam_train.loop.gym.gym_spaces import Entry, entries, names, pack
+from bam_train.loop.gym.gym_spaces import Kind, flat, kinds, names, pack
 
 FLAGS = ("terminated", "truncated", "done")
 SUCCESS = "info/is_success"
@@ -48,7 +48,7 @@ class RobotAgent(Agent):
         writes = (*self.observation_names, *(output_string + name for name in rest))
         self._declare(RobotAgent, reads=(), reads_previous=(input_string,), writes=writes)
         self._total, self._steps = 0.0, 0
-        self._entries: list[Entry] = []
+        self._kinds: dict[str, Kind] = {}
         self._running = self._closed = False
 
     def connect(self) -> None:
@@ -82,7 +82,7 @@ class RobotAgent(Agent):
         if t == 0:
             self._closed = False
             observation, info = self.env.reset(seed=seed)
-            self._entries = entries(observation, self.env.observation_space, for_torch=False)
+            self._kinds = kinds(flat(observation), self.env.observation_space, for_torch=False)
             self._total, self._steps, self._running = 0.0, 0, True
             self._write(t, observation, 0.0, (False, False), info)
             return
@@ -99,6 +99,7 @@ class RobotAgent(Agent):
 
     def _write(self, t: int, observation: Any, reward: float, ends: tuple[bool, bool], info: Mapping[str, Any]) -> None:
         values = {
+            **pack(self._kinds, [observation]),
             "reward": np.array([reward]),
             "cumulated_reward": np.array([self._total]),
             "timestep": np.array([self._steps]),
@@ -108,8 +109,6 @@ class RobotAgent(Agent):
             SUCCESS: np.array([bool(info.get("is_success", False))]),
             SAYS_SUCCESS: np.array(["is_success" in info]),
         }
-        for entry in self._entries:
-            self.set((self.output + entry.name, t), pack(entry, [observation]))
         for name, value in values.items():
             self.set((self.output + name, t), value)
 

@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium.wrappers import Autoreset
 
 from bam_train.errors import SettingsError
-from bam_train.loop.gym.gym_agent import Frame
+from bam_train.loop.gym.gym_spaces import Arrays
 from bam_train.loop.gym.parallel_gym_agent import Env, ParallelGymAgent, has_autoreset
 
 
@@ -105,9 +105,11 @@ class _OldGymAgent(ParallelGymAgent):
             if save_render:
                 self._put({"rendering": np.array(pictures)}, t)
 
-    def _numbers(self, frame: Frame) -> dict[str, Any]:
-        numbers = {**frame.numbers, "truncated": frame.numbers["truncated"] & ~frame.numbers["terminated"]}
-        return {name: numbers[name] for name in ("done", "truncated", "reward", "timestep", "cumulated_reward")}
+    def _frame(self, *parts: Any) -> Arrays:
+        frame = super()._frame(*parts)
+        frame["truncated"] &= ~frame.pop("terminated")
+        numbers = {name: frame.pop(name) for name in ("done", "truncated", "reward", "timestep", "cumulated_reward")}
+        return {**frame, **numbers}
 
     def _written(self) -> tuple[str, ...]:
         return tuple(name for name in super()._written() if name != f"{self.output}terminated")

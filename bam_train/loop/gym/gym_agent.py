@@ -4,68 +4,23 @@ from __future__ import annotations
 
 import sys
 import warnings
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import Space, spaces
 
-from bam_train.errors import LoopError, SettingsError
+from bam_train.errors import LoopError, SettingsError, ValueMismatch
 from bam_train.loop.agent import agent_name, import_torch
 from bam_train.loop.agents import SeedableAgent
-from bam_train.loop.gym.gym_spaces import ActionReader, Array, Entry, InfoRecorder, names
-from bam_train.loop.workspace import Workspace
+from bam_train.loop.gym.gym_spaces import Array, Arrays, InfoRecorder, Kind, names
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
 NUMBERS = ("terminated", "truncated", "done", "reward", "cumulated_reward", "timestep")
 """Variables of one number for each environment, in the order in which they are written."""
-
-
-class Frame(NamedTuple):
-    """What n environments gave at one time: new arrays (n, ...) by name, without the output prefix."""
-
-    observations: dict[str, Array]
-    numbers: dict[str, Array]
-    """The `NUMBERS`."""
-    infos: dict[str, Array]
-
-
-class Stepper(ABC):
-    """The environments of one run of an agent, with the sums and counts of their episodes."""
-
-    def __init__(self, agent: Any) -> None:
-        self._envs, self._include_last = agent.envs, agent.include_last_state
-        self._for_torch = agent.arrays == "torch"
-        self._floats = np.dtype(np.float32 if self._for_torch else np.float64)
-        self._actions = ActionReader(agent.input, agent.action_space, agent.num_envs)
-        self._infos = InfoRecorder(agent.info_keys, agent.num_envs, self._floats)
-        self._entries: list[Entry] = []
-        self._cumulated: Any = np.zeros(agent.num_envs)
-        self._timestep = np.zeros(agent.num_envs, dtype=np.int64)
-
-    @abstractmethod
-    def reset(self, seeds: Any) -> Frame:
-        """Begin an episode in every environment; `seeds` is a number to count from, or one for each environment."""
-
-    @abstractmethod
-    def step(self, workspace: Workspace, t: int) -> Frame:
-        """Step every environment with its action of time t."""
-
-    def _frame(
-        self, observations: dict[str, Array], rewards: Any, terminated: Array, truncated: Array, infos: dict[str, Array]
-    ) -> Frame:
-        numbers = {
-            "terminated": terminated,
-            "truncated": truncated,
-            "done": terminated | truncated,
-            "reward": np.array(rewards, dtype=self._floats),
-            "cumulated_reward": np.array(self._cumulated, dtype=self._floats),
-            "timestep": self._timestep.copy(),
-        }
-        return Frame(observations, numbers, infos)
 
 
 class GymAgent(SeedableAgent):
@@ -96,7 +51,6 @@ class GymAgent(SeedableAgent):
     num_envs: int
     observation_space: Space[Any]
     action_space: Space[Any]
-    _STEPPER: type[Stepper]
     _SEED_AGAIN = "give a run another seed with agent(workspace, t=0, seed={seed})."
 
     def __new__(cls, *args: Any, arrays: str = "torch", **kwargs: Any) -> Self:
@@ -125,7 +79,8 @@ class GymAgent(SeedableAgent):
         self.reward_at_t, self.include_last_state = reward_at_t, include_last_state
         self.arrays, self.info_keys = arrays, tuple(info_keys)
         self._nb_reset = 1
-        self._stepper: Stepper | None = None
+        self._running = False
+        self._floats = np.dtype(np.float32 if arrays == "torch" else np.float64)
         self.ghost_params: Any = None
         if arrays == "torch":
             torch = sys.modules["torch"]
@@ -133,14 +88,22 @@ class GymAgent(SeedableAgent):
 
     # -- running ---------------------------------------------------------------------------------------------------
 
+    @abstractmethod
     def _open(self) -> None:
         """Make the environments `envs`, and call `_opened`."""
-        raise NotImplementedError
 
     def _opened(self, observation_space: Space[Any], action_space: Space[Any]) -> None:
         """Take the spaces of one environment and declare what is written."""
         self.observation_space, self.action_space = observation_space, action_space
         self._declare(GymAgent, reads=None, writes=self._written())
+
+    @abstractmethod
+    def _begin(self, seeds: Any) -> Arrays:
+        """Begin an episode in every environment; `seeds` is a number to count from, or one for each environment."""
+
+    @abstractmethod
+    def _step(self, t: int) -> Arrays:
+        """Step every environment with its action of time t."""
 
     def forward(self, t: int = 0, **kwargs: Any) -> None:
         """One step of every environment with the action of t - 1; at t = 0 all are reset.
@@ -162,31 +125,40 @@ class GymAgent(SeedableAgent):
             self._nb_reset += 1
             if self.envs is None:
                 self._open()
-            self._stepper = self._STEPPER(self)
-            frame = self._stepper.reset(self._reset_seeds(seed))
-        elif self._stepper is None:
+            self._infos = InfoRecorder(self.info_keys, self.num_envs, self._floats)
+            self._kinds: dict[str, Kind] = {}
+            self._cumulated: Any = np.zeros(self.num_envs)
+            self._timestep = np.zeros(self.num_envs, dtype=np.int64)
+            frame = self._begin(self._reset_seeds(seed))
+            self._running = True
+        elif not self._running:
             raise LoopError(f"{agent_name(self)} has no episode running; its environments are (re)started at t=0.")
         else:
-            frame = self._stepper.step(self.workspace, t - 1)
-        numbers = self._numbers(frame)
-        self._put(frame.observations, t)
+            frame = self._step(t - 1)
         if self.reward_at_t:
-            shifted = {key: numbers[key] for key in ("reward", "cumulated_reward")}
+            shifted = {key: frame[key] for key in ("reward", "cumulated_reward")}
             if t > 0:
                 self._put(shifted, t - 1)
-            numbers = {
-                **numbers,  # new arrays: no two times share memory
-                "reward": np.zeros_like(shifted["reward"]),
-                "cumulated_reward": shifted["cumulated_reward"].copy(),
-            }
-        self._put(numbers, t)
-        self._put(frame.infos, t)
+            frame["reward"] = np.zeros_like(frame["reward"])  # new arrays: no two times share memory
+            frame["cumulated_reward"] = frame["cumulated_reward"].copy()
+        self._put(frame, t)
 
-    def _numbers(self, frame: Frame) -> dict[str, Array]:
-        """The numbers that are written."""
-        return frame.numbers
+    def _frame(self, observations: Arrays, rewards: Any, terminated: Array, truncated: Array, infos: Arrays) -> Arrays:
+        """What n environments gave at one time: new arrays (n, ...) by name, without the output prefix."""
+        reward = np.array(rewards, dtype=self._floats)
+        if reward.ndim != 1:
+            raise ValueMismatch(f"'reward': expected one number from each environment, found {rewards[0]!r}.")
+        numbers = {
+            "terminated": terminated,
+            "truncated": truncated,
+            "done": terminated | truncated,
+            "reward": reward,
+            "cumulated_reward": np.array(self._cumulated, dtype=self._floats),
+            "timestep": self._timestep.copy(),
+        }
+        return {**observations, **numbers, **infos}
 
-    def _put(self, arrays: dict[str, Array], t: int) -> None:
+    def _put(self, arrays: Arrays, t: int) -> None:
         """Write arrays (B x ...) at t, by name without the output prefix, on the device of `ghost_params`."""
         workspace, prefix = self.workspace, self.output
         if self.arrays == "numpy":

@@ -6,7 +6,7 @@ infos is the variable ``info/k`` beside the mask ``info/_k``. It begins with the
 since its dtype and shape are not known earlier; from then on it is written at every time, zero where the mask is False.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +17,7 @@ from bam_train.errors import ValueMismatch
 from bam_train.loop.variables import kind_name, mismatch, to_array
 
 Array = NDArray[Any]
+Arrays = dict[str, Array]
 NAME = "env_obs"
 _WHOLE = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 _GIVEN = {"f": np.float64, "i": np.int64, "u": np.int64, "b": np.bool_}
@@ -26,90 +27,78 @@ _GIVEN = {"f": np.float64, "i": np.int64, "u": np.int64, "b": np.bool_}
 # -- observations ------------------------------------------------------------------------------------------------------
 
 
-class Entry(NamedTuple):
-    """One variable of an observation."""
+class Kind(NamedTuple):
+    """What one variable of an observation is written as."""
 
-    name: str
-    """``env_obs`` or ``env_obs/<key>/<key>``."""
-    path: tuple[str, ...]
-    """The keys to it; none for an observation that is no dict."""
     dtype: np.dtype[Any]
-    """What it is written as."""
     shape: tuple[int, ...]
     """The shape for one environment; () for a number."""
 
 
-def names(space: Space[Any], name: str = NAME) -> tuple[str, ...]:
+def names(space: Space[Any]) -> tuple[str, ...]:
     """The variables that observations of `space` are written to."""
-    if isinstance(space, spaces.Dict):
-        return tuple(one for key, part in space.spaces.items() for one in names(part, f"{name}/{key}"))
-    return (name,)
+    return tuple(flat(space))
 
 
-def entries(
-    value: Any, space: Space[Any] | None, for_torch: bool, name: str = NAME, path: tuple[str, ...] = ()
-) -> list[Entry]:
-    """The variables of the observation `value` of one environment.
+def flat(value: Any, name: str = NAME) -> dict[str, Any]:
+    """The parts of an observation, or of its space, by variable; tensors become arrays."""
+    if isinstance(value, np.ndarray):  # the usual case
+        return {name: value}
+    if isinstance(value, Mapping):
+        return {path: one for key, part in value.items() for path, one in flat(part, f"{name}/{key}").items()}
+    return {name: value.detach().cpu().numpy() if hasattr(value, "detach") else value}
+
+
+def kinds(parts: Mapping[str, Any], space: Space[Any] | None, for_torch: bool) -> dict[str, Kind]:
+    """What the variables of an observation are written as.
 
     Args:
-        value: An array, a number or a dict of them; anything else raises `ValueMismatch`.
-        space: Where the dtype comes from unless `for_torch`; None for the observation's own.
+        parts: `flat` of the observation of one environment: arrays or numbers; anything else raises `ValueMismatch`.
+        space: Where the dtypes come from unless `for_torch`; None for the observation's own.
         for_torch: Floats become float32 and integers int64, whatever they are.
-        name: The variable; of a dict, the first part of its entries'.
-        path: The keys to it.
     """
-    if isinstance(value, Mapping):
-        found = []
-        for key, one in value.items():
-            part = space.spaces.get(key) if isinstance(space, spaces.Dict) else None
-            found += entries(one, part, for_torch, f"{name}/{key}", (*path, key))
-        return found
-    dtype = None if isinstance(value, (tuple, str)) else np.asarray(_plain(value)).dtype
-    if dtype is None or dtype.kind not in "fiub":
-        raise ValueMismatch(
-            f"{name!r}: expected an array, a number or a dict of them, found a {kind_name(value)}; "
-            "wrap the environment, for example in gymnasium.wrappers.FlattenObservation."
-        )
-    if for_torch:
-        whole = bool if isinstance(value, (bool, np.bool_)) else np.int64
-        dtype = np.dtype(np.float32 if dtype.kind == "f" else whole)
-    elif space is not None and space.dtype is not None:
-        dtype = np.dtype(space.dtype)
-    return [Entry(name, path, dtype, np.shape(_plain(value)))]
+    found, of_space = {}, flat(space)
+    for name, value in parts.items():
+        dtype = None if isinstance(value, (tuple, str)) else np.asarray(value).dtype
+        if dtype is None or dtype.kind not in "fiub":
+            raise ValueMismatch(
+                f"{name!r}: expected an array, a number or a dict of them, found a {kind_name(value)}; "
+                "wrap the environment, for example in gymnasium.wrappers.FlattenObservation."
+            )
+        if for_torch:
+            whole = bool if isinstance(value, (bool, np.bool_)) else np.int64
+            dtype = np.dtype(np.float32 if dtype.kind == "f" else whole)
+        elif (wanted := getattr(of_space.get(name), "dtype", None)) is not None:
+            dtype = np.dtype(wanted)
+        found[name] = Kind(dtype, np.shape(value))
+    return found
 
 
-def _plain(value: Any) -> Any:
-    """The value itself; of a tensor, its NumPy array."""
-    return value.detach().cpu().numpy() if hasattr(value, "detach") else value
-
-
-def pack(entry: Entry, observations: Sequence[Any]) -> Array:
-    """One new array (n, ...) from the observations of n environments.
+def pack(kinds: Mapping[str, Kind], observations: Sequence[Any]) -> Arrays:
+    """New arrays (n, ...) by variable from the observations of n environments.
 
     Raises:
         ValueMismatch: One has another shape than the first observation of all had, or lacks a key.
     """
-    values = [pick(entry, one) for one in observations] if entry.path else observations
-    if hasattr(values[0], "detach"):
-        values = [_plain(one) for one in values]
-    try:
-        array = np.array(values, dtype=entry.dtype)
-    except ValueError:  # they differ among each other
-        array = np.empty(0)
-    if array.shape[1:] != entry.shape or len(array) != len(observations):
-        k, shape = next((k, s) for k, s in enumerate(map(np.shape, values)) if s != entry.shape)
-        raise ValueMismatch(f"{entry.name!r}: expected shape {entry.shape}, found {shape} from environment {k}.")
-    return array
+    rows, packed = [flat(one) for one in observations], {}
+    for name, (dtype, shape) in kinds.items():
+        values = [pick(row, name) for row in rows]
+        try:
+            array = np.array(values, dtype=dtype)
+        except ValueError:  # they differ among each other
+            array = np.empty(0)
+        if array.shape != (len(rows), *shape):
+            k, other = next((k, s) for k, s in enumerate(map(np.shape, values)) if s != shape)
+            raise ValueMismatch(f"{name!r}: expected shape {shape}, found {other} from environment {k}.")
+        packed[name] = array
+    return packed
 
 
-def pick(entry: Entry, observation: Any) -> Any:
-    """The part of an observation that `entry` is about."""
-    try:
-        for key in entry.path:
-            observation = observation[key]
-    except (KeyError, TypeError, IndexError):
-        raise ValueMismatch(f"{entry.name!r}: the environment gave an observation without it.") from None
-    return observation
+def pick(parts: Mapping[str, Any], name: str) -> Any:
+    """One variable's part of an observation."""
+    if name not in parts:
+        raise ValueMismatch(f"{name!r}: the environment gave an observation without it.")
+    return parts[name]
 
 
 # -- infos -------------------------------------------------------------------------------------------------------------
@@ -124,17 +113,17 @@ class InfoRecorder:
         self._dtypes = {"b": np.dtype(bool), "i": whole, "u": whole, "f": floats}
         self._known: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
 
-    def of_each(self, infos: Sequence[Mapping[str, Any]]) -> dict[str, Array]:
+    def of_each(self, infos: Sequence[Mapping[str, Any]]) -> Arrays:
         """From one info for each environment."""
-        found: dict[str, Array] = {}
+        found: Arrays = {}
         for key in self._keys:
             mask = np.array([key in info for info in infos])
             self._record(found, key, mask, [(k, info[key]) for k, info in enumerate(infos) if mask[k]])
         return found
 
-    def of_vector(self, infos: Mapping[str, Any]) -> dict[str, Array]:
+    def of_vector(self, infos: Mapping[str, Any]) -> Arrays:
         """From the infos of a vector environment."""
-        found: dict[str, Array] = {}
+        found: Arrays = {}
         for key in self._keys:
             mask = np.zeros(self._num_envs, dtype=bool)
             if key in infos:
@@ -142,7 +131,7 @@ class InfoRecorder:
             self._record(found, key, mask, [(mask, np.asarray(infos[key])[mask])] if mask.any() else [])
         return found
 
-    def _record(self, found: dict[str, Array], key: str, mask: Array, given: Sequence[tuple[Any, Any]]) -> None:
+    def _record(self, found: Arrays, key: str, mask: Array, given: Sequence[tuple[Any, Any]]) -> None:
         """Add one entry to `found`; `given` has indices of environments, and their values."""
         for index, value in given:
             one = value[0] if np.ndim(index) else value
@@ -164,97 +153,58 @@ class InfoRecorder:
 # -- actions -----------------------------------------------------------------------------------------------------------
 
 
-class ActionReader:
-    """Reads the actions of n environments, and checks them against the action space.
-
-    Its methods raise `UnknownVariable` or `TimeNotWritten` where nobody wrote an action, and `ValueMismatch` where it
-    does not fit the space or is not for n environments.
+def each_action(workspace: Any, t: int, name: str, space: Space[Any], num_envs: int) -> Sequence[Any]:
+    """One action for each environment: an int, an array (float64 or int64), or a nested dict of these.
 
     Args:
-        name: The variable, or the first part of the variables' names.
+        workspace: Where the actions are.
+        t: The time.
+        name: The variable; where actions are dicts, the first part of the variables' names.
         space: Of one environment. Spaces of other kinds than Box, Discrete, MultiDiscrete, MultiBinary and Dict are
             not checked.
-        num_envs: n.
+        num_envs: The number of environments.
+
+    Raises:
+        UnknownVariable, TimeNotWritten: Nobody wrote an action.
+        ValueMismatch: It does not fit the space, or is not for `num_envs` environments.
     """
-
-    def __init__(self, name: str, space: Space[Any], num_envs: int) -> None:
-        self._num_envs, self._is_nested = num_envs, isinstance(space, spaces.Dict)
-        self._parts = list(_parts(name, (), space, num_envs))
-
-    def each(self, workspace: Any, t: int) -> Sequence[Any]:
-        """One action for each environment: an int, an array (float64 or int64), or a nested dict of these."""
-        if not self._is_nested:
-            return self._parts[0].each(workspace, t)
-        columns = [(part.path, part.each(workspace, t)) for part in self._parts]
-        return [_nested((path, values[k]) for path, values in columns) for k in range(self._num_envs)]
-
-    def batch(self, workspace: Any, t: int) -> Any:
-        """The actions of all environments together: a new array of the space's dtype, or a nested dict of these."""
-        if not self._is_nested:
-            return self._parts[0].batch(workspace, t)
-        return _nested((part.path, part.batch(workspace, t)) for part in self._parts)
+    if isinstance(space, spaces.Dict):
+        columns = {key: each_action(workspace, t, f"{name}/{key}", part, num_envs) for key, part in space.items()}
+        return [{key: column[k] for key, column in columns.items()} for k in range(num_envs)]
+    array = _read(workspace, t, name, space, num_envs)
+    if array.ndim > 1:
+        return list(array.astype(_GIVEN[array.dtype.kind]))
+    plain: list[Any] = array.tolist()
+    return [np.asarray(one) for one in plain] if array.dtype.kind == "f" else plain
 
 
-class _Part:
-    """One variable of the action, and what is known of it."""
+def batch_action(workspace: Any, t: int, name: str, space: Space[Any], num_envs: int) -> Any:
+    """All actions together, see `each_action`: a new array of the space's dtype, or a nested dict of these."""
+    if isinstance(space, spaces.Dict):
+        return {key: batch_action(workspace, t, f"{name}/{key}", part, num_envs) for key, part in space.items()}
+    array = _read(workspace, t, name, space, num_envs)
+    fits = space.dtype is not None and np.can_cast(array.dtype, space.dtype, "same_kind")
+    return np.array(array, dtype=space.dtype if fits else None)
 
-    def __init__(self, name: str, path: tuple[str, ...], space: Space[Any], num_envs: int) -> None:
-        self.path = path
-        self._name, self._space, self._num_envs = name, space, num_envs
-        self._shape = (num_envs, *(space.shape or ())) if isinstance(space, (spaces.Box, *_WHOLE)) else None
-        self._dtype = None if space.dtype is None else np.dtype(space.dtype)
 
-    def each(self, workspace: Any, t: int) -> Sequence[Any]:
-        array = self._read(workspace, t)
-        if array.ndim > 1:
-            return list(array.astype(_GIVEN[array.dtype.kind]))
-        plain: list[Any] = array.tolist()
-        if isinstance(self._space, spaces.Discrete):
-            self._check_range(plain, min(plain), max(plain), t)
-        return [np.asarray(one) for one in plain] if array.dtype.kind == "f" else plain
-
-    def batch(self, workspace: Any, t: int) -> Array:
-        array = self._read(workspace, t)
-        if isinstance(self._space, spaces.Discrete):
-            self._check_range(array, np.minimum.reduce(array), np.maximum.reduce(array), t)
-        fits = self._dtype is not None and np.can_cast(array.dtype, self._dtype, "same_kind")
-        return np.array(array, dtype=self._dtype if fits else None)
-
-    def _read(self, workspace: Any, t: int) -> Array:
-        array = to_array(workspace.get(self._name, t))
-        if self._shape is None:
-            if len(array) != self._num_envs:
-                raise mismatch(self._name, f"t={t}", "batch size", self._num_envs, len(array))
-        elif array.shape != self._shape:
-            raise mismatch(self._name, f"t={t}", "shape", self._shape, array.shape)
-        elif array.dtype.kind == "f" and isinstance(self._space, _WHOLE):
-            raise ValueMismatch(f"{self._name!r} at t={t}: {self._space} takes whole numbers, found {array.dtype}.")
+def _read(workspace: Any, t: int, name: str, space: Space[Any], num_envs: int) -> Array:
+    """One variable of the actions, checked."""
+    array = to_array(workspace.get(name, t))
+    if not isinstance(space, (spaces.Box, *_WHOLE)):
+        if len(array) != num_envs:
+            raise mismatch(name, f"t={t}", "batch size", num_envs, len(array))
         return array
-
-    def _check_range(self, actions: Any, least: int, most: int, t: int) -> None:
-        first, last = int(self._space.start), int(self._space.start + self._space.n - 1)  # type: ignore[attr-defined]
-        if least < first or most > last:
-            k, found = next((k, int(one)) for k, one in enumerate(actions) if not first <= one <= last)
+    shape = (num_envs, *(space.shape or ()))
+    if array.shape != shape:
+        raise mismatch(name, f"t={t}", "shape", shape, array.shape)
+    if array.dtype.kind == "f" and isinstance(space, _WHOLE):
+        raise ValueMismatch(f"{name!r} at t={t}: {space} takes whole numbers, found {array.dtype}.")
+    if isinstance(space, spaces.Discrete):
+        first, last = int(space.start), int(space.start + space.n - 1)
+        plain = array.tolist()  # quicker than NumPy for few environments
+        if min(plain) < first or max(plain) > last:
+            k, found = next((k, one) for k, one in enumerate(plain) if not first <= one <= last)
             raise ValueMismatch(
-                f"{self._name!r} at t={t}: {self._space} takes {first} to {last}, found {found} for environment {k}."
+                f"{name!r} at t={t}: {space} takes {first} to {last}, found {found} for environment {k}."
             )
-
-
-def _parts(name: str, path: tuple[str, ...], space: Space[Any], num_envs: int) -> Iterator[_Part]:
-    """The variables of an action of this space."""
-    if not isinstance(space, spaces.Dict):
-        yield _Part(name, path, space, num_envs)
-        return
-    for key, part in space.spaces.items():
-        yield from _parts(f"{name}/{key}", (*path, key), part, num_envs)
-
-
-def _nested(pairs: Iterable[tuple[tuple[str, ...], Any]]) -> dict[str, Any]:
-    """Values by their paths of keys as a nested dict."""
-    tree: dict[str, Any] = {}
-    for (*above, last), value in pairs:
-        branch = tree
-        for key in above:
-            branch = branch.setdefault(key, {})
-        branch[last] = value
-    return tree
+    return array

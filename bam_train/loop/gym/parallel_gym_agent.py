@@ -26,10 +26,9 @@ import numpy as np
 from gymnasium.wrappers import Autoreset
 
 from bam_envs.safety.gate import SafeRobot
-from bam_train.errors import SettingsError, ValueMismatch
-from bam_train.loop.gym.gym_agent import Frame, GymAgent, Stepper
-from bam_train.loop.gym.gym_spaces import Array, entries, pack
-from bam_train.loop.workspace import Workspace
+from bam_train.errors import SettingsError
+from bam_train.loop.gym.gym_agent import GymAgent
+from bam_train.loop.gym.gym_spaces import Arrays, each_action, flat, kinds, pack
 
 Env = gym.Env[Any, Any]
 
@@ -60,56 +59,6 @@ def has_autoreset(env: Env) -> bool:
             return True
         env = env.env
     return False
-
-
-class _SingleEnvs(Stepper):
-    """n environments, stepped one after the other."""
-
-    def __init__(self, agent: ParallelGymAgent) -> None:
-        super().__init__(agent)
-        self._autoreset = agent._is_autoreset
-        self._steps: list[Callable[[Any], Any]] = [env.step for env in self._envs]
-        self._cumulated = [0.0] * len(self._envs)  # Python's sums, as BBRL's
-        self._advance = np.ones(len(self._envs), dtype=np.int64)
-
-    def reset(self, seeds: int | Sequence[int | None]) -> Frame:
-        """Begin an episode in every environment."""
-        n = len(self._envs)
-        each = range(seeds, seeds + n) if isinstance(seeds, int) else seeds
-        pairs = [env.reset(seed=seed) for env, seed in zip(self._envs, each, strict=True)]
-        observations, infos = zip(*pairs, strict=True)
-        self._entries = entries(observations[0], self._envs[0].observation_space, self._for_torch)
-        return self._joined(observations, [0.0] * n, np.zeros(n, dtype=bool), np.zeros(n, dtype=bool), infos)
-
-    def step(self, workspace: Workspace, t: int) -> Frame:
-        """Step every environment that has not ended for good."""
-        actions = self._actions.each(workspace, t)
-        results = [step(action) for step, action in zip(self._steps, actions, strict=True)]
-        observations, rewards, terminated, truncated, infos = zip(*results, strict=True)
-        self._cumulated = list(map(add, self._cumulated, rewards))
-        self._timestep = self._timestep + self._advance
-        terminations, truncations = np.array(terminated, dtype=bool), np.array(truncated, dtype=bool)
-        ended = np.flatnonzero(terminations | truncations).tolist() if any(terminated) or any(truncated) else ()
-        if ended and self._autoreset and not self._include_last:
-            firsts = {k: self._steps[k](None)[0] for k in ended}
-            observations = tuple(firsts.get(k, one) for k, one in enumerate(observations))
-        frame = self._joined(observations, rewards, terminations, truncations, infos)
-        for k in ended:
-            if self._autoreset:
-                self._cumulated[k] = 0.0
-                self._timestep[k] = -1  # so that the reset is step 0
-            else:
-                observation, _, *rest = results[k]
-                self._steps[k], self._advance[k] = partial(_repeat, (observation, 0.0, *rest)), 0
-        return frame
-
-    def _joined(self, observations: Any, rewards: Any, terminated: Array, truncated: Array, infos: Any) -> Frame:
-        """The frame of what the environments gave, one by one."""
-        packed = {entry.name: pack(entry, observations) for entry in self._entries}
-        frame = self._frame(packed, rewards, terminated, truncated, self._infos.of_each(infos))
-        if frame.numbers["reward"].ndim != 1:
-            raise ValueMismatch(f"'reward': expected one number from each environment, found {rewards[0]!r}.")
-        return frame
 
 
 def _repeat(result: tuple[Any, ...], action: Any) -> tuple[Any, ...]:
@@ -147,8 +96,6 @@ class ParallelGymAgent(GymAgent):
         SettingsError: `num_envs` is not at least 1, or `make_env_fn` does not make new single environments.
     """
 
-    _STEPPER = _SingleEnvs
-
     def __init__(
         self,
         make_env_fn: Callable[..., Env],
@@ -183,9 +130,43 @@ class ParallelGymAgent(GymAgent):
             )
         return self.make_env_fn(**self._make_env_args)
 
+    def _begin(self, seeds: int | Sequence[int | None]) -> Arrays:
+        n = self.num_envs
+        each = range(seeds, seeds + n) if isinstance(seeds, int) else seeds
+        pairs = [env.reset(seed=seed) for env, seed in zip(self.envs, each, strict=True)]
+        observations, infos = zip(*pairs, strict=True)
+        self._kinds = kinds(flat(observations[0]), self.observation_space, self.arrays == "torch")
+        self._steps: list[Callable[[Any], Any]] = [env.step for env in self.envs]
+        self._cumulated = [0.0] * n  # Python's sums, as BBRL's
+        self._advance = np.ones(n, dtype=np.int64)
+        no = np.zeros(n, dtype=bool)
+        return self._frame(pack(self._kinds, observations), [0.0] * n, no, no.copy(), self._infos.of_each(infos))
+
+    def _step(self, t: int) -> Arrays:
+        """Step every environment that has not ended for good."""
+        actions = each_action(self.workspace, t, self.input, self.action_space, self.num_envs)
+        results = [step(action) for step, action in zip(self._steps, actions, strict=True)]
+        observations, rewards, terminated, truncated, infos = zip(*results, strict=True)
+        self._cumulated[:] = map(add, self._cumulated, rewards)
+        np.add(self._timestep, self._advance, out=self._timestep)
+        ended = [k for k in range(self.num_envs) if terminated[k] or truncated[k]]
+        if ended and self._is_autoreset and not self.include_last_state:
+            firsts = {k: self._steps[k](None)[0] for k in ended}
+            observations = tuple(firsts.get(k, one) for k, one in enumerate(observations))
+        ends = np.array(terminated, dtype=bool), np.array(truncated, dtype=bool)
+        frame = self._frame(pack(self._kinds, observations), rewards, *ends, self._infos.of_each(infos))
+        for k in ended:
+            if self._is_autoreset:
+                self._cumulated[k] = 0.0
+                self._timestep[k] = -1  # so that the reset is step 0
+            else:
+                observation, _, *rest = results[k]
+                self._steps[k], self._advance[k] = partial(_repeat, (observation, 0.0, *rest)), 0
+        return frame
+
     def close(self) -> None:
         """Close the environments; they are made anew at the next t = 0."""
-        envs, self.envs, self._stepper = self.envs or (), None, None
+        envs, self.envs, self._running = self.envs or (), None, False
         with ExitStack() as stack:  # all of them, also when one fails
             for env in envs:
                 stack.callback(env.close)
@@ -195,8 +176,8 @@ class ParallelGymAgent(GymAgent):
         """One observation as tensors with a batch dimension of 1, by the names of its variables without prefix."""
         import torch
 
-        found = entries(frame, None, for_torch=True)
-        return {entry.name: torch.from_numpy(pack(entry, [frame])) for entry in found}
+        arrays = pack(kinds(flat(frame), None, for_torch=True), [frame])
+        return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
 
 def _require_envs(envs: Sequence[Any]) -> None:

@@ -26,132 +26,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from bam_train.errors import LoopError, SettingsError
-from bam_train.loop.gym.gym_agent import Frame, GymAgent, Stepper
-from bam_train.loop.gym.gym_spaces import Array, entries, pick
-from bam_train.loop.workspace import Workspace
-
-_Arrays = dict[str, Array]
-
-
-class _VectorEnvs(Stepper):
-    """A vector environment. Its frames are filled in place until `step` returns them."""
-
-    def __init__(self, agent: VecGymAgent) -> None:
-        super().__init__(agent)
-        self._mode, self._auto_reset = agent._mode, agent.auto_reset
-        n = agent.num_envs
-        self._begin, self._over = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
-        self._advance: Any = 1
-        self._last = Frame({}, {}, {})  # without auto-reset
-        self._turns = self._mode != AutoresetMode.NEXT_STEP
-        # Whether an environment is one step into its next episode when its first observation is due.
-        self._ahead = self._turns and self._auto_reset and self._include_last
-
-    def reset(self, seeds: int | Sequence[int | None]) -> Frame:
-        """Begin an episode in every environment."""
-        envs, n = self._envs, len(self._begin)
-        observations, infos = envs.reset(seed=seeds)
-        self._entries = entries(_first(observations), envs.single_observation_space, self._for_torch)
-        no = np.zeros(n, dtype=bool)
-        return self._frame(self._packed(observations), np.zeros(n), no, no.copy(), self._infos.of_vector(infos))
-
-    def step(self, workspace: Workspace, t: int) -> Frame:
-        """Step every environment."""
-        actions = self._actions.batch(workspace, t)
-        if np.count_nonzero(self._over) == len(self._over):
-            last = _copy(self._last)
-            last.numbers["reward"][:] = 0
-            return last
-        observations, rewards, terminated, truncated, infos = self._envs.step(actions)
-        packed, recorded = self._packed(observations), self._infos.of_vector(infos)
-        terminated, truncated = np.array(terminated, dtype=bool), np.array(truncated, dtype=bool)
-        rewards = np.array(rewards, dtype=np.float64)
-        # count_nonzero: any() takes ten times as long.
-        if self._turns and (np.count_nonzero(terminated | truncated) or np.count_nonzero(self._begin)):
-            self._turn(packed, rewards, terminated, truncated, infos, recorded)
-        if self._over.any():  # repeat the last frame where episodes are over for good, with reward 0
-            over, last = self._over, self._last
-            for name, array in packed.items():
-                array[over] = last.observations[name][over]
-            terminated[over], truncated[over] = last.numbers["terminated"][over], last.numbers["truncated"][over]
-            rewards[over] = 0
-            _replace(recorded, last.infos, over)
-        self._cumulated += rewards
-        self._timestep += self._advance
-        frame = self._frame(packed, rewards, terminated, truncated, recorded)
-        done = frame.numbers["done"]
-        if not self._auto_reset:
-            self._over, self._advance, self._last = done.copy(), ~done, _copy(frame)
-            return frame
-        if self._turns:
-            self._begin = done.copy()
-        if np.count_nonzero(done):
-            self._cumulated[done] = 0
-            self._timestep[done] = -1  # so that the reset is step 0
-        return frame
-
-    def _turn(
-        self, packed: _Arrays, rewards: Array, terminated: Array, truncated: Array, infos: Any, recorded: _Arrays
-    ) -> None:
-        """Put the last observation where episodes end, and the first where they begin; changes what it is given."""
-        begin = self._begin & self._ahead
-        ended = terminated | truncated
-        if self._mode == AutoresetMode.SAME_STEP and ended.any():
-            if self._include_last:
-                self._take_final(packed, ended, infos)
-            if "final_info" in infos:
-                _replace(recorded, self._infos.of_vector(infos["final_info"]), ended)
-        again = begin | ended if self._mode == AutoresetMode.DISABLED else begin
-        if not again.any():
-            return
-        observations, first_infos = self._envs.reset(options={"reset_mask": again.copy()})
-        first, others = self._packed(observations), ~(again | ended)
-        if any(first[name][others].tobytes() != packed[name][others].tobytes() for name in packed):
-            raise LoopError(
-                f'{self._envs} does not obey reset(options={{"reset_mask": ...}}): it changed other environments.'
-            )
-        shown = begin if self._include_last else again
-        for name, array in first.items():
-            packed[name][shown] = array[shown]
-        if begin.any():
-            _replace(recorded, self._infos.of_vector(first_infos), begin)
-        rewards[begin], terminated[begin], truncated[begin] = 0, False, False
-
-    def _take_final(self, packed: _Arrays, ended: Array, infos: Mapping[str, Any]) -> None:
-        """The last observation where episodes ended."""
-        if "final_obs" not in infos:
-            raise LoopError(f'{self._envs} is AutoresetMode.SAME_STEP but gave no infos["final_obs"] at an end.')
-        final = infos["final_obs"]
-        if isinstance(final, np.ndarray) and final.dtype == object:  # one observation for each that ended
-            for entry in self._entries:
-                for k in np.flatnonzero(ended):
-                    packed[entry.name][k] = pick(entry, final[k])
-        else:
-            for entry in self._entries:
-                packed[entry.name][ended] = pick(entry, final)[ended]
-
-    def _packed(self, observations: Any) -> _Arrays:
-        """Copies of the observations' arrays by variable, in the dtype they are written as."""
-        return {entry.name: np.array(pick(entry, observations), dtype=entry.dtype) for entry in self._entries}
-
-
-def _copy(frame: Frame) -> Frame:
-    return Frame(*({name: array.copy() for name, array in part.items()} for part in frame))
-
-
-def _replace(new: _Arrays, old: _Arrays, chosen: Array) -> None:
-    """In infos `new`, take the environments `chosen` (n,) bool from `old`; 0 where `old` has nothing."""
-    for name, array in old.items():
-        new.setdefault(name, np.zeros_like(array))
-    for name, array in new.items():
-        array[chosen] = old[name][chosen] if name in old else 0
-
-
-def _first(observations: Any) -> Any:
-    """The first environment's part of a batch of observations; dicts stay dicts."""
-    if isinstance(observations, Mapping):
-        return {key: _first(one) for key, one in observations.items()}
-    return observations if isinstance(observations, tuple) else observations[0]
+from bam_train.loop.gym.gym_agent import GymAgent
+from bam_train.loop.gym.gym_spaces import Array, Arrays, batch_action, flat, kinds, pick
 
 
 class VecGymAgent(GymAgent):
@@ -172,8 +48,6 @@ class VecGymAgent(GymAgent):
         SettingsError: The environment does not say in its metadata what it does with ended environments, or resets
             them in the next step and `include_last_state` is False.
     """
-
-    _STEPPER = _VectorEnvs
 
     def __init__(
         self,
@@ -218,12 +92,105 @@ class VecGymAgent(GymAgent):
         self.num_envs = self.envs.num_envs
         self._opened(self.envs.single_observation_space, self.envs.single_action_space)
 
+    def _begin(self, seeds: int | Sequence[int | None]) -> Arrays:
+        observations, infos = self.envs.reset(seed=seeds)
+        first = {name: one if isinstance(one, tuple) else one[0] for name, one in flat(observations).items()}
+        self._kinds = kinds(first, self.observation_space, self.arrays == "torch")
+        no = np.zeros(self.num_envs, dtype=bool)
+        self._due, self._over = no.copy(), no.copy()
+        self._last: Arrays = {}  # without auto-reset
+        return self._frame(
+            self._packed(observations), np.zeros(self.num_envs), no, no.copy(), self._infos.of_vector(infos)
+        )
+
+    def _step(self, t: int) -> Arrays:
+        actions = batch_action(self.workspace, t, self.input, self.action_space, self.num_envs)
+        if np.count_nonzero(self._over) == self.num_envs:
+            return {**_copies(self._last), "reward": np.zeros(self.num_envs, self._floats)}
+        observations, rewards, terminated, truncated, infos = self.envs.step(actions)
+        packed, recorded = self._packed(observations), self._infos.of_vector(infos)
+        terminated, truncated = np.array(terminated, dtype=bool), np.array(truncated, dtype=bool)
+        rewards = np.array(rewards, dtype=np.float64)
+        # count_nonzero: any() takes ten times as long.
+        if self._mode != AutoresetMode.NEXT_STEP and np.count_nonzero(terminated | truncated | self._due):
+            self._turn(packed, rewards, terminated, truncated, infos, recorded)
+        np.add(self._cumulated, rewards, out=self._cumulated)
+        np.add(self._timestep, 1, out=self._timestep)
+        frame = self._frame(packed, rewards, terminated, truncated, recorded)
+        if not self.auto_reset:
+            _replace(frame, self._last, self._over)  # where episodes are over for good
+            frame["reward"][self._over] = 0
+            self._over, self._last = frame["done"].copy(), _copies(frame)
+            return frame
+        done = frame["done"]
+        if self._mode != AutoresetMode.NEXT_STEP and self.include_last_state:
+            self._due[:] = done
+        if np.count_nonzero(done):
+            self._cumulated[done] = 0
+            self._timestep[done] = -1  # so that the reset is step 0
+        return frame
+
+    def _turn(
+        self, packed: Arrays, rewards: Array, terminated: Array, truncated: Array, infos: Any, recorded: Arrays
+    ) -> None:
+        """Put the last observation where episodes end, and the first where they begin; changes what it is given."""
+        begin = self._due.copy()  # each is a step into its next episode when its first observation is due
+        ended = terminated | truncated
+        if self._mode == AutoresetMode.SAME_STEP and ended.any():
+            if self.include_last_state:
+                self._take_final(packed, ended, infos)
+            if "final_info" in infos:
+                _replace(recorded, self._infos.of_vector(infos["final_info"]), ended)
+        again = begin | ended if self._mode == AutoresetMode.DISABLED else begin
+        if not again.any():
+            return
+        observations, first_infos = self.envs.reset(options={"reset_mask": again.copy()})
+        first, others = self._packed(observations), ~(again | ended)
+        if any(first[name][others].tobytes() != packed[name][others].tobytes() for name in packed):
+            raise LoopError(
+                f'{self.envs} does not obey reset(options={{"reset_mask": ...}}): it changed other environments.'
+            )
+        _replace(packed, first, begin if self.include_last_state else again)
+        if begin.any():
+            _replace(recorded, self._infos.of_vector(first_infos), begin)
+        rewards[begin], terminated[begin], truncated[begin] = 0, False, False
+
+    def _take_final(self, packed: Arrays, ended: Array, infos: Mapping[str, Any]) -> None:
+        """The last observation where episodes ended."""
+        if "final_obs" not in infos:
+            raise LoopError(f'{self.envs} is AutoresetMode.SAME_STEP but gave no infos["final_obs"] at an end.')
+        final = infos["final_obs"]
+        if not (isinstance(final, np.ndarray) and final.dtype == object):
+            _replace(packed, self._packed(final), ended)
+            return
+        for k in np.flatnonzero(ended):  # one observation for each that ended
+            parts = flat(final[k])
+            for name, array in packed.items():
+                array[k] = pick(parts, name)
+
+    def _packed(self, observations: Any) -> Arrays:
+        """Copies of the observations' arrays by variable, in the dtype they are written as."""
+        parts = flat(observations)
+        return {name: np.array(pick(parts, name), dtype=kind.dtype) for name, kind in self._kinds.items()}
+
     def close(self) -> None:
         """Close the environment; it is made anew at the next t = 0."""
-        envs, self.envs, self._stepper = self.envs, None, None
+        envs, self.envs, self._running = self.envs, None, False
         if envs is not None:
             envs.close()
 
     def __getstate__(self) -> dict[str, Any]:
         """A copy makes its own environment at its next t = 0: processes and simulators cannot be copied."""
-        return {**super().__getstate__(), "envs": None, "_stepper": None}
+        return {**super().__getstate__(), "envs": None, "_running": False}
+
+
+def _copies(arrays: Arrays) -> Arrays:
+    return {name: array.copy() for name, array in arrays.items()}
+
+
+def _replace(new: Arrays, old: Arrays, chosen: Array) -> None:
+    """In `new`, take the environments `chosen` (n,) bool from `old`; 0 where `old` has nothing."""
+    for name, array in old.items():
+        new.setdefault(name, np.zeros_like(array))
+    for name, array in new.items():
+        array[chosen] = old[name][chosen] if name in old else 0
