@@ -4,13 +4,11 @@ A rosbridge server does not report a wrong topic or type. So each one is checked
 server can tell it (rosapi), and by the first message of every source.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, ProtocolError, RemoteError, StaleState
 from bam_envs.core.timing import Deadline
@@ -20,10 +18,8 @@ from bam_envs.ros.freshness import Tagger
 from bam_envs.ros.messages import bare_type, same_type
 from bam_envs.ros.profile_tables import Readiness, RobotProfile, Sink
 from bam_envs.rosbridge.bus import Listener, namespaces_with
+from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.sessions import LEASE_TOPIC, LEAVE, RENEW, SESSION_SERVICE, read_session
-
-if TYPE_CHECKING:
-    from bam_envs.rosbridge.client import RosbridgeLink
 
 TIMEOUT = 3.0
 """Longest wait for the answer of a service, and for a first message, if the endpoint says nothing else [s]."""
@@ -79,17 +75,17 @@ def tagged_sinks(profile: RobotProfile, mode: str | None, info: RobotInfo) -> tu
 
 
 class TopicTypes:
-    """Asks a server for the types of its topics, if it offers rosapi; waits `timeout` [s] for each at most."""
+    """Asks a server for the types of its topics, if it offers rosapi; waits at most `timeout` [s] for each."""
 
     def __init__(self, link: RosbridgeLink, profile: RobotProfile, timeout: float) -> None:
         self._link, self._profile, self._timeout, self._answers = link, profile, timeout, True
 
     def check(self, topic: str, expected: str) -> str:
         """The type to use for `topic`, `expected` if the server does not know; `ProtocolError` if it has another."""
-        found = self._found(topic)
-        if found and not same_type(found, expected):
+        found = self._found(topic) or expected
+        if not same_type(found, expected):
             raise self._misfit(topic, expected, found)
-        return found or expected
+        return found
 
     def may_be(self, topic: str, kind: str) -> bool:
         """Whether `topic` is of type `kind` there, or the server does not know."""

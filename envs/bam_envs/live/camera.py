@@ -49,13 +49,7 @@ class CameraImage:
 
 
 class LiveCamera:
-    """One camera behind a rosbridge server.
-
-    Args:
-        endpoint: As of the robot: its namespace goes before the camera's topic.
-        source: The camera, as a profile describes it.
-        clock: Monotonic clock [s].
-    """
+    """One camera of a profile behind a rosbridge server; the namespace of `endpoint` goes before its topic."""
 
     def __init__(
         self, endpoint: Endpoint | str, source: CameraSource, *, clock: Callable[[], float] = time.monotonic
@@ -68,12 +62,7 @@ class LiveCamera:
         self._decoded: CameraImage | None = None
 
     def connect(self) -> None:
-        """Open a connection for this camera, and wait for its first image. Idempotent.
-
-        Raises:
-            NoServer: There is no usable server.
-            StaleState: No image came.
-        """
+        """Open a connection for this camera, and wait for its first image, else `StaleState`. Idempotent."""
         if self._link is not None:
             return
         self._mailbox = mailbox = Mailbox(self._clock)
@@ -99,7 +88,6 @@ class LiveCamera:
         """The newest image; each is decoded at most once.
 
         Raises:
-            ResetNeeded: Not connected.
             StaleState: It is older than the profile allows.
             ProtocolError: It is not an image.
             MissingExtra: Pillow is not installed.

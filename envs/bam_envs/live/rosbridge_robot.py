@@ -62,7 +62,6 @@ _RESET_TIMEOUT = 3.0
 _HALT_WAITS = 0.05
 """Longest that a halt waits for a command that is being sent, so that it comes after it [s]."""
 _BY_HAND = "stop it by hand if it moves; a robot with a command timeout stops by itself"
-_HALT_NOT_SENT = f"%s: the halt could not be sent, %s: {_BY_HAND}."
 _AS_SAID = ". Nothing was sent, and nothing is kept"
 _FAR, _CANNOT_BE_FAR = 0.3, 1.0
 """An arm that was commanded in the last second [s] cannot be farther than this [rad] from its command."""
@@ -71,19 +70,9 @@ _LATE = ("expired", "old message", "old connection")
 
 
 class RosbridgeRobot:
-    """One robot behind a rosbridge server; commands reach it only through a `SafeRobot`, which `live_robot` builds.
+    """One robot behind a rosbridge server; commands reach it only through a `SafeRobot`. See `live_robot`.
 
-    Args:
-        endpoint: Its rosbridge server, with a namespace behind the URL if its topics have one.
-        profile: Its topics.
-        spec: What the task needs; only these signals are subscribed, only these commands sent. None: everything that
-            is not optional.
-        command: Command mode, such as ``"trajectory"``; None: the profile's default.
-        clock: Monotonic clock [s].
-
-    Raises:
-        InvalidValue: The address is not valid, or the robot does not measure, or take, what `spec` names.
-        UnknownName: The profile has no such command mode.
+    Only the signals of `spec` are subscribed, and only its commands sent; None: everything that is not optional.
     """
 
     needs_clearance = True
@@ -142,8 +131,7 @@ class RosbridgeRobot:
 
         Raises:
             NoServer: There is no usable server.
-            ProtocolError: A topic has another type, nobody listens to commands, or a first message is not what the
-                profile says.
+            ProtocolError: A topic is not what the profile says, or nobody listens to commands.
             StaleState: A topic is silent.
         """
         if self._control is not None:
@@ -190,9 +178,9 @@ class RosbridgeRobot:
         fewest = int(1000 * min(self.spec.period, self.profile.max_age) / _STATES)
         for topic, kind in {source.topic: source.type for source in self._state.sources}.items():
             name = self.namespace + topic
-            # A driver may send 500 states a second, and queues of a busy bridge delay every one of them; a fifth of
-            # the period costs no freshness that matters. Where several publish on a topic, the bridge might always drop
-            # the messages of the same one. A robot that describes itself sends no more than is needed.
+            # A driver may send 500 states a second, and the queues of a busy bridge delay them all. Where several
+            # publish on a topic, the bridge might always drop the messages of the same one. A robot that describes
+            # itself sends no more than is needed.
             least = 0 if self._describes_itself or topic in shared else fewest
             listener, kind = self._state.listener(topic), types.check(name, kind)
             control.subscribe(name, kind, listener, throttle_ms=least, queue_length=1 if least else 0)
@@ -247,8 +235,6 @@ class RosbridgeRobot:
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
         """A fresh state. Nothing real moves; a simulated robot is at rest, its object where `initial` says.
 
-        After the link has dropped and is back, this makes the robot usable again.
-
         Raises:
             LinkLost: The link is down.
             NotReady: The robot says that it cannot move now.
@@ -295,12 +281,10 @@ class RosbridgeRobot:
         A simulated robot in lockstep, whose time advances with commands only, ends the period with its answer.
 
         Raises:
-            ResetNeeded: Not connected.
             InvalidValue: The command did not pass the guards.
             LinkLost: A connection dropped, before or during this step; nothing more is sent until `reset`.
             NotReady: The robot says that it cannot move now.
-            NotInCommand: Another client is in command of the robot.
-            RemoteError: The robot's side refused a command.
+            RemoteError: The robot's side refused a command; `NotInCommand` if another client is in command.
             StaleState: The robot did not answer in time.
             ProtocolError: The state is not what the profile says.
         """
@@ -342,23 +326,14 @@ class RosbridgeRobot:
                     self._owed[tag.sequence] = self._sent_at
 
     def measure(self) -> RobotState:
-        """The newest state, with the command that was sent last.
-
-        Raises:
-            ResetNeeded: Not connected.
-            StaleState: No message has arrived yet.
-            ProtocolError: A message is not what the profile says.
-        """
+        """The newest state, with the command that was sent last. Raises as `step`."""
         self._connected()
         signals, stamp = self._state.read()
         command = self._at_rest(signals) if self._sent is None else self._sent
         return RobotState(signals, np.array([stamp]), command[None].copy())
 
     def age(self) -> float:
-        """Age of the state [s], by its oldest source; infinite without a message of one.
-
-        In lockstep it is 0: no time passes between two commands.
-        """
+        """Age of the state [s], by its oldest source; infinite without a message of one, 0 in lockstep."""
         age = self._state.age()
         return 0.0 if self.info.lockstep and math.isfinite(age) else age
 
@@ -387,7 +362,8 @@ class RosbridgeRobot:
             self._halt_failed = False
         except BamEnvsError as error:  # reported once: several threads and `close` try it too
             if not self._halt_failed:
-                _LOG.warning(_HALT_NOT_SENT, self.url, bare_reason(halting.url, error).removesuffix(_AS_SAID))
+                why = bare_reason(halting.url, error).removesuffix(_AS_SAID)
+                _LOG.warning("%s: the halt could not be sent, %s: %s.", self.url, why, _BY_HAND)
             self._halt_failed = True
         finally:
             if first:
@@ -462,10 +438,7 @@ class RosbridgeRobot:
             raise LinkLost(f"{self.url}: the connection that halts the robot is down. Nothing is sent without it.")
 
     def not_ready(self) -> str | None:
-        """Why the robot cannot move now, as it says itself; None if it does not say so, or is not connected.
-
-        Not to be called while commands are sent: it may ask the server, which takes a while.
-        """
+        """Why the robot cannot move now, as it says itself; None if it does not say so. May ask it: at rest only."""
         control = self._control
         return None if control is None or self._readiness is None else self._readiness.not_ready(control)
 

@@ -23,10 +23,10 @@ JUMP = 0.05
 """A joint may be measured this much farther away than it can have turned [rad]."""
 
 
-def fastest_joints(spec: RobotSpec, limits: Limits) -> Array:
-    """Maximum speed of each joint [rad/s]: of the limits and of the data sheet."""
+def fastest_joints(spec: RobotSpec, limits: Limits, unlimited: float = math.inf) -> Array:
+    """Maximum speed of each joint [rad/s]: of the limits and of the data sheet; `unlimited` where neither has one."""
     fastest: Array = np.minimum(limits.joint_speed, max_rate(spec.command)[columns_in(spec.command, "rad")])
-    return fastest
+    return np.where(np.isfinite(fastest), fastest, unlimited)
 
 
 class PositionLimits(Guard):
@@ -70,10 +70,8 @@ class RampIn(Guard):
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self.limit_value, self._joints = limits.reset_speed, columns_in(spec.command, "rad")
-        fastest = fastest_joints(spec, limits)
         # If nothing limited a joint's speed, a first step of any length would count as near.
-        free = np.where(np.isfinite(fastest), fastest, limits.reset_speed)
-        self._one_step = free * spec.period * ROUNDING
+        self._one_step = fastest_joints(spec, limits, limits.reset_speed) * spec.period * ROUNDING
         self._longest = math.ceil(limits.ramp_time / spec.period)
         self._left: int | None = None
 

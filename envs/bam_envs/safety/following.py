@@ -75,8 +75,7 @@ class JointFollowing(Following):
         self._joints, self._period = columns_in(spec.command, "rad"), spec.period
         self._tool, self._tool_reach = tool_position, limits.tool_speed * spec.period
         self._labels = np.array(spec.command.labels)[self._joints]
-        fastest = fastest_joints(spec, limits)
-        self._fastest = np.where(np.isfinite(fastest), fastest, limits.reset_speed)
+        self._fastest = fastest_joints(spec, limits, limits.reset_speed)
         self._slowest = np.minimum(self._fastest, limits.reset_speed)
         self._tolerance = limits.follow_tolerance
         self.limit_value = float(self._fastest.max()) * (self._lag + self._period)

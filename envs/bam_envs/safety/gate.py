@@ -6,8 +6,6 @@ Several such ticks in a row, or a measurement beyond the data sheet, stop the ro
 Longer than most files here: the gate stands beside the seal of what it lets through, so that nobody else can make one.
 """
 
-from __future__ import annotations
-
 import math
 import time
 import weakref
@@ -33,7 +31,7 @@ from bam_envs.safety.guard import (
     position_range,
     require_bounded,
 )
-from bam_envs.safety.guards import LATE, Freshness, Shape, default_guards
+from bam_envs.safety.guards import LATE, Freshness, MeasuredLimits, Shape, default_guards
 
 __all__ = ["ClearedCommand", "Limits", "SafeRobot"]
 
@@ -62,11 +60,7 @@ class ClearedCommand(metaclass=Sealed):
         raise InvalidValue("A cleared command cannot be copied: it is good for one tick.")
 
     def for_robot(self, robot: object) -> Array:
-        """What to send to `robot`; read-only. Shape: (1, m).
-
-        Raises:
-            InvalidValue: Its tick is over, it was never cleared, or it was cleared for another robot.
-        """
+        """What to send to `robot` in this tick, read-only (1, m); `InvalidValue` for another one, and later."""
         if self not in _CLEARED:
             raise InvalidValue(
                 "The tick that this command was cleared for is over. Give the next one to the SafeRobot."
@@ -78,7 +72,6 @@ class ClearedCommand(metaclass=Sealed):
 
 
 _CLEARED: weakref.WeakKeyDictionary[ClearedCommand, tuple[object, Array]] = weakref.WeakKeyDictionary()
-_GUARDED: weakref.WeakKeyDictionary[Any, weakref.ref[SafeRobot]] = weakref.WeakKeyDictionary()
 
 
 def _clear(robot: object, command: Array) -> ClearedCommand:
@@ -406,7 +399,7 @@ class SafeRobot(metaclass=Sealed):
 
     def _require_in_range(self, state: RobotState) -> None:
         for guard in self._guards:
-            if (reason := guard.trip(state)) is not None:
+            if isinstance(guard, MeasuredLimits) and (reason := guard.trip(state)) is not None:
                 self._stop(guard, reason)
 
     def _stop(self, guard: Guard, reason: str) -> NoReturn:
@@ -524,6 +517,9 @@ class SafeRobot(metaclass=Sealed):
         """Halt, then drop the link."""
         self._robot.close()
         self._forget()
+
+
+_GUARDED: weakref.WeakKeyDictionary[Any, weakref.ref[SafeRobot]] = weakref.WeakKeyDictionary()
 
 
 def _copied(state: RobotState) -> RobotState:

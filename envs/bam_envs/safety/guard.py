@@ -14,7 +14,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, UnknownName
-from bam_envs.core.robot import RobotSpec, RobotState, SignalSpec
+from bam_envs.core.robot import RobotSpec, SignalSpec
 from bam_envs.core.validation import check
 
 Array = NDArray[np.float64]
@@ -100,11 +100,7 @@ class Limits:
         return limits
 
     def require_bounded(self) -> None:
-        """Check what a live robot may have.
-
-        Raises:
-            InvalidValue: A limit is outside `BOUNDS`.
-        """
+        """`InvalidValue` if a limit is outside `BOUNDS`, in which those of live robots are."""
         for name, (least, most, unit) in BOUNDS.items():
             value = getattr(self, name)
             if value is not None and not least <= value <= most:
@@ -214,10 +210,6 @@ class Guard(metaclass=Sealed):
         """Bring ``tick.command`` inside the limit; whether that changed it."""
         return False
 
-    def trip(self, state: RobotState) -> str | None:
-        """Why a robot that measured `state` must be stopped, or None."""
-        return None
-
 
 def clip(tick: Tick, columns: Any, low: Array, high: Array) -> bool:
     """Clip `columns` of the command to `low` and `high`; whether that changed it."""
@@ -247,11 +239,7 @@ def max_rate(command: SignalSpec) -> Array:
 
 
 def position_range(spec: RobotSpec, limits: Limits) -> tuple[Array, Array]:
-    """Lowest and highest command, with the margin of the joints taken off.
-
-    Raises:
-        InvalidValue: The margin leaves a joint no room.
-    """
+    """Lowest and highest command, with the margin of the joints taken off; `InvalidValue` if that leaves no room."""
     margin = np.where([unit == "rad" for unit in spec.command.units], limits.position_margin, 0.0)
     low, high = np.array(spec.command.low) + margin, np.array(spec.command.high) - margin
     if (low > high).any():

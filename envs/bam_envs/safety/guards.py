@@ -194,7 +194,7 @@ class MeasuredLimits(Guard):
         self._ranges = {one.name: (np.array(one.low), np.array(one.high)) for one in self._watched}
 
     def trip(self, state: RobotState) -> str | None:
-        """Names the first number that is outside."""
+        """Why a robot that measured `state` must be stopped: the first number that is outside; or None."""
         for signal in self._watched:
             low, high = self._ranges[signal.name]
             values = state.signals[signal.name][0]
