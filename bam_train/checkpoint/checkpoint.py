@@ -14,13 +14,14 @@ Reading never unpickles.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
 import os
 import zipfile
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,7 @@ from bam_train.errors import AlteredCheckpoint, CheckpointError, CheckpointMisma
 
 POLICY = "bam/policy.onnx"
 GOLDEN = "bam/golden.safetensors"
+_MISFITS = (RuntimeError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, AssertionError)
 
 
 @dataclass(frozen=True)
@@ -98,12 +100,29 @@ class Checkpoint:
         except FormatError as error:
             raise AlteredCheckpoint(self.path, member, f"{member} cannot be read: {error}") from error
 
+    def state(self, name: str, to_tensor: Callable[[np.ndarray], Any] | None = None) -> Any:
+        """Return the state that `safetensors_file.pack` wrote as ``name.json`` and ``name.safetensors``."""
+        skeleton, arrays = self.read(f"{name}.json"), self.read(f"{name}.safetensors")
+        try:
+            return safetensors_file.unpack(skeleton, arrays, to_tensor)
+        except FormatError as error:
+            raise AlteredCheckpoint(self.path, name, str(error)) from error
+
     def json(self, member: str) -> Any:
         """Return a JSON member's value."""
         try:
             return json.loads(self.read(member))
         except (ValueError, RecursionError) as error:
             raise AlteredCheckpoint(self.path, member, f"{member} is not JSON: {error}") from error
+
+    @contextlib.contextmanager
+    def fitting(self, member: str) -> Iterator[None]:
+        """Map what is raised where a member's state does not fit what it is restored into to `AlteredCheckpoint`."""
+        try:
+            yield
+        except _MISFITS as error:
+            text = f"{member} does not fit these settings: {' '.join(str(error).split()):.200}"
+            raise AlteredCheckpoint(self.path, member, text) from error
 
     def requires_env(self, env_id: str) -> None:
         """Refuse another environment than its own (CheckpointMismatch); a name of robo-gym for it is no other."""

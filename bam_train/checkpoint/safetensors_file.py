@@ -43,8 +43,8 @@ def parse(data: bytes) -> dict[str, np.ndarray]:
         raise FormatError(f"not a safetensors file: {error}") from error
 
 
-def pack(tree: Any) -> tuple[bytes, bytes]:
-    """Turn a tree into (JSON skeleton, safetensors).
+def pack(name: str, tree: Any) -> dict[str, bytes]:
+    """Turn a tree into the members ``name.json``, its skeleton, and ``name.safetensors``.
 
     It may have None, bool, int, float, str, NumPy scalars and arrays, torch tensors; lists, tuples and mappings of
     these. Anything else is a FormatError that names where.
@@ -80,7 +80,7 @@ def pack(tree: Any) -> tuple[bytes, bytes]:
         return {"$items": [[put(key, path), put(item, f"{path}/{key}")] for key, item in value.items()]}
 
     skeleton = put(tree, "")
-    return json.dumps(skeleton, allow_nan=False).encode(), dump(arrays)
+    return {f"{name}.json": json.dumps(skeleton, allow_nan=False).encode(), f"{name}.safetensors": dump(arrays)}
 
 
 def unpack(skeleton: bytes, arrays: bytes, to_tensor: Callable[[np.ndarray], Any] | None = None) -> Any:

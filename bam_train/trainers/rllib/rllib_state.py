@@ -46,7 +46,7 @@ def load(checkpoint: Checkpoint, algorithm: Any) -> None:
     """
     require_version(checkpoint)
     state = read(checkpoint)
-    with _fitting(checkpoint, FOLDER):
+    with checkpoint.fitting(FOLDER):
         algorithm.metrics.set_state(state["metrics_logger"])
         if algorithm.env_runner_group is None:  # `Algorithm.set_state` expects runners
             algorithm.learner_group.set_state(state["learner_group"])
@@ -55,20 +55,10 @@ def load(checkpoint: Checkpoint, algorithm: Any) -> None:
             algorithm.set_state(state)
             hand_out(algorithm)
     if checkpoint.has(EXTRAS):
-        with _fitting(checkpoint, EXTRAS):
+        with checkpoint.fitting(EXTRAS):
             give = functools.partial(_give, extras=json.loads(checkpoint.read(EXTRAS)))
             for result in algorithm.learner_group.foreach_learner(give):
                 result.get()  # raises what went wrong there
-
-
-@contextmanager
-def _fitting(checkpoint: Checkpoint, member: str) -> Iterator[None]:
-    """The errors of an algorithm that is given a state that does not fit it, as our own."""
-    try:
-        yield
-    except (RuntimeError, ValueError, KeyError, TypeError, IndexError, AttributeError, AssertionError) as error:
-        text = f"{member} does not fit these settings: {' '.join(str(error).split()):.200}"
-        raise AlteredCheckpoint(checkpoint.path, member, text) from error
 
 
 def read(checkpoint: Checkpoint) -> dict[str, Any]:

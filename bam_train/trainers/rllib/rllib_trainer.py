@@ -36,6 +36,7 @@ from bam_train.trainers.rllib.rllib_freezing import FrozenModule, RLlibPolicy, g
 from bam_train.trainers.rllib.rllib_hyperparameters import complete, complete_normalize
 from bam_train.trainers.rllib.robot_env_runner import ENDS
 from bam_train.trainers.rllib.runner_deaths import RunnerWatch
+from bam_train.trainers.tensorboard_files import TensorBoardFiles
 
 _EPISODES = 100
 """Training episodes behind the means of `Statistics`."""
@@ -54,7 +55,7 @@ class RLlibTrainer:
         self._ends = {name: deque[float](maxlen=_EPISODES) for name in ("return", "length", "success")}
         self._result: dict[str, Any] = {}
         self._steps = 0
-        self._tensorboard: Any = None
+        self._tensorboard: TensorBoardFiles | None = None
         self._spare: Any = None
         runners, each = settings.num_env_runners, envs_each(settings)
         if runners and each * runners != settings.num_envs:
@@ -140,9 +141,7 @@ class RLlibTrainer:
 
     def log_to(self, folder: Path) -> None:
         """Write TensorBoard files into a folder from now on."""
-        from torch.utils.tensorboard import SummaryWriter
-
-        self._tensorboard = SummaryWriter(str(folder))
+        self._tensorboard = TensorBoardFiles(folder)
 
     @property
     def steps(self) -> int:
@@ -264,15 +263,13 @@ class RLlibTrainer:
 
     def log(self, metrics: Mapping[str, float]) -> None:
         """Put numbers next to the trainer's own in TensorBoard."""
-        with contextlib.suppress(OSError):  # a full disk ends these files, not the run
-            for name, value in metrics.items() if self._tensorboard is not None else ():
-                self._tensorboard.add_scalar(name, value, self.steps)
+        if self._tensorboard is not None:
+            self._tensorboard.write(metrics, self.steps)
 
     def close(self) -> None:
         """Let go of environments, log files and Ray."""
         if self._tensorboard is not None:
-            with contextlib.suppress(OSError):
-                self._tensorboard.close()
+            self._tensorboard.close()
         self._open.close()
 
 

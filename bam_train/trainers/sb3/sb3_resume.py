@@ -1,7 +1,6 @@
 """The state from which a run of stable-baselines3 continues exactly: ``bam/resume/…`` in its checkpoints.
 
-It is taken between two updates (before a rollout begins): no rollout is half collected, no gradient half applied. It is
-restored into a new model. The file is long because each kind of state is saved and restored differently.
+It is taken between two updates: no rollout is half collected, no gradient half applied.
 """
 
 import json
@@ -10,25 +9,29 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from msgspec import Meta
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.vec_env import VecNormalize
 
+from bam_envs.core.validation import check
 from bam_train.checkpoint import Checkpoint
-from bam_train.checkpoint.safetensors_file import pack, unpack
-from bam_train.errors import AlteredCheckpoint, FormatError
+from bam_train.checkpoint.safetensors_file import pack
 from bam_train.trainers.frozen_network import leaves
 
 MODEL, STATE, REPLAY, NOTES = "bam/resume/model", "bam/resume/state", "bam/resume/replay", "bam/resume/notes.json"
-_SUFFIXES = (".json", ".safetensors")
 
-_COUNTS = ("num_timesteps", "_episode_num", "_n_updates", "_n_calls")
-_SHARES = ("_current_progress_remaining", "exploration_rate")
-"""Numbers that a model counts with, where it has them: counts, and shares of the run."""
+_Count = Annotated[int, Meta(ge=0, le=2**53, description="a count")]
+_Share = Annotated[float, Meta(ge=-1, le=1, description="a share of the run")]
+_COUNTERS = {
+    **dict.fromkeys(("num_timesteps", "_episode_num", "_n_updates", "_n_calls"), _Count),
+    **dict.fromkeys(("_current_progress_remaining", "exploration_rate"), _Share),
+}
+"""Numbers that a model counts with, where it has them."""
 _LAST = ("_last_obs", "_last_original_obs", "_last_episode_starts")
 """The last observations, with which the next rollout begins."""
 _DEQUES = ("ep_info_buffer", "ep_success_buffer")
@@ -47,8 +50,8 @@ class Waiting:
     """Whether the episodes that ran when the checkpoint was saved continue."""
 
     def restore(self, model: Any) -> None:
-        """Restore it; raises AlteredCheckpoint if it does not fit the model."""
-        with _fits(self.checkpoint, STATE):
+        """Restore it into a model."""
+        with self.checkpoint.fitting(STATE):
             for one, previous in zip(_correlated_noises(model), self.noise, strict=True):
                 one.noise_prev = previous
             load_random_states(model, self.random)
@@ -57,7 +60,7 @@ class Waiting:
 def members(
     model: Any, venv: Any, normaliser: VecNormalize | None, waiting: Waiting | None, notes: Mapping[str, Any]
 ) -> dict[str, bytes]:
-    """The members of a checkpoint from which the run continues.
+    """The members of a checkpoint from which a run continues.
 
     Args:
         model: The model, between two updates.
@@ -75,38 +78,30 @@ def members(
         "random": waiting.random if waiting else random_states(model),
         "noise": waiting.noise if waiting else [one.noise_prev for one in _correlated_noises(model)],
     }
-    packed = {MODEL: pack(weights), STATE: pack(tree)}
+    written = {NOTES: json.dumps(dict(notes)).encode(), **pack(MODEL, weights), **pack(STATE, tree)}
     buffer = getattr(model, "replay_buffer", None)
     if buffer is not None:
         # + 1: a buffer with optimize_memory_usage keeps the newest next observation at `pos`.
         filled = buffer.buffer_size if buffer.full else min(buffer.pos + 1, buffer.buffer_size)
-        arrays: dict[str, Any] = {}
-        for name in _REPLAY:
-            own = getattr(buffer, name, None)
-            arrays[name] = {key: one[:filled] for key, one in own.items()} if isinstance(own, dict) else own
-            if isinstance(own, np.ndarray):
-                arrays[name] = own[:filled]
-        packed[REPLAY] = pack({"pos": buffer.pos, "full": buffer.full, "filled": filled, "arrays": arrays})
-    written = {NOTES: json.dumps(dict(notes)).encode()}
-    for name, pair in packed.items():
-        written |= {f"{name}{suffix}": data for suffix, data in zip(_SUFFIXES, pair, strict=True)}
+        arrays: dict[str, Any] = {name: getattr(buffer, name, None) for name in _REPLAY}
+        for name, own in arrays.items():
+            if own is not None:
+                keyed = isinstance(own, dict)
+                arrays[name] = {key: one[:filled] for key, one in own.items()} if keyed else own[:filled]
+        written |= pack(REPLAY, {"pos": buffer.pos, "full": buffer.full, "filled": filled, "arrays": arrays})
     return written
 
 
 def load(checkpoint: Checkpoint, model: Any, venv: Any, normaliser: VecNormalize | None) -> Waiting:
-    """Restore a checkpoint's state into a new model of the same settings; returns the rest, to be restored later.
-
-    Raises:
-        AlteredCheckpoint: A member is missing, or does not fit the model.
-    """
-    with _fits(checkpoint, MODEL):
-        weights = _read(checkpoint, MODEL)
+    """Restore a checkpoint's state into a new model of the same settings; returns the rest, to be restored later."""
+    with checkpoint.fitting(MODEL):
+        weights = checkpoint.state(MODEL, torch.from_numpy)
         model.set_parameters(weights["states"], exact_match=True, device=model.device)
         for name, value in weights["loose"].items():
             if value is not None:
                 recursive_getattr(model, name).data.copy_(value)
-    tree = _read(checkpoint, STATE)
-    with _fits(checkpoint, STATE):
+    tree = checkpoint.state(STATE, torch.from_numpy)
+    with checkpoint.fitting(STATE):
         _load_counters(model, tree["counters"])
         if normaliser is not None:
             _load_statistics(normaliser, tree["normaliser"])
@@ -118,8 +113,8 @@ def load(checkpoint: Checkpoint, model: Any, venv: Any, normaliser: VecNormalize
             venv.seed(model.seed + model.num_timesteps)
         waiting = Waiting(checkpoint, tree["random"], tree["noise"], same)
     if checkpoint.has(f"{REPLAY}.json"):
-        with _fits(checkpoint, REPLAY):
-            saved = _read(checkpoint, REPLAY)
+        with checkpoint.fitting(REPLAY):
+            saved = checkpoint.state(REPLAY, torch.from_numpy)
             buffer, filled = model.replay_buffer, saved["filled"]
             for name, arrays in saved["arrays"].items():
                 own = getattr(buffer, name, None)
@@ -132,27 +127,9 @@ def load(checkpoint: Checkpoint, model: Any, venv: Any, normaliser: VecNormalize
     return waiting
 
 
-@contextmanager
-def _fits(checkpoint: Checkpoint, name: str) -> Iterator[None]:
-    """Maps the errors of restoring a state into a model that is not made like the saved one."""
-    try:
-        yield
-    except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
-        reason = " ".join(str(error).split())
-        raise AlteredCheckpoint(checkpoint.path, name, f"{name} does not fit these settings: {reason:.200}") from error
-
-
-def _read(checkpoint: Checkpoint, name: str) -> Any:
-    skeleton, arrays = (checkpoint.read(f"{name}{suffix}") for suffix in _SUFFIXES)
-    try:
-        return unpack(skeleton, arrays, torch.from_numpy)
-    except FormatError as error:
-        raise AlteredCheckpoint(checkpoint.path, name, str(error)) from error
-
-
 def _counters(model: Any) -> dict[str, Any]:
     """Counters, the last observations, and the returns of the last episodes."""
-    tree: dict[str, Any] = {name: getattr(model, name) for name in (*_COUNTS, *_SHARES) if hasattr(model, name)}
+    tree: dict[str, Any] = {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)}
     tree["last"] = {name: getattr(model, name) for name in _LAST}
     tree["deques"] = {name: list(getattr(model, name) or ()) for name in _DEQUES}
     lstm = getattr(model, "_last_lstm_states", None)
@@ -161,17 +138,10 @@ def _counters(model: Any) -> dict[str, Any]:
 
 
 def _load_counters(model: Any, tree: Mapping[str, Any]) -> None:
-    """Restore `_counters`.
-
-    Raises:
-        ValueError: One is of another kind, or what was seen last has another shape than the environments'.
-    """
-    for name in (*_COUNTS, *_SHARES):
-        kinds, most, what = ((int,), 2**53, "a count") if name in _COUNTS else ((int, float), 1, "a share of the run")
+    """Restore `_counters`, checked: kinds, ranges and shapes."""
+    for name, kind in _COUNTERS.items():
         if name in tree:
-            if type(tree[name]) not in kinds or not -1 <= tree[name] <= most:
-                raise ValueError(f"{name}: expected {what}, found {tree[name]!r:.40}")
-            setattr(model, name, tree[name])
+            setattr(model, name, check(tree[name], kind, name))
     for name in _LAST:
         value = tree["last"][name]
         if value is not None:  # as it is before the first step
@@ -239,8 +209,7 @@ def random_states(model: Any) -> dict[str, Any]:
 
 def load_random_states(model: Any, tree: Mapping[str, Any]) -> None:
     """Restore `random_states`; the last thing to do before training continues."""
-    version, numbers, gauss = tree["python"]
-    random.setstate((version, tuple(numbers), gauss))
+    random.setstate(tree["python"])
     saved = tree["numpy"]
     np.random.set_state((saved["kind"], saved["keys"], saved["position"], saved["has_gauss"], saved["gauss"]))
     torch.set_rng_state(tree["torch"].cpu())
@@ -257,16 +226,3 @@ def undisturbed(model: Any) -> Iterator[None]:
         yield
     finally:
         load_random_states(model, before)
-
-
-def all_finite(model: Any) -> bool:
-    """Whether every parameter of the policy is a finite number, and the standard deviation of its actions too."""
-    log_std = getattr(model.policy, "log_std", None)
-    numbers = [*model.policy.parameters(), *([] if log_std is None else [log_std.exp()])]
-    return all(bool(torch.isfinite(one).all()) for one in numbers)
-
-
-def refused_distribution(error: Exception) -> bool:
-    """Whether torch refused a distribution: weights that are finite can still overflow on their way to it."""
-    text = str(error)
-    return "Expected parameter" in text or "expects all elements of std" in text or "probability tensor" in text

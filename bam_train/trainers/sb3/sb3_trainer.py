@@ -10,7 +10,6 @@ import dataclasses
 import functools
 import io
 import math
-import threading
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -19,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium.vector import VectorEnv
-from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
+from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from bam_envs.core.spaces import space_to_json
@@ -34,10 +33,13 @@ from bam_train.trainers.resolve_settings import own_settings
 from bam_train.trainers.sb3 import sb3_hyperparameters as hyperparameters
 from bam_train.trainers.sb3 import sb3_resume as resume
 from bam_train.trainers.sb3.sb3_freezing import freeze, golden
-from bam_train.trainers.sb3.sb3_resume import all_finite, refused_distribution, undisturbed
+from bam_train.trainers.sb3.sb3_resume import undisturbed
 from bam_train.trainers.sb3.sb3_vec_env import BatchVecEnv, make_training_env, one_env
+from bam_train.trainers.tensorboard_files import TensorBoardFiles
 
 _FINITE = "expected finite numbers: try a smaller learning_rate"
+_REFUSED = ("Expected parameter", "expects all elements of std", "probability tensor")
+"""What torch says of a distribution: weights that are finite can still overflow on their way to it."""
 
 
 class _Stop(Exception):  # noqa: N818 - never leaves this module
@@ -113,7 +115,7 @@ class SB3Trainer:
 
     def log_to(self, folder: Path) -> None:
         """Write TensorBoard files into a folder from now on."""
-        self.model.set_logger(Logger(str(folder), [_ForgivingTensorBoard(folder)]))
+        self.model.set_logger(Logger(str(folder), [_ToTensorBoard(folder)]))
 
     @property
     def steps(self) -> int:
@@ -140,7 +142,7 @@ class SB3Trainer:
         try:
             yield
         except (ValueError, RuntimeError) as error:
-            if all_finite(self.model) and not refused_distribution(error):
+            if self._is_finite() and not any(text in str(error) for text in _REFUSED):
                 raise
             text = f"the policy's weights or actions are NaN or infinite after step {self.steps}; {_FINITE}"
             raise TrainingFailed(text) from error
@@ -164,8 +166,14 @@ class SB3Trainer:
         if not self._on_progress(Progress(self.steps, self._total, self._statistics)):
             raise _Stop
 
+    def _is_finite(self) -> bool:
+        """Whether every parameter of the policy is a finite number, and the standard deviation of its actions too."""
+        log_std = getattr(self.model.policy, "log_std", None)
+        numbers = [*self.model.policy.parameters(), *([] if log_std is None else [log_std.exp()])]
+        return all(bool(torch.isfinite(one).all()) for one in numbers)
+
     def _require_finite_weights(self) -> None:
-        if not all_finite(self.model):
+        if not self._is_finite():
             raise TrainingFailed(f"the policy's weights are NaN or infinite at step {self.steps}; {_FINITE}")
 
     def _statistics(self) -> Statistics:
@@ -233,30 +241,14 @@ class SB3Trainer:
         self.model.env.close()
 
 
-class _ForgivingTensorBoard(KVWriter):  # type: ignore[misc]
-    """Writes TensorBoard's event files into a folder until it cannot: a full disk ends them, not the run."""
-
+class _ToTensorBoard(KVWriter):  # type: ignore[misc]
     def __init__(self, folder: Path) -> None:
-        self._files: TensorBoardOutputFormat | None = TensorBoardOutputFormat(str(folder))
-        self._hook = threading.excepthook
-        threading.excepthook = self._thread_failed
+        self._files = TensorBoardFiles(folder)
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
-        try:
-            if self._files is not None:
-                self._files.write(key_values, key_excluded, step)
-        except OSError:
-            self.close()
+        self._files.write(
+            {name: one for name, one in key_values.items() if "tensorboard" not in key_excluded[name]}, step
+        )
 
     def close(self) -> None:
-        files, self._files = self._files, None
-        if files is None:
-            return
-        with contextlib.suppress(OSError):
-            files.close()
-        threading.excepthook = self._hook
-
-    def _thread_failed(self, failed: threading.ExceptHookArgs) -> None:
-        """TensorBoard's own thread says on standard error what `write` is told too: leave that out."""
-        if not (isinstance(failed.exc_value, OSError) and type(failed.thread).__module__.startswith("tensorboard.")):
-            self._hook(failed)
+        self._files.close()

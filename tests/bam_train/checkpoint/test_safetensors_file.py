@@ -133,28 +133,28 @@ def same(one, other):
     ],
 )
 def test_exact_both_ways(tree):
-    assert same(unpack(*pack(tree)), tree)
+    assert same(unpack(*pack("a", tree).values()), tree)
 
 
 def test_tensors_come_back_as_tensors():
     torch = pytest.importorskip("torch")
-    packed = pack({"w": torch.arange(3.0), "step": torch.tensor(2.0)})
-    found = unpack(*packed, torch.from_numpy)
+    packed = pack("a", {"w": torch.arange(3.0), "step": torch.tensor(2.0)})
+    found = unpack(*packed.values(), torch.from_numpy)
     assert torch.equal(found["w"], torch.arange(3.0))
     assert found["step"].shape == ()
-    assert isinstance(unpack(*packed)["w"], np.ndarray)
+    assert isinstance(unpack(*packed.values())["w"], np.ndarray)
 
 
 def test_arrays_are_copies():
     array = np.zeros(2)
-    packed = pack([array])
+    packed = pack("a", [array])
     array[:] = 1
-    assert unpack(*packed)[0].tolist() == [0, 0]
+    assert unpack(*packed.values())[0].tolist() == [0, 0]
 
 
 def test_what_cannot_be_saved_is_named():
     with pytest.raises(FormatError, match=r"^/a/1: expected numbers, text, arrays or nests of them, found a object$"):
-        pack({"a": [1, object()]})
+        pack("a", {"a": [1, object()]})
 
 
 @pytest.mark.parametrize(
@@ -162,4 +162,4 @@ def test_what_cannot_be_saved_is_named():
 )
 def test_a_damaged_skeleton_is_refused(skeleton):
     with pytest.raises(FormatError, match=r"^a saved state cannot be read: "):
-        unpack(skeleton.encode(), pack(None)[1])
+        unpack(skeleton.encode(), pack("a", None)["a.safetensors"])

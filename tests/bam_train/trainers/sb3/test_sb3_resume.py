@@ -213,7 +213,7 @@ def half(tmp_path_factory):
         (["counters", "deques"], {}, "'ep_info_buffer'"),
         (["counters"], {}, "'last'"),
         (["random"], 5, "'int' object is not subscriptable"),
-        (["random", "python"], [3, [1], None], "state vector is the wrong size"),
+        (["random", "python"], [3, [1], None], "state vector must be a tuple"),
         (["random", "numpy", "position"], "x", "an integer is required"),
         (["random", "torch"], None, "'NoneType' object has no attribute 'cpu'"),
         (["noise"], [1, 2], "zip() argument 2 is longer"),
