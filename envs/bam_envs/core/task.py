@@ -93,8 +93,8 @@ def labelled_box(labels: Sequence[Label]) -> spaces.Box:
     return spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
 
 
-class TaskMemory:
-    """The memory of a task as `Task.state_dict` has it: copies of the arrays that `memory` names."""
+class Memory:
+    """The memory of a task or of simulated robots, as `Task.state_dict` has it: the arrays that `memory` names."""
 
     memory: Mapping[str, str] = {}
     """Key in the saved memory -> attribute."""
@@ -103,10 +103,15 @@ class TaskMemory:
         """A copy of each array."""
         return {key: getattr(self, attribute).copy() for key, attribute in self.memory.items()}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: dict[str, Any]) -> Any:
         """Go to what `state_dict` returned."""
         for key, attribute in self.memory.items():
             setattr(self, attribute, np.array(state[key], dtype=getattr(self, attribute).dtype))
+
+    def own_memory(self) -> None:
+        """Go on with copies: what was handed out of the arrays keeps its numbers."""
+        for attribute in self.memory.values():
+            setattr(self, attribute, getattr(self, attribute).copy())
 
 
 def draw_seeds(rngs: Sequence[np.random.Generator]) -> NDArray[np.int64]:

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from bam_envs.core.env_options import finite_numbers
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import Array, Flags, Floats, Label, Score, TaskMemory, as_objects, draw_seeds, labelled_box
+from bam_envs.core.task import Array, Flags, Floats, Label, Memory, Score, as_objects, draw_seeds, labelled_box
 from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS, SCAN_RANGE
 
 FASTEST = np.array([0.5, 0.7])
@@ -38,7 +38,7 @@ START_TOLERANCE = 0.2
 """A base that is nearer than this to where it is to start is there [m], [rad]."""
 
 
-class DriveTask(TaskMemory):
+class DriveTask(Memory):
     """Drive to within `ARRIVED` of a target; the heading there does not matter.
 
     Args:

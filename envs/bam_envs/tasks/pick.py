@@ -8,7 +8,7 @@ from gymnasium import spaces
 
 from bam_envs.core.kinematics import cube_yaw_phase
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import Array, Floats, Label, Score, TaskMemory, draw_seeds, labelled_box
+from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box
 from bam_envs.robots.ur5e import GEOMETRY
 from bam_envs.tasks.tool_control import ACTION_LABELS, HAND_LABELS, WORKSPACE, ToolControl, hand_state
 
@@ -50,7 +50,7 @@ class CubeSense:
         self.distance: Array = np.sqrt(np.einsum("ij,ij->i", self.offset, self.offset))
 
 
-class PickTask(TaskMemory):
+class PickTask(Memory):
     """Grasp the cube, lift it by `LIFT` and hold it for `HOLD_STEPS`.
 
     Start:

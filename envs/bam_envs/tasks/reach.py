@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium import spaces
 
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import Array, Floats, Label, Score, TaskMemory, draw_seeds, labelled_box
+from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box
 from bam_envs.robots.ur5e import GEOMETRY, GRIPPER_OPEN, JOINTS
 from bam_envs.tasks.tool_control import JOINT_STEP, TOOL_STEP
 
@@ -28,7 +28,7 @@ LEASH = 0.15
 _LOW = np.array([-2 * np.pi, -2 * np.pi, -np.pi, -2 * np.pi, -2 * np.pi, -2 * np.pi]) + JOINT_MARGIN
 
 
-class ReachTask(TaskMemory):
+class ReachTask(Memory):
     """Bring the tool within `GOAL_RADIUS` of a goal.
 
     Start:

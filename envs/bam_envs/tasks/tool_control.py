@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from bam_envs.core.robot import EnvIds, RobotState
-from bam_envs.core.task import Array, Floats, Label, TaskMemory
+from bam_envs.core.task import Array, Floats, Label, Memory
 from bam_envs.robots.ur5e import GEOMETRY, GRIPPER_OPEN
 
 TOOL_STEP = 0.0124
@@ -48,7 +48,7 @@ HAND_LABELS = (
 )
 
 
-class ToolControl(TaskMemory):
+class ToolControl(Memory):
     """The commanded tool of n environments: its target, its yaw, the joints that were commanded, the gripper."""
 
     memory: Mapping[str, str] = {"target": "target", "yaw": "yaw", "closed": "closed", "joints": "_joints"}

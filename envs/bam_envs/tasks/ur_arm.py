@@ -18,7 +18,7 @@ from bam_envs.core.env_options import finite_numbers
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.kinematics import LINKS, quaternions
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import Array, Flags, Floats, Label, TaskMemory, as_objects, draw_seeds, labelled_box
+from bam_envs.core.task import Array, Flags, Floats, Label, Memory, as_objects, draw_seeds, labelled_box
 from bam_envs.robots.ur import DEFAULT_MODEL, JOINTS, UrModel
 from bam_envs.robots.ur import ur_model as model_called
 
@@ -34,7 +34,7 @@ POSITIONS = tuple(f"{joint}_joint_position" for joint in WIRE_JOINTS)
 VELOCITIES = tuple(f"{joint}_joint_velocity" for joint in WIRE_JOINTS)
 
 
-class UrTask(TaskMemory):
+class UrTask(Memory):
     """A task of UR arms: it has the arm's options, steps it counts, and infos.
 
     Args:

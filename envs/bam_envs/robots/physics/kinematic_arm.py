@@ -4,16 +4,17 @@ What makes an arm slow is in its commands (`bam_envs.tasks.ur_arm`), so that a l
 looked for, and nothing stops at them: they are told in ``state.truth["collision"]``, until the next reset.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds, Initial, RobotState, checked_command
+from bam_envs.core.task import Memory
 from bam_envs.robots.physics.obstacles import RADIUS, Obstacles
 from bam_envs.robots.physics.shapes import BLUE, GREY, RED, WOOD, Drawn, Shape, View
 from bam_envs.robots.ur import DEFAULT_MODEL, START, UrModel, ur_spec
@@ -40,16 +41,12 @@ LEAST_SHARE = 0.7
 """Where arms differ: the least share of the way to its set point that one goes in a period."""
 
 
-@dataclass(frozen=True)
-class Capsules:
-    """The tubes of n arms, in ``base_link``."""
+class Capsules(NamedTuple):
+    """The tubes of n arms, in ``base_link`` [m]. Shapes: (n, k, 3), (n, k, 3), (k,)."""
 
     start: Array
-    """Shape: (n, k, 3) [m]."""
     end: Array
-    """Shape: (n, k, 3) [m]."""
     radius: Array
-    """Shape: (k,) [m]."""
 
 
 class ArmContacts:
@@ -72,27 +69,17 @@ class ArmContacts:
     def capsules(self, q: Array) -> Capsules:
         """The tubes at joint positions `q` (n, 6) [rad]: base, shoulder, upper arm, forearm, wrists 1 to 3, elbow."""
         positions, rotations = self._geometry.link_poses(q)
-        shoulder, elbow, flange = positions[:, 1], positions[:, 2], positions[:, 5]
+        _, shoulder, elbow, wrist_1, wrist_2, flange = positions.swapaxes(0, 1)
         sideways = rotations[:, 1, :, 2]
-        beside = self._outline.upper_arm_offset * sideways
-        inside = self._outline.forearm_offset * sideways
-        wrist = positions[:, 3] + (self._outline.forearm_offset - self._geometry.d4) * sideways
-        start = [np.zeros_like(shoulder), shoulder, shoulder + beside, elbow + inside, wrist]
-        start += [positions[:, 3], positions[:, 4], elbow + beside]
-        end = [shoulder, shoulder + beside, elbow + beside, wrist, positions[:, 3]]
-        end += [positions[:, 4], flange, elbow + inside]
+        beside, inside = self._outline.upper_arm_offset * sideways, self._outline.forearm_offset * sideways
+        wrist = wrist_1 + (self._outline.forearm_offset - self._geometry.d4) * sideways
+        start = [np.zeros_like(shoulder), shoulder, shoulder + beside, elbow + inside]
+        start += [wrist, wrist_1, wrist_2, elbow + beside]
+        end = [shoulder, shoulder + beside, elbow + beside, wrist, wrist_1, wrist_2, flange, elbow + inside]
         return Capsules(np.stack(start, axis=1), np.stack(end, axis=1), self._radius)
 
     def touching(self, q: Array, obstacle: Array | None = None) -> Flags:
-        """Whether each arm touches anything.
-
-        Args:
-            q: Joint positions [rad]. Shape: (n, 6).
-            obstacle: Middle of a ball [m]. Shape: (n, 3).
-
-        Returns:
-            Shape: (n,).
-        """
+        """Whether arms at `q` [rad] touch anything, a ball at `obstacle` [m] too. Shapes: (n, 6), (n, 3) -> (n,)."""
         arms = self.capsules(q)
         touching = self.touching_itself(arms) | self.touching_table(arms)
         return touching if obstacle is None else touching | self.touching_ball(arms, obstacle)
@@ -166,7 +153,7 @@ def _dot(one: Array, other: Array) -> Array:
     return product
 
 
-class KinematicArm(Drawn):
+class KinematicArm(Memory, Drawn):
     """n arms of one model on a table, which move exactly.
 
     Args:
@@ -178,6 +165,9 @@ class KinematicArm(Drawn):
     """
 
     floor, mark_radius = GROUND, 0.025
+    memory: Mapping[str, str] = {
+        name: f"_{name}" for name in ("position", "velocity", "share", "stamp", "collided", "command")
+    }
 
     def __init__(
         self,
@@ -217,8 +207,7 @@ class KinematicArm(Drawn):
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
         """Set these environments to the initial joint positions, at rest, and begin the way of their obstacles."""
         self._require_link()
-        for name in _ARRAYS:  # states of before keep theirs
-            setattr(self, "_" + name, getattr(self, "_" + name).copy())
+        self.own_memory()
         self._position[env_ids] = initial.signals["joint_position"]
         self._velocity[env_ids], self._stamp[env_ids] = 0.0, 0.0
         self._command[env_ids] = self._position[env_ids]
@@ -231,10 +220,7 @@ class KinematicArm(Drawn):
         return self._measure()
 
     def slices(self, command: Array, parts: int) -> Iterator[RobotState]:
-        """Send `command` (n, 6) [rad], and give the state after each of `parts` equal parts of the period.
-
-        A halt between two parts holds for the rest of the period.
-        """
+        """As for every `Drawn`: joint positions [rad]; a halt between two parts holds for the rest of the period."""
         self._require_link()
         if parts < 1:
             raise InvalidValue(f"A period cannot be divided into {parts!r} parts.")
@@ -288,22 +274,15 @@ class KinematicArm(Drawn):
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the future of the simulated robots depends on."""
-        state: dict[str, Any] = {name: getattr(self, "_" + name).copy() for name in _ARRAYS}
-        if self._obstacles is not None:
-            state["obstacles"] = self._obstacles.state_dict()
-        return state
+        return super().state_dict() | ({} if self._obstacles is None else {"obstacles": self._obstacles.state_dict()})
 
     def load_state_dict(self, state: dict[str, Any]) -> RobotState:
         """Go to what `state_dict` returned; the state there."""
         self.connect()
-        for name in _ARRAYS:
-            setattr(self, "_" + name, np.array(state[name]))
+        super().load_state_dict(state)
         if self._obstacles is not None:
             self._obstacles.load_state_dict(state["obstacles"])
         return self._measure()
-
-
-_ARRAYS = ("position", "velocity", "share", "stamp", "collided", "command")
 
 
 reach_arm = partial(KinematicArm, period=0.1)

@@ -1,6 +1,6 @@
 """MiR100 bases in NumPy, many stepped together: the drive and its limits, walls, boxes, contacts and lasers."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Any
 
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds, Initial, RobotState, checked_command
+from bam_envs.core.task import Memory
 from bam_envs.robots.mir100 import (
     BACK_MASKED,
     BACK_MOUNT,
@@ -27,24 +28,21 @@ from bam_envs.robots.physics.room import BOX_EDGE, LAB, NOWHERE, LaserScanner, R
 from bam_envs.robots.physics.shapes import BLUE, DARK, GREY, RED, WOOD, Colour, Drawn, Shape, View, turned
 
 Array = NDArray[np.float64]
-HEIGHT = 0.352
-"""Of a MiR100 [m]."""
+_HEIGHT = 0.352  # of a MiR100 [m]
 _BODY: tuple[tuple[float, tuple[float, float, float], float, Colour], ...] = (
-    (FOOTPRINT_AHEAD, (*FOOTPRINT, HEIGHT - 0.05), HEIGHT, BLUE),
-    (FOOTPRINT_AHEAD + FOOTPRINT[0] / 2 - 0.1, (0.08, FOOTPRINT[1] - 0.1, 0.02), HEIGHT + 0.02, DARK),
+    (FOOTPRINT_AHEAD, (*FOOTPRINT, _HEIGHT - 0.05), _HEIGHT, BLUE),
+    (FOOTPRINT_AHEAD + FOOTPRINT[0] / 2 - 0.1, (0.08, FOOTPRINT[1] - 0.1, 0.02), _HEIGHT + 0.02, DARK),
 )
 """Boxes that the base looks like: how far ahead [m], edges [m], height of the top [m], colour."""
 _WALL = (0.15, 0.5)  # thickness and height [m]
 _LASER_HEIGHT = 0.1914
-_EVERY = 6
-"""One of so many rays is drawn."""
-_STAYS = 2.5
-"""How far the base goes before the camera goes with it [m]."""
+_EVERY = 6  # one of so many rays is drawn
+_STAYS = 2.5  # how far the base goes before the camera goes with it [m]
 GAIN_SPREAD = 0.05
 """A randomised drive goes at most this much faster or slower than it is told."""
 
 
-class SimulatedBase(Drawn):
+class SimulatedBase(Memory, Drawn):
     """Bases with the signals of a MiR100, each in a room of its own.
 
     Speeds change no faster than the `max_rate` of the spec, at the beginning of a period; then the base goes along an
@@ -59,6 +57,11 @@ class SimulatedBase(Drawn):
     """
 
     mark_radius = 0.2
+    memory: Mapping[str, str] = {
+        "pose": "pose",
+        "boxes": "boxes",
+        **{name: f"_{name}" for name in ("velocity", "command", "stamp", "collision", "gain", "seeds", "scans")},
+    }
 
     def __init__(
         self,
@@ -104,8 +107,8 @@ class SimulatedBase(Drawn):
             raise InvalidValue(
                 f"The base cannot start at {where} (x, y [m], yaw [rad]): it touches a wall or a box there.{walls}"
             )
-        for attribute in ("_seen", *_MEMORY.values()):  # states that were handed out keep theirs
-            setattr(self, attribute, getattr(self, attribute).copy())
+        self.own_memory()
+        self._seen = self._seen.copy()  # states that were handed out keep theirs
         self.pose[env_ids], self.boxes[env_ids] = pose, boxes
         self._velocity[env_ids], self._stamp[env_ids], self._command[env_ids] = 0.0, 0.0, 0.0
         self._collision[env_ids], self._scans[env_ids] = False, 0
@@ -117,7 +120,7 @@ class SimulatedBase(Drawn):
         return self._state()
 
     def slices(self, command: Array, parts: int) -> Iterator[RobotState]:
-        """Send `command` (n, 2), forward [m/s] and turning [rad/s], and give the state after each of `parts` parts."""
+        """As for every `Drawn`: speeds forward [m/s] and of turning [rad/s]."""
         self._require_link()
         self._command = checked_command(command, (self.num_robots, 2))
         target = np.clip(self._command, self._low, self._high) * self._gain
@@ -187,32 +190,13 @@ class SimulatedBase(Drawn):
         x, y = pose[:2] - np.clip(pose[:2], -_STAYS, _STAYS) if self.room is None else (0.0, 0.0)
         return shapes, View((round(float(x), 3), round(float(y), 3), 0.0), 11.0, 90.0, -65.0)
 
-    def state_dict(self) -> dict[str, Any]:
-        """Everything the future of the bases depends on."""
-        return {name: getattr(self, attribute).copy() for name, attribute in _MEMORY.items()}
-
     def load_state_dict(self, state: dict[str, Any]) -> RobotState:
         """Go to what `state_dict` returned; the state there."""
         self.connect()
-        for name, attribute in _MEMORY.items():
-            setattr(self, attribute, np.array(state[name]))
+        super().load_state_dict(state)
         self._seen = np.empty_like(self._seen)
         self._scan(np.arange(self.num_robots))
         return self._state()
-
-
-_MEMORY = {
-    "pose": "pose",
-    "boxes": "boxes",
-    "velocity": "_velocity",
-    "command": "_command",
-    "stamp": "_stamp",
-    "collision": "_collision",
-    "gain": "_gain",
-    "seeds": "_seeds",
-    "scans": "_scans",
-}
-"""Name in a saved state -> attribute."""
 
 
 def wall_shapes(room: Room) -> list[Shape]:

@@ -18,7 +18,7 @@ from bam_envs.robots.ur5e import COMMAND, GRIPPER_OPEN, GRIPPER_SPEED, arm_spec
 if TYPE_CHECKING:
     from bam_envs.robots.physics.domain_randomization import Imperfection
     from bam_envs.robots.physics.mujoco_batch import Physics
-    from bam_envs.robots.physics.rendering import SceneRenderer
+    from bam_envs.robots.physics.rendering import OffScreen, Window
 
 Array = NDArray[np.float64]
 
@@ -28,8 +28,7 @@ GRIPPER_LEASH = 0.011
 """Farthest the gripper's set point runs ahead of its fingers [m]: what full force needs, so that it opens at once."""
 LAG = 0.05
 """How far the joints are behind their set points [s]: damping by stiffness of the actuators."""
-PHYSICS_STEPS = 10
-"""Physics steps a control period."""
+PHYSICS_STEPS = 10  # in a period
 
 
 class SimulatedArm:
@@ -52,7 +51,7 @@ class SimulatedArm:
         self._scene = "ur5e_cube.xml" if with_object else "ur5e_gripper.xml"
         self._physics: Physics | None = None
         self._imperfection: Imperfection | None = None
-        self._renderer: SceneRenderer | None = None
+        self._view: OffScreen | Window | None = None
         self._all = np.arange(num_robots)
         self._setpoint = np.zeros((num_robots, 7))
         self._command = np.zeros((num_robots, 7))
@@ -83,20 +82,14 @@ class SimulatedArm:
 
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
         """Set these environments to the initial joint positions and object pose, at rest, the gripper open."""
-        physics, signals = self.physics, initial.signals
+        physics, joints = self.physics, initial.signals["joint_position"]
         physics.state = physics.state.copy()  # states handed out earlier are views of the old array
         physics.time[env_ids], physics.qvel[env_ids] = 0.0, 0.0
-        physics.qpos[env_ids, :6] = signals["joint_position"]
-        physics.qpos[env_ids, 6:8] = GRIPPER_OPEN / 2
-        self._setpoint[env_ids, :6], self._setpoint[env_ids, 6] = signals["joint_position"], GRIPPER_OPEN
+        physics.qpos[env_ids, :6], physics.qpos[env_ids, 6:8] = joints, GRIPPER_OPEN / 2
+        self._setpoint[env_ids, :6], self._setpoint[env_ids, 6] = joints, GRIPPER_OPEN
         self._command = self._command.copy()  # so does the command
         self._command[env_ids] = self._setpoint[env_ids]
-        if self._imperfection is not None:
-            for env, seed in zip(env_ids, initial.seeds, strict=True):
-                self._imperfection.reset(int(env), int(seed), self._setpoint[env])
-        if self._with_object:
-            self._lay_object(env_ids, signals["object_pose"])
-        return self._measure(env_ids)
+        return self._begin(env_ids, initial.signals["object_pose"] if self._with_object else None, initial.seeds)
 
     def place_object(self, pose: Array | None, seeds: NDArray[np.int64]) -> RobotState:
         """Put the object elsewhere, draw a new episode's differences; all is at rest, and the arms stay where they are.
@@ -113,23 +106,22 @@ class SimulatedArm:
         physics = self.physics
         if pose is not None and not self._with_object:
             raise InvalidValue(f"The robot {self.spec.name!r} has no object that could be placed.")
-        if self._imperfection is not None:
-            for env, seed in enumerate(seeds):
-                self._imperfection.reset(env, int(seed), self._command[env])
         physics.state = physics.state.copy()  # states handed out earlier are views of the old array
         physics.qvel[:, : 8 if pose is None else None] = 0.0
-        if pose is not None:
-            self._lay_object(self._all, pose)
-        return self._measure(self._all)
+        return self._begin(self._all, pose, seeds)
 
-    def _lay_object(self, env_ids: EnvIds, pose: Array) -> None:
-        """Put the object flat on the table at x, y [m] and yaw [rad] of `pose` (k, 3)."""
+    def _begin(self, env_ids: EnvIds, pose: Array | None, seeds: NDArray[np.int64]) -> RobotState:
+        """Draw an episode's differences; the object lies flat on the table at x, y [m] and yaw [rad] of `pose`."""
         physics = self.physics
-        qpos = physics.qpos
-        qpos[env_ids, 8:10] = pose[:, :2]
-        geom = physics.model.geom("object").id
-        qpos[env_ids, 10] = [physics.model_of(int(env)).geom_size[geom, 2] for env in env_ids]
-        qpos[env_ids, 11], qpos[env_ids, 12:14], qpos[env_ids, 14] = np.cos(pose[:, 2] / 2), 0.0, np.sin(pose[:, 2] / 2)
+        if self._imperfection is not None:
+            for env, seed in zip(env_ids, seeds, strict=True):
+                self._imperfection.reset(int(env), int(seed), self._command[env])
+        if pose is not None:
+            qpos, geom, half = physics.qpos, physics.model.geom("object").id, pose[:, 2] / 2
+            qpos[env_ids, 8:10] = pose[:, :2]
+            qpos[env_ids, 10] = [physics.model_of(int(env)).geom_size[geom, 2] for env in env_ids]
+            qpos[env_ids, 11], qpos[env_ids, 12:14], qpos[env_ids, 14] = np.cos(half), 0.0, np.sin(half)
+        return self._measure(env_ids)
 
     def step(self, command: Array) -> RobotState:
         """Send `command` (n, 7): six joint positions [rad] and the gripper's width [m]; one period later, measure."""
@@ -142,12 +134,8 @@ class SimulatedArm:
         of the physics starts anew with each part. A halt between two parts holds for the rest of the period; whoever
         stops asking leaves the robots in the middle of the period, where the next command begins.
 
-        Args:
-            command: As for `step`.
-            parts: 1, 2, 5 or 10.
-
         Raises:
-            InvalidValue: The period cannot be divided so.
+            InvalidValue: `parts` is not 1, 2, 5 or 10.
         """
         if parts not in range(1, PHYSICS_STEPS + 1) or PHYSICS_STEPS % parts:
             raise InvalidValue(f"A period has {PHYSICS_STEPS} physics steps; it cannot be divided into {parts!r}.")
@@ -184,11 +172,8 @@ class SimulatedArm:
         if not np.isfinite(physics.state.sum()):
             env_ids = np.flatnonzero(~np.isfinite(physics.state).all(axis=1)).tolist()
             raise PhysicsDiverged(f"The simulated state of environments {env_ids} is not finite. Reset them.")
-        signals = {
-            "joint_position": qpos[:, :6],
-            "joint_velocity": qvel[:, :6],
-            "gripper_width": qpos[:, 6:7] + qpos[:, 7:8],
-        }
+        signals = {"joint_position": qpos[:, :6], "joint_velocity": qvel[:, :6]}
+        signals["gripper_width"] = qpos[:, 6:7] + qpos[:, 7:8]
         if self._with_object:
             pose = qpos[:, 8:15]
             if self._imperfection is not None:
@@ -202,8 +187,7 @@ class SimulatedArm:
         physics, imperfection = self._physics, self._imperfection  # `close` may come from another thread
         if physics is None:
             return
-        setpoint = self._setpoint.copy()
-        setpoint[:, :6] = physics.qpos[:, :6]
+        setpoint = np.concatenate([physics.qpos[:, :6], self._setpoint[:, 6:]], axis=1)
         self._setpoint, self._command = setpoint, setpoint.copy()
         if imperfection is not None:
             imperfection.forget(setpoint)
@@ -211,34 +195,27 @@ class SimulatedArm:
     def close(self) -> None:
         """Halt, drop the physics and the window."""
         self.halt()
-        if self._renderer is not None:
-            self._renderer.close()
+        if self._view is not None:
+            self._view.close()
         if self._physics is not None:
             self._physics.close()
-        self._renderer = self._physics = self._imperfection = None
+        self._view = self._physics = self._imperfection = None
 
     def render(
         self, mode: str, marks: list[tuple[Array, tuple[float, float, float, float]]]
     ) -> NDArray[np.uint8] | None:
-        """Show environment 0: an image (480, 640, 3) for ``rgb_array``, a window for ``human``.
+        """Show environment 0 and `marks`: an image (480, 640, 3) for ``rgb_array``, a window for ``human``."""
+        from bam_envs.robots.physics.rendering import open_view
 
-        Args:
-            mode: ``"rgb_array"`` or ``"human"``.
-            marks: Spheres to draw: position (3,) [m] and colour (red, green, blue, alpha).
-        """
-        from bam_envs.robots.physics.rendering import SceneRenderer
-
-        if self._renderer is None:
-            self._renderer = SceneRenderer(self.physics, mode)
-        return self._renderer.render(marked(marks))
+        if self._view is None:
+            self._view = open_view(self.physics.model_of(0), mode, camera="front")
+        return self._view.show(self.physics.data_of(0), marked(marks))
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the future of the simulated robots depends on."""
-        state: dict[str, Any] = {"physics": self.physics.state.copy()}
-        state |= {"setpoint": self._setpoint.copy(), "command": self._command.copy()}
-        if self._imperfection is not None:
-            state["imperfection"] = self._imperfection.state_dict()
-        return state
+        arrays = {"physics": self.physics.state, "setpoint": self._setpoint, "command": self._command}
+        extra = {} if self._imperfection is None else {"imperfection": self._imperfection.state_dict()}
+        return {name: array.copy() for name, array in arrays.items()} | extra
 
     def load_state_dict(self, state: dict[str, Any]) -> RobotState:
         """Go to what `state_dict` returned; the state there."""

@@ -9,39 +9,33 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds
 from bam_envs.core.splines import Splines, splines_through
+from bam_envs.core.task import Memory
 
 Array = NDArray[np.float64]
 UPDATE_RATE = 100.0
 """How often an obstacle moves on [Hz]."""
 PATH_POINTS = 10
 """Points of a closed path, the last of which is the first."""
-WAVE_X, WAVE_Y = 0.12, 0.34
-"""Where the obstacle goes up and down [m]."""
-WAVE_FREQUENCY = 0.125
-"""How often it goes up and down [Hz]."""
-WAVE_AMPLITUDE = (0.09, 0.35)
-"""Least and most that it goes up and down from its middle [m]."""
-WAVE_MIDDLE = (0.2, 0.6)
-"""Lowest and highest middle [m]."""
 RADIUS = 0.025
 """Of the obstacle, a sphere [m]."""
 
 
 def wave_signals(draws: Array) -> dict[str, Array]:
-    """Start signals of obstacles that go up and down; `draws` are numbers from 0 to 1. Shape: (k, 2)."""
-    amplitude = WAVE_AMPLITUDE[0] + draws[:, 0] * (WAVE_AMPLITUDE[1] - WAVE_AMPLITUDE[0])
-    middle = WAVE_MIDDLE[0] + draws[:, 1] * (WAVE_MIDDLE[1] - WAVE_MIDDLE[0])
-    place = np.stack([np.full(len(draws), WAVE_X), np.full(len(draws), WAVE_Y), middle], axis=1)
+    """Start signals of obstacles that go up and down at 0.125 Hz; `draws` are numbers from 0 to 1. Shape: (k, 2).
+
+    They go 0.09 to 0.35 m from their middle, which is at (0.12, 0.34, 0.2 to 0.6) m.
+    """
+    least, most, fixed = np.array([0.09, 0.2]), np.array([0.35, 0.6]), np.ones(len(draws))
+    amplitude, middle = (least + draws * (most - least)).T
     return {
-        "obstacle_position": place,
-        "obstacle_wave": np.stack([amplitude, np.full(len(draws), WAVE_FREQUENCY)], axis=1),
+        "obstacle_position": np.stack([0.12 * fixed, 0.34 * fixed, middle], axis=1),
+        "obstacle_wave": np.stack([amplitude, 0.125 * fixed], axis=1),
     }
 
 
-class Obstacles:
+class Obstacles(Memory):
     """One obstacle in each environment.
 
     The start signals of k environments say how theirs move:
@@ -52,10 +46,9 @@ class Obstacles:
       points [m], and how many hundredths of a second it takes once around.
 
     Without any of them the wave is drawn from the environment's seed.
-
-    Args:
-        num_envs: How many.
     """
+
+    memory: Mapping[str, str] = {name: f"_{name}" for name in ("place", "wave", "points", "samples")}
 
     def __init__(self, num_envs: int) -> None:
         self.num_envs = num_envs
@@ -67,30 +60,21 @@ class Obstacles:
         self._samples = np.zeros(num_envs, dtype=np.int64)
 
     def begin(self, env_ids: EnvIds, signals: Mapping[str, Array], seeds: NDArray[np.int64]) -> None:
-        """The obstacles of these environments start anew, as the ``obstacle_*`` of `signals` say.
-
-        Raises:
-            InvalidValue: A path without its number of samples, or of other than ten points.
-        """
+        """The obstacles of these environments start anew, as the ``obstacle_*`` of `signals` say."""
         given = {name: value for name, value in signals.items() if name.startswith("obstacle_")}
         if not given:
             given = wave_signals(np.stack([np.random.default_rng(seed).random(2) for seed in seeds]))
         self._samples[env_ids] = 0
         self._wave[env_ids] = given.get("obstacle_wave", np.zeros(2))
         if "obstacle_path" in given:
-            self._follow(env_ids, given["obstacle_path"], given.get("obstacle_samples"))
+            self._points[env_ids], self._samples[env_ids] = given["obstacle_path"], given["obstacle_samples"]
+            self._follow(env_ids)
         else:
             self._place[env_ids] = given["obstacle_position"]
 
-    def _follow(self, env_ids: EnvIds, points: Array, samples: Array | None) -> None:
-        """Put these environments on the paths through `points` (k, 10, 3)."""
-        if samples is None or points.shape[1:] != (PATH_POINTS, 3):
-            raise InvalidValue(
-                f"A path has {PATH_POINTS} points of x, y, z and obstacle_samples; this has shape {points.shape[1:]}"
-                f"{' and no samples' if samples is None else ''}."
-            )
-        path = splines_through(points)
-        self._points[env_ids], self._samples[env_ids] = points, samples
+    def _follow(self, env_ids: EnvIds) -> None:
+        """Work out the paths through the points of these environments."""
+        path = splines_through(self._points[env_ids])
         self._knots[env_ids], self._coefficients[env_ids] = path.knots, path.coefficients
 
     def position(self, time: Array) -> Array:
@@ -110,19 +94,9 @@ class Obstacles:
             place[follows] = path.at((sample[follows] % count / (count - 1))[:, None])[:, 0]
         return place
 
-    def state_dict(self) -> dict[str, Any]:
-        """How each obstacle moves, as plain arrays."""
-        return {
-            "place": self._place.copy(),
-            "wave": self._wave.copy(),
-            "points": self._points.copy(),
-            "samples": self._samples.copy(),
-        }
-
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go to what `state_dict` returned."""
-        self._place, self._wave = np.array(state["place"]), np.array(state["wave"])
-        self._points, self._samples = np.array(state["points"]), np.array(state["samples"])
+        super().load_state_dict(state)
         env_ids = np.flatnonzero(self._samples)
         if len(env_ids):
-            self._follow(env_ids, self._points[env_ids], self._samples[env_ids].astype(np.float64))
+            self._follow(env_ids)

@@ -16,21 +16,18 @@ import threading
 import warnings
 from collections.abc import Sequence
 from functools import cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import BamEnvsError
-from bam_envs.robots.physics.mujoco_batch import mujoco
+from bam_envs.robots.physics.mujoco_batch import MODELS, mujoco
 
 if TYPE_CHECKING:
-    from bam_envs.robots.physics.mujoco_batch import Physics
     from bam_envs.robots.physics.shapes import Shape, View
 
 WIDTH, HEIGHT = 640, 480
-CAMERA = "front"
 MOST_GEOMS = 1000
 BACKENDS = ("egl", "osmesa")
 _PROBE = "import sys, importlib; importlib.import_module('mujoco.' + sys.argv[1]).GLContext(16, 16).make_current()"
@@ -38,66 +35,6 @@ _PROBE = "import sys, importlib; importlib.import_module('mujoco.' + sys.argv[1]
 
 class RenderingUnavailable(BamEnvsError, RuntimeError):  # noqa: N818 - reads as what happened
     """No OpenGL backend works here; the text says what to install."""
-
-
-class SceneRenderer:
-    """Draws environment 0 of a `Physics`, off screen or in a window."""
-
-    def __init__(self, physics: Physics, mode: str) -> None:
-        model = physics.model_of(0)
-        self._physics, self._view = physics, _open_view(model, mode)
-        self._view.camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._view.camera.fixedcamid = model.camera(CAMERA).id
-
-    def render(self, shapes: Sequence[Shape]) -> NDArray[np.uint8] | None:
-        """An image (480, 640, 3), or None from a window; with `shapes` besides."""
-        return self._view.show(self._physics.data_of(0), shapes)
-
-    def close(self) -> None:
-        """Free the OpenGL context or close the window."""
-        self._view.close()
-
-
-class ShapeRenderer:
-    """Draws shapes on a floor, off screen or in a window; OpenGL is started by the first picture.
-
-    Args:
-        mode: ``"rgb_array"`` or ``"human"``.
-        floor: Height of the floor [m].
-    """
-
-    def __init__(self, mode: str, floor: float = 0.0) -> None:
-        scene = mujoco.MjSpec.from_file(str(Path(__file__).parent / "models" / "floor.xml"))
-        scene.geom("floor").pos = [0.0, 0.0, floor]
-        model = scene.compile()
-        self._data = mujoco.MjData(model)
-        mujoco.mj_forward(model, self._data)
-        self._view = _open_view(model, mode)
-        self._seen: View | None = None
-
-    def render(self, shapes: Sequence[Shape], view: View) -> NDArray[np.uint8] | None:
-        """An image (480, 640, 3), or None from a window.
-
-        Args:
-            shapes: What there is; what is beyond MuJoCo's most bodies is left out.
-            view: From where. In a window, the mouse turns it; only a new target is followed.
-        """
-        camera = self._view.camera
-        if self._seen is None:
-            camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-            camera.distance, camera.azimuth, camera.elevation = view.distance, view.azimuth, view.elevation
-        if self._seen is None or self._seen.target != view.target:
-            camera.lookat[:] = view.target
-        self._seen = view
-        return self._view.show(self._data, shapes)
-
-    def close(self) -> None:
-        """Free the OpenGL context or close the window; idempotent."""
-        self._view.close()
-
-
-def _open_view(model: Any, mode: str) -> OffScreen | Window:
-    return OffScreen(model) if mode == "rgb_array" else Window(model)
 
 
 class OffScreen:
@@ -170,6 +107,52 @@ class Window:
         self._viewer.close()
         for thread in self._threads:
             thread.join(timeout=5)
+
+
+def open_view(model: Any, mode: str, camera: str | None = None) -> OffScreen | Window:
+    """A view of a model for ``rgb_array`` or ``human``, through one of its cameras or a free one."""
+    view = OffScreen(model) if mode == "rgb_array" else Window(model)
+    if camera is not None:
+        view.camera.type, view.camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, model.camera(camera).id
+    return view
+
+
+class ShapeRenderer:
+    """Draws shapes on a floor, off screen or in a window; OpenGL is started by the first picture.
+
+    Args:
+        mode: ``"rgb_array"`` or ``"human"``.
+        floor: Height of the floor [m].
+    """
+
+    def __init__(self, mode: str, floor: float = 0.0) -> None:
+        scene = mujoco.MjSpec.from_file(str(MODELS / "floor.xml"))
+        scene.geom("floor").pos = [0.0, 0.0, floor]
+        model = scene.compile()
+        self._data = mujoco.MjData(model)
+        mujoco.mj_forward(model, self._data)
+        self._view = open_view(model, mode)
+        self._seen: View | None = None
+
+    def render(self, shapes: Sequence[Shape], view: View) -> NDArray[np.uint8] | None:
+        """An image (480, 640, 3), or None from a window.
+
+        Args:
+            shapes: What there is; what is beyond MuJoCo's most bodies is left out.
+            view: From where. In a window, the mouse turns it; only a new target is followed.
+        """
+        camera = self._view.camera
+        if self._seen is None:
+            camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+            camera.distance, camera.azimuth, camera.elevation = view.distance, view.azimuth, view.elevation
+        if self._seen is None or self._seen.target != view.target:
+            camera.lookat[:] = view.target
+        self._seen = view
+        return self._view.show(self._data, shapes)
+
+    def close(self) -> None:
+        """Free the OpenGL context or close the window; idempotent."""
+        self._view.close()
 
 
 def require_display() -> None:

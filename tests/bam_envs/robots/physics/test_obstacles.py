@@ -1,9 +1,7 @@
 """Moving obstacles: still, up and down, along closed paths."""
 
 import numpy as np
-import pytest
 
-from bam_envs.core.errors import InvalidValue
 from bam_envs.core.splines import splines_through
 from bam_envs.robots.physics.obstacles import Obstacles, wave_signals
 
@@ -84,14 +82,3 @@ def test_rows_move_each_its_own_way():
     np.testing.assert_array_equal(positions[2], [1.0, 0.0, 0.5])
     obstacles.begin(np.array([1]), {"obstacle_position": np.array([[0.0, 1.0, 0.5]])}, SEED)
     np.testing.assert_array_equal(obstacles.position(np.full(3, 9.0))[1], [0.0, 1.0, 0.5])
-
-
-def test_paths_that_are_none():
-    with pytest.raises(InvalidValue) as caught:
-        begun({"obstacle_path": PATH})
-    assert str(caught.value) == (
-        "A path has 10 points of x, y, z and obstacle_samples; this has shape (10, 3) and no samples."
-    )
-    with pytest.raises(InvalidValue) as caught:
-        begun({"obstacle_path": PATH[:, :9], "obstacle_samples": np.ones(1)})
-    assert str(caught.value) == "A path has 10 points of x, y, z and obstacle_samples; this has shape (9, 3)."

@@ -11,7 +11,7 @@ import pytest
 from bam_envs.core.errors import InvalidValue
 from bam_envs.robots.physics import rendering
 from bam_envs.robots.physics.mujoco_batch import Physics
-from bam_envs.robots.physics.rendering import RenderingUnavailable, SceneRenderer, find_backend
+from bam_envs.robots.physics.rendering import RenderingUnavailable, find_backend, open_view
 
 
 @pytest.fixture(autouse=True)
@@ -66,7 +66,7 @@ def test_a_window_needs_a_display(monkeypatch):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(rendering.sys, "platform", "linux")
     monkeypatch.setenv("MUJOCO_GL", "glfw")  # a backend that needs one too
-    for act in (lambda: SceneRenderer(Physics("ur5e_cube.xml", 1), "human"), find_backend):
+    for act in (lambda: open_view(Physics("ur5e_cube.xml", 1).model, "human"), find_backend):
         with pytest.raises(RenderingUnavailable) as caught:
             act()
         assert str(caught.value) == (
