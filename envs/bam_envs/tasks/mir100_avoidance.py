@@ -65,7 +65,6 @@ class Mir100AvoidanceTask(DriveTask):
         super().__init__(num_envs, **options)
         self.obstacles = np.zeros((num_envs, len(BOXES), 3))
         """Boxes of a simulated room: x, y [m] and yaw [rad]. Shape: (n, 3, 3)."""
-        self._sectors: tuple[RobotState, Array] | None = None
 
     def labels(self) -> tuple[Label, ...]:
         """Those of driving, and ranges."""
@@ -100,15 +99,11 @@ class Mir100AvoidanceTask(DriveTask):
         return {"obstacle_pose": self.obstacles[env_ids]}
 
     def sectors(self, state: RobotState) -> Array:
-        """The shortest ray of each sector [m], worked out once for each state. Shape: (n, 16).
-
-        A ray that is not a number is 0, the shortest there can be.
-        """
-        if self._sectors is None or self._sectors[0] is not state:
-            front = np.minimum.reduceat(state.signals["f_scan"], _FRONT_STARTS, axis=1)
-            back = np.minimum.reduceat(state.signals["b_scan"], _BACK_STARTS, axis=1)
-            self._sectors = (state, np.nan_to_num(np.concatenate([front, back], axis=1), nan=0.0))
-        return self._sectors[1]
+        """The shortest ray of each sector [m]; one that is not a number is 0, the shortest there can be. (n, 16)."""
+        front = np.minimum.reduceat(state.signals["f_scan"], _FRONT_STARTS, axis=1)
+        back = np.minimum.reduceat(state.signals["b_scan"], _BACK_STARTS, axis=1)
+        sectors: Array = np.nan_to_num(np.concatenate([front, back], axis=1), nan=0.0)
+        return sectors
 
     def seen(self, state: RobotState) -> list[Floats]:
         """The shortest rays of sectors. Shape: (n, 16)."""

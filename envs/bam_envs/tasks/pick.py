@@ -72,9 +72,6 @@ class PickTask(Memory):
 
     Info:
         `distance` of the tool from the cube [m], `lift` of the cube above where it lay [m].
-
-    Args:
-        num_envs: How many environments are scored together.
     """
 
     memory: Mapping[str, str] = {"rest_height": "rest_height", "held": "held"}

@@ -57,9 +57,6 @@ class PickPlaceTask(PickTask):
     Info:
         `distance` of the tool from the cube [m], `lift` of the cube above where it lay [m], `goal_distance` of the cube
         from where it would lie at the goal [m].
-
-    Args:
-        num_envs: How many environments are scored together.
     """
 
     memory: Mapping[str, str] = {**PickTask.memory, "goal": "goal", "picked": "picked"}

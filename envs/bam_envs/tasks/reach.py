@@ -47,9 +47,6 @@ class ReachTask(Memory):
 
     Info:
         `distance` of the tool from the goal [m].
-
-    Args:
-        num_envs: How many environments are scored together.
     """
 
     memory: Mapping[str, str] = {"goal": "goal"}

@@ -5,6 +5,7 @@ episode is drawn at its start (a tape of `TAPE` steps, read in a circle), which 
 episode instead of one for each step.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.robot import EnvIds
+from bam_envs.core.task import Memory
 from bam_envs.robots.physics.mujoco_batch import Physics
 
 Array = NDArray[np.float64]
@@ -23,7 +25,7 @@ TAPE = 256
 
 @dataclass(frozen=True)
 class Ranges:
-    """How far a randomised robot differs from the nominal one."""
+    """How far a randomised robot differs from the nominal one; a span is the least and the most."""
 
     mass: tuple[float, float] = (0.5, 2.0)
     """Factor on the object's mass."""
@@ -43,8 +45,10 @@ class Ranges:
     """Probability that the tracker gives no new object pose in a step; the last one is seen again."""
 
 
-class Imperfection:
+class Imperfection(Memory):
     """Varied models, late commands and a noisy tracker for the environments of one `Physics`."""
+
+    memory: Mapping[str, str] = {"seeds": "seeds", "step_count": "step_count", "sent": "_sent", "seen": "seen"}
 
     def __init__(self, physics: Physics, ranges: Ranges | None = None) -> None:
         self.ranges = ranges or Ranges()
@@ -82,9 +86,8 @@ class Imperfection:
         body, geom = model.body("object").id, model.geom("object").id
         model.body_mass[body] = nominal.body_mass[body] * mass
         model.body_inertia[body] = nominal.body_inertia[body] * mass * size**2
-        model.geom_size[geom] = nominal.geom_size[geom] * size
-        model.geom_rbound[geom] = nominal.geom_rbound[geom] * size
-        model.geom_aabb[geom] = nominal.geom_aabb[geom] * size
+        for name in ("geom_size", "geom_rbound", "geom_aabb"):
+            getattr(model, name)[geom] = getattr(nominal, name)[geom] * size
         for name in ("object", "left_pad", "right_pad"):
             index = model.geom(name).id
             model.geom_friction[index, 0] = nominal.geom_friction[index, 0] * friction
@@ -113,18 +116,8 @@ class Imperfection:
         self.seen[env_ids] = np.where(self._dropped[env_ids, now][:, None], self.seen[env_ids], fresh)
         self.step_count[env_ids] += 1
 
-    def state_dict(self) -> dict[str, Array | NDArray[np.int64]]:
-        """What `load_state_dict` needs to go on exactly; the draws themselves follow from the seeds."""
-        return {
-            "seeds": self.seeds.copy(),
-            "step_count": self.step_count.copy(),
-            "sent": self._sent.copy(),
-            "seen": self.seen.copy(),
-        }
-
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Draw each environment again from its seed, then go to where it was."""
         for env, seed in enumerate(state["seeds"]):
             self.reset(env, int(seed), self._sent[env, 0])
-        self.step_count = np.asarray(state["step_count"]).copy()
-        self._sent, self.seen = np.asarray(state["sent"]).copy(), np.asarray(state["seen"]).copy()
+        super().load_state_dict(state)

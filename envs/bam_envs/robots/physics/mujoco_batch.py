@@ -72,7 +72,7 @@ class Physics:
     @property
     def qvel(self) -> Array:
         """Generalised velocities. Shape: (n, nv). A view."""
-        return self.state[:, 1 + self.model.nq : 1 + self.model.nq + self.model.nv]
+        return self.state[:, 1 + self.model.nq :]
 
     def model_of(self, env: int) -> Any:
         """The model of `env`; its own where models are varied."""
@@ -83,11 +83,7 @@ class Physics:
         mujoco.mj_setConst(self.model_of(env), self._scratch)
 
     def step(self, control: Array) -> None:
-        """Advance all environments by ``control.shape[1]`` physics steps.
-
-        Args:
-            control: Actuator set points for each physics step. Shape: (n, steps, nu).
-        """
+        """Advance all environments; `control` are the actuators' set points for each physics step (n, steps, nu)."""
         steps = control.shape[1]
         if steps not in self._buffers:
             states = np.empty((self.num_envs, steps, self.state.shape[1]))

@@ -5,7 +5,7 @@ its 1012 rays takes about 10 µs.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,9 @@ BOX_EDGE = 0.5
 """Edge of a box [m]."""
 NOWHERE = (1000.0, 1000.0, 0.0)
 """Pose of a box that is not there: out of sight [m, m, rad]."""
-_HALF = (FOOTPRINT[0] / 2, FOOTPRINT[1] / 2)
 NOISE = 0.01
 """Standard deviation of a measured range [m]."""
+_HALF = (FOOTPRINT[0] / 2, FOOTPRINT[1] / 2)
 _CHUNK = 64
 _TAPE = 1 << 17
 _ONE, _HALF_EDGE = np.float32(1.0), np.float32(BOX_EDGE / 2)
@@ -30,12 +30,10 @@ _ONE, _HALF_EDGE = np.float32(1.0), np.float32(BOX_EDGE / 2)
 
 @dataclass(frozen=True)
 class Room:
-    """Four walls; what is inside them is free."""
+    """Four walls, from the lowest x and y [m] to the highest; what is inside them is free."""
 
     low: tuple[float, float]
-    """Lowest x and y [m]."""
     high: tuple[float, float]
-    """Highest x and y [m]."""
 
 
 LAB = Room((-2.877, -3.836), (2.823, 3.864))
@@ -43,15 +41,9 @@ LAB = Room((-2.877, -3.836), (2.823, 3.864))
 
 
 def touches(pose: Array, room: Room | None, boxes: Array) -> Flags:
-    """Whether the footprint of each base touches a wall or a box.
+    """Whether the footprint of each base touches a wall, if there is a `room`, or a box.
 
-    Args:
-        pose: Of the bases: x, y [m], yaw [rad]. Shape: (n, 3).
-        room: The walls; None for none.
-        boxes: Of each base: x, y [m], yaw [rad]. Shape: (n, b, 3).
-
-    Returns:
-        Shape: (n,).
+    Poses are x, y [m], yaw [rad]. Shapes: (n, 3), (n, b, 3) -> (n,).
     """
     yaw = pose[:, 2].copy()
     cos, sin = np.cos(yaw), np.sin(yaw)
@@ -92,27 +84,19 @@ class LaserScanner:
     def __init__(self, mount: tuple[float, float, float], masked: tuple[int, int]) -> None:
         self._mount = mount
         bearing = np.linspace(*SCAN_SPAN, SCAN_RAYS)[masked[0] : SCAN_RAYS - masked[1]]
-        self.rays = len(bearing)
-        """How many rays there are."""
         self._directions = (np.cos(bearing).astype(np.float32), np.sin(bearing).astype(np.float32))
-        self._scratch = np.empty((6, _CHUNK, self.rays), np.float32)
-        self._hits = np.empty((_CHUNK, self.rays), bool)
+        self._scratch = np.empty((6, _CHUNK, len(bearing)), np.float32)
+        self._hits = np.empty((_CHUNK, len(bearing)), bool)
 
     def cast(self, pose: Array, room: Room | None, boxes: Array) -> Floats:
         """How far each ray goes before it meets something [m]; infinite if it never does.
 
-        Args:
-            pose: Of the bases: x, y [m], yaw [rad]. Shape: (n, 3).
-            room: The walls; None for none.
-            boxes: Of each base: x, y [m], yaw [rad]. Shape: (n, b, 3).
-
-        Returns:
-            Shape: (n, rays).
+        Poses of bases and boxes as in `touches`. Shapes: (n, 3), (n, b, 3) -> (n, rays).
         """
         x, y, yaw = np.ascontiguousarray(pose.T)
         (ahead, left, turned), cos, sin = self._mount, np.cos(yaw), np.sin(yaw)
         eye, heading = np.stack([x + ahead * cos - left * sin, y + ahead * sin + left * cos], axis=1), yaw + turned
-        ranges = np.empty((len(pose), self.rays), np.float32)
+        ranges = np.empty((len(pose), self._hits.shape[1]), np.float32)
         with np.errstate(divide="ignore", invalid="ignore"):  # rays along an axis
             for start in range(0, len(pose), _CHUNK):
                 chunk = slice(start, start + _CHUNK)
@@ -188,27 +172,18 @@ def measured(ranges: Floats, deviates: Floats) -> Array:
 
 
 def noise(seeds: Seeds, count: Seeds, rays: int) -> Floats:
-    """Normal deviates of mean 0 and standard deviation `NOISE` [m].
+    """Normal deviates of mean 0 and standard deviation `NOISE` [m]; `rays` are at most the 1012 of both scanners.
 
-    Each scan is a stretch of one long tape that begins where the seed and the number of the scan say: so no
-    environment has a generator of its own to keep, and a scan costs a copy.
-
-    Args:
-        seeds: Of the bases. Shape: (n,).
-        count: Number of the scan in each episode. Shape: (n,).
-        rays: How many are wanted; at most the 1012 of both scanners.
-
-    Returns:
-        Shape: (n, rays).
+    Each scan is a stretch of one long tape that begins where the seed of its base and its number `count` in the episode
+    say: so no environment has a generator of its own to keep, and a scan costs a copy. Shapes: (n,), (n,) -> (n, rays).
     """
     starts = mixed(seeds + mixed(count)) % np.uint64(_TAPE)
     deviates: Floats = np.lib.stride_tricks.sliding_window_view(_tape(), rays)[starts.astype(np.int64)]
     return deviates
 
 
-@lru_cache(maxsize=1)
+@cache
 def _tape() -> Floats:
-    """Deviates for every beginning. Shape: (_TAPE + 2 * SCAN_RAYS,)."""
     deviates = np.random.Generator(np.random.PCG64(100)).standard_normal(_TAPE + 2 * SCAN_RAYS, dtype=np.float32)
     tape: Floats = deviates * np.float32(NOISE)
     return tape

@@ -48,7 +48,7 @@ class View:
     target: tuple[float, float, float]
     """What is in the middle [m]."""
     distance: float
-    """How far away the camera is [m]."""
+    """Of the camera [m]."""
     azimuth: float
     """Where it looks to, seen from above: 0 along x, 90 along y [deg]."""
     elevation: float
@@ -61,10 +61,7 @@ def marked(marks: Sequence[tuple[Array, Colour]], radius: float = 0.02) -> list[
 
 
 class Drawn:
-    """A robot simulated in NumPy, which says what it looks like, and so has pictures.
-
-    A subclass defines `slices`, `halt` and `picture`.
-    """
+    """A robot simulated in NumPy, which says what it looks like, and so has pictures."""
 
     floor: float = 0.0
     """Height of the floor [m]."""
@@ -105,12 +102,7 @@ class Drawn:
         raise NotImplementedError
 
     def render(self, mode: str, marks: Sequence[tuple[Array, Colour]]) -> NDArray[np.uint8] | None:
-        """Show environment 0: an image (480, 640, 3) for ``rgb_array``, a window for ``human``.
-
-        Args:
-            mode: ``"rgb_array"`` or ``"human"``.
-            marks: Spheres to draw: position (3,) [m] and colour.
-        """
+        """Show environment 0 and `marks`: an image (480, 640, 3) for ``rgb_array``, a window for ``human``."""
         from bam_envs.robots.physics.rendering import ShapeRenderer
 
         if self._renderer is None:
