@@ -268,18 +268,13 @@ class EnvCodec:
             version: The messages' version.
             executed: Whether the action was done.
         """
-        observation, *ends, info = result
-        size, space = self.spec.num_envs, self.spec.observation_space
-        each: Any = [(observation, *(ends or (0.0, False, False)), info)]
-        if self.spec.vector:
-            each = zip(observation, *(ends or [[0.0] * size, [False] * size, [False] * size]), info, strict=True)
         feedback = []
-        for observed, reward, terminated, truncated, one in each:
-            if self.spec.vector and "final_obs" in one:
-                one = {**one, "final_obs": pack(space, one["final_obs"], "final_obs")}
-            fields, trees = self._observations.encode(observed, stamp, version)
-            flags = (reward, terminated, truncated)
-            feedback.append(write_feedback(fields, trees, flags, one, version, executed=executed))
+        for observation, *ends, info in self.spec.split(result):
+            if self.spec.vector and "final_obs" in info:
+                info = {**info, "final_obs": pack(self.spec.observation_space, info["final_obs"], "final_obs")}
+            fields, trees = self._observations.encode(observation, stamp, version)
+            flags: Any = ends or (0.0, False, False)
+            feedback.append(write_feedback(fields, trees, flags, info, version, executed=executed))
         return feedback
 
     def read_result(self, response: GymResponse) -> tuple[Any, Any, Any, Any, Any]:
@@ -287,10 +282,9 @@ class EnvCodec:
         size, found = self.spec.num_envs, len(response.feedback)
         if found != size:
             raise ProtocolError(f"The response must have {size} feedback, one for each environment, not {found}.")
-        each = [self._read(*one) for one in zip(response.feedback, response.infos, response.exact, strict=True)]
-        if not self.spec.vector:
-            return each[0]
-        return tuple(list(column) for column in zip(*each, strict=True))  # type: ignore[return-value]
+        each = zip(response.feedback, response.infos, response.exact, strict=True)
+        result: tuple[Any, Any, Any, Any, Any] = self.spec.joined([self._read(*one) for one in each])
+        return result
 
     def _read(self, feedback: Mapping[str, Any], info: Info, ours: Info) -> tuple[Any, float, bool, bool, Info]:
         trees = ours.get("observation", {})

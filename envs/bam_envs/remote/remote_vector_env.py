@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cached_property
-from itertools import accumulate
+from itertools import accumulate, chain
 from typing import Any, TypeVar
 
 import gymnasium as gym
@@ -25,11 +25,6 @@ Result = TypeVar("Result")
 Seeds = list[int | None]
 
 
-Results = tuple[list[Any], list[float], list[bool], list[bool], list[Info]]
-"""Of a step: observations (where an episode ended, the first of the next), rewards, terminated, truncated and infos
-(where an episode ended, of the next one, with ``final_obs`` and ``final_info``), each for every environment."""
-
-
 class Rack:
     """The environments of one transport, reset in the step that ends an episode whatever is at the other end.
 
@@ -46,8 +41,8 @@ class Rack:
 
     def reset(
         self, seeds: Seeds, mask: NDArray[np.bool_], options: Info | None, before: list[Any]
-    ) -> tuple[list[Any], list[Info]]:
-        """Begin episodes in the environments of the mask; (observations, infos) of all of this rack.
+    ) -> list[tuple[Any, ...]]:
+        """Begin episodes in the environments of the mask; (observation, info) of every one of this rack.
 
         Args:
             seeds: One for each environment of this rack.
@@ -56,42 +51,33 @@ class Rack:
             before: The last observation of each.
         """
         if not mask.any():
-            return before, [{}] * len(mask)
+            return [(observation, {}) for observation in before]
         if self.spec.vector and self.spec.autoreset:
             if not mask.all():
                 options = {**(options or {}), "reset_mask": mask}
             seeded = any(seed is not None for seed in seeds)
-            observations, infos = self.transport.reset(seeds if seeded else None, options)
-            return observations, infos
+            return self.spec.split(self.transport.reset(seeds if seeded else None, options))
         first, those = seeds[0], f"The {len(seeds)} environments of {self.spec.env_id} begin together"
         if not mask.all():
             raise InvalidValue(f"{those}; reset_mask must hold all of them or none.")
         if seeds != [None if first is None else first + number for number in range(len(seeds))]:
             raise InvalidValue(f"{those}, from one seed s that stands for s, s + 1, …; not from {seeds}.")
-        return self._begin(first, options)
+        return self.spec.split(self.transport.reset(first, options))
 
-    def step(self, actions: list[Any]) -> Results:
-        """Step every environment; those whose episode ended are reset."""
-        if self.spec.vector:
-            results = self.transport.step(actions)
-        else:
-            observation, reward, late, cut, info = self.transport.step(actions[0])
-            results = [observation], [reward], [late], [cut], [info]
-        last, rewards, terminated, truncated, infos = results
-        if (self.spec.vector and self.spec.autoreset) or not (any(terminated) or any(truncated)):
-            return results
+    def step(self, actions: list[Any]) -> list[tuple[Any, ...]]:
+        """Step every environment, and reset those whose episode ended; the result of each.
+
+        Where an episode ended, observation and info are of the next one, with ``final_obs`` and ``final_info``.
+        """
+        each = self.spec.split(self.transport.step(actions if self.spec.vector else actions[0]))
+        if (self.spec.vector and self.spec.autoreset) or not any(one[2] or one[3] for one in each):
+            return each
         # There is one reset for all, so all episodes end; that of another one is a time limit to those that go on.
-        truncated = [not ended or late for ended, late in zip(terminated, truncated, strict=True)]
-        first, begun = self._begin(None, None)
-        infos = [
-            {**info, "final_obs": final_obs, "final_info": final_info}
-            for info, final_obs, final_info in zip(begun, last, infos, strict=True)
+        begun = self.spec.split(self.transport.reset(None, None))
+        return [
+            (first, reward, terminated, truncated or not terminated, {**info, "final_obs": last, "final_info": final})
+            for (first, info), (last, reward, terminated, truncated, final) in zip(begun, each, strict=True)
         ]
-        return first, rewards, terminated, truncated, infos
-
-    def _begin(self, seed: int | None, options: Info | None) -> tuple[list[Any], list[Info]]:
-        observation, info = self.transport.reset(seed, options)
-        return (observation, info) if self.spec.vector else ([observation], [info])
 
 
 class Described:
@@ -228,9 +214,8 @@ class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
         parts = self._at_once(
             lambda rack: rack.reset(seeds[rack.part], mask[rack.part], rest, before[rack.part]), self._racks
         )
-        self._observations = [one for observations, _ in parts for one in observations]
-        joined = stack(self.single_observation_space, self._observations)
-        return joined, join_infos([info for _, infos in parts for info in infos])
+        self._observations, infos = map(list, zip(*chain(*parts), strict=True))
+        return stack(self.single_observation_space, self._observations), join_infos(infos)
 
     def step(
         self, actions: Any
@@ -247,8 +232,8 @@ class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
         if len(each) != self.num_envs:
             raise InvalidValue(f"There must be one action for each of {self.num_envs} environments, not {len(each)}.")
         self._observations = None  # until it went well
-        results = self._at_once(lambda rack: rack.step(each[rack.part]), self._racks)
-        columns: Any = ([one for result in results for one in result[place]] for place in range(5))
+        parts = self._at_once(lambda rack: rack.step(each[rack.part]), self._racks)
+        columns: Any = map(list, zip(*chain(*parts), strict=True))
         self._observations, rewards, terminated, truncated, infos = columns
         joined, space = join_infos(infos), self.single_observation_space
         if "final_obs" in joined:

@@ -100,7 +100,7 @@ class RosbridgeTransport:
         self._name, self._lock, self._closed = name, threading.Lock(), False
         self._described_epoch: int | None = None
         self._known_epoch: int | None = None  # of the connection on which the state over there is known
-        self._last: Any = None  # the last observation, or a list of them
+        self._last: list[Any] = []  # the last observation of each environment
         self._begin_process()
 
     def connect(self) -> EnvSpecMessage:
@@ -122,10 +122,9 @@ class RosbridgeTransport:
                 refuse_foreign(plain, options)
             epoch = self._link.epoch
             response = self._ask(RequestType.RESET, seed=plain, options=options, take=self.take)
-            observation, *_, info = there.read_result(response)
-            self._known_epoch = epoch
-            self._last = observation
-            return observation, info
+            result = there.read_result(response)
+            self._known_epoch, self._last = epoch, [one[0] for one in there.spec.split(result)]
+            return result[0], result[-1]
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
         """(observation, reward, terminated, truncated, info). Sent once, or not at all.
@@ -145,25 +144,16 @@ class RosbridgeTransport:
             result = there.read_result(self._ask(RequestType.STEP, actions=there.write_actions(action)))
             june = self._version is not None and self._version.june
             if there.foreign and (june if self._autoreset is None else self._autoreset):
-                return self._with_last_known(result, there.spec.vector)
+                # The rack has begun the next episode, and the last observation of the old one never comes: that of the
+                # step before stands in its place.
+                each, before = there.spec.split(result), self._last
+                self._last = [one[0] for one in each]
+                for i, (_, reward, terminated, truncated, info) in enumerate(each):
+                    if terminated or truncated:
+                        info = {**info, "stale_observation": True}
+                        each[i] = (before[i], reward, terminated, truncated, info)
+                result = there.spec.joined(each)
             return result
-
-    def _with_last_known(self, result: tuple[Any, Any, Any, Any, Any], vector: bool) -> tuple[Any, Any, Any, Any, Any]:
-        """A step's result of a rack that begins the next episode in the step that ends one.
-
-        It then observes the first observation of the next episode, and the last one of the old never comes: that of the
-        step before stands in its place, and `info` has ``stale_observation``.
-        """
-        before, (observation, reward, terminated, truncated, info) = self._last, result
-        self._last = observation
-        if not vector:
-            if terminated or truncated:
-                observation, info = before, {**info, "stale_observation": True}
-            return observation, reward, terminated, truncated, info
-        ended = [done or cut for done, cut in zip(terminated, truncated, strict=True)]
-        observation = [before[i] if end else observation[i] for i, end in enumerate(ended)]
-        info = [{**info[i], "stale_observation": True} if end else info[i] for i, end in enumerate(ended)]
-        return observation, reward, terminated, truncated, info
 
     def close(self) -> None:
         """Release the environment there and drop the link; a request under way ends with `LinkLost`."""

@@ -90,7 +90,7 @@ class TcpTransport:
 
     def reset(self, seed: Seed = None, options: Info | None = None) -> tuple[Any, Any]:
         """Begin an episode; connects again if the link dropped."""
-        plain = plain_seed(seed, 2**64 - 1)
+        plain = plain_seed(seed)
         with self._lock:
             spec = self._connected()
             tag = self._tag(self.timeout)

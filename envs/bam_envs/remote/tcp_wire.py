@@ -186,21 +186,22 @@ def read_result(spec: EnvSpecMessage, tree: Tree, size: int) -> tuple[Any, ...]:
     """The result of `size` values that `pack_result` was given. Raises ProtocolError if it is something else."""
     if not isinstance(tree, list) or len(tree) != size:
         raise ProtocolError(f"Expected a result of {size} values, found {brief(tree)}.")
-    observation, *between, info = tree
-    space = spec.observation_space
+    for column in tree if spec.vector else ():
+        if not isinstance(column, list) and not (isinstance(column, np.ndarray) and column.ndim):
+            raise ProtocolError(f"Expected a list with one value for each environment, found {brief(column)}.")
+        if len(column) != spec.num_envs:
+            raise ProtocolError(f"Expected values of {spec.num_envs} environments, found {brief(column)}.")
+    each, space = [], spec.observation_space
     try:
-        if not spec.vector:
-            return exact(space, observation, "observation"), *between, info
-        for column in tree:
-            if not isinstance(column, list) and not (isinstance(column, np.ndarray) and column.ndim):
-                raise ProtocolError(f"Expected a list with one value for each environment, found {brief(column)}.")
-            if len(column) != spec.num_envs:
-                raise ProtocolError(f"Expected values of {spec.num_envs} environments, found {brief(column)}.")
-        each = [exact(space, one, f"observation of environment {i}") for i, one in enumerate(observation)]
-        final = [{**one, "final_obs": exact(space, one["final_obs"])} if "final_obs" in one else one for one in info]
+        for i, (observation, *ends, info) in enumerate(spec.split(tree)):
+            if spec.vector and "final_obs" in info:
+                info = {**info, "final_obs": exact(space, info["final_obs"])}
+            where = f" of environment {i}" if spec.vector else ""
+            each.append((exact(space, observation, f"observation{where}"), *ends, info))
     except InvalidValue as error:
         raise ProtocolError(str(error)) from error
-    return each, *between, final
+    result: tuple[Any, ...] = spec.joined(each)
+    return result
 
 
 class ForeignPeer(ProtocolError):  # noqa: N818 - reads as what was found

@@ -1,7 +1,6 @@
 """The Transport protocol: what carries a whole environment, one or a batch of them, to wherever it runs."""
 
-import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
@@ -16,6 +15,7 @@ from bam_envs.remote.values import plain_info, tree_from_json, tree_to_json
 Info = dict[str, Any]
 Seed = int | list[int | None] | None
 """Of a reset: one, or one for each environment of a batch."""
+_MAX_SEED = 2**64 - 1
 
 
 @dataclass(frozen=True)
@@ -52,16 +52,23 @@ class EnvSpecMessage:
             )
         return each
 
+    def split(self, result: Iterable[Any]) -> list[tuple[Any, ...]]:
+        """The result of each environment, out of what `Transport.reset` or `Transport.step` returns."""
+        return list(zip(*result, strict=True)) if self.vector else [tuple(result)]
 
-def plain_seed(seed: Any, largest: float = math.inf) -> Seed:
-    """A seed, or one for each environment, as Python's numbers. Raises InvalidValue if it is beyond 0 to `largest`."""
+    def joined(self, each: Sequence[tuple[Any, ...]]) -> Any:
+        """What `Transport.reset` or `Transport.step` returns, of the result of each environment."""
+        return tuple(map(list, zip(*each, strict=True))) if self.vector else each[0]
+
+
+def plain_seed(seed: Any) -> Seed:
+    """A seed, or one for each environment, as Python's numbers. Raises InvalidValue if it is not of 64 bits."""
     if seed is None:
         return None
     if isinstance(seed, (list, tuple, np.ndarray)):
-        return [plain_seed(one, largest) for one in seed]  # type: ignore[misc]
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed <= largest:
-        upper = f"to {largest}" if largest < math.inf else "on"
-        raise InvalidValue(f"A seed must be a whole number from 0 {upper}, not {seed!r}.")
+        return [plain_seed(one) for one in seed]  # type: ignore[misc]
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed <= _MAX_SEED:
+        raise InvalidValue(f"A seed must be a whole number from 0 to {_MAX_SEED}, not {seed!r}.")
     return int(seed)
 
 

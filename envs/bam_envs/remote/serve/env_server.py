@@ -183,7 +183,8 @@ class EnvServer:
                 given = None if options is None else dict(options)  # environments may change it
                 if given and "reset_mask" in given:
                     given["reset_mask"] = np.asarray(given["reset_mask"], dtype=bool)
-                begun = self._begun(*self.env.reset(seed=seed, options=given))  # type: ignore[arg-type]
+                observation, info = self.env.reset(seed=seed, options=given)  # type: ignore[arg-type]
+                begun: tuple[Any, Any] = self._checked(observation, info)
             self._episode = client
         if self._pacer is not None:
             self._pacer.start()
@@ -216,7 +217,9 @@ class EnvServer:
                 checked = stack(space, many) if vector else exact(space, action, "action")
                 self._episode = None  # until it went well
                 with _errors_of_environment():
-                    stepped = self._stepped(*self.env.step(checked))
+                    observation, reward, terminated, truncated, info = self.env.step(checked)
+                    stepped: tuple[Any, Any, Any, Any, Any]
+                    stepped = self._checked(observation, reward, terminated, truncated, info)
                 goes_on = vector or not (stepped[2] or stepped[3])
                 self._episode, self._over = (client, None) if goes_on else (None, client)
             if self._pacer is not None:
@@ -263,29 +266,29 @@ class EnvServer:
                 raise RemoteError("The environment is closed.")
             yield
 
-    def _begun(self, observation: Any, info: Any) -> tuple[Any, Any]:
-        """The result of a reset, checked and with a list in place of a batch."""
-        space = self._spec.observation_space
-        if not self._spec.vector:
-            return exact(space, observation, "observation"), plain_info(info)
-        each = enumerate(iterate(self.env.observation_space, observation))
-        infos = []
-        for i, reported in enumerate(split_infos(info, self._spec.num_envs)):
-            last = reported.pop("final_obs", None)
-            infos.append(plain_info(reported))
-            if last is not None:
-                infos[i]["final_obs"] = exact(space, last, f"final_obs of environment {i}")
-        return [exact(space, one, f"observation of environment {i}") for i, one in each], infos
+    def _checked(self, observation: Any, *rest: Any) -> Any:
+        """The result of a reset or step, checked and with lists in place of batches."""
+        spec, (*ends, infos) = self._spec, rest
+        if not spec.vector:
+            return self._checked_one("", None, observation, *rest)
+        observations, each = iterate(self.env.observation_space, observation), split_infos(infos, spec.num_envs)
+        lasts = [info.pop("final_obs", None) for info in each]
+        rows = enumerate(zip(lasts, observations, *ends, each, strict=True))
+        return spec.joined([self._checked_one(f" of environment {i}", *row) for i, row in rows])
 
-    def _stepped(
-        self, observation: Any, reward: Any, terminated: Any, truncated: Any, info: Any
-    ) -> tuple[Any, Any, Any, Any, Any]:
-        """The result of a step, checked and with lists in place of batches."""
-        seen, infos = self._begun(observation, info)
-        if not self._spec.vector:
-            return seen, _reward(reward), bool(terminated), bool(truncated), infos
-        rewards = [_reward(one, f"reward of environment {i}") for i, one in enumerate(reward)]
-        return seen, rewards, [bool(one) for one in terminated], [bool(one) for one in truncated], infos
+    def _checked_one(self, where: str, last: Any, observation: Any, *rest: Any) -> tuple[Any, ...]:
+        """The result of one environment, whose episode before ended with the observation `last` in this step."""
+        space, (*ends, info) = self._spec.observation_space, rest
+        checked = [exact(space, observation, f"observation{where}")]
+        if ends:
+            reward, terminated, truncated = ends
+            if (reward := float(reward)) != reward:
+                raise InvalidValue(f"reward{where} is NaN; only numbers are sent.")
+            checked += [reward, bool(terminated), bool(truncated)]
+        plain = plain_info(info)
+        if last is not None:
+            plain["final_obs"] = exact(space, last, f"final_obs{where}")
+        return *checked, plain
 
     def _end_episode(self, before: str | None, after: str | None) -> None:
         self._episode = self._over = None
@@ -298,13 +301,6 @@ def _errors_of_environment() -> Iterator[None]:
         yield
     except Exception as error:  # environments are other people's code and raise anything
         raise RemoteError(f"{type(error).__name__}: {' '.join(str(error).split())}") from error
-
-
-def _reward(value: Any, name: str = "reward") -> float:
-    reward = float(value)
-    if reward != reward:
-        raise InvalidValue(f"{name} is NaN; only numbers are sent.")
-    return reward
 
 
 def split_infos(infos: Mapping[str, Any], num_envs: int) -> list[Info]:

@@ -106,7 +106,7 @@ class Odd(FakeEnv):
         ),
         ((np.zeros(2), 0, False, False, {}), "InvalidValue: observation must have shape (3,), not (2,)."),
         ((np.zeros(3), np.nan, False, False, {}), "InvalidValue: reward is NaN; only numbers are sent."),
-        ((np.zeros(3), 0, False), "TypeError: "),
+        ((np.zeros(3), {}), "ValueError: not enough values to unpack (expected 5, got 2)"),
         ((np.zeros(3), "much", False, False, {}), "ValueError: could not convert string to float: 'much'"),
     ],
 )
