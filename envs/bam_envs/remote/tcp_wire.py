@@ -57,8 +57,6 @@ _ARRAY, _SCALAR = 1, 2
 _MAX_HEADER, _MAX_DIMENSIONS = 2**24, 32
 _KEEPALIVE = {"TCP_KEEPIDLE": 4, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT": 3}
 """A computer that vanished without a word is noticed after 10 s."""
-_MOST_PARTS = 512  # below IOV_MAX of every system
-_SMALL = 32768  # bytes that are copied together quicker than listed
 
 
 class Hello(msgspec.Struct, frozen=True):
@@ -208,8 +206,8 @@ class ForeignPeer(ProtocolError):  # noqa: N818 - reads as what was found
     """The other end speaks another protocol; the text names it where it can be recognised."""
 
 
-def encode(message: Tree) -> list[bytes | memoryview]:
-    """The parts of a frame, to be sent one after the other; arrays are not copied.
+def encode(message: Tree) -> bytes:
+    """The frame of a message.
 
     Raises:
         ProtocolError: The frame would be larger than `MAX_FRAME`, or something in it cannot be sent.
@@ -227,8 +225,7 @@ def encode(message: Tree) -> list[bytes | memoryview]:
         content = msgspec.msgpack.encode([value.dtype.str, value.shape, size])
         if value.size:
             padding = -value.nbytes % _ALIGN
-            arrays.append(value.reshape(-1).view(np.uint8).data)
-            arrays.extend([bytes(padding)] if padding else [])
+            arrays.extend([value.reshape(-1).view(np.uint8).data, bytes(padding)])
             size += value.nbytes + padding
         return Ext(_ARRAY, content)
 
@@ -238,8 +235,7 @@ def encode(message: Tree) -> list[bytes | memoryview]:
         raise ProtocolError(f"A message cannot be sent: {str(error).rstrip('.')}.") from error
     if len(header) + size > MAX_FRAME:
         raise ProtocolError(f"A message of {len(header) + size} bytes is too large; {MAX_FRAME} are allowed.")
-    parts = [_PREFIX.pack(MARK, VERSION, len(header), size), header, *arrays]
-    return [b"".join(parts)] if size <= _SMALL else parts
+    return b"".join([_PREFIX.pack(MARK, VERSION, len(header), size), header, *arrays])
 
 
 def read_prefix(prefix: bytes | bytearray) -> tuple[int, int]:
@@ -295,19 +291,11 @@ class FrameSocket:
                 sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
         self._socket = sock
 
-    def send(self, parts: list[bytes | memoryview], deadline: float = math.inf) -> None:
-        """Send a frame of `encode` before `deadline` [s, monotonic].
-
-        Raises:
-            LinkLost: The other end is gone, or takes nothing.
-        """
+    def send(self, frame: bytes, deadline: float) -> None:
+        """Send a frame before `deadline` [s, monotonic]. Raises LinkLost if the other end is gone, or takes nothing."""
         try:
-            while parts:
-                self._set_timeout(deadline)
-                sent, done = self._socket.sendmsg(parts[:_MOST_PARTS]), 0
-                while done < len(parts) and sent >= len(parts[done]):
-                    sent, done = sent - len(parts[done]), done + 1
-                parts = [memoryview(parts[done])[sent:], *parts[done + 1 :]] if done < len(parts) else []
+            self._set_timeout(deadline)
+            self._socket.sendall(frame)  # all of it within the time
         except OSError as error:
             raise LinkLost(error.strerror or str(error)) from error
 

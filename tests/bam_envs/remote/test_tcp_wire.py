@@ -43,7 +43,7 @@ BOX, TEXT = spaces.Box(-1, 1, (2,)), spaces.Text(3)
 
 
 def through_bytes(message, kind=Any):
-    data = b"".join(encode(message))
+    data = encode(message)
     header, body = read_prefix(data[:12])
     assert len(data) == 12 + header + body
     body = np.frombuffer(bytearray(data[12 + header :]), np.uint8)
@@ -51,11 +51,11 @@ def through_bytes(message, kind=Any):
 
 
 def test_a_frame_byte_for_byte():
-    assert b"".join(encode(["a", 1])) == b"bam\x01" + b"\0\0\0\x04" + b"\0\0\0\0" + b"\x92\xa1a\x01"
+    assert encode(["a", 1]) == b"bam\x01" + b"\0\0\0\x04" + b"\0\0\0\0" + b"\x92\xa1a\x01"
     one = np.array([1.5], "<f4")
     place = packed(["<f4", [1], 0])
     header = packed(Ext(1, place))
-    assert b"".join(encode(one)) == (
+    assert encode(one) == (
         b"bam\x01" + len(header).to_bytes(4, "big") + b"\0\0\0\x10" + header + one.tobytes() + bytes(12)
     )
 
@@ -78,14 +78,6 @@ def test_arrays_and_scalars_keep_every_bit(size):
     assert [one.dtype for one in back["scalar"]] == [np.float32, np.bool_, np.int64]
     assert back["scalar"] == tree["scalar"]
     assert back["text"] == tree["text"]
-
-
-def test_large_arrays_are_not_copied():
-    image = np.zeros((480, 640, 3), np.uint8)
-    parts = encode([image])
-    image[0, 0, 0] = 7
-    assert len(parts) == 3
-    assert parts[2][0] == 7
 
 
 def test_what_cannot_be_sent():

@@ -224,10 +224,10 @@ class _Connection:
             self._frames.close()
             self._owner.forget(self)
 
-    def _send(self, parts: list[bytes | memoryview]) -> None:
-        self._frames.send(parts, time.monotonic() + self._owner.patience)
+    def _send(self, frame: bytes) -> None:
+        self._frames.send(frame, time.monotonic() + self._owner.patience)
 
-    def _answer(self, request: Request) -> list[bytes | memoryview]:
+    def _answer(self, request: Request) -> bytes:
         """The frame that answers `request`."""
         tag = request.tag
         try:

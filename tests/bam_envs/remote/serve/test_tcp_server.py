@@ -207,7 +207,7 @@ def test_the_token(env):
 
 def test_a_token_that_is_no_text_is_refused(env):
     with TcpServer(EnvServer(env), token="secret") as server, contextlib.closing(Stranger(server)) as one:
-        [hello] = encode(["hello", Hello("s1", 1, "stranger", "XYZ", "")])
+        hello = encode(["hello", Hello("s1", 1, "stranger", "XYZ", "")])
         one.socket.sendall(hello.replace(b"XYZ", b"\xed\xa0\x80"))  # half of a surrogate pair
         assert one.frames.receive(time.monotonic() + PATIENCE)[2].startswith("A message is damaged: ")
 
