@@ -17,42 +17,23 @@ if TYPE_CHECKING:
     from bam_envs.remote.tcp_transport import TcpTransport
     from bam_envs.remote.transport import EnvSpecMessage, Transport
 
+__all__ = ["EnvServer", "EnvSpecMessage", "FakeTransport", "LocalTransport", "RclpyTransport", "RemoteEnv"]
+__all__ += ["RemoteVectorEnv", "RosbridgeTransport", "ServeOptions", "ServedEnvironment", "TcpServer", "TcpTransport"]
+__all__ += ["Transport", "make_remote_env", "make_remote_vector_env", "open_transport"]
+
 _MODULES = {
-    "EnvServer": "bam_envs.remote.serve.env_server",
-    "EnvSpecMessage": "bam_envs.remote.transport",
-    "FakeTransport": "bam_envs.remote.serve.local_transport",
-    "LocalTransport": "bam_envs.remote.serve.local_transport",
-    "RclpyTransport": "bam_envs.remote.ros2_transport",
-    "RemoteEnv": "bam_envs.remote.remote_env",
-    "RemoteVectorEnv": "bam_envs.remote.remote_vector_env",
-    "RosbridgeTransport": "bam_envs.remote.rosbridge_transport",
-    "ServeOptions": "bam_envs.remote.serve.serve_options",
-    "ServedEnvironment": "bam_envs.remote.serve.served_environment",
-    "TcpServer": "bam_envs.remote.serve.tcp_server",
-    "TcpTransport": "bam_envs.remote.tcp_transport",
-    "Transport": "bam_envs.remote.transport",
-    "make_remote_env": "bam_envs.remote.remote_env",
-    "make_remote_vector_env": "bam_envs.remote.remote_env",
-    "open_transport": "bam_envs.remote.remote_env",
+    "remote_env": ("RemoteEnv", "make_remote_env", "make_remote_vector_env", "open_transport"),
+    "remote_vector_env": ("RemoteVectorEnv",),
+    "ros2_transport": ("RclpyTransport",),
+    "rosbridge_transport": ("RosbridgeTransport",),
+    "serve.env_server": ("EnvServer",),
+    "serve.local_transport": ("FakeTransport", "LocalTransport"),
+    "serve.serve_options": ("ServeOptions",),
+    "serve.served_environment": ("ServedEnvironment",),
+    "serve.tcp_server": ("TcpServer",),
+    "tcp_transport": ("TcpTransport",),
+    "transport": ("EnvSpecMessage", "Transport"),
 }
-
-__all__ = [
-    "EnvServer",
-    "EnvSpecMessage",
-    "FakeTransport",
-    "LocalTransport",
-    "RclpyTransport",
-    "RemoteEnv",
-    "RemoteVectorEnv",
-    "RosbridgeTransport",
-    "ServeOptions",
-    "ServedEnvironment",
-    "TcpServer",
-    "TcpTransport",
-    "Transport",
-    "make_remote_env",
-    "make_remote_vector_env",
-    "open_transport",
-]
-
-__getattr__, __dir__ = lazy_imports(__name__, _MODULES)
+__getattr__, __dir__ = lazy_imports(
+    __name__, {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}
+)

@@ -1,6 +1,4 @@
-"""How a Gymnasium space lies in the flat lists of a GymAPI message: one leaf for each number array, pose and image.
-
-Both ends find the same leaves from the space alone, so numbers need no other description than their names:
+"""How a Gymnasium space lies in the flat lists of a GymAPI message; both ends find the same leaves from the space.
 
 ============  =================================================  ============================================
 kind          spaces                                             names
@@ -53,8 +51,8 @@ class Leaf:
     """Keys and places that lead to it."""
     space: Space[Any]
     """Of this part."""
-    labels: tuple[str, ...] = ()
-    """Names of its numbers."""
+    labels: tuple[str, ...]
+    """Names of its numbers; else its own name."""
 
     def of(self, value: Any) -> Any:
         """This part of a checked value."""
@@ -66,10 +64,9 @@ class Leaf:
 def leaves_of(space: Space[Any], name: str, *, gripper: bool = False) -> tuple[Leaf, ...]:
     """The leaves of `space`, which is called `name`; with `gripper`, a pose may have a gripper width."""
     leaves = tuple(_walk(space, (), name, gripper))
-    names = [leaf.name for leaf in leaves]
-    taken = [label for leaf in leaves for label in (leaf.labels or (leaf.name,))]
-    unique = len({*names}) == len(names) and len({*taken}) == len(taken)
-    return leaves if unique else (Leaf(EXACT, name, (), space),)
+    names, labels = [leaf.name for leaf in leaves], [label for leaf in leaves for label in leaf.labels]
+    unique = len({*names}) == len(names) and len({*labels}) == len(labels)
+    return leaves if unique else (Leaf(EXACT, name, (), space, (name,)),)
 
 
 def joined(space: Space[Any], values: Mapping[Path, Any], path: Path = ()) -> Any:
@@ -84,19 +81,22 @@ def _walk(space: Space[Any], path: Path, name: str, gripper: bool) -> list[Leaf]
     parts, is_pose = _parts(space), _is_pose(space, gripper)
     if parts and not is_pose:
         return [leaf for key, part in parts.items() for leaf in _walk(part, (*path, key), name, gripper)]
-    name, shape, dtype = "/".join(map(str, path)) or name, space.shape or (), space.dtype
-    if is_pose:
-        return [Leaf(POSE, name, path, space)]
-    flat = not isinstance(space, spaces.Box) or dtype != np.uint8 or len(shape) not in (2, 3)
-    if not flat and min(shape[:2]) >= _SMALLEST_IMAGE and shape[2:] in _CHANNELS:
-        return [Leaf(IMAGE, name, path, space)]
+    name, shape, kind, labels = "/".join(map(str, path)) or name, space.shape or (), EXACT, None
     arrays = isinstance(space, (spaces.Box, spaces.MultiDiscrete, spaces.MultiBinary))
-    fits = arrays and 0 < np.prod(shape) <= _MOST_NUMBERS and np.dtype(dtype).itemsize <= 8
-    if not fits and not isinstance(space, spaces.Discrete):
-        return [Leaf(EXACT, name, path, space)]
-    indices = np.ndindex(*shape)
-    labels = tuple(f"{name}[{', '.join(map(str, index))}]" if index else name for index in indices)
-    return [Leaf(NUMBERS, name, path, space, labels)]
+    fits = arrays and 0 < np.prod(shape) <= _MOST_NUMBERS and np.dtype(space.dtype).itemsize <= 8
+    if is_pose:
+        kind = POSE
+    elif _is_image(space, shape):
+        kind = IMAGE
+    elif fits or isinstance(space, spaces.Discrete):
+        indices, kind = np.ndindex(*shape), NUMBERS
+        labels = tuple(f"{name}[{', '.join(map(str, index))}]" if index else name for index in indices)
+    return [Leaf(kind, name, path, space, labels or (name,))]
+
+
+def _is_image(space: Space[Any], shape: tuple[int, ...]) -> bool:
+    bytes_ = isinstance(space, spaces.Box) and space.dtype == np.uint8
+    return bytes_ and len(shape) in (2, 3) and min(shape[:2]) >= _SMALLEST_IMAGE and shape[2:] in _CHANNELS
 
 
 def _parts(space: Space[Any]) -> Mapping[Any, Space[Any]]:
@@ -142,23 +142,22 @@ class Lists:
         written = _numbers(part) if leaf.kind == NUMBERS else _pose(part)
         if written is None:
             return False
-        fields.setdefault(self.names, []).extend(leaf.labels or (leaf.name,))
+        fields.setdefault(self.names, []).extend(leaf.labels)
         fields.setdefault(self.values, []).extend(written)
         return True
 
     def read(self, message: Mapping[str, Any]) -> list[tuple[Leaf, list[Any]]]:
         """Each leaf with its numbers, or with its one pose. Raises ProtocolError for one missing or one too many."""
         ordered = iter(self.in_order(message[self.values], message[self.names]))
-        return [(leaf, list(islice(ordered, len(leaf.labels) or 1))) for leaf in self.leaves]
+        return [(leaf, list(islice(ordered, len(leaf.labels)))) for leaf in self.leaves]
 
     def in_order(self, values: Sequence[Any], names: Sequence[str], field: str = "") -> Sequence[Any]:
-        """`values` in the order of the leaves: by their `names` if there are any, else as they come.
+        """`values`, which errors call `field`, by their `names` in the order of the leaves.
 
-        Names none of which is expected are ignored: then only the number of values counts.
-        Errors call the values `field`, by default the field of the values.
+        If none of the names is expected, only the number of values counts.
         """
         field = field or self.values
-        expected = tuple(label for leaf in self.leaves for label in (leaf.labels or (leaf.name,)))
+        expected = tuple(label for leaf in self.leaves for label in leaf.labels)
         known = set(expected) & set(names)
         if not known:
             if len(values) != len(expected):

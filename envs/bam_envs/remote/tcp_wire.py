@@ -291,7 +291,7 @@ class FrameSocket:
                 sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
         self._socket = sock
 
-    def send(self, frame: bytes, deadline: float) -> None:
+    def send(self, frame: bytes, deadline: float = math.inf) -> None:
         """Send a frame before `deadline` [s, monotonic]. Raises LinkLost if the other end is gone, or takes nothing."""
         try:
             self._set_timeout(deadline)

@@ -30,30 +30,31 @@ class LocalTransport:
 
     def connect(self) -> EnvSpecMessage:
         """Return the description of the environment."""
-        self._require_open()
+        self._enter("connect")
         return self.server.spec()
 
     def reset(self, seed: Seed = None, options: Info | None = None) -> tuple[Any, Any]:
         """Begin an episode; (observation, info)."""
-        self._require_open()
+        self._enter("reset", seed, options)
         with _as_over_a_network():
             return self.server.reset(self.client, seed, options)
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
         """(observation, reward, terminated, truncated, info)."""
-        self._require_open()
+        self._enter("step", action)
         with _as_over_a_network():
             return self.server.step(self.client, action)
 
     def close(self) -> None:
         """Release the environment; one that no server shares is closed."""
+        self._enter("close")
         self._closed = True
         self.server.leave(self.client)
         if self._owned:
             self.server.close()
 
-    def _require_open(self) -> None:
-        if self._closed:
+    def _enter(self, call: str, *arguments: Any) -> None:
+        if self._closed and call != "close":
             raise LinkLost("This transport is closed; make a new one.")
 
 
@@ -69,13 +70,7 @@ def _as_over_a_network() -> Iterator[None]:
 
 
 class FakeEnv(gym.Env[Any, Any]):
-    """Its observations are samples of their space; the reward is the number of the step.
-
-    Args:
-        observation_space: Three numbers by default.
-        action_space: Two numbers from -1 to 1 by default.
-        episode_steps: Steps after which an episode is terminated.
-    """
+    """Its observations are samples of their space; the reward is the number of the step, at most `episode_steps`."""
 
     def __init__(
         self,
@@ -125,27 +120,8 @@ class FakeTransport(LocalTransport):
         self.faults: deque[BaseException] = deque()
         """Raised by the next calls of `reset` and `step`, one each, which do nothing then."""
 
-    def connect(self) -> EnvSpecMessage:
-        """Return the description of the environment."""
-        self.calls.append(("connect",))
-        return super().connect()
-
-    def reset(self, seed: Seed = None, options: Info | None = None) -> tuple[Any, Any]:
-        """Begin an episode; (observation, info)."""
-        self._record("reset", seed, options)
-        return super().reset(seed, options)
-
-    def step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
-        """(observation, reward, terminated, truncated, info)."""
-        self._record("step", action)
-        return super().step(action)
-
-    def close(self) -> None:
-        """Release the environment."""
-        self.calls.append(("close",))
-        super().close()
-
-    def _record(self, *call: Any) -> None:
-        self.calls.append(call)
-        if self.faults:
+    def _enter(self, call: str, *arguments: Any) -> None:
+        self.calls.append((call, *arguments))
+        if self.faults and call in ("reset", "step"):
             raise self.faults.popleft()
+        super()._enter(call, *arguments)
