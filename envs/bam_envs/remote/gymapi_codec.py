@@ -66,22 +66,29 @@ class ActionCodec:
 
     def __init__(self, space: Space[Any], action_type: int = DEFAULT) -> None:
         self.space, self.action_type = space, action_type
-        self._leaves = leaves_of(space, "action", gripper=True)
-        numbers = [leaf for leaf in self._leaves if leaf.kind == NUMBERS]
-        boxes = tuple(leaf for leaf in numbers if isinstance(leaf.space, spaces.Box))
-        others = tuple(leaf for leaf in numbers if not isinstance(leaf.space, spaces.Box))
-        self._continuous = Lists("continuous_names", "continuous_action", boxes)
-        self._discrete = Lists("discrete_names", "discrete_action", others)
-        poses = tuple(leaf for leaf in self._leaves if leaf.kind == POSE)
-        self._poses = Lists("pose_names", "pose_action", poses)
+        leaves = leaves_of(space, "action", gripper=True)
+        boxes = tuple(leaf for leaf in leaves if leaf.kind == NUMBERS and isinstance(leaf.space, spaces.Box))
+        others = tuple(leaf for leaf in leaves if leaf.kind == NUMBERS and not isinstance(leaf.space, spaces.Box))
+        self._numbers = [
+            Lists("continuous_names", "continuous_action", boxes),
+            Lists("discrete_names", "discrete_action", others),
+        ]
+        self._poses = Lists("pose_names", "pose_action", tuple(leaf for leaf in leaves if leaf.kind == POSE))
+        self._fits = all(leaf.kind in (NUMBERS, POSE) for leaf in leaves)
 
     def encode(self, action: Any) -> dict[str, Any]:
         """The message of `action`, without fields at their defaults; raises InvalidValue if it does not fit."""
         value = exact(self.space, action, "action")
         fields: dict[str, Any] = {}
-        if not all(self._write(leaf, leaf.of(value), fields) for leaf in self._leaves):
-            tree = tree_to_json(pack(self.space, value, "action"))
-            fields = {"prefix": PREFIX + dump_json({"action": tree}, "An action")}
+        for lists in (*self._numbers, self._poses):
+            written = self._fits and all(lists.write(leaf, leaf.of(value), fields) for leaf in lists.leaves)
+            if not written:
+                tree = tree_to_json(pack(self.space, value, "action"))
+                text = PREFIX + dump_json({"action": tree}, "An action")
+                return {"action_type": self.action_type, "prefix": text}
+        if poses := [leaf.of(value) for leaf in self._poses.leaves]:
+            widths = [float(one.get(GRIPPER_WIDTH, np.zeros(())).item()) for one in poses]
+            fields["pose_param"] = [{**WAYPOINT, GRIPPER_WIDTH: width} for width in widths]
         return {"action_type": self.action_type, **fields}
 
     def decode(self, message: Mapping[str, Any]) -> Any:
@@ -97,23 +104,11 @@ class ActionCodec:
             return exact(self.space, tree, "action")
         poses = self._poses.read(message)
         widths = [one[GRIPPER_WIDTH] for one in message["pose_param"]] or [0.0] * len(poses)
-        values: Values = {}
         ordered = self._poses.in_order(widths, message["pose_names"], "pose_param")
-        for (leaf, [pose]), width in zip(poses, ordered, strict=True):
-            values[leaf.path] = read_pose(leaf, pose, width)
-        for lists in (self._continuous, self._discrete):
+        values = {leaf.path: read_pose(leaf, pose, width) for (leaf, [pose]), width in zip(poses, ordered, strict=True)}
+        for lists in self._numbers:
             values |= {leaf.path: read_numbers(leaf, numbers) for leaf, numbers in lists.read(message)}
         return joined(self.space, values)
-
-    def _write(self, leaf: Leaf, part: Any, fields: dict[str, Any]) -> bool:
-        if leaf.kind == NUMBERS:
-            lists = self._continuous if isinstance(leaf.space, spaces.Box) else self._discrete
-            return lists.write(leaf, part, fields)
-        if leaf.kind != POSE or not self._poses.write(leaf, part, fields):
-            return False
-        width = float(part[GRIPPER_WIDTH].item()) if GRIPPER_WIDTH in part else 0.0
-        fields.setdefault("pose_param", []).append({**WAYPOINT, GRIPPER_WIDTH: width})
-        return True
 
 
 class ObservationCodec:
@@ -154,11 +149,7 @@ class ObservationCodec:
         return fields, trees
 
     def decode(self, feedback: Mapping[str, Any], trees: Mapping[str, Any]) -> Any:
-        """The observation in a complete, checked message and its exact trees.
-
-        Raises:
-            ProtocolError: Something is missing or does not fit the space.
-        """
+        """The observation in a checked message and its exact trees; raises ProtocolError if it does not fit."""
         try:
             values: Values = {
                 leaf.path: exact(leaf.space, tree_from_json(trees[leaf.name]), leaf.name)
@@ -166,11 +157,10 @@ class ObservationCodec:
                 if leaf.name in trees
             }
             self._read_images(feedback, values)
-            numbers, poses = self._missing(NUMBERS, values), self._missing(POSE, values)
-            if numbers:
+            if numbers := self._missing(NUMBERS, values):
                 parts = _lists(NUMBERS, numbers).read(feedback)
                 values |= {leaf.path: read_numbers(leaf, some) for leaf, some in parts}
-            if poses:
+            if poses := self._missing(POSE, values):
                 values |= {leaf.path: read_pose(leaf, *pose) for leaf, pose in _lists(POSE, poses).read(feedback)}
             if unread := self._missing(EXACT, values):
                 names = ", ".join(leaf.name for leaf in unread)
@@ -224,22 +214,10 @@ def _shaped(leaf: Leaf, image: np.ndarray[Any, Any], field: str) -> np.ndarray[A
 
 
 class EnvCodec:
-    """Actions and results of one environment, or of a batch of them, as messages: one for each environment.
-
-    Args:
-        spec: What is served.
-        foreign: Whether its server is not of bam-train.
-        action_type: See `ActionCodec`.
-        image_format: See `ObservationCodec`.
-    """
+    """Actions and results as messages, one for each environment of `spec`; `foreign`: of a server that is not ours."""
 
     def __init__(
-        self,
-        spec: EnvSpecMessage,
-        *,
-        foreign: bool = False,
-        action_type: int = DEFAULT,
-        image_format: str = "png",
+        self, spec: EnvSpecMessage, *, foreign: bool = False, action_type: int = DEFAULT, image_format: str = "png"
     ) -> None:
         self.spec, self.foreign = spec, foreign
         self._actions = ActionCodec(spec.action_space, action_type)
@@ -260,14 +238,7 @@ class EnvCodec:
     def write_result(
         self, result: tuple[Any, ...], stamp: Mapping[str, int], version: Version = JUNE_22, *, executed: bool = True
     ) -> list[dict[str, Any]]:
-        """The feedback of a reset or step: (observation, info), or with reward, terminated and truncated between.
-
-        Args:
-            result: As Gymnasium gives it.
-            stamp: When.
-            version: The messages' version.
-            executed: Whether the action was done.
-        """
+        """The feedback of a reset or step, sent at `stamp`; `executed`: whether the action was done."""
         feedback = []
         for observation, *ends, info in self.spec.split(result):
             if self.spec.vector and "final_obs" in info:
@@ -292,10 +263,10 @@ class EnvCodec:
             raise ProtocolError(f"info.bam.observation must be an object, not {brief(trees)}.")
         observation = self._observations.decode(feedback, trees)
         if self.foreign:
-            info = {**info, "executed": feedback["executed"]}
+            info["executed"] = feedback["executed"]
         elif self.spec.vector and "final_obs" in info:
             try:
-                info = {**info, "final_obs": exact(self.spec.observation_space, info["final_obs"], "final_obs")}
+                info["final_obs"] = exact(self.spec.observation_space, info["final_obs"], "final_obs")
             except InvalidValue as error:
                 raise ProtocolError(str(error)) from error
         return observation, float(feedback["reward"]), feedback["terminated"], feedback["truncated"], info

@@ -206,7 +206,7 @@ def write_feedback(
         fields: What holds the observation.
         trees: The parts of it that the fields cannot hold, as JSON.
         ends: Reward, terminated, truncated.
-        info: Gymnasium's, as a tree.
+        info: A tree.
         version: Of the messages.
         executed: Whether the action was done.
     """
