@@ -57,12 +57,7 @@ WAYPOINT = {
 
 
 class ActionCodec:
-    """Actions of one space as GymAction messages and back.
-
-    Args:
-        space: Of a single environment.
-        action_type: What a rack does with it: 1 default, 2 pick and lift, 3 pick and place, 4 open, 5 fold.
-    """
+    """Actions of one space as GymAction messages and back; `action_type` is as of `RosbridgeTransport`."""
 
     def __init__(self, space: Space[Any], action_type: int = DEFAULT) -> None:
         self.space, self.action_type = space, action_type
@@ -92,12 +87,7 @@ class ActionCodec:
         return {"action_type": self.action_type, **fields}
 
     def decode(self, message: Mapping[str, Any]) -> Any:
-        """The action in a complete, checked message.
-
-        Raises:
-            ProtocolError: Something is missing, too much, or does not fit.
-            InvalidValue: It is not one of the space.
-        """
+        """The action in a checked message; raises ProtocolError or InvalidValue if it does not fit."""
         prefix = message["prefix"]
         if prefix.startswith(PREFIX):
             tree = tree_from_json(load_json(prefix.removeprefix(PREFIX), "prefix").get("action"))
@@ -112,12 +102,7 @@ class ActionCodec:
 
 
 class ObservationCodec:
-    """Observations of one space as fields of GymFeedback and back.
-
-    Args:
-        space: Of a single environment.
-        image_format: ``"png"``, which keeps every bit, or ``"jpeg"``.
-    """
+    """Observations of one space as fields of GymFeedback and back; `image_format` is ``png`` or ``jpeg``."""
 
     def __init__(self, space: Space[Any], image_format: str = "png") -> None:
         self.space, self.image_format = space, image_format

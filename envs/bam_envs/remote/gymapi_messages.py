@@ -158,12 +158,7 @@ def refuse_foreign(seed: Seed, options: Info | None) -> None:
 
 
 def read_request(message: object) -> GymRequest:
-    """The request in `message`, of any client.
-
-    Raises:
-        InvalidValue: A field is of the wrong kind.
-        ProtocolError: The text in ``prefix`` cannot be read.
-    """
+    """The request in `message`, of any client. Raises InvalidValue or ProtocolError for what cannot be read."""
     whole = complete(request_type(KIND), message, lenient=True)
     header = whole["header"]
     if header["request_type"] not in list(RequestType):
@@ -200,7 +195,7 @@ def write_feedback(
     *,
     executed: bool = True,
 ) -> dict[str, Any]:
-    """The message of one environment.
+    """The message of one environment; see `write_response`.
 
     Args:
         fields: What holds the observation.
@@ -267,10 +262,9 @@ def read_response(message: object) -> GymResponse:
 
 
 def _without_nulls(feedback: Any) -> Any:
-    """A feedback as it came, with zeros for numbers and poses that are null.
+    """A feedback as it came, with zeros for numbers and poses that are null: every rosbridge writes NaN as null.
 
-    Every rosbridge writes NaN as null: the joint without a sensor, the cup that was not found, the camera without a
-    calibration. Whether that is a fault depends on what the space needs.
+    Whether it is a fault that a sensor or a cup was not there depends on what the space needs.
     """
     if not isinstance(feedback, Mapping):
         return feedback

@@ -28,13 +28,10 @@ _CLASSES = {
 
 
 class RemoteEnv(Described, gym.Env[Any, Any]):
-    """One environment behind a transport, with the spaces, period and labels of the other end.
+    """One environment behind a transport, which is connected when something of the other end is first needed.
 
-    It connects when something of the other end is first needed. `LinkLost` and the other faults of the transport go
-    through: a lost link is no end of an episode. The next `reset` connects again. It is closed when Python ends.
-
-    Args:
-        transport: Not connected yet, or connected.
+    A lost link is no end of an episode: `LinkLost` and the other faults of the transport go through, and the next
+    `reset` connects again. It is closed when Python ends.
     """
 
     def __init__(self, transport: Transport) -> None:
@@ -95,10 +92,7 @@ class RemoteEnv(Described, gym.Env[Any, Any]):
         return observation, reward, terminated, truncated, info
 
     def _warn_if_truncated(self) -> None:
-        """Warn once when the limit of the id here, which `gymnasium.make` puts around this, ended an episode early.
-
-        It is seen only then: whether there is that wrapper, and with which limit, is not known in here.
-        """
+        """Warn once, after the limit of the id here, which `gymnasium.make` puts around this, ended an episode."""
         entry = gym.registry.get(self.spec.id) if self.spec is not None else None
         if entry is None or self._warned or not self._running or self._steps != entry.max_episode_steps:
             return
@@ -123,11 +117,8 @@ def make_remote_env(env_id: str, transport: Where, **options: Any) -> RemoteEnv:
 
     Args:
         env_id: Which one; a server that has another one refuses. "" for whatever is there.
-        transport: A URL such as ``tcp://10.0.0.5:5555`` (see `open_transport`), or a transport.
-        options: What `open_transport` takes, such as ``timeout`` and ``token_file``.
-
-    Raises:
-        InvalidValue: A URL that is none, or an option that its transport does not have.
+        transport: A transport, or the URL of `open_transport`, which takes the `options` and raises InvalidValue.
+        options: Such as ``timeout`` and ``token_file``.
     """
     opened = open_transport(transport, env_id=env_id, **options) if isinstance(transport, str) else transport
     return RemoteEnv(opened)
@@ -136,12 +127,12 @@ def make_remote_env(env_id: str, transport: Where, **options: Any) -> RemoteEnv:
 def make_remote_vector_env(
     env_id: str, transport: Where | Sequence[Where], num_envs: int | None = None, **options: Any
 ) -> RemoteVectorEnv:
-    """The environments `env_id` that run at `transport`, stepped together; connects on first use.
+    """The environments `env_id` that run at `transport`, stepped together; as `make_remote_env`.
 
     Args:
-        env_id: As for `make_remote_env`, as are the errors.
-        transport: One, or several, which are stepped at the same time.
-        num_envs: Environments in all, if they must be so many; one transport may have many.
+        env_id: Which ones.
+        transport: One, or several, which are stepped at the same time; each may have many environments.
+        num_envs: Environments in all, if they must be so many.
         options: As for `make_remote_env`.
     """
     several = [transport] if isinstance(transport, (str, Transport)) else transport
@@ -170,7 +161,7 @@ def open_transport(
     =======================  ====================================================
 
     Args:
-        url: Where the environment runs; `space` is a ROS namespace and may be left out.
+        url: `space` is a ROS namespace and may be left out.
         env_id: Which environment is wanted; "" for the one that is there.
         ca_file: Certificates that the server's is checked against, with wss://.
         token_file: A file that holds the server's secret.

@@ -26,13 +26,7 @@ Seeds = list[int | None]
 
 
 class Rack:
-    """The environments of one transport, reset in the step that ends an episode whatever is at the other end.
-
-    Args:
-        transport: What carries them.
-        spec: What it connected to.
-        first: The number of its first environment.
-    """
+    """The environments of one transport, from number `first` on; reset in the step that ends an episode in any case."""
 
     def __init__(self, transport: Transport, spec: EnvSpecMessage, first: int) -> None:
         self.transport, self.spec = transport, spec
@@ -42,11 +36,11 @@ class Rack:
     def reset(
         self, seeds: Seeds, mask: NDArray[np.bool_], options: Info | None, before: list[Any]
     ) -> list[tuple[Any, ...]]:
-        """Begin episodes in the environments of the mask; (observation, info) of every one of this rack.
+        """Begin episodes in the environments of `mask` (n,); (observation, info) of every one of this rack.
 
         Args:
-            seeds: One for each environment of this rack.
-            mask: Which of them begin an episode. Shape: (n,).
+            seeds: One for each environment.
+            mask: Which of them begin an episode.
             options: For the other end.
             before: The last observation of each.
         """
@@ -108,16 +102,15 @@ class Described:
 
 
 class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
-    """The environments of one or several transports, stepped at the same time.
+    """The environments of one or several transports with the same spaces, stepped at the same time.
 
-    All environments of one transport are one request. One whose episode ends is reset in the same step
-    (`AutoresetMode.SAME_STEP`), as in `RobotVectorEnv`. The arms of a rack that is not ours have one reset: when an
-    episode of one ends, those of its others are truncated. It connects when something of the other end is first
-    needed. Faults go through, once every transport has answered; a `reset` is needed then. It is closed when Python
-    ends.
+    One whose episode ends is reset in the same step (`AutoresetMode.SAME_STEP`). The arms of a rack that is not ours
+    have one reset: when an episode of one ends, those of its others are truncated. It connects when something of the
+    other end is first needed. Faults go through, once every transport has answered; a `reset` is needed then. It is
+    closed when Python ends.
 
     Args:
-        transports: One, or several with the same spaces.
+        transports: Each is one request a step.
         num_envs: Environments in all, if they must be so many.
     """
 
@@ -194,8 +187,7 @@ class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
         """Begin an episode in every environment, or in those of ``options["reset_mask"]`` (n,) bool.
 
         Args:
-            seed: Environment i is seeded with ``seed + i``, or with ``seed[i]``; a rack that is not ours gets
-                that of its first arm.
+            seed: Environment i is seeded with ``seed + i`` or ``seed[i]``; a rack that is not ours with its first one.
             options: ``reset_mask``, and what the other ends take.
         """
         if seed is None or isinstance(seed, (int, np.integer)):

@@ -31,9 +31,7 @@ _INSTALL = "pip install 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-std-msgs ros-jazzy
 
 
 class RclpyBus(Bus):
-    """Topics and services of one ROS 2 node.
-
-    ROS reports neither who sent a message nor who leaves: callers are unknown, and `on_leave` never calls.
+    """Topics and services of one ROS 2 node; ROS reports neither who sends nor who leaves.
 
     Args:
         name: Of the node.
@@ -107,12 +105,7 @@ class RclpyBus(Bus):
                 self._publishers[topic] = (make, self._require_node().create_publisher(make, topic, quality))
 
     def publish_all(self, messages: Sequence[tuple[str, Message]]) -> None:
-        """Send several messages now, each on its topic, in this order: all of them or none.
-
-        Raises:
-            LinkLost: The node is gone, or does not publish such a topic.
-            InvalidValue: A message does not fit its type, or a number in it is not finite.
-        """
+        """Send several messages now, in this order: all or none. Raises LinkLost or InvalidValue, as every `Bus`."""
         made = []
         for topic, message in messages:
             if topic not in self._publishers:
@@ -146,8 +139,8 @@ class RclpyBus(Bus):
     def serve(self, service: str, kind: str, handler: Handler) -> None:
         """Answer `service`, also when the handler fails: ROS has no failed responses, and a client waits for ever.
 
-        Where the handler failed, the response is as ROS makes it, with the error's text where the type has room for it.
-        A service whose type is in no package here is not offered; see `refused`.
+        Then the response is as ROS makes it, with the error's text where there is room. A service whose type is in no
+        package here is not offered; see `refused`.
         """
         from rclpy.callback_groups import ReentrantCallbackGroup
 
@@ -170,7 +163,7 @@ class RclpyBus(Bus):
         self._caller.create_service(types, service, answer, callback_group=ReentrantCallbackGroup())
 
     def call(self, service: str, kind: str, request: Message, timeout: float) -> dict[str, Any]:
-        """The response of `service` to `request`.
+        """The response of `service`.
 
         Raises:
             InvalidValue: `request` does not fit `kind`, or that is in no package here.
@@ -292,8 +285,7 @@ def _element(kind: str) -> str | None:
 def to_message(make: Any, fields: Mapping[str, Any], where: str) -> Any:
     """A message of the class `make`; fields that `fields` has not are as ROS makes them.
 
-    Raises:
-        InvalidValue: `make` has not such a field, or a value does not fit or is not finite.
+    Raises InvalidValue if `make` has no such field, or a value does not fit or is not finite.
     """
     message = make()
     types = make.get_fields_and_field_types()

@@ -47,14 +47,7 @@ class RclpyTransport(RosbridgeTransport):
 
 
 class RclpyLink(RclpyBus):
-    """The node of a client, with the methods of a `RosbridgeLink`, for one environment.
-
-    Args:
-        url: ``ros2://namespace``.
-        channel: Where `connect` looks for the environment: ``"topics"`` or ``"service"``.
-        timeout: How long it looks [s].
-        domain: ROS domain; None for that of the environment variable ROS_DOMAIN_ID.
-    """
+    """The node of a client, with the methods of a `RosbridgeLink`; `connect` looks for the environment of `channel`."""
 
     def __init__(self, url: str, channel: str, *, timeout: float = 3.0, domain: int | None = None) -> None:
         scheme, separator, rest = url.partition("://")

@@ -44,9 +44,6 @@ _CLOSE_TIMEOUT = 1.0  # [s]; a server that is gone must not hold up `close`
 class RosbridgeTransport:
     """Carries an environment through rosbridge. One request at a time; `close` may be called from any thread.
 
-    A server of bam-train describes its environment. Another rack does not: then the spaces must be given, and it is
-    sent only what racks understand.
-
     Args:
         url: ``ws://host:port/namespace`` or ``wss://…``; the namespace may be left out.
         env_id: The environment that is wanted, as the server calls it; "" for the one that is there.
@@ -58,14 +55,15 @@ class RosbridgeTransport:
         ca_file: PEM file of the authorities to trust instead of the system's.
         token: The server's shared secret, if it has one.
         take: Take command from the client that has it.
-        observation_space: Of a single environment, of a rack whose server is not of bam-train.
+        observation_space: Of a single environment. This and what follows is for racks that do not describe their
+            environment, as servers of bam-train do; they are sent only what racks understand.
         action_space: Likewise.
-        num_envs: Of another rack: environments (arms), which begin their episodes together.
-        period: Of another rack: time between two actions [s]; None if nobody knows.
-        action_type: Of another rack's actions: 1 default, 2 pick and lift, 3 pick and place, 4 open, 5 fold.
-        gymapi_version: Version of another rack's messages; None to find out by its first answer.
-        autoreset: Whether another rack begins the next episode in the step that ends one; None: as racks of its version
-            do, from June on.
+        num_envs: Environments (arms), which begin their episodes together.
+        period: Time between two actions [s]; None if nobody knows.
+        action_type: Of the actions: 1 default, 2 pick and lift, 3 pick and place, 4 open, 5 fold.
+        gymapi_version: Version of the messages; None to find out by the first answer.
+        autoreset: Whether the rack begins the next episode in the step that ends one; None: as racks of its version do,
+            from June on.
 
     Raises:
         InvalidValue: The URL or an option is not possible.
@@ -104,11 +102,7 @@ class RosbridgeTransport:
         self._begin_process()
 
     def connect(self) -> EnvSpecMessage:
-        """Open the link and ask what is there; moves nothing.
-
-        Raises:
-            NoServer: Nobody there, no such environment, or another rack whose spaces were not given.
-        """
+        """Open the link and ask what is there. Raises NoServer, also for another rack whose spaces were not given."""
         with self._lock:
             return self._connect().spec
 

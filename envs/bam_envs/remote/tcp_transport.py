@@ -80,11 +80,7 @@ class TcpTransport:
         self._closed = False
 
     def connect(self) -> EnvSpecMessage:
-        """Open the link and ask what is there.
-
-        Raises:
-            NoServer: Nobody there, something else, or it refuses this client.
-        """
+        """Open the link and ask what is there. Raises NoServer if nobody, something else, or it refuses this client."""
         with self._lock:
             return self._connected()
 

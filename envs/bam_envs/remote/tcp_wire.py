@@ -132,12 +132,7 @@ def refusal(sequence: int, error: BamEnvsError) -> Tree:
 
 
 def content_of(answer: Tree, sequence: int) -> Tree:
-    """The content of `answer`, which must be that to request number `sequence`.
-
-    Raises:
-        RemoteError: The answer is a `refusal`; `NotInCommand` if another client is in command.
-        ProtocolError: It is no answer, or one to another request.
-    """
+    """The content of `answer`, which must be that to request number `sequence`; raises the error of a `refusal`."""
     try:
         number, kind, content = msgspec.convert(answer, _Answer)
     except msgspec.ValidationError:
@@ -207,11 +202,7 @@ class ForeignPeer(ProtocolError):  # noqa: N818 - reads as what was found
 
 
 def encode(message: Tree) -> bytes:
-    """The frame of a message.
-
-    Raises:
-        ProtocolError: The frame would be larger than `MAX_FRAME`, or something in it cannot be sent.
-    """
+    """The frame of a message. Raises ProtocolError if it cannot be sent, or is larger than `MAX_FRAME`."""
     arrays: list[bytes | memoryview] = []
     size = 0
 
@@ -277,11 +268,7 @@ _EXPECTED = {Greeting: "a hello", Request: "a request"}
 
 
 class FrameSocket:
-    """Sends and receives frames over a connected socket, each within a deadline. One thread for each direction.
-
-    Args:
-        sock: It is closed with this.
-    """
+    """Sends and receives frames over a connected socket, which it closes. One thread for each direction."""
 
     def __init__(self, sock: socket.socket) -> None:
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

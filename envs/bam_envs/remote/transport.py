@@ -113,11 +113,7 @@ class Transport(Protocol):
     """
 
     def connect(self) -> EnvSpecMessage:
-        """Open the link and ask what is there. Moves nothing; idempotent.
-
-        Raises:
-            NoServer: Nobody there, or nobody who knows this environment.
-        """
+        """Open the link and ask what is there; NoServer if nobody knows this environment. Moves nothing; idempotent."""
 
     def reset(self, seed: Seed = None, options: Info | None = None) -> tuple[Any, Any]:
         """Begin an episode; (observation, info).

@@ -39,12 +39,7 @@ _DTYPE = re.compile("[<>|=]?[biuf][0-9]{1,2}")
 
 
 def pack(space: Space[Any], value: Any, name: str = "value") -> Tree:
-    """Check `value`, which may be a tree already, and return its tree.
-
-    Raises:
-        InvalidValue: It does not fit; the text names the place, such as ``action['arm'][2]``.
-        UnknownName: No value of such a space can be sent.
-    """
+    """The tree of `value`, which may be one already. InvalidValue names what is wrong, as in ``action['arm'][2]``."""
     if isinstance(space, spaces.Box):
         return _finite(space, _array(space, value, name), name)
     if isinstance(space, spaces.Discrete):
@@ -183,9 +178,9 @@ def _unstacked(feature: Space[Any], value: Any, name: str) -> list[Any]:
 
 
 def plain_info(value: Any) -> Tree:
-    """An info as a tree: tuples and sets become lists, keys and other objects their text.
+    """An info as a tree: tuples and sets become lists, keys and other objects their text, and NumPy's numbers stay.
 
-    Numbers keep their values, and those of NumPy their dtypes. NaN is let through: nothing learns from an info.
+    NaN is let through: nothing learns from an info.
     """
     if isinstance(value, str):  # first: NumPy's texts would be taken for numbers
         return value.encode(errors="replace").decode()  # halves of surrogate pairs cannot be sent

@@ -17,12 +17,8 @@ LEASE_SECONDS = 2.0
 class CommandLease:
     """Command of one robot or environment. The first to ask has it, until it leaves or another one may take it.
 
-    A client without a sign of life for longer than `seconds` keeps command until another one asks. A sign of life is a
-    request, an explicit `renew`, or what the connection shows by itself. Safe to call from any thread.
-
-    Args:
-        seconds: Time without a sign of life after which another client may take command [s].
-        clock: A monotonic clock [s].
+    A client without a sign of life for longer than `seconds` [s] keeps command until another one asks. A sign of life
+    is a request, `renew`, or what the connection shows by itself. Safe to call from any thread.
     """
 
     def __init__(self, seconds: float = LEASE_SECONDS, clock: Callable[[], float] = time.monotonic) -> None:

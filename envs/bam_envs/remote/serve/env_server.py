@@ -71,8 +71,7 @@ def describe_env(env: Env, env_id: str | None = None) -> EnvSpecMessage:
 def same_name(one: str, other: str) -> bool:
     """Whether two names are of one environment: namespace, version, case and punctuation do not count.
 
-    ``PickPlace``, ``pick-place``, ``bam/pick-place`` and ``bam/pick-place-v0`` are one; so are robo-gym's names and
-    ours of one environment.
+    ``PickPlace`` and ``bam/pick-place-v0`` are one; so are robo-gym's names and ours of one environment.
     """
     one, other = (_other_names().get(name, name) for name in (_plain_name(one), _plain_name(other)))
     return one == other
@@ -91,12 +90,9 @@ def _other_names() -> dict[str, str]:
 class EnvServer:
     """Serves an environment to clients, one of them in command. Safe to call from any thread; calls wait their turn.
 
-    Values are as `Transport` says: those of a vector environment are lists with one entry for each environment.
-
     Args:
         env: Any Gymnasium environment, or a vector environment that resets in the same step.
-        lease: Time without a sign of life after which another client may take command [s], or the lease itself, to
-            share it.
+        lease: Time without a sign of life after which another client may take command [s], or a lease that is shared.
         realtime: A step returns no sooner than one period after the one before.
         env_id: What to call it; its Gymnasium id by default.
         clock: A monotonic clock [s].
@@ -136,11 +132,7 @@ class EnvServer:
         return self._spec
 
     def require_name(self, name: str) -> None:
-        """Accept "" or the id of what is served, with or without namespace and version, in any spelling (PickPlace).
-
-        Raises:
-            RemoteError: It is another environment's.
-        """
+        """Raise RemoteError unless `name` is "" or a name of what is served; see `same_name`."""
         if name and not same_name(name, self._spec.env_id):
             raise RemoteError(f"There is no environment {name!r} here; {self._spec.env_id} is served.")
 
@@ -155,12 +147,12 @@ class EnvServer:
         caller: Caller = UNKNOWN_CALLER,
         shown: str | None = None,
     ) -> tuple[Any, Any]:
-        """Put `client` in command and begin an episode; (observation, info).
+        """Put `client` in command and begin an episode; as `Transport.reset`.
 
         Args:
             client: Its name.
-            seed: As for `gymnasium.Env.reset`; one or a list for a vector environment.
-            options: As for `gymnasium.Env.reset`.
+            seed: See above.
+            options: See above.
             take: Take command from the client that has it, which only an operator may.
             deadline: When it is too late to begin [s], on the clock of this server.
             caller: The connection on which it asks.
@@ -192,12 +184,7 @@ class EnvServer:
         return begun
 
     def step(self, client: str, action: Any, *, deadline: float | None = None) -> tuple[Any, Any, Any, Any, Any]:
-        """Do `action`; (observation, reward, terminated, truncated, info).
-
-        Args:
-            client: Its name.
-            action: One of the action space, or a list with one for each environment.
-            deadline: When it is too late to begin [s], on the clock of this server.
+        """Do `action` before `deadline` [s], on the clock of this server; as `Transport.step`.
 
         Raises:
             NotInCommand: Another client is in command.

@@ -44,22 +44,17 @@ class GymApiService:
     """Answers GymAPI requests for an `EnvServer`: those of racks' own clients, and of `RosbridgeTransport`.
 
     A request with a tag is executed once and only in time; without one, which is a rack's own client, it is executed
-    as it comes, and a step after the end of an episode begins the next one. One client is in command; its name is
-    ``client_id`` with its session, or with its connection.
-
-    Answers are in the version of the request where that shows it; else in `version`, in that of the compiled types on
-    the other side of `bus`, or in the newest.
+    as it comes, and a step after the end of an episode begins the next one. The name of a client is ``client_id`` with
+    its session, or with its connection.
 
     Args:
         env: What is served.
         bus: Where.
         namespace: Put before every name.
         image_format: ``"png"``, which keeps every bit, or ``"jpeg"``.
-        version: Of the messages, such as ``"2025-06-17"``; None to find out.
+        version: Of the answers, such as ``"2025-06-17"``, where the request does not show its own; None for that of the
+            compiled types on the other side of `bus`, or the newest.
         clock: Wall clock [s], for stamps.
-
-    Raises:
-        InvalidValue: `image_format` or `version` is not possible.
     """
 
     def __init__(

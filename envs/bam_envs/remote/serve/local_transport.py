@@ -18,7 +18,7 @@ class LocalTransport:
     """An environment in this process, without a network. Results are those of the other transports bit for bit.
 
     Args:
-        env: A Gymnasium environment, a vector environment (see `EnvServer`), or a server, which others may share.
+        env: An environment (see `EnvServer`), or a server, which others may share.
         client: The name of this client for a shared server.
     """
 

@@ -84,7 +84,7 @@ class RobotService:
     """Puts one robot on a bus.
 
     Args:
-        robot: The robot; everything else that moves it does so through this object, too.
+        robot: Everything else that moves it does so through this object, too.
         profile: Its topics; those of commands that `robot` does not take are not offered.
         bus: Carries them.
         lease: Who is in command; shared with everything else that moves the robot.
@@ -193,10 +193,7 @@ class RobotService:
             self._lease.release(client)
 
     def _on_halt(self, message: Message, caller: Caller) -> None:
-        """Halt, for any client; waits only for the part of a period that is being computed.
-
-        In lockstep the one whose command it overtook waits for an answer, and gets it: nothing moved.
-        """
+        """Halt, for any client. In lockstep the one whose command it overtook gets its answer: nothing moved."""
         if self._rest().complete and self.info.lockstep:
             self.clock.wake()
 

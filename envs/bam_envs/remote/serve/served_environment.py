@@ -179,8 +179,7 @@ class ServedEnvironment:
     def _not_offered(self) -> set[str]:
         """Names that the server of ``--via``, or ROS 2 here, does not carry; reports the reasons and remedies.
 
-        One kind of rosbridge server reports them in `status` messages. The others report nothing; there, what rosapi
-        does not list is not carried.
+        Some rosbridge servers report them in `status` messages; with others, what rosapi does not list is not carried.
         """
         bus = self.bus
         if isinstance(bus, RclpyBus):
@@ -208,11 +207,7 @@ class ServedEnvironment:
         return set(refused)
 
     def _offered(self, profile: RobotProfile | None, refused: set[str]) -> str:
-        """A line of text about what is offered, without the names in `refused`.
-
-        Raises:
-            RemoteError: Nothing, and it is served nowhere else.
-        """
+        """A line about what is offered, without `refused`. Raises RemoteError if it is served nowhere at all."""
         prefix, base = self.prefix, base_name(self.prefix)
         offered = [service_name(prefix)] if service_name(prefix) not in refused else []
         if not offered and not refused & {f"{base}/request", f"{base}/reply"}:

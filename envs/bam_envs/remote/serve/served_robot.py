@@ -91,11 +91,7 @@ class ServedRobot:
             return self.state
 
     def step(self, command: Array) -> RobotState:
-        """Send `command` (n, m) and return the state one period later; in real time, when that has passed.
-
-        Raises:
-            RobotFault: The robot failed; `reset` brings it back.
-        """
+        """Send `command` (n, m); the state one period later. Raises RobotFault; `reset` brings the robot back."""
         with self._changed:
             command = checked_command(command, self._target.shape)
             if not self.realtime:
@@ -120,11 +116,9 @@ class ServedRobot:
             return self.state
 
     def follow(self, command: Array, *, at_once: bool = True) -> None:
-        """Execute `command` (n, m) from the next tick on, at most for the command timeout.
+        """Execute the finite `command` (n, m) from the next tick on, at most for the command timeout.
 
-        Args:
-            command: Finite. Shape: (n, m).
-            at_once: Not to wait for the end of the period that runs.
+        With `at_once` it does not wait for the end of the period that runs.
         """
         with self._changed:
             self._target = command
@@ -163,10 +157,8 @@ class ServedRobot:
                 self._changed.notify_all()
 
     def _reachable(self) -> Array:
-        """The target, no farther than the robot may go in a period from where it is.
-
-        The robot itself counts from its last command, which one that comes early finds half executed.
-        """
+        """The target, no farther than the robot may go in a period from where it is."""
+        # The robot itself counts from its last command, which one that comes early finds half executed.
         rate, setpoint = self.spec.command.max_rate, getattr(self._robot, "setpoint", None)
         if not self._midway or rate is None or setpoint is None:
             return self._target
@@ -180,14 +172,11 @@ class ServedRobot:
         self._parts, self._left = iter(()), 0
 
     def place_object(self, pose: Array | None, seeds: NDArray[np.int64]) -> None:
-        """Set the scene of a simulated robot, which stays as it is.
+        """Set the scene of a simulated robot, which stays as it is. Raises RemoteError if it has none.
 
         Args:
             pose: Where its object is to lie: x, y [m], yaw [rad]; None leaves it. Shape: (n, 3).
             seeds: For what the robot itself draws. Shape: (n,).
-
-        Raises:
-            RemoteError: This robot has no scene.
         """
         with self._changed:
             place = getattr(self._robot, "place_object", None)

@@ -156,11 +156,7 @@ class TcpServer:
             raise
 
     def admit(self, hello: Hello, connection: _Connection) -> None:
-        """Let a client in; its own older connections are dropped.
-
-        Raises:
-            RemoteError: It does not know the token, wants another environment, or there is no room.
-        """
+        """Let a client in, and drop its older connections; RemoteError if it may not be here, or there is no room."""
         role = None
         if self._tokens.needed or (hello.token and self._tokens.exist):
             if not self._guesses.may_try(connection.host):
