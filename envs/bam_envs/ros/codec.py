@@ -21,15 +21,13 @@ from bam_envs.ros.freshness import Tag, read_tag
 from bam_envs.ros.messages import (
     has_header,
     names_of,
-    number,
     number_at,
     numbers,
+    numbers_of,
     put_at,
     require_frame,
     require_message,
-    require_names,
     tag_text,
-    usual_numbers,
     value_at,
     write_stamp,
 )
@@ -97,7 +95,10 @@ def decode_source(source: Source, message: object, size: int) -> Array:
     if source.fields:
         raw = np.array([number_at(content, path, where) for path in source.fields])
     elif source.names:
-        raw = _by_name(source, content, where)
+        found = names_of(content, "name", where)
+        raw = numbers_of(
+            source.names, content, source.field, found, where, ignore=source.ignore, missing=source.missing
+        )
     else:
         raw = numbers(value_at(content, source.field, where), f"{where}: {source.field}", missing=source.missing)
         first, last = source.skip
@@ -107,26 +108,6 @@ def decode_source(source: Source, message: object, size: int) -> Array:
     if source.frame:
         require_frame(source.frame, content, where)
     return _to_si(source, raw if source.within is None else np.clip(raw, *source.within))
-
-
-def _by_name(source: Source, message: Message, where: str) -> Array:
-    """The numbers of the names of `source`, whatever their order in the message."""
-    usual = usual_numbers(message.get(source.field)) if message.get("name") == list(source.names) else None
-    if usual is not None and len(usual) == len(source.names):
-        return usual
-    found = names_of(message, "name", where)
-    require_names(source.names, found, where, source.ignore)
-    values = value_at(message, source.field, where)
-    if isinstance(values, (list, tuple)) and not values:
-        raise ProtocolError(f"{where}: {source.field} is empty, and {source.signal} is read from it.")
-    if not isinstance(values, (list, tuple, np.ndarray)) or len(values) != len(found):
-        length = f"{len(values)} numbers" if isinstance(values, (list, tuple, np.ndarray)) else brief(values)
-        raise ProtocolError(f"{where}: {source.field} must have {len(found)} numbers, one for each name, not {length}.")
-    place = {name: values[index] for index, name in enumerate(found)}
-    # One by one, so that an error names the joint.
-    return np.array(
-        [number(place[name], f"{where}: {source.field} of {name}", missing=source.missing) for name in source.names]
-    )
 
 
 def _to_si(entry: Source | Sink, raw: Array) -> Array:
@@ -284,16 +265,11 @@ def _read_command(sink: Sink, message: Message) -> Array:
             expected = f"{len(sink.labels)} ({', '.join(sink.labels)})"
             raise ProtocolError(f"{where}: data must have {expected} numbers, not {len(values)}.")
         return values
-    field = "position"
-    names = names_of(message, "name" if sink.type == _JOINTS else "joint_names", where)
-    if sink.type != _JOINTS:
-        field, points = "positions", value_at(message, "points", where)
-        if not isinstance(points, list) or len(points) != 1:
-            found = f"{len(points)}" if isinstance(points, list) else brief(points)
-            raise ProtocolError(f"{where}: points must be a list of 1 point, not {found}.")
-        message = require_message(points[0], f"{where}: points[0]")
-    require_names(sink.names, names, where)
-    values = numbers(value_at(message, field, where), f"{where}: {field}")
-    if len(values) != len(names):
-        raise ProtocolError(f"{where}: {field} must have {len(names)} numbers, not {len(values)}.")
-    return values[[names.index(name) for name in sink.names]]
+    if sink.type == _JOINTS:
+        return numbers_of(sink.names, message, "position", names_of(message, "name", where), where)
+    points = value_at(message, "points", where)
+    if not isinstance(points, list) or len(points) != 1:
+        found = f"{len(points)}" if isinstance(points, list) else brief(points)
+        raise ProtocolError(f"{where}: points must be a list of 1 point, not {found}.")
+    point = require_message(points[0], f"{where}: points[0]")
+    return numbers_of(sink.names, point, "positions", names_of(message, "joint_names", where), where)

@@ -1,4 +1,4 @@
-"""Camera images as ROS messages: colour as sensor_msgs/CompressedImage, depth as a PNG of uint16 millimetres.
+"""Camera images in ROS messages, as PNG or JPEG; depth as a PNG of uint16 millimetres, or raw.
 
 Arrays are RGB. Message data are `bytes`, or base64 text as a JSON bridge sends them.
 """
@@ -15,13 +15,9 @@ from numpy.typing import NDArray
 from bam_envs.core.errors import InvalidValue, MissingExtra, ProtocolError
 
 FORMATS = ("png", "jpeg")
-_JPEG_QUALITY = 90
-_MAX_DEPTH = 65.535  # farthest that a depth image can say [m]
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
-_DEPTH_ENCODING = "16UC1; png"
 _PIXEL_DTYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
-_CHANNELS = (1, 3, 4)
 
 
 def encode_image(image: NDArray[np.uint8], kind: str = "png") -> bytes:
@@ -39,12 +35,15 @@ def encode_image(image: NDArray[np.uint8], kind: str = "png") -> bytes:
         raise InvalidValue(f"The image format must be png or jpeg, not {kind!r}.")
     array = np.asarray(image)
     channels = array.shape[2] if array.ndim == 3 else 1
-    fits = array.dtype == np.uint8 and array.ndim in (2, 3) and channels in _CHANNELS and array.size
+    fits = array.dtype == np.uint8 and array.ndim in (2, 3) and channels in (1, 3, 4) and array.size
     if not fits or (kind == "jpeg" and channels == 4):
         raise InvalidValue(
             f"A {kind} image must be uint8 of shape (height, width, 3), not {array.dtype} of {array.shape}."
         )
-    return _encode(array, kind)
+    file, options = io.BytesIO(), {"compress_level": 1} if kind == "png" else {"quality": 90}
+    array = array[:, :, 0] if array.ndim == 3 and channels == 1 else array
+    _pillow().fromarray(np.ascontiguousarray(array)).save(file, kind, **options)
+    return file.getvalue()
 
 
 def decode_image(data: bytes) -> NDArray[np.uint8]:
@@ -60,31 +59,12 @@ def decode_image(data: bytes) -> NDArray[np.uint8]:
     return image
 
 
-def encode_depth(depth: NDArray[np.floating[Any]]) -> bytes:
-    """`depth` as a PNG of uint16 millimetres.
-
-    Args:
-        depth: Shape (height, width) or (height, width, 1) [m]. What is not finite or below 0 becomes 0, which means
-            that nothing was measured; what is farther than 65.535 m becomes that.
-    """
-    metres = np.nan_to_num(np.asarray(depth, np.float64), nan=0.0, posinf=0.0, neginf=0.0)
-    return _encode(np.rint(np.clip(metres, 0.0, _MAX_DEPTH) * 1000.0).astype(np.uint16), "png")
-
-
 def color_message(
     image: NDArray[np.uint8], kind: str = "png", frame_id: str = "", stamp: Mapping[str, int] | None = None
 ) -> dict[str, Any]:
     """sensor_msgs/CompressedImage of `image`; see `encode_image`."""
-    return {"header": _header(frame_id, stamp), "format": kind, "data": encode_image(image, kind)}
-
-
-def depth_message(
-    depth: NDArray[np.floating[Any]], frame_id: str = "", stamp: Mapping[str, int] | None = None
-) -> dict[str, Any]:
-    """sensor_msgs/Image of `depth` [m], whose data are a PNG; see `encode_depth`."""
-    height, width = np.shape(depth)[:2]
-    size = {"height": height, "width": width, "encoding": _DEPTH_ENCODING, "is_bigendian": 0, "step": 2 * width}
-    return {"header": _header(frame_id, stamp), **size, "data": encode_depth(depth)}
+    header = {"stamp": dict(stamp or {"sec": 0, "nanosec": 0}), "frame_id": frame_id}
+    return {"header": header, "format": kind, "data": encode_image(image, kind)}
 
 
 def read_color_message(message: Mapping[str, Any]) -> NDArray[np.uint8] | None:
@@ -134,28 +114,16 @@ def message_bytes(message: Mapping[str, Any]) -> bytes:
         raise ProtocolError(f"data of an image must be bytes or base64: {error}.") from error
 
 
-def _header(frame_id: str, stamp: Mapping[str, int] | None) -> dict[str, Any]:
-    return {"stamp": dict(stamp or {"sec": 0, "nanosec": 0}), "frame_id": frame_id}
-
-
-def _encode(image: NDArray[Any], kind: str) -> bytes:
-    file, options = io.BytesIO(), {"compress_level": 1} if kind == "png" else {"quality": _JPEG_QUALITY}
-    image = image[:, :, 0] if image.ndim == 3 and image.shape[2] == 1 else image
-    _pillow().fromarray(np.ascontiguousarray(image)).save(file, kind, **options)
-    return file.getvalue()
-
-
 def _decode(data: bytes) -> NDArray[Any]:
     if not data.startswith((_PNG, _JPEG)):
         raise ProtocolError(f"An image must be a PNG or JPEG file, not one that begins with {data[:8]!r}.")
     pillow = _pillow()
-    # Pillow raises SyntaxError for a broken PNG, and DecompressionBombError for an image that would fill the memory.
-    errors = (OSError, SyntaxError, ValueError, pillow.DecompressionBombError)
     try:
         with pillow.open(io.BytesIO(data)) as image:
             wide = image.mode.startswith("I")
             array = np.asarray(image.convert("RGB") if image.mode in ("P", "CMYK", "1") else image)
-    except errors as error:
+    # Pillow raises SyntaxError for a broken PNG, and DecompressionBombError for an image that would fill the memory.
+    except (OSError, SyntaxError, ValueError, pillow.DecompressionBombError) as error:
         raise ProtocolError(f"An image cannot be read: {error}.") from error
     return array.astype(np.uint16) if wide else array
 

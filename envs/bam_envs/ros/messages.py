@@ -78,16 +78,14 @@ def number_at(message: Message, path: str, where: str) -> float:
     """The finite number at `path`; for ``yaw(path)`` the angle about z [rad] of the quaternion there."""
     quaternion = _quaternion(path)
     if not quaternion:
-        value = value_at(message, path, where)
-        # The usual case first: an error's text is not made a thousand times a second.
-        return value if type(value) is float and math.isfinite(value) else number(value, f"{where}: {path}")
+        return number(value_at(message, path, where), f"{where}: {path}")
     x, y, z, w = (number_at(message, axis, where) for axis in quaternion)
     return math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
 def number(value: object, where: str, *, missing: float | None = None) -> float:
     """`value`, which must be a plain finite number; null, NaN and infinities become `missing`, if it is given."""
-    if missing is not None and _is_missing(value):
+    if missing is not None and (value is None or (isinstance(value, float) and not math.isfinite(value))):
         return missing
     if isinstance(value, (float, int, np.integer, np.floating)) and not isinstance(value, bool):
         try:
@@ -99,35 +97,17 @@ def number(value: object, where: str, *, missing: float | None = None) -> float:
     raise ProtocolError(f"{where} must be a finite number, not {brief(value)}.")
 
 
-def usual_numbers(value: object) -> Array | None:
-    """The list `value` if all of it is finite plain numbers, as it nearly always is; else None. Shape: (k,)."""
-    if type(value) is not list or not value or not set(map(type, value)) <= {float, int}:
-        return None
-    try:
-        return np.array(value, dtype=np.float64) if math.isfinite(sum(value)) else None  # finite terms, too
-    except OverflowError:
-        return None
-
-
-def numbers(value: object, where: str, *, missing: float | None = None) -> Array:
-    """The list `value` of plain finite numbers; `missing`, if given, is what the others become. Shape: (k,)."""
-    usual = usual_numbers(value)
-    if usual is not None:
-        return usual
+def numbers(value: object, where: str, *, names: Sequence[str] = (), missing: float | None = None) -> Array:
+    """The list `value` of plain finite numbers, which may have `names`; shape (k,). `missing` as of `number`."""
     if isinstance(value, np.ndarray) and value.ndim == 1:
         value = value.tolist()
     if not isinstance(value, Sequence) or isinstance(value, (str, bytes, bytearray)):
         raise ProtocolError(f"{where} must be a list of numbers, not {brief(value)}.")
-    if missing is not None:
-        value = [missing if _is_missing(one) else one for one in value]
-        usual = usual_numbers(value)
-        if usual is not None:
-            return usual
-    return np.array([number(one, f"{where}[{place}]") for place, one in enumerate(value)], dtype=np.float64)
-
-
-def _is_missing(value: object) -> bool:
-    return value is None or (isinstance(value, float) and not math.isfinite(value))
+    if set(map(type, value)) == {float} and math.isfinite(sum(value)):  # nearly always; a finite sum has finite terms
+        return np.array(value)
+    places = [f"{where} of {name}" for name in names] or [f"{where}[{place}]" for place in range(len(value))]
+    found = [number(one, place, missing=missing) for one, place in zip(value, places, strict=True)]
+    return np.array(found, dtype=np.float64)
 
 
 def names_of(message: Message, field: str, where: str) -> list[str]:
@@ -141,17 +121,35 @@ def names_of(message: Message, field: str, where: str) -> list[str]:
     return list(names)
 
 
-def require_names(names: Sequence[str], found: list[str], where: str, ignore: Sequence[str] = ()) -> None:
-    """`found` are `names`, in any order, and at most what is to `ignore`."""
-    missing = [name for name in names if name not in found]
-    if missing:
-        raise ProtocolError(f"{where}: {', '.join(missing)} missing; found: {', '.join(found) or 'no name'}.")
+def numbers_of(
+    names: Sequence[str],
+    message: Message,
+    field: str,
+    found: list[str],
+    where: str,
+    *,
+    ignore: Sequence[str] = (),
+    missing: float | None = None,
+) -> Array:
+    """The numbers of `names` in the list `field`, which has one for each name that was `found`; shape (k,).
+
+    There may be others only for the names to `ignore`. `missing` is as of `number`.
+    """
+    absent = [name for name in names if name not in found]
+    if absent:
+        raise ProtocolError(f"{where}: {', '.join(absent)} missing; found: {', '.join(found) or 'no name'}.")
     extra = [name for name in found if name not in names and name not in ignore]
     if extra:
         raise ProtocolError(
             f"{where}: {', '.join(extra)} not expected; expected: {', '.join(names)}. "
             f"List what is not ours in ignore of the profile."
         )
+    values = value_at(message, field, where)
+    if not isinstance(values, (list, tuple, np.ndarray)) or len(values) != len(found):
+        length = f"{len(values)} numbers" if isinstance(values, (list, tuple, np.ndarray)) else brief(values)
+        raise ProtocolError(f"{where}: {field} must have {len(found)} numbers, one for each name, not {length}.")
+    place = dict(zip(found, values, strict=True))
+    return numbers([place[name] for name in names], f"{where}: {field}", names=names, missing=missing)
 
 
 def require_frame(frame: str, message: Message, where: str) -> None:
@@ -186,17 +184,13 @@ def read_stamp(message: Message, where: str) -> float | None:
     stamp = header.get("stamp") if isinstance(header, _OBJECT) else None
     if stamp is None:
         return None
-    if not isinstance(stamp, _OBJECT):
-        require_message(stamp, f"{where}: header.stamp")
+    require_message(stamp, f"{where}: header.stamp")
     parts = []
     for ros2, ros1 in (("sec", "secs"), ("nanosec", "nsecs")):
         name = ros2 if ros2 in stamp else ros1
         if name not in stamp:
             raise ProtocolError(f"{where}: header.stamp has no {ros2}; found: {', '.join(stamp)}.")
-        part = stamp[name]
-        # The usual case first: an error's text is not made a thousand times a second.
-        plain = type(part) is int and part < 2**63
-        parts.append(part if plain else number(part, f"{where}: header.stamp.{name}"))
+        parts.append(number(stamp[name], f"{where}: header.stamp.{name}"))
     seconds, nano = parts
     if seconds < 0 or not 0 <= nano < _NANO:
         raise ProtocolError(f"{where}: header.stamp must be seconds and nanoseconds, not {brief(stamp)}.")

@@ -123,7 +123,9 @@ def test_a_foreign_rack_has_names_of_its_own_or_none():
 def test_a_foreign_rack_sends_one_image_or_a_list(many):
     value = RNG.integers(0, 256, CAMERA.shape, dtype=np.uint8)
     metres = np.full(DEPTH.shape[:2], 0.75, np.float32)
-    color, depth = images.color_message(value), images.depth_message(metres)
+    color = images.color_message(value)
+    height, width = metres.shape
+    depth = {"height": height, "width": width, "encoding": "32FC1", "data": metres.tobytes()}
     message = {"color_img": [color] if many else color, "depth_img": [depth] if many else depth}
     back = read(spaces.Dict(camera=CAMERA, depth=DEPTH), **message)
     np.testing.assert_array_equal(back["camera"], value)

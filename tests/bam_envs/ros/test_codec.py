@@ -123,7 +123,7 @@ LENGTH = "position must have 6 numbers, one for each name, not"
         ),
         ({"name": [*JOINTS, "elbow_joint"]}, "elbow_joint comes twice in name."),
         ({"position": [0.0] * 5}, f"{LENGTH} 5 numbers."),
-        ({"position": []}, "position is empty, and joint_position is read from it."),
+        ({"position": []}, "position must have 6 numbers, one for each name, not 0 numbers."),
         ({"position": None}, f"{LENGTH} None."),
         ({"position": "123456"}, f"{LENGTH} '123456'."),
         ({"name": "abc"}, "name must be a list of names, not 'abc'."),
@@ -323,7 +323,7 @@ def test_commands_that_are_refused(message, text):
     [
         (JOINTS, [[0.0] * 6] * 2, "points must be a list of 1 point, not 2."),
         (JOINTS[:5], [[0.0] * 6], f"wrist_3_joint missing; found: {', '.join(JOINTS[:5])}."),
-        (JOINTS, [[0.0] * 5], "positions must have 6 numbers, not 5."),
+        (JOINTS, [[0.0] * 5], "positions must have 6 numbers, one for each name, not 5 numbers."),
     ],
 )
 def test_trajectories_that_are_refused(names, points, text):
