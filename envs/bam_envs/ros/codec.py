@@ -1,7 +1,6 @@
 """States and commands as ROS messages and back, as a profile says: pure functions on dicts and arrays.
 
-A live robot reads states and writes commands; a served one writes states and reads commands. A command type that holds
-a list of numbers is written and read by its own lines here; all others field by field (``fields`` of the sink).
+Command types that hold a list of numbers have their own lines here; all others go field by field.
 """
 
 import json
@@ -111,13 +110,11 @@ def decode_source(source: Source, message: object, size: int) -> Array:
 
 
 def _to_si(entry: Source | Sink, raw: Array) -> Array:
-    values: Array = raw * np.array(entry.scale) + np.array(entry.offset)
-    return values
+    return np.asarray(raw * entry.scale + entry.offset)
 
 
 def _from_si(entry: Source | Sink, values: Array) -> list[float]:
-    raw: list[float] = ((values - np.array(entry.offset)) / np.array(entry.scale)).tolist()
-    return raw
+    return list(((values - entry.offset) / entry.scale).tolist())
 
 
 @cache
@@ -129,15 +126,15 @@ def _places(labels: tuple[str, ...], command: tuple[str, ...]) -> list[int]:
 def encode_state(
     profile: RobotProfile, state: RobotState, env_id: int, stamp: Mapping[str, int], tag: str = ""
 ) -> list[Envelope]:
-    """The messages that a served robot publishes of one environment of `state`.
+    """The messages that a served robot publishes of one environment of `state`; signals it has not are left out.
 
     Args:
-        profile: The robot; signals that `state` has not are left out.
+        profile: The robot.
         state: Of all environments.
         env_id: Which of them.
         stamp: When, as ROS 1 or ROS 2 writes it.
-        tag: `Tag.echo` of the command that this state is the answer to; it goes into ``frame_id`` of the last of the
-            messages, which is one without a frame, so that with it everything has arrived.
+        tag: `Tag.echo` of the command that this state is the answer to; it goes into ``frame_id`` of the last message,
+            so that with it everything has arrived.
     """
     messages: dict[tuple[str, tuple[str, ...]], Envelope] = {}
     for source in profile.state:
@@ -178,14 +175,11 @@ def encode_command(
     Args:
         profile: The robot.
         spec: Labels of the command, and the period.
-        command: Finite numbers [SI]. Shape: (m,).
+        command: Finite numbers [SI], else `InvalidValue`. Shape: (m,).
         tag: Who sends it when, for how long it means anything.
         mode: One of the profile's.
         sign: Makes the text of `tag`; None: without a signature.
         ros1: Whether stamps are spelled as in ROS 1.
-
-    Raises:
-        InvalidValue: A number is not finite.
     """
     if command.shape != (len(spec.command.labels),) or not np.isfinite(command).all():
         raise InvalidValue(f"A command must be {len(spec.command.labels)} finite numbers, not {command.tolist()}.")

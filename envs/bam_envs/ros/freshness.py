@@ -2,18 +2,18 @@
 
 A tag travels as text in a field that the message type has anyway: ``header.frame_id``, or the label of the first
 dimension of a multi-array. It looks like ``bam1 s=4f1c e=2 q=17 t=1700000000.250000 d=1700000000.350000``, followed by
-a signature, ``m=`` and 32 hexadecimal digits, where its session was opened (`bam_envs.rosbridge.sessions`). Everybody
-may read a tag; the state that answers a command repeats only its session and number (`Tag.echo`).
+a signature, ``m=`` and 32 hexadecimal digits, where its session was opened (`bam_envs.rosbridge.sessions`).
 """
 
 import hmac
 import math
+import re
 import threading
 import time
 import uuid
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from bam_envs.core.errors import RemoteError
 
@@ -33,19 +33,15 @@ class Tag:
     sequence: int
     """Counts its messages over all epochs."""
     sent: float
-    """When it was sent [s], on the sender's steady clock (any zero: the receiver estimates the offset)."""
+    """When it was sent [s], on the sender's steady clock; the receiver estimates the offset."""
     deadline: float
     """Time after which it must not be executed [s], same clock."""
     mac: str = ""
     """The signature that came with it; empty without one."""
-    received: str = field(default="", compare=False)
-    """The text that it was read from, without the signature: that text is signed. Empty for a new tag."""
 
     def to_text(self) -> str:
         """The tag as it travels, without a signature."""
-        return self.received or (
-            f"{_MARK} s={self.session} e={self.epoch} q={self.sequence} t={self.sent:.6f} d={self.deadline:.6f}"
-        )
+        return f"{_MARK} s={self.session} e={self.epoch} q={self.sequence} t={self.sent:.6f} d={self.deadline:.6f}"
 
     @property
     def echo(self) -> str:
@@ -58,10 +54,9 @@ def read_tag(text: object) -> Tag | None:
     if not isinstance(text, str) or len(text) > _LONGEST or not text.startswith(_MARK + " "):
         return None
     fields = dict(part.split("=", 1) for part in text.split()[1:] if "=" in part)
-    mac = fields.get("m", "")
     try:
         numbers = int(fields["e"]), int(fields["q"]), float(fields["t"]), float(fields["d"])
-        tag = Tag(fields["s"], *numbers, mac, text.rpartition(" m=")[0] if mac else "")
+        tag = Tag(fields["s"], *numbers, fields.get("m", ""))
     except (KeyError, ValueError):
         return None
     return tag if math.isfinite(tag.sent) and math.isfinite(tag.deadline) else None
@@ -71,11 +66,8 @@ def read_echo(text: object) -> tuple[str, int] | None:
     """Session and number of the command that a state with the text `text` answers; None if it answers none."""
     if not isinstance(text, str) or len(text) > _LONGEST:
         return None
-    mark, *fields = text.split(" ")
-    if mark != _MARK or len(fields) != 2 or not fields[0].startswith("s=") or not fields[1].startswith("q="):
-        return None
-    number = fields[1][2:]
-    return (fields[0][2:], int(number)) if number.isascii() and number.isdigit() else None
+    echo = re.fullmatch(rf"{_MARK} s=(\S*) q=([0-9]+)", text)
+    return None if echo is None else (echo[1], int(echo[2]))
 
 
 def signature(key: bytes, tag: Tag, channel: str, content: bytes) -> str:
@@ -111,10 +103,9 @@ class Tagger:
 
 
 class ClockOffset:
-    """Estimates the offset to the clock of a sender from one-way messages, assuming that the quickest one took no time.
+    """Estimates the offset to the clock of a sender, as if the quickest of its messages had taken no time.
 
-    The offset is the smallest difference seen, so the age of a message is how much longer it took than the quickest.
-    The smallest difference grows by `drift` [s/s], which follows clocks that drift apart.
+    It grows by `drift` [s/s], which follows clocks that drift apart.
     """
 
     def __init__(self, drift: float = 1e-4) -> None:

@@ -96,7 +96,7 @@ def complete(kind: str, message: object, *, lenient: bool = False) -> dict[str, 
     Raises:
         InvalidValue: It does not fit: the text names type, field, expected and found.
     """
-    name = kind if isinstance(kind, str) and kind in _table() else normal_name(kind)
+    name = normal_name(kind)
     try:
         # Unknown types are not kept: a client could name any number of them.
         check = _check(name, None, 0, lenient) if name in _table() else _any
@@ -234,17 +234,12 @@ def _array(kind: str, one: Check, size: int | None) -> Check:
 def _usual(kind: str, values: Sequence[Any]) -> list[Any] | None:
     """A checked copy of many numbers or texts, by a few passes in C; None where items need a closer look."""
     kinds = set(map(type, values))
-    if kind in FLOATS and kinds and kinds <= {float, int}:
-        try:
-            floats = list(values) if int not in kinds else list(map(float, values))
-        except OverflowError:
-            return None
-        finite = math.isfinite(sum(floats))  # a finite sum has finite terms
-        return floats if finite and (kind == "float64" or max(map(abs, floats)) <= FLOATS[kind]) else None
-    if kind in INTEGERS and kinds == {int}:
+    if kinds == {float} and kind in FLOATS and math.isfinite(sum(values)):  # a finite sum has finite terms
+        return list(values) if max(map(abs, values)) <= FLOATS[kind] else None
+    if kinds == {int} and kind in INTEGERS:
         low, high = INTEGERS[kind]
         return list(values) if low <= min(values) and max(values) <= high else None
-    if kind == "string" and kinds == {str}:
+    if kinds == {str} and kind == "string":
         return list(values) if "".join(values).isascii() else None
     return None
 

@@ -7,6 +7,7 @@ import ssl
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from bam_envs.core.errors import InvalidValue
@@ -17,14 +18,11 @@ _NAMESPACE = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)*")
 _EXAMPLE = "Expected ws://host:port or wss://host:port, with a namespace behind it if there is one."
 
 
-@dataclass(frozen=True)
-class Address:
+class Address(NamedTuple):
     """The parts of the URL of a rosbridge server."""
 
     host: str
-    """Name or IP address."""
     port: int
-    """TCP port."""
     secure: bool
     """Whether the connection uses TLS."""
     namespace: str
@@ -41,8 +39,7 @@ class Address:
 class Endpoint:
     """A server as a client sees it: a rosbridge server (``ws://``, ``wss://``) or a whole environment (``tcp://``, …).
 
-    Raises:
-        InvalidValue: The address, the token or a time-out is not valid, or `ca_file` is given without TLS.
+    `InvalidValue` for an address, a token or a time-out that is not valid, and for `ca_file` without TLS.
     """
 
     url: str
@@ -57,7 +54,7 @@ class Endpoint:
     """Longest time to wait for an answer [s]; None: the default of the caller."""
 
     def __post_init__(self) -> None:
-        if self.is_websocket:
+        if self.url.startswith(("ws://", "wss://")):
             self.address  # noqa: B018 - parsed here, so that a wrong one is reported where it was written
             if self.token is not None and not re.fullmatch(r"[!-~]+", self.token):
                 raise InvalidValue(
@@ -82,14 +79,9 @@ class Endpoint:
         connect_timeout: float = 3.0,
         timeout: float | None = None,
     ) -> Endpoint:
-        """The endpoint whose token is in `token_file`, as commands and ``gym.make`` take it. Raises as the class."""
+        """The endpoint whose token is in `token_file`, as commands and ``gym.make`` take it."""
         token = None if token_file is None else read_token(token_file)
         return cls(url, None if ca_file is None else str(ca_file), token, connect_timeout, timeout)
-
-    @property
-    def is_websocket(self) -> bool:
-        """Whether it is a rosbridge server."""
-        return self.url.startswith(("ws://", "wss://"))
 
     @cached_property
     def address(self) -> Address:
