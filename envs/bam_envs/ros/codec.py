@@ -30,7 +30,7 @@ from bam_envs.ros.messages import (
     value_at,
     write_stamp,
 )
-from bam_envs.ros.profile_tables import RobotProfile, Sink, Source
+from bam_envs.ros.profile_tables import Content, RobotProfile, Sink, Source
 
 Array = NDArray[np.float64]
 Message = Mapping[str, Any]
@@ -109,11 +109,11 @@ def decode_source(source: Source, message: object, size: int) -> Array:
     return _to_si(source, raw if source.within is None else np.clip(raw, *source.within))
 
 
-def _to_si(entry: Source | Sink, raw: Array) -> Array:
+def _to_si(entry: Content, raw: Array) -> Array:
     return np.asarray(raw * entry.scale + entry.offset)
 
 
-def _from_si(entry: Source | Sink, values: Array) -> list[float]:
+def _from_si(entry: Content, values: Array) -> list[float]:
     return list(((values - entry.offset) / entry.scale).tolist())
 
 
@@ -128,13 +128,8 @@ def encode_state(
 ) -> list[Envelope]:
     """The messages that a served robot publishes of one environment of `state`; signals it has not are left out.
 
-    Args:
-        profile: The robot.
-        state: Of all environments.
-        env_id: Which of them.
-        stamp: When, as ROS 1 or ROS 2 writes it.
-        tag: `Tag.echo` of the command that this state is the answer to; it goes into ``frame_id`` of the last message,
-            so that with it everything has arrived.
+    `stamp` is as ROS 1 or ROS 2 writes it. `tag`, the `Tag.echo` of the command that this state is the answer to, goes
+    into ``frame_id`` of the last message, so that with it everything has arrived.
     """
     messages: dict[tuple[str, tuple[str, ...]], Envelope] = {}
     for source in profile.state:

@@ -1,10 +1,9 @@
 """The message and service types that are known by their fields, one a line.
 
 ``pkg/Type: type field; type field`` for a message, ``pkg/Type: request -> response`` for a service. A ``|`` separates
-spellings of one type: ROS 1 has ``secs``, ``nsecs`` and ``seq`` where ROS 2 has ``sec`` and ``nanosec``, and bam_msgs
-has several versions. A type without
-a package is in the package of its line; ``time`` and ``duration`` are the built-in ones; ``any`` is any plain value;
-``Type[?]`` is one or a list of them; ``type field=1`` has a default other than zero.
+spellings of one type, of ROS 1 and ROS 2 or of versions. A type without a package is in the package of its line;
+``time`` and ``duration`` are the built-in ones; ``any`` is any plain value; ``Type[?]`` is one or a list of them;
+``type field=1`` has a default other than zero.
 """
 
 _NUMBERS = ("Int8", "Int16", "Int32", "Int64", "UInt8", "UInt16", "UInt32", "UInt64", "Float32", "Float64")

@@ -21,15 +21,10 @@ _PIXEL_DTYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 
 
 def encode_image(image: NDArray[np.uint8], kind: str = "png") -> bytes:
-    """`image` as a file.
+    """`image` as a file: ``"png"``, which keeps every bit, or ``"jpeg"``, which is smaller and has no alpha.
 
-    Args:
-        image: Shape (height, width), (height, width, 1), (height, width, 3) RGB or (height, width, 4) RGBA.
-        kind: ``"png"``, which keeps every bit, or ``"jpeg"``, which is smaller and has no alpha.
-
-    Raises:
-        InvalidValue: Another kind, dtype or shape.
-        MissingExtra: Pillow is not installed.
+    Its shape is (height, width), (height, width, 1), (height, width, 3) RGB or (height, width, 4) RGBA; another one, or
+    another dtype or kind, is an `InvalidValue`. Without Pillow all here raise `MissingExtra`.
     """
     if kind not in FORMATS:
         raise InvalidValue(f"The image format must be png or jpeg, not {kind!r}.")
@@ -49,9 +44,7 @@ def encode_image(image: NDArray[np.uint8], kind: str = "png") -> bytes:
 def decode_image(data: bytes) -> NDArray[np.uint8]:
     """The image in a PNG or JPEG file: uint8, (height, width) if grey, else (height, width, 3 or 4) RGB or RGBA.
 
-    Raises:
-        ProtocolError: It is not such a file, or its pixels are not 8 bits.
-        MissingExtra: Pillow is not installed.
+    `ProtocolError` if it is not such a file, or its pixels are not 8 bits.
     """
     image = _decode(data)
     if image.dtype != np.uint8:
@@ -76,10 +69,8 @@ def read_color_message(message: Mapping[str, Any]) -> NDArray[np.uint8] | None:
 def read_depth_message(message: Mapping[str, Any]) -> NDArray[np.float32] | None:
     """Metres in an Image or CompressedImage, or None if it is empty: float32, (height, width).
 
-    Its data are a grey PNG of 16 bits in mm, or raw: 16UC1 in mm, 32FC1 in m. 0 is where nothing was measured.
-
-    Raises:
-        ProtocolError: Its data are neither.
+    Its data are a grey PNG of 16 bits in mm, or raw, 16UC1 in mm, 32FC1 in m, else `ProtocolError`. 0 is where nothing
+    was measured.
     """
     data = message_bytes(message)
     if not data:

@@ -91,10 +91,7 @@ def complete(kind: str, message: object, *, lenient: bool = False) -> dict[str, 
     """A message of type `kind` with every field there: a new dict, byte arrays as `bytes`. Read it, do not change it.
 
     Byte arrays of `message` may be base64, as JSON has them, `bytes`, or lists of integers. A `lenient` check ignores
-    fields that the type does not have: they may be of a newer version of it.
-
-    Raises:
-        InvalidValue: It does not fit: the text names type, field, expected and found.
+    fields that the type does not have: they may be of a newer version of it. What does not fit is an `InvalidValue`.
     """
     name = normal_name(kind)
     try:
@@ -305,18 +302,14 @@ def _any(value: Any, depth: int) -> Any:
 def _plain(value: Any, depth: int, *, null: bool) -> None:
     if depth > MAX_DEPTH:
         raise _Misfit(f"at most {MAX_DEPTH} lists and objects in one another", value)
-    kind = type(value)
-    if kind is dict:
-        for name, item in value.items():
+    parts: list[tuple[str, Any]] = []
+    if type(value) is dict:
+        for name in value:
             if not isinstance(name, str):
                 raise _Misfit("texts as names", name)
-            _plain_item(f".{_string(name, 0)}", item, depth, null=null)
-    elif kind is list or kind is tuple:
-        kinds = set(map(type, value))
-        whole = kinds == {int} and min(value) >= -(2**63) and max(value) < 2**64
-        if not whole and not (kinds <= {float} and math.isfinite(sum(value))):
-            for place, item in enumerate(value):
-                _plain_item(f"[{place}]", item, depth, null=null)
+            parts.append((f".{_string(name, 0)}", value[name]))
+    elif type(value) in (list, tuple):
+        parts = [(f"[{place}]", item) for place, item in enumerate(value)]
     elif isinstance(value, str):
         _string(value, depth)
     elif not isinstance(value, (bool, bytes)) and not (null and value is None):
@@ -326,10 +319,8 @@ def _plain(value: Any, depth: int, *, null: bool) -> None:
             raise _Misfit("a number of 64 bits", value)
         if isinstance(value, float) and not math.isfinite(value):
             raise _Misfit("a finite number", value)
-
-
-def _plain_item(step: str, item: Any, depth: int, *, null: bool) -> None:
-    try:
-        _plain(item, depth + 1, null=null)
-    except _Misfit as misfit:
-        raise misfit.under(step) from None
+    for step, item in parts:
+        try:
+            _plain(item, depth + 1, null=null)
+        except _Misfit as misfit:  # noqa: PERF203
+            raise misfit.under(step) from None

@@ -29,30 +29,36 @@ _LAGS = {"arm": 0.1, "base": 0.3}
 """How far live robots are behind their commands [s], network and controller together; the limit `lag` changes it."""
 
 
-@dataclass(frozen=True)
-class Source:
-    """Where the numbers of one signal come from."""
+@dataclass(frozen=True, kw_only=True)
+class Content:
+    """Where numbers are in the messages of a topic."""
 
-    signal: NonEmpty
-    """Which signal."""
     topic: Topic
     type: MessageType
     """Message type, ``pkg/Type``. What is stamped (``pkg/TypeStamped``) is read too where `type` is not."""
-    field: NonEmpty = ""
-    """Where the list of its numbers is, e.g. ``position``; or `fields`."""
     fields: tuple[NonEmpty, ...] = ()
     """Where each number is, e.g. ``pose.position.x``; ``yaw(orientation)`` is the angle about z of a quaternion."""
     names: tuple[NonEmpty, ...] = ()
-    """Names of the numbers at the robot, in the order of the signal's labels; they are looked up in the message's
-    ``name``, whatever their order there. Empty: the numbers come in order, without names."""
-    ignore: tuple[NonEmpty, ...] = ()
-    """Names that may come too, and are not ours."""
-    partial: bool = False
-    """Whether several publishers share the topic, so that messages without any of `names` are somebody else's."""
+    """Names of the numbers at the robot, in the order of the labels; a message may have them in another one. Empty: the
+    numbers of a source have no names, those of a sink are called like its labels."""
     scale: tuple[Finite, ...] = (1.0,)
     """SI value = number x scale + offset; one for all, or one for each."""
     offset: tuple[Finite, ...] = (0.0,)
     """See `scale`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source(Content):
+    """Where the numbers of one signal come from."""
+
+    signal: NonEmpty
+    """Which signal."""
+    field: NonEmpty = ""
+    """Where the list of its numbers is, e.g. ``position``; or `fields`."""
+    ignore: tuple[NonEmpty, ...] = ()
+    """Names that may come too, and are not ours."""
+    partial: bool = False
+    """Whether several publishers share the topic, so that messages without any of `names` are somebody else's."""
     skip: tuple[NonNegativeInt, NonNegativeInt] = (0, 0)
     """How many numbers of `field` to leave out at the beginning and at the end."""
     missing: Finite | None = None
@@ -69,22 +75,12 @@ class Source:
     """Further fields of the message, as a simulated robot sends them."""
 
 
-@dataclass(frozen=True)
-class Sink:
+@dataclass(frozen=True, kw_only=True)
+class Sink(Content):
     """Where some of the numbers of a command go."""
 
-    topic: Topic
-    type: MessageType
     labels: tuple[NonEmpty, ...]
     """Which numbers of the command, by label, in the order of the message."""
-    names: tuple[NonEmpty, ...] = ()
-    """Names of the numbers at the robot, for types that have names; the labels by default."""
-    fields: tuple[NonEmpty, ...] = ()
-    """Where each number goes, for types without a list, e.g. ``linear.x``."""
-    scale: tuple[Finite, ...] = (1.0,)
-    """SI value = number x scale + offset; one for all, or one for each."""
-    offset: tuple[Finite, ...] = (0.0,)
-    """See `scale`."""
     reach: Positive | None = None
     """When a trajectory's point is to be reached [s]; None: `reach_periods` after it was sent."""
     reach_periods: Positive = 1.0
@@ -191,10 +187,8 @@ class RobotProfile:
         return {sink.topic: sink for sinks in reversed([*self.commands.values()]) for sink in reversed(sinks)}
 
     def command_life(self, period: float) -> float:
-        """For how long a command means something to who sends one every `period` [s]: two periods at least.
-
-        The robot would else rest in the middle of a slow task whenever the next command is a little late.
-        """
+        """For how long a command means something to who sends one every `period` [s]: two periods at least."""
+        # The robot would else rest in the middle of a slow task whenever the next command is a little late.
         return max(self.command_timeout, 2.0 * period)
 
     def source(self, signal: str) -> Source:
@@ -228,11 +222,7 @@ class RobotProfile:
         """The same robot, for a task that commands only the numbers `labels`, in their order.
 
         Sinks that take none of them are not in it: nothing is ever sent there. Nor are modes that would cut a message,
-        and that is an error for `mode` (None: the default one).
-
-        Raises:
-            InvalidValue: It does not take one of them, or a sink of `mode` takes some of its numbers only.
-            UnknownName: There is no such mode.
+        and that is an `InvalidValue` for `mode` (None: the default one), as is a label that it does not take.
         """
         if labels == self.command.labels:
             return self
@@ -255,14 +245,9 @@ class RobotProfile:
         return dataclasses.replace(self, command=self.command.part(labels), commands=commands)
 
     def spec(self, wanted: RobotSpec | None = None, mode: str | None = None) -> RobotSpec:
-        """What this robot measures and is sent; only the signals and commands of `wanted`, at its period, if given.
+        """What this robot measures and is sent; of it what a task has `wanted`, at its period, if that is given.
 
-        Args:
-            wanted: What a task needs.
-            mode: As of `narrowed`, and so are its errors.
-
-        Raises:
-            InvalidValue: It does not measure a signal of `wanted`, or does not take its commands.
+        `mode` and errors are as of `narrowed`; a signal that it does not measure is an `InvalidValue` too.
         """
         period = self.period if wanted is None else wanted.period
         # A trajectory that takes longer than a period is behind its commands for longer.

@@ -50,9 +50,6 @@ class RosbridgeLink(Declarations):
         lost_after: The link drops when the server answers no WebSocket ping for so long [s]. Infinite: only when the
             network reports it.
         max_message: Largest message, in either direction [bytes].
-
-    Raises:
-        InvalidValue: The address is not the one of a rosbridge server.
     """
 
     def __init__(
@@ -96,7 +93,6 @@ class RosbridgeLink(Declarations):
 
         Raises:
             NoServer: There is no server that can be used; the text says why.
-            InvalidValue: The CA file cannot be read.
             LinkLost: The link was closed, or dropped and is not back yet.
         """
         self._require_waiting_allowed("connect")
@@ -172,9 +168,7 @@ class RosbridgeLink(Declarations):
             LinkLost: The link is down, and nothing was sent. Or it drops while waiting, or no answer comes in `timeout`
                 [s] or in the time that the server itself allows: what was asked may have been done.
             RemoteError: The service, or the server, refused or failed.
-            ProtocolError: The response has no fields.
-            InvalidValue: A number in `args` is not finite or not plain, `timeout` is not a time, or the caller is the
-                network thread.
+            InvalidValue: `args` are not plain and finite, `timeout` is no time, or this is the network thread.
         """
         self._require_waiting_allowed("call")
         if not isinstance(timeout, int | float) or not 0.0 < timeout < float("inf"):

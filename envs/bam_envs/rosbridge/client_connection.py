@@ -47,15 +47,10 @@ def bare_reason(url: str, error: BamEnvsError) -> str:
 
 
 class Connection:
-    """One connection.
+    """Connection number `epoch` of a link; `max_message` and `lost_after` are the link's.
 
-    Args:
-        endpoint: The server.
-        epoch: Its number among the connections of a link.
-        max_message: As of `RosbridgeLink`, as is `lost_after`.
-        lost_after: Silence of the server after which the connection is lost [s]; infinite: it never is.
-        on_message: Takes each message that is not an answer: publish, call_service, status.
-        on_end: Called once, when it has ended, before pending answers get the error.
+    `on_message` takes each message that is not an answer: publish, call_service, status. `on_end` is called once, when
+    it has ended, before pending answers get the error.
     """
 
     def __init__(
@@ -88,10 +83,7 @@ class Connection:
     async def open(self, timeout: float) -> None:
         """Connect, and see that a rosbridge server answers, all within `timeout` [s].
 
-        Raises:
-            NoServer: One of many reasons, each with its own text; a `ConnectionRefusedError` is its cause where the
-                server may just not be up yet.
-            InvalidValue: The CA file cannot be read.
+        `NoServer` says why not; a `ConnectionRefusedError` is its cause where the server may just not be up yet.
         """
         deadline = time.monotonic() + timeout
         self._socket = await _open_socket(self._endpoint, timeout, self._max_message)

@@ -1,7 +1,7 @@
 """What a client has declared: its topics, subscriptions and services, and the listeners of each topic.
 
-It outlives connections, because each new one must be told all of it again. The server gets one subscription per topic,
-whatever the number of listeners: it sends one stream per topic, and ends it at the first unsubscribe.
+Each new connection is told all of it again. The server gets one subscription per topic, whatever the number of
+listeners: it sends one stream per topic, and ends it at the first unsubscribe.
 """
 
 import logging
@@ -62,15 +62,12 @@ class Declarations(Bus):
 
         Args:
             topic: Its name.
-            kind: Its type.
+            kind: Its type, the same for all listeners.
             listener: Must return at once.
             throttle_ms: Least time between two messages [ms], the lowest of all listeners; the server drops the others.
             queue_length: How many messages the server keeps while they are throttled, the newest; 0: none.
             compression: ``"none"`` for JSON, or ``"cbor"``, seven times as fast for images and large arrays; its typed
                 arrays come as NumPy arrays, byte arrays as `bytes`.
-
-        Raises:
-            InvalidValue: The topic has another type here already, or a number is not whole.
         """
         self._require_process()
         wish = {"throttle_rate": throttle_ms, "queue_length": queue_length}

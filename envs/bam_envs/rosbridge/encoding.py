@@ -49,10 +49,8 @@ _TYPED = {_DTYPES[tag].name: (tag, _DTYPES[tag]) for tag in (69, 70, 71, 72, 77,
 
 
 def decode_frame(data: str | bytes) -> dict[str, Any]:
-    """The message in a frame of a client: one JSON object, alone and bounded. A binary frame holds the same in UTF-8.
-
-    NaN and infinities are read, so that what refuses them can say in which message and field they were.
-    """
+    """The message in a frame of a client: one JSON object, alone and bounded, in UTF-8."""
+    # NaN and infinities are read, so that what refuses them can say in which message and field they were.
     return _object(data, MOST_ITEMS, _STRICT)
 
 
@@ -233,10 +231,7 @@ class _Parts:
 
 
 class Fragments:
-    """Joins the fragments of one connection, in whatever order they come.
-
-    All unfinished messages may hold `max_size` bytes together, and each may stay unfinished for `lifetime` [s].
-    """
+    """Joins the fragments of one connection, in any order: `max_size` bytes at most, each message in `lifetime` [s]."""
 
     def __init__(self, max_size: int, lifetime: float = 10.0) -> None:
         self.max_size, self.lifetime = max_size, lifetime

@@ -54,10 +54,8 @@ class Sessions:
     def prove(self, tag: Tag, channel: str, content: bytes, caller: Caller, *, anywhere: bool = False) -> Freshness:
         """Check that `content` was signed for `channel` by the session of `tag`; returns what is fresh of the session.
 
-        It must come over the connection that opened the session, or, with `anywhere`, over any.
-
-        Raises:
-            RemoteError: The session is not open, or did not send this.
+        It must come over the connection that opened the session, or, with `anywhere`, over any. `RemoteError` if the
+        session is not open, or did not send this.
         """
         with self._lock:
             session = self._sessions.get(tag.session)

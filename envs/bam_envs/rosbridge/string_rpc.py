@@ -36,12 +36,9 @@ _ANSWERS_KEPT = 32  # the newest, by the key of their request: one that comes tw
 
 
 class StringRpc:
-    """Calls what a `StringRpcService` of the same name answers. Any thread; the first call opens the topics.
+    """Calls what a `StringRpcService` of the same name, such as ``/bam/scene``, answers; `tagger` is of the session.
 
-    Args:
-        link: Carries the topics; when it drops, calls under way fail at once.
-        name: Such as ``/bam/scene``.
-        tagger: Of the session to ask for; None: of none.
+    Any thread; the first call opens the topics. When the link drops, calls under way fail at once.
     """
 
     def __init__(self, link: RosbridgeLink, name: str, tagger: Tagger | None = None) -> None:
@@ -116,11 +113,8 @@ class StringRpc:
 class StringRpcService:
     """Answers requests, each once, in threads of its own; what is old is refused.
 
-    Args:
-        bus: Carries the topics.
-        name: Such as ``/bam/scene``.
-        handler: Makes the reply's payload. What it raises of our errors is the text of the reply's error.
-        sessions: Those that requests may be signed for; None: a signature means nothing.
+    The `handler` makes the reply's payload; what it raises of our errors is the text of the reply's error. Requests may
+    be signed for `sessions`; without them a signature means nothing.
     """
 
     def __init__(self, bus: Bus, name: str, handler: Handler, sessions: Sessions | None = None) -> None:

@@ -63,8 +63,7 @@ class LoopThread:
     def do(self, work: Callable[[], T], within: float = _PATIENCE) -> T:
         """Run `work` in the thread, in the caller's where the loop does not run, and return its result.
 
-        Raises:
-            LinkLost: It had not begun after `within` [s], and never will.
+        `LinkLost` if it had not begun after `within` [s], and never will.
         """
         done: Future[T] = Future()
 

@@ -1,9 +1,7 @@
 """The rosbridge v2 protocol of a server without any I/O: frames in, things to do out, the time passed in.
 
-One object, used by one thread. `BridgeServer` gives it sockets and a clock; a test gives it lists. Whatever a client
-sends, it is answered: a request by its response, everything else that does not work by a message ``status``.
-
-Longer than other modules, because every operation of the protocol is in it.
+Whatever a client sends, it is answered: a request by its response, everything else that does not work by a message
+``status``. Every operation of the protocol is here.
 """
 
 import contextlib

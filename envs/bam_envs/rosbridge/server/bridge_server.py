@@ -1,8 +1,7 @@
 """The embedded rosbridge server: the protocol of `bridge` on WebSockets, in a thread of its own.
 
 The network thread runs the protocol and the listeners; handlers of services run in a pool of threads, and long messages
-are read in a thread of their own, so that no halt waits for them. A client that sends nonsense, does not read,
-or opens sockets and says nothing costs a bounded amount of memory and time.
+are read in a thread of their own, so that no halt waits for them.
 """
 
 from __future__ import annotations

@@ -25,8 +25,7 @@ _FRAME = 200  # about what a frame costs beside what it holds [bytes]
 class Outbox:
     """A queue for one client that drops the oldest message of a topic for a newer one, and nothing else.
 
-    At most `most_bytes` wait (one message more, of whatever size, is taken when less than that waits), and of one topic
-    at most `most_of_a_stream` messages, unless the client asked for fewer.
+    At most `most_bytes` wait, and one message more; of one topic at most `most_of_a_stream` messages.
     """
 
     def __init__(self, most_bytes: int, most_of_a_stream: int) -> None:
