@@ -4,14 +4,14 @@
 
     from bam_train.loop import Agent, Agents, TemporalAgent, Workspace
 
-The core needs NumPy only. What needs torch is imported when it is asked for, and so is what only programs written for
-BBRL need, which is in `bam_train.compat.bbrl`.
+The core needs NumPy only. What needs torch, and what only programs written for BBRL need, is imported on use.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
 from bam_train.loop.agent import Agent as Agent
+from bam_train.loop.agent import import_torch
 from bam_train.loop.agents import Agents as Agents
 from bam_train.loop.agents import CopyTAgent as CopyTAgent
 from bam_train.loop.agents import EpisodesDone as EpisodesDone
@@ -72,11 +72,9 @@ def __getattr__(name: str) -> Any:
     try:
         value = getattr(importlib.import_module(f"bam_train.{_MODULES[name]}"), name)
     except ModuleNotFoundError as error:
-        if error.name != "torch":
-            raise
-        from bam_envs.core.errors import MissingExtra  # brings Gymnasium
-
-        raise MissingExtra("torch", "train", f"bam_train.loop.{name}") from error
+        if error.name == "torch":
+            import_torch(f"bam_train.loop.{name}")  # says how to install it
+        raise
     globals()[name] = value
     return value
 

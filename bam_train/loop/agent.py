@@ -1,8 +1,7 @@
-"""An agent reads variables of a workspace and writes others.
+"""An agent reads variables of a workspace and writes others: BBRL's `Agent`.
 
-It is BBRL's `Agent`. An agent that is made after torch was imported is an `nn.Module` too, with everything that belongs
-to one: its class is a subclass of its own class and of `nn.Module`. Without torch it is a plain object, and agents that
-work on NumPy arrays need nothing more.
+Made after torch was imported, it is an `nn.Module` too: its class is a subclass of its own class and of `nn.Module`.
+Without torch it is a plain object, which is enough for NumPy arrays.
 
 Differences from BBRL: after an exception the agent can be used again; two threads in one agent are an error; `reads`,
 `reads_previous` and `writes` can be declared, and are then checked before anything runs; `close` is called when an
@@ -98,7 +97,7 @@ class Agent(_Base):  # type: ignore[misc]
     def close(self) -> None:
         """Stop what moves and release what is open; called when an exception leaves the loop.
 
-        By default it closes the agents in it, those that move something real first; a failure is raised at the end.
+        By default it closes the agents in it, the live ones first; a failure is raised at the end.
         """
         with ExitStack() as stack:  # closes what is left when one fails, last one first
             for agent in sorted(self._inner(), key=is_live):
@@ -107,10 +106,6 @@ class Agent(_Base):  # type: ignore[misc]
     def _inner(self) -> tuple[Agent, ...]:
         """The agents in it."""
         return ()
-
-    def _parts(self) -> tuple[Agent, ...] | None:
-        """The agents that do its work and nothing else is done; None if it does some itself."""
-        return None
 
     def _declare(
         self,
@@ -156,7 +151,7 @@ class Agent(_Base):  # type: ignore[misc]
 
     @property
     def name(self) -> str | None:
-        """What `get_by_name` finds; a subclass may have a `name` of its own beside it."""
+        """What `get_by_name` finds; a subclass may redefine it."""
         return self._name
 
     @name.setter
@@ -218,11 +213,7 @@ class Agent(_Base):  # type: ignore[misc]
 
 
 def import_torch(purpose: str) -> Any:
-    """The module torch.
-
-    Raises:
-        MissingExtra: It is not installed; says how to install it for `purpose`.
-    """
+    """The module torch; `MissingExtra` says how to install it for `purpose`."""
     try:
         import torch
     except ModuleNotFoundError as error:

@@ -1,7 +1,7 @@
-"""Agents that are made of others, and a few small ones: `Agents`, `KWAgentWrapper`, `CopyTAgent`, `PrintAgent`, ...
+"""Agents that are made of others, and a few small ones.
 
-Differences from BBRL: `KWAgentWrapper` wraps anything that can be called, `Agents` too; `CopyTAgent` detaches
-without t as well; `PrintAgent` without names prints what there is each time.
+Differences from BBRL: `KWAgentWrapper` wraps `Agents` too; `CopyTAgent` detaches without t as well; `PrintAgent`
+without names prints what there is each time.
 """
 
 import sys
@@ -15,16 +15,10 @@ from bam_train.loop.agent import Agent, agent_name, is_module
 
 
 class Agents(Agent):
-    """Runs its members in order, with the same keywords.
-
-    Args:
-        agents: The members.
+    """Runs its members, which it has in `agents` (an ``nn.ModuleList`` once torch is imported), with the same keywords.
 
     Raises:
         LoopError: One of them is no agent.
-
-    Attributes:
-        agents: The members: an ``nn.ModuleList`` once torch is imported, else a list.
     """
 
     def __init__(self, *agents: Agent, name: str | None = None) -> None:
@@ -57,9 +51,6 @@ class Agents(Agent):
     def _inner(self) -> tuple[Agent, ...]:
         return tuple(self._members())
 
-    def _parts(self) -> tuple[Agent, ...] | None:
-        return self._inner() if _only_runs_members(self) else None
-
     def _members(self) -> Iterable[Agent]:
         # Around nn.Module's __getattr__ and ModuleList's own, which cost as much as a small agent.
         own = self.__dict__
@@ -68,12 +59,7 @@ class Agents(Agent):
 
 
 class KWAgentWrapper(Agent):
-    """Runs an agent with more keywords.
-
-    Args:
-        agent: What to run.
-        kwargs: Keywords added to those of the call.
-    """
+    """Runs `agent` with more keywords."""
 
     def __init__(self, agent: Agent, **kwargs: Any) -> None:
         super().__init__()
@@ -87,18 +73,9 @@ class KWAgentWrapper(Agent):
     def _inner(self) -> tuple[Agent, ...]:
         return (self.wrapped,)
 
-    def _parts(self) -> tuple[Agent, ...] | None:
-        return self._inner() if type(self).forward is KWAgentWrapper.forward else None
-
 
 class CopyTAgent(Agent):
-    """Copies a variable: at time t, or all of it when the call has no t.
-
-    Args:
-        input_name: From.
-        output_name: To.
-        detach: Cut the copy off the graph.
-    """
+    """Copies a variable, cut off the graph with `detach`: at time t, or all of it when the call has no t."""
 
     def __init__(self, input_name: str, output_name: str, detach: bool = False, name: str | None = None) -> None:
         super().__init__(name=name)
@@ -114,11 +91,7 @@ class CopyTAgent(Agent):
 
 
 class PrintAgent(Agent):
-    """Prints variables at time t.
-
-    Args:
-        names: Which; all that there are by default.
-    """
+    """Prints variables at time t; without names all that there are."""
 
     def __init__(self, *names: str, name: str | None = None) -> None:
         super().__init__(name=name)
@@ -137,12 +110,7 @@ class PrintAgent(Agent):
 
 
 class EpisodesDone(Agent):
-    """Writes whether an episode has ended at t or before: a running OR, begun again at t = 0.
-
-    Args:
-        in_var: The flag that is true at an end (B,).
-        out_var: The flag that stays true (B,), bool.
-    """
+    """Writes to `out_var` (B,) whether `in_var` (B,) was true at t or before: a running OR, begun again at t = 0."""
 
     def __init__(self, in_var: str = "env/done", out_var: str = "env/done") -> None:
         super().__init__()
@@ -159,12 +127,7 @@ class EpisodesDone(Agent):
 
 
 class SeedableAgent(Agent):
-    """An agent that is seeded once.
-
-    Args:
-        seed: The seed, if it is known already.
-        kwargs: ``name``, ``verbose``.
-    """
+    """An agent that is seeded once, here or by `seed`."""
 
     _SEED_AGAIN = "SeedableAgentLast, SeedableAgentSum and SeedableAgentMean take several seeds."
 
@@ -185,28 +148,3 @@ class SeedableAgent(Agent):
             )
         self._seed = seed
         return self
-
-
-def _only_runs_members(agent: Agent) -> bool:
-    kind: Any = type(agent)
-    return kind.forward is Agents.forward and kind.__call__ is Agent.__call__
-
-
-def members(agent: Agent) -> list[Agent]:
-    """What to call instead of `agent`: the members of an `Agents`, and of those in it."""
-    if not _only_runs_members(agent):
-        return [agent]
-    return [one for member in agent._inner() for one in members(member)]
-
-
-def leaves(agent: Agent) -> list[Agent]:
-    """The agents that do the work, in the order in which they run."""
-    parts = agent._parts()
-    return [agent] if parts is None else [leaf for part in parts for leaf in leaves(part)]
-
-
-def describe(agent: Agent) -> str:
-    """Such as ``Agents(RobotAgent, PolicyAgent)``."""
-    if isinstance(agent, Agents):
-        return f"Agents({', '.join(describe(member) for member in agent)})"
-    return agent_name(agent)

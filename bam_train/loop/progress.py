@@ -34,8 +34,8 @@ def progress_display(
     A loop that ends early is shown as finished; one that an exception leaves stays where it was.
 
     Args:
-        progress: The caller's display, which gets one more task, or True for a display of its own on stderr, which is
-            drawn on a terminal and in a notebook only.
+        progress: The caller's display, which gets one more task, or True for one on stderr, drawn on a terminal and in
+            a notebook only.
         n_steps: The most steps there will be; None where only a stop variable ends the loop.
         t: The time of the first step.
         description: What is written in front of the bar.

@@ -20,17 +20,15 @@ SAYS_SUCCESS = "info/_is_success"
 class RobotAgent(Agent):
     """At t = 0 resets the environment, later steps it with the action of t - 1.
 
-    It writes at every t, with a batch of one: ``env/env_obs`` (or ``env/env_obs/<key>`` of a Dict) with the space's
-    dtype, ``env/reward`` and ``env/cumulated_reward`` (float64; 0 at a reset), ``env/timestep`` (int64; steps since the
-    reset), ``env/terminated``, ``env/truncated`` and ``env/done`` (bool), and ``env/info/is_success`` with its mask
-    ``env/info/_is_success`` (bool). Run it until ``env/done``; a call at t = 0 begins the next episode.
+    It writes, with a batch of one, what `ParallelGymAgent` writes with ``arrays="numpy"`` and
+    ``info_keys=("is_success",)``. Run it until ``env/done``; a call at t = 0 begins the next episode.
 
     An environment with a robot is live: a chain with it is checked when it is built, before the robot is connected.
 
     Args:
         env: The environment; closed by `close`.
-        input_string: The variable that has the action.
-        output_string: What its variables' names begin with.
+        input_string: The variable with the action.
+        output_string: Put before the names of all variables that it writes.
     """
 
     def __init__(
@@ -71,10 +69,8 @@ class RobotAgent(Agent):
             return
         try:
             self.halt()
-        except Exception:
+        finally:
             self.env.close()  # type: ignore[no-untyped-call]
-            raise
-        self.env.close()  # type: ignore[no-untyped-call]
         self._closed = True
 
     def forward(self, t: int, seed: int | None = None, **kwargs: Any) -> None:
@@ -128,8 +124,6 @@ class PolicyAgent(Agent):
         policy: Has ``reset(env_ids=None)`` and ``act_batch(observations)``, or ``act(observation)`` with `single`.
         observation_names: The variables that make up its observation; of a Dict ``env/env_obs/<key>`` each.
         single: The batch is one environment, and the policy's `act` takes it without a batch axis.
-        output_string: The variable of the action.
-        input_prefix: What the environment's variables begin with.
     """
 
     def __init__(

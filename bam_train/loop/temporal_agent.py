@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from bam_train.errors import LoopError, UnknownVariable, WiringError
 from bam_train.loop.agent import Agent, agent_name, is_live
-from bam_train.loop.agents import describe, leaves, members
+from bam_train.loop.agents import Agents, KWAgentWrapper
 from bam_train.loop.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -48,9 +48,7 @@ class TemporalAgent(Agent):
         stop_variable: str | None = None,
         **kwargs: Any,
     ) -> None:
-        """Run the agent from time t on.
-
-        When an exception leaves it, every agent's `close` is called; earlier times stay readable.
+        """Run the agent from time t on. After an exception every agent is closed; earlier times stay readable.
 
         Args:
             workspace: What it reads and writes.
@@ -72,15 +70,10 @@ class TemporalAgent(Agent):
         super().__call__(workspace, t=t, n_steps=n_steps, stop_variable=stop_variable, **kwargs)
 
     def forward(self, t: int, n_steps: int | None, stop_variable: str | None, **kwargs: Any) -> None:
-        """Check the agents and run them; close them when an exception comes."""
+        """Check the agents, run them, and close them when an exception comes."""
         workspace = self.workspace
         try:
             _check(self.agent, workspace, stop_variable)
-        except WiringError:
-            if is_live(self.agent):  # a robot that waits for the next call
-                self.agent.close()
-            raise
-        try:
             display: Any = nullcontext(None)
             if self.progress is not False:
                 from bam_train.loop.progress import progress_display
@@ -104,14 +97,16 @@ class TemporalAgent(Agent):
         advance: Callable[[int], None] | None,
         kwargs: dict[str, Any],
     ) -> None:
-        calls = [(agent, agent.__call__) for agent in members(self.agent)]  # bound: quicker than agent(...)
+        calls = [
+            (agent, agent.__call__) for agent in _unfolded(self.agent, (Agents,))
+        ]  # bound: quicker than agent(...)
         end = None if n_steps is None else t + n_steps
         while True:
             for agent, call in calls:
                 try:
                     call(workspace, t=t, **kwargs)
                 except BaseException as error:  # noqa: PERF203 - free of cost until it happens
-                    _note(error, f"In {agent_name(agent)} of {describe(self.agent)} at t={t}.")
+                    _note(error, f"In {agent_name(agent)} of {_describe(self.agent)} at t={t}.")
                     raise
             if advance is not None:
                 advance(1)
@@ -127,12 +122,22 @@ class TemporalAgent(Agent):
     def _inner(self) -> tuple[Agent, ...]:
         return (self.agent,)
 
-    def _parts(self) -> tuple[Agent, ...] | None:
-        return self._inner() if type(self).__call__ is TemporalAgent.__call__ else None
-
     def __getstate__(self) -> dict[str, Any]:
         """A display of the caller's stays with the original."""
         return {**super().__getstate__(), "progress": self.progress is True}
+
+
+def _unfolded(agent: Agent, kinds: tuple[type[Agent], ...]) -> list[Agent]:
+    """The agents in it, in the order in which they run; itself unless it is of these kinds and does nothing else."""
+    own = type(agent)
+    if any(own.forward is kind.forward and own.__call__ is kind.__call__ for kind in kinds):
+        return [one for inner in agent._inner() for one in _unfolded(inner, kinds)]
+    return [agent]
+
+
+def _describe(agent: Agent) -> str:
+    """Such as ``Agents(RobotAgent, PolicyAgent)``."""
+    return f"Agents({', '.join(map(_describe, agent))})" if isinstance(agent, Agents) else agent_name(agent)
 
 
 def _note(error: BaseException, text: str) -> None:
@@ -140,22 +145,13 @@ def _note(error: BaseException, text: str) -> None:
         error.add_note(text)
 
 
-# -- who reads and who writes what, checked before anything runs -------------------------------------------------------
-#
-# An agent says what it does with `reads` (at t, so an agent before it must write it), `reads_previous` (at t - 1, so
-# any agent may write it) and `writes`. A chain with a robot in it is checked when it is built, and every agent in it
-# has to say. Any other chain is checked when it is called; what the workspace holds counts as written, and as long as
-# one agent does not say what it writes, anything may be.
-
-
 def _check(agent: Agent, held: Iterable[str], stop_variable: str | None) -> None:
-    """Check a chain that runs on a workspace which holds the variables `held`.
+    """Check that what the agents read and the stop variable are written, before anything runs.
 
-    Raises:
-        WiringError: An agent reads what nobody writes, nobody writes the stop variable, or an agent in a chain with a
-            robot does not say what it reads and writes.
+    In a chain with a robot every agent has to say what it reads and writes. In any other one, what the workspace holds
+    already (`held`) counts as written, and as long as one agent does not say what it writes, anything may be.
     """
-    chain, before = leaves(agent), set(held)
+    chain, before = _unfolded(agent, (Agents, KWAgentWrapper, TemporalAgent)), set(held)
     if is_live(agent):
         for one in chain:
             if one.reads is None or one.writes is None:

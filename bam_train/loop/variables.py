@@ -3,20 +3,14 @@
 A variable that `set` writes is a list. One that `set_full` writes is one array, until the next `set`. The joined form
 of a list is kept until the next write through the workspace, so that a second full read costs only a copy. A stored
 value that is changed in place after a full read does not show in the next full read.
-
-NumPy values are copied in. `bam_train.loop.tensors.tensor_variable.TensorVariable` keeps the tensor objects themselves,
-with their graph: what was written at t and read at t + 1 can still be differentiated through, as in BBRL.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from bam_train.errors import TimeNotWritten, ValueMismatch, WorkspaceError
-
-UNLIMITED = 2**62
-"""More times than any workspace holds."""
 
 
 class Variable:
@@ -25,8 +19,6 @@ class Variable:
     Args:
         name: For error messages.
         first: The first time kept; only a windowed workspace starts later than 0.
-        limit: The most times that are kept.
-        make_room: Called with a time that does not fit; it must call `drop`.
 
     Attributes:
         shape: The shape of one time; None before the first write, as `dtype`.
@@ -41,10 +33,8 @@ class Variable:
     library: Any = np
     """Has `stack` and `concatenate` for them."""
 
-    def __init__(
-        self, name: str, first: int = 0, limit: int = UNLIMITED, make_room: Callable[[int], None] | None = None
-    ) -> None:
-        self.name, self.first, self._limit, self._make_room = name, first, limit, make_room
+    def __init__(self, name: str, first: int = 0) -> None:
+        self.name, self.first = name, first
         self.shape: Any = None
         self.dtype: Any = None
         self._values: list[Any] | None = []
@@ -82,7 +72,7 @@ class Variable:
         if self.COPIES:
             value = np.array(value)
         values = self._values
-        if values is not None and t - self.first == len(values) < self._limit:  # the usual case, without a call
+        if values is not None and t - self.first == len(values):  # the usual case, without a call
             self._joined = None
             values.append(value)
         else:
@@ -189,9 +179,6 @@ class Variable:
         values = self._listed() if self._values is None else self._values
         count = len(values)
         index = t - self.first if t >= 0 else count + t
-        if index >= self._limit and self._make_room is not None:
-            self._make_room(t)
-            index, count = t - self.first, len(values)
         if index == count:
             values.append(value)
         elif index > count:

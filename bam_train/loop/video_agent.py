@@ -15,11 +15,7 @@ from bam_train.video import Frame, open_video, picture, require_video_path
 
 
 class VideoAgent(Agent):
-    """Gives pictures of an environment, which renders ``"rgb_array"``, to `add`; stands behind the environment's agent.
-
-    Attributes:
-        count: The number of pictures taken.
-    """
+    """Gives `count` pictures of an environment, one at each t, to `add`; stands behind the environment's agent."""
 
     reads = ()
     writes = ()
@@ -29,7 +25,7 @@ class VideoAgent(Agent):
         self.env, self.add, self.count = env, add, 0
 
     def forward(self, t: int, **kwargs: Any) -> None:
-        """Take the picture at time t; refused where the environment gives none."""
+        """Take the picture; refused where the environment gives none."""
         self.add(picture(self.env))
         self.count += 1
 
@@ -41,8 +37,7 @@ def record_video(env: gym.Env[Any, Any], policy: Agent, path: str | Path, *, arr
 
     Args:
         env: Made with ``render_mode="rgb_array"``.
-        policy: Called with ``t`` and ``workspace`` after every observation; of a `TemporalAgent`, the agent in it. It
-            finds what `ParallelGymAgent` writes.
+        policy: Called with ``t`` after every observation; it finds what `ParallelGymAgent` writes.
         path: Ends in ``.mp4`` or ``.gif``; without a suffix it is an ``.mp4``. Its folder is made.
         arrays: What the policy reads and writes: ``"torch"``, without gradients, or ``"numpy"``.
 

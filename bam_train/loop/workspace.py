@@ -1,7 +1,7 @@
 """The workspace: named variables over time, which agents read and write.
 
-A variable is T x B x ...: time first, batch second; at one time it is B x .... Values are torch tensors, which are kept
-as they are, with their graph, or NumPy arrays, which are copied in and need no torch.
+A variable is T x B x ...: time first, batch second; at one time it is B x .... Values are torch tensors, kept as they
+are, with their graph, or NumPy arrays, which are copied in.
 
 It is BBRL's `Workspace`, with these differences:
 
@@ -13,7 +13,7 @@ It is BBRL's `Workspace`, with these differences:
 - A workspace with a window gives old times to a sink and forgets them: memory stays flat however long the loop runs.
   What is made of it (`contiguous`, `select_batch`, `to`, a copy) holds the times kept, and begins at time 0 again.
 
-Longer than most files here: BBRL's users find every member in one class.
+Longer than most files: BBRL's users find every member in one class.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bam_train.errors import TimeNotWritten, UnknownVariable, WorkspaceError
-from bam_train.loop.variables import UNLIMITED, Variable, kind_mismatch, no_batch
+from bam_train.loop.variables import Variable, kind_mismatch, no_batch
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -45,8 +45,7 @@ class Workspace:
         workspace: Begin as a copy of this one, sharing no memory.
         window: Keep at least the last so many times and forget older ones; None keeps all.
         sink: Gets what leaves the window, in order: ``sink(first_time, {name: array (n, B, ...)})``. A variable that
-            nobody wrote at these times is shorter or absent. The write that needs room calls it: a loop with a
-            deadline waits for it.
+            nobody wrote at these times is shorter or absent. The write that needs room waits for it.
 
     Attributes:
         variables: The variables by name, in the order of their first write.
@@ -86,10 +85,12 @@ class Workspace:
         if variable is None:
             variable = self.variables[name] = self._new(name, value, f"t={t}")
         try:
+            if self.window is not None and t - self.first_time >= self.window + max(self.window, _LEAST_PIECE):
+                self._forget(t - self.window + 1)
             variable.set(t, value)
         except BaseException as error:
             if is_first:
-                del self.variables[name]
+                self.variables.pop(name, None)
             if isinstance(error, (TypeError, IndexError)):
                 raise _no_time(name, t) from None
             raise
@@ -131,12 +132,7 @@ class Workspace:
         return self._variable(name).full()
 
     def get_time_truncated(self, name: str, from_time: int, to_time: int) -> Any:
-        """Times [from_time, to_time) of one variable, cut off at the end.
-
-        Raises:
-            WorkspaceError: Not ``0 <= from_time < to_time``.
-            TimeNotWritten: It begins with a time that has left the window.
-        """
+        """Times [from_time, to_time) of one variable, ``0 <= from_time < to_time``, cut off at the end."""
         variable = self._variable(name)
         self._require_times(name, from_time, to_time)
         return variable.truncated(from_time, to_time)
@@ -195,11 +191,7 @@ class Workspace:
             one.copy_time(from_time, to_time, n_steps)
 
     def copy_n_last_steps(self, n: int, var_names: Sequence[str] | None = None) -> None:
-        """Copy the last n times onto the first n; the length does not change.
-
-        Raises:
-            WorkspaceError: The variables have different lengths, or fewer than n times.
-        """
+        """Copy the last n times onto the first n; the length, which must be common, does not change."""
         size = _common("time", {name: one.time_size() for name, one in self._chosen(var_names).items()})
         if size is None:
             return
@@ -208,11 +200,7 @@ class Workspace:
         self.copy_time(size - n, 0, n, var_names)
 
     def subtime(self, from_t: int, to_t: int) -> Workspace:
-        """A new workspace of times [from_t, to_t) of all variables, which have one length, by Python's slice rules.
-
-        Raises:
-            TimeNotWritten: It begins with a time that has left the window.
-        """
+        """A new workspace of times [from_t, to_t) of all variables, which have one length, by Python's slice rules."""
         begin, end, _ = slice(from_t, to_t).indices(self.time_size() or 0)
         for name in self.variables if begin < end else ():
             self._require_times(name, begin, end)
@@ -239,11 +227,7 @@ class Workspace:
         return self.select_batch(torch.randint(size, (n,)) if torch else np.random.randint(size, size=n))
 
     def select_subtime(self, t: Any, window_size: int) -> Workspace:
-        """A new workspace where column b has times t[b] to t[b] + window_size - 1; `t` is (B,), int.
-
-        Raises:
-            TimeNotWritten: A window goes beyond the times of a variable.
-        """
+        """A new workspace where column b has times t[b] to t[b] + window_size - 1; `t` is (B,), int."""
         result = {}
         for name, one in self.variables.items():
             array = one.view()
@@ -262,9 +246,6 @@ class Workspace:
 
         Each has `n_timesteps` times and `n_batch_elements` columns, drawn without replacement (all if there are not
         more).
-
-        Raises:
-            WorkspaceError: A window is longer than what there is.
         """
         times = self.time_size() or 0
         if n_timesteps > times or n_times < 1:
@@ -307,9 +288,6 @@ class Workspace:
 
         A pair whose first step has `filter_key` true joins the last state of an episode to the first of the next one;
         such pairs are left out, unless `no_final_state`, which needs no `filter_key`.
-
-        Raises:
-            WorkspaceError: A variable is not as long as `filter_key`.
         """
         inside = None
         if not no_final_state:
@@ -343,15 +321,16 @@ class Workspace:
     def flush(self) -> None:
         """Give all that is left to the sink, forget it, and begin again at time 0."""
         stop = max((one.time_size() for one in self.variables.values()), default=0)
-        first, piece = self._take_out(stop) if stop > self.first_time else (0, {})
-        self.clear()
-        if self._sink is not None and piece:
-            self._sink(first, piece)
+        try:
+            if stop > self.first_time:
+                self._forget(stop)
+        finally:
+            self.clear()
 
     # -- pictures --------------------------------------------------------------------------------------------------
 
     def plot(self, *names: str, batch: int | Sequence[int] | None = None) -> Figure:
-        """A matplotlib figure of these variables over time (all without a name), see `bam_train.loop.plotting.plot`."""
+        """A matplotlib figure of these variables over time, see `bam_train.loop.plotting.plot`."""
         from bam_train.loop.plotting import plot
 
         return plot(self, *names, batch=batch)
@@ -382,10 +361,7 @@ class Workspace:
             raise no_batch(name, where)
         else:
             raise kind_mismatch(name, where, "a torch.Tensor or a numpy.ndarray", value)
-        # Only with a window: a workspace in a cycle with its variables is freed late, by the garbage collector.
-        if self.window is None:
-            return kind(name, 0, UNLIMITED)
-        return kind(name, self.first_time, self.window + max(self.window, _LEAST_PIECE), self._make_room)
+        return kind(name, self.first_time)
 
     def _chosen(self, names: Sequence[str] | None) -> dict[str, Variable]:
         return {name: self._variable(name) for name in (self.variables if names is None else names)}
@@ -401,23 +377,18 @@ class Workspace:
         if begin < self.first_time:
             raise TimeNotWritten(f"{name!r} has lost t={begin}: times before {self.first_time} have left the window.")
 
-    def _make_room(self, t: int) -> None:
-        """Forget so much that time t fits; what is forgotten goes to the sink."""
-        stop = t - (self.window or 0) + 1
-        first, piece = self._take_out(stop)
-        for one in self.variables.values():
-            one.drop(stop)
-        if self._sink is not None:
-            self._sink(first, piece)  # last: each piece goes there once, also if it fails
-
-    def _take_out(self, stop: int) -> tuple[int, dict[str, Any]]:
-        """The first time kept and what the sink gets of the times before `stop`, which count as forgotten now."""
+    def _forget(self, stop: int) -> None:
+        """Forget the times before `stop`; they go to the sink."""
         first, self.first_time = self.first_time, stop
-        return first, {
+        piece = {
             name: one.copied(one.truncated(first, min(stop, one.time_size())))  # of one array it would be a view
             for name, one in self.variables.items()
             if one.time_size() > first and self._sink is not None
         }
+        for one in self.variables.values():
+            one.drop(stop)
+        if self._sink is not None:
+            self._sink(first, piece)  # last: each piece goes there once, also if it fails
 
 
 def _of(arrays: Mapping[str, Any]) -> Workspace:

@@ -55,12 +55,7 @@ class SerializableAgent(Agent):
         return self
 
     def save(self, filename: str | Path) -> None:
-        """Pickle `serialize` into a file.
-
-        Raises:
-            LoopError: Something in it cannot be pickled.
-            OutputError: The file cannot be written.
-        """
+        """Pickle `serialize` into a file: `LoopError` if it cannot be pickled, `OutputError` if not written."""
         try:
             data = pickle.dumps(self.serialize())
         except (pickle.PicklingError, TypeError, AttributeError) as error:
@@ -72,11 +67,7 @@ class SerializableAgent(Agent):
 
 
 def load(filename: str | Path) -> Any:
-    """The agent in a file of `SerializableAgent.save`. It is a pickle and runs what is in it: trust its maker.
-
-    Raises:
-        LoopError: No such file, or not a pickle.
-    """
+    """The agent in a file of `SerializableAgent.save`. It is a pickle and runs what is in it: trust its maker."""
     try:
         return pickle.loads(Path(filename).expanduser().read_bytes())
     except (OSError, pickle.UnpicklingError, EOFError) as error:
@@ -113,11 +104,7 @@ def get_arguments(arguments: Any) -> dict[str, Any]:
 
 
 def instantiate_class(arguments: Any) -> Any:
-    """Call the class that a configuration names, with its other entries as keyword arguments.
-
-    Raises:
-        SettingsError: There is no `classname`, or it cannot be imported.
-    """
+    """Call the class that a configuration names (see `get_class`), with its other entries as keyword arguments."""
     return get_class(arguments)(**get_arguments(arguments))
 
 

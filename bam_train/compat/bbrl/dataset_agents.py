@@ -63,7 +63,7 @@ class DataLoaderAgent(_DatasetAgent):
             agent(workspace)
 
     Args:
-        dataloader: A ``torch.utils.data.DataLoader``, or anything else that can be iterated over again and again.
+        dataloader: A ``torch.utils.data.DataLoader``, or anything that can be iterated over again and again.
         output_names: Variables for the values of a batch, B x ... each; further values are left out.
     """
 

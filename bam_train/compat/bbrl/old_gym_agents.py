@@ -19,19 +19,8 @@ from bam_train.loop.gym.parallel_gym_agent import Env, ParallelGymAgent, has_aut
 class _OldGymAgent(ParallelGymAgent):
     """Writes env_obs, done, truncated, reward, timestep and cumulated_reward as `ParallelGymAgent` does.
 
-    Environment k is seeded with ``seed + k`` when it is made; no reset seeds it again.
-
-    Args:
-        make_env_fn: Called `n_envs` times with `make_env_args`.
-        make_env_args: Its keywords.
-        n_envs: The number of environments.
-        seed: Of the first environment; required.
-        action_string: The variable with the action.
-        output: Put before the names of all variables.
-        arrays: ``"torch"`` or ``"numpy"``, see `GymAgent`.
-
-    Raises:
-        SettingsError: There is no seed, or `n_envs` is not at least 1.
+    Environment k is seeded with ``seed + k`` when it is made; no reset seeds it again. `seed` and `n_envs` are
+    required, in spite of their defaults.
     """
 
     _autoreset: bool
@@ -51,15 +40,8 @@ class _OldGymAgent(ParallelGymAgent):
             raise SettingsError(f"{type(self).__name__}: expected a seed, found None.")
         if n_envs is None:
             raise SettingsError(f"{type(self).__name__}: expected n_envs, the number of environments, found None.")
-        super().__init__(
-            make_env_fn,
-            n_envs,
-            make_env_args,
-            seed=seed,
-            input_string=action_string,
-            output_string=output,
-            arrays=arrays,
-        )
+        strings = {"input_string": action_string, "output_string": output}
+        super().__init__(make_env_fn, n_envs, make_env_args, seed=seed, arrays=arrays, **strings)
         self._declare(_OldGymAgent, reads=None, writes=self._written())
 
     @property
@@ -90,14 +72,7 @@ class _OldGymAgent(ParallelGymAgent):
         return [None if self._seeded else int(self._seed or 0) + k for k in range(self.num_envs)]
 
     def forward(self, t: int = 0, save_render: bool = False, render: bool = False, **kwargs: Any) -> None:
-        """One step of every environment with the action of t - 1; at t = 0 all are reset.
-
-        Args:
-            t: The time.
-            save_render: Write the pictures of all environments to ``env/rendering``.
-            render: Have all environments rendered.
-            kwargs: ``seed``, see `ParallelGymAgent`.
-        """
+        """See `GymAgent`; then render all environments, and write their pictures with `save_render`."""
         super().forward(t, **kwargs)
         self._seeded = True
         if save_render or render:

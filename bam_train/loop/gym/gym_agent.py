@@ -27,7 +27,7 @@ class GymAgent(SeedableAgent):
     """Base of `ParallelGymAgent` and `VecGymAgent`.
 
     Args:
-        input_string: The variable with the action; or, where actions are dicts, the first part of their names.
+        input_string: The variable with the action; where actions are dicts, the first part of their names.
         output_string: Put before the names of all variables that it writes.
         reward_at_t: Write the reward and the cumulated reward of action[t] at t, not at t + 1. The reward at the
             newest time is 0 until the next step overwrites it.
@@ -111,8 +111,7 @@ class GymAgent(SeedableAgent):
         Args:
             t: The time.
             kwargs: ``seed``: at t = 0, what environment k is reset with: a number s for s + k, or one number for
-                each. Without it BBRL's rule holds: num_envs * r * seed + k + 1, r counting the resets from 2. Other
-                keywords are not looked at.
+                each. Without it BBRL's rule holds: num_envs * r * seed + k + 1, r counting the resets from 2.
 
         Raises:
             LoopError: t > 0 and the environments were never reset, or closed since; or nobody wrote an action, or one
@@ -177,12 +176,8 @@ class GymAgent(SeedableAgent):
         return tuple(self.output + name for name in (*names(self.observation_space), *NUMBERS, *infos))
 
     def _reset_seeds(self, seed: Any) -> int | list[int | None]:
-        """What the environments are reset with at t = 0: one seed to count from, or one for each.
-
-        `seed` is what the call was given: None for the agent's own rule.
-        """
+        """What the environments are reset with: one seed to count from, or one for each; None for the own rule."""
         if seed is None:
-            # Environment k gets num_envs * (number of the reset, from 2) * seed + k + 1, as BBRL's ParallelGymAgent.
             return self.num_envs * self._nb_reset * int(self._seed or 0) + 1
         if isinstance(seed, (int, np.integer)):
             return int(seed)
@@ -207,8 +202,7 @@ class GymAgent(SeedableAgent):
     def get_obs_and_actions_sizes(self) -> tuple[Any, Any]:
         """Sizes of observation and action: length, or number of choices; with a warning, the shape of more dimensions.
 
-        Raises:
-            LoopError: A space has no size, such as a dict.
+        A space without a size, such as a dict, raises `LoopError`.
         """
         return _size(self.observation_space), _size(self.action_space)
 

@@ -16,7 +16,7 @@ from bam_train.loop.workspace import Workspace
 
 
 class ReplayBuffer:
-    """The newest `max_size` items that were put in; an item is T times of every variable.
+    """The newest `max_size` (at least 1) items that were put in; an item is T times of every variable.
 
     The first `put` fixes the names, T, shapes and dtypes.
 
@@ -24,13 +24,6 @@ class ReplayBuffer:
         variables: Name to tensor, max_size x T x ...; items from `size()` on are zeros that nobody wrote.
         position: The item that the next `put` writes first.
         is_full: Whether `max_size` items have been put in.
-
-    Args:
-        max_size: The most items that are kept, at least 1.
-        device: Where items are kept and drawn.
-
-    Raises:
-        WorkspaceError: `max_size` is less than 1.
     """
 
     def __init__(self, max_size: int, device: torch.device | str = torch.device("cpu")) -> None:  # noqa: B008 - a value
@@ -43,10 +36,9 @@ class ReplayBuffer:
         self.is_full = False
 
     def put(self, workspace: Workspace) -> None:
-        """Add the N columns of a workspace (T x N x ...) as N items; the oldest items make room.
+        """Add the N columns of a workspace (T x N x ..., such as transitions, where T is 2) as N items, detached.
 
-        Values are copied, detached, to the buffer's device. Transitions (`get_transitions`) have T = 2; whole rollouts
-        of one length T can be put as well.
+        The oldest items make room.
 
         Raises:
             UnknownVariable: A variable that the buffer has is missing.
@@ -86,9 +78,6 @@ class ReplayBuffer:
         """A workspace (T x batch_size x ...) of items drawn uniformly, with replacement; one draw for all variables.
 
         Draws from torch's global generator: the same ``torch.manual_seed`` gives the same items as BBRL's.
-
-        Raises:
-            WorkspaceError: Nothing has been put in.
         """
         size = self.size()
         if not size:
@@ -100,7 +89,7 @@ class ReplayBuffer:
         return workspace
 
     def to(self, device: torch.device | str) -> ReplayBuffer:
-        """Move the items, and those of later puts, to a device; returns the buffer."""
+        """Move the items, and those put later, to a device; returns the buffer."""
         self.device = torch.device(device)
         self.variables = {name: value.to(self.device) for name, value in self.variables.items()}
         return self

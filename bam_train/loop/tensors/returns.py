@@ -112,7 +112,7 @@ def doubleqlearning_temporal_difference(
     Returns:
         T x B; the last time is 0.
     """
-    name = "doubleqlearning_temporal_difference"
+    name = doubleqlearning_temporal_difference.__name__
     _require_shapes(name, q.shape, q_target=q_target)
     _require_shapes(name, q.shape[:-1], action=action, reward=reward)
     must_bootstrap = _flags(name, reward, must_bootstrap)
