@@ -83,8 +83,3 @@ def require_known(
         if name not in elsewhere:
             raise SettingsError(f"Unknown {what} {name!r}. {did_you_mean(name, [*known, *others])}")
         raise SettingsError(f"{name} is not a hyperparameter here: {elsewhere[name]}")
-
-
-def ranges(kinds: Mapping[Any, Iterable[str]]) -> dict[str, Any]:
-    """Name of a hyperparameter to the kind of number it is, out of names by kind."""
-    return {name: kind for kind, names in kinds.items() for name in names}

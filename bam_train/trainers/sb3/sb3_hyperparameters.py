@@ -27,7 +27,7 @@ from bam_train.errors import SettingsError
 from bam_train.settings import NAMES, TrainSettings
 from bam_train.trainers.algorithms import SB3_ALGORITHMS, Algorithm
 from bam_train.trainers.frozen_network import leaves
-from bam_train.trainers.library_arguments import fit, linear_start, ranges, require_known
+from bam_train.trainers.library_arguments import fit, linear_start, require_known
 
 ELSEWHERE = {
     "seed": "use --seed",
@@ -57,20 +57,14 @@ CLASSES: dict[str, dict[str, type]] = {
 _NOISE = re.compile(r"(?P<kind>normal|ornstein-uhlenbeck)_(?P<sigma>\d.*)")
 
 
-_RANGES = ranges(
-    {
-        Fraction: (
-            *("gamma", "gae_lambda", "tau"),
-            *("exploration_fraction", "exploration_initial_eps", "exploration_final_eps"),
-        ),
-        Positive: ("learning_rate", "clip_range", "max_grad_norm", "rms_prop_eps", "target_kl"),
-        PositiveInt: (
-            *("n_steps", "batch_size", "n_epochs", "buffer_size", "train_freq"),
-            *("target_update_interval", "policy_delay"),
-        ),
-        NonNegative: ("learning_starts", "ent_coef", "vf_coef"),
-    }
-)
+_EXPLORATION = ("exploration_fraction", "exploration_initial_eps", "exploration_final_eps")
+_COUNTS = ("n_steps", "batch_size", "n_epochs", "buffer_size", "train_freq", "target_update_interval", "policy_delay")
+_RANGES = {
+    **dict.fromkeys(("gamma", "gae_lambda", "tau", *_EXPLORATION), Fraction),
+    **dict.fromkeys(("learning_rate", "clip_range", "max_grad_norm", "rms_prop_eps", "target_kl"), Positive),
+    **dict.fromkeys(_COUNTS, PositiveInt),
+    **dict.fromkeys(("learning_starts", "ent_coef", "vf_coef"), NonNegative),
+}
 """Numbers that no algorithm can learn with, but the library takes without a word, are out of these."""
 
 
