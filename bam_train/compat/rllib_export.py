@@ -41,7 +41,8 @@ from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
 from bam_train.trainers.base import origin
 from bam_train.trainers.frozen_network import leaves, pack
-from bam_train.trainers.rllib.rllib_freezing import AnySpace, FrozenModule, PolicyParts, golden
+from bam_train.trainers.rllib.rllib_freezing import AnySpace, FrozenModule, PolicyParts, RLlibPolicy, golden
+from bam_train.trainers.zero_based_spaces import space_from_zero
 
 EXPORTED = "exported"
 """Setting of the manifest that says where an exported checkpoint comes from; a run's own has none of this name."""
@@ -148,7 +149,8 @@ def export(
         arrays = pack(observations, np.asarray(actions, parts.action_space.dtype))
     else:
         by = f"RLlib {metadata.version('ray')}"
-        arrays = golden(module, saved.by_rllib((parts.observation_space, parts.action_space)))
+        env_spaces = parts.observation_space, parts.action_space
+        arrays = golden(module, RLlibPolicy(saved.module, saved.env_to_module, saved.config, env_spaces))
     frozen = FrozenPolicy.from_graph(graph, *map(space_to_json, (parts.observation_space, parts.action_space)))
     worst, _ = frozen.worst_difference(safetensors_file.parse(arrays))
     if not worst <= TOLERANCE:  # NaN too
@@ -191,7 +193,7 @@ def _algorithm(saved: SavedPolicy, asked: str | None) -> str:
 def _environment(
     saved: SavedPolicy, asked: str | None, trust: bool, warn: Callable[[str], None]
 ) -> tuple[str, dict[str, Any]]:
-    """Id and keyword arguments of the environment: what was asked for, else what the directory says."""
+    """Id and keyword arguments of the environment that was asked for, else of the directory's."""
     own, given = _own_environment(saved, asked, trust), saved.directory.given
     if asked is None and own is None:
         raise CheckpointMismatch(given, "does not say on which environment it was trained; give --env ID")
@@ -217,11 +219,7 @@ def _of_numpy(value: Any) -> Any:
 
 
 def _own_environment(saved: SavedPolicy, asked: str | None, trust: bool) -> str | None:
-    """The environment that the directory names, if it is known here; its module is imported only if the user says so.
-
-    Raises:
-        CheckpointMismatch: It is not known, and no other was asked for.
-    """
+    """The environment that the directory names, if it is known here; its module is imported if the user says so."""
     name, given = saved.env, saved.directory.given
     module = (name or "").rpartition(":")[0]
     if name is None or (asked is not None and module and asked != name):
@@ -241,11 +239,7 @@ def _own_environment(saved: SavedPolicy, asked: str | None, trust: bool) -> str 
 def _in_environment(
     saved: SavedPolicy, env_id: str, warn: Callable[[str], None], env_kwargs: dict[str, Any]
 ) -> tuple[PolicyParts, dict[str, Any], float | None]:
-    """The parts with the environment's own spaces, its signals and its period.
-
-    Raises:
-        CheckpointMismatch: Its spaces are not those that the policy was trained with; names the first difference.
-    """
+    """The parts with the environment's own spaces, if the policy was trained with these, its signals and its period."""
     with contextlib.closing(make_env(env_id, env_kwargs)) as env:
         describe = getattr(env.unwrapped, "describe", None)
         signals, period = describe() if describe else {}, control_period(env)
@@ -254,23 +248,23 @@ def _in_environment(
     pairs = [("action_space", parts.action_space, ours[1])]
     if saved.whole:
         pairs.append(("observation_space", parts.observation_space, ours[0]))
-    for name, theirs, own in pairs:
-        differing = first_difference(_from_zero(space_to_json(theirs)), _from_zero(space_to_json(own)), name)
+    for name, theirs, own in pairs:  # the trainer may have seen whole numbers counted from 0
+        there, here = (space_to_json(space_from_zero(space)) for space in (theirs, own))
+        differing = first_difference(there, here, name)
         if differing is not None:
-            what, there, here = differing
-            text = f"{what} is {_short(there)} in the directory and {_short(here)} in {env_id}"
-            raise CheckpointMismatch(saved.directory.given, f"{text}; {_NAME_IT}")
+            text = f"{differing[0]} is {_short(differing[1])} in the directory and {_short(differing[2])} in {env_id}"
+            raise CheckpointMismatch(saved.directory.given, f"{text}; {_GIVE_ENV}")
     if isinstance(parts.action_space, (spaces.Discrete, spaces.MultiDiscrete)) and np.any(parts.action_space.start):
         text = "RLlib counts actions from 0 whatever their start; it cannot be frozen"
         raise PolicyError(f"action space {parts.action_space}: {text}")
     return replace(parts, observation_space=ours[0], action_space=ours[1]), signals, period
 
 
-_NAME_IT = "give the environment it was trained on with --env"
+_GIVE_ENV = "give the environment it was trained on with --env"
 
 
 def _guessed(saved: SavedPolicy, env_id: str, ours: AnySpace, warn: Callable[[str], None]) -> PolicyParts:
-    """Parts of a policy alone, whose directory does not say what came before and after the network."""
+    """Parts of a policy alone: its directory does not say what came before and after the network."""
     parts, given = saved.parts, saved.directory.given
     theirs = parts.observation_space
     if space_to_json(theirs) == space_to_json(ours):
@@ -278,21 +272,12 @@ def _guessed(saved: SavedPolicy, env_id: str, ours: AnySpace, warn: Callable[[st
     shape, width = theirs.shape or (), sum(spaces.flatdim(leaf) for leaf in leaves(ours).values())
     text = f"its network takes observations {_space(theirs)}, and {env_id} gives {_space(ours)}"
     if not isinstance(theirs, spaces.Box) or (theirs.shape != ours.shape and shape != (width,)):
-        raise CheckpointMismatch(given, f"{text}; {_NAME_IT}")
+        raise CheckpointMismatch(given, f"{text}; {_GIVE_ENV}")
     if np.isfinite(theirs.low).any() or np.isfinite(theirs.high).any():
         more = "what RLlib did to them in between (MeanStdFilter) is not in a policy's directory"
         raise CheckpointMismatch(given, f"{text}: {more}. Give that of the whole algorithm")
     warn("a policy's directory does not say how observations were flattened: taken as FlattenObservations does it")
     return replace(parts, flatten=True)
-
-
-def _from_zero(space: Any) -> Any:
-    """A space's JSON form without ``start`` of whole numbers: the trainer may have seen them counted from 0."""
-    if not isinstance(space, Mapping):
-        return space
-    if space.get("type") == "Dict":
-        return {**space, "spaces": {key: _from_zero(inner) for key, inner in sorted(dict(space["spaces"]).items())}}
-    return {key: value for key, value in space.items() if key != "start"}
 
 
 def _space(space: AnySpace) -> str:

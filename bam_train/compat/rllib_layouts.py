@@ -8,7 +8,7 @@ running what is in it, and its network is built from the names of its weights: d
 import json
 import pickle
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from gymnasium import spaces
 from torch import nn
 
 from bam_train.compat.rllib_directory import AGAIN, ARGUMENTS, OLD_STATE, Directory
-from bam_train.errors import AlteredCheckpoint, CheckpointMismatch, FormatError, PolicyError, SettingsError
+from bam_train.errors import CheckpointMismatch, FormatError, PolicyError, SettingsError
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
 from bam_train.trainers.rllib.rllib_freezing import (
@@ -27,7 +27,6 @@ from bam_train.trainers.rllib.rllib_freezing import (
     AnySpace,
     Filter,
     PolicyParts,
-    RLlibPolicy,
     parts_of,
     require_layout_only,
 )
@@ -57,10 +56,6 @@ class SavedPolicy:
     config: Any = field(default=None, repr=False)
     """The AlgorithmConfig; RLlib's default if the directory has none."""
 
-    def by_rllib(self, env_spaces: tuple[Any, Any]) -> RLlibPolicy:
-        """The same policy, run by RLlib; of the present API."""
-        return RLlibPolicy(self.module, self.env_to_module, self.config, env_spaces)
-
 
 def _named(env: Any, env_kwargs: Any) -> tuple[str | None, dict[str, Any]]:
     """Environment and arguments of a configuration, which may also hold a class and a function's result."""
@@ -71,7 +66,7 @@ def _named(env: Any, env_kwargs: Any) -> tuple[str | None, dict[str, Any]]:
 
 
 def restore(directory: Directory) -> SavedPolicy:
-    """Let RLlib read the directory.
+    """Let RLlib read the directory, which runs what is in it.
 
     Raises:
         AlteredCheckpoint: RLlib cannot.
@@ -113,24 +108,22 @@ def restore(directory: Directory) -> SavedPolicy:
 
 def _restored(directory: Directory, folder: Path, kind: Any) -> Any:
     """The object that RLlib restores of a folder; None if there is no such folder."""
-    if not (folder / ARGUMENTS).is_file():
-        return None
-    try:
-        return kind.from_checkpoint(str(folder))
-    except Exception as error:  # anything: it is a program
-        reason = " ".join(str(error).split())
-        text = f"cannot be restored by RLlib: {type(error).__name__}: {reason:.160}"
-        raise directory.altered(folder / ARGUMENTS, text) from error
+    path = folder / ARGUMENTS
+    return _ran(directory, path, lambda: kind.from_checkpoint(str(folder))) if path.is_file() else None
 
 
 def _unpickled(directory: Directory, path: Path) -> Any:
+    data = directory.read_bytes(path)
+    return _ran(directory, path, lambda: pickle.loads(data))
+
+
+def _ran(directory: Directory, path: Path, read: Callable[[], Any]) -> Any:
+    """What reading a file gives, which is a program that may raise anything."""
     try:
-        return pickle.loads(directory.read_bytes(path))
-    except AlteredCheckpoint:
-        raise
-    except Exception as error:  # anything: it is a program
+        return read()
+    except Exception as error:
         reason = " ".join(str(error).split())
-        text = f"cannot be unpickled: {type(error).__name__}: {reason:.160}"
+        text = f"cannot be restored by RLlib: {type(error).__name__}: {reason:.160}"
         raise directory.altered(path, text) from error
 
 
@@ -250,14 +243,18 @@ def _old_policy(directory: Directory, state: Mapping[str, Any]) -> SavedPolicy:
     does = config
     if after_names:
         does = {f"{one}_actions": f"{one.title()}ActionsConnector" in after_names for one in ("normalize", "clip")}
-    filters = [one for name, one in before if name in _FILTERS]
+    filters = [
+        Filter.of(*one["running_stats"], one["clip"], one["demean"], one["destd"])
+        for name, one in before
+        if name in _FILTERS
+    ]
     model = {**config["model"], **(config.get("policy_model_config") or {})}
     parts = PolicyParts(
         algorithm=algorithm,
         observation_space=space,
         action_space=action_space,
         network=_network(state["weights"], model, squashed),
-        filter=_old_filter(filters[0]) if filters else None,
+        filter=filters[0] if filters else None,
         flatten=not (isinstance(space, spaces.Box) and len(space.shape) == 1),
         normalize_actions=bool(does.get("normalize_actions")),
         clip_actions=bool(does.get("clip_actions")),
@@ -284,11 +281,6 @@ def _space(value: Mapping[str, Any]) -> AnySpace:
     if kind == "dict":
         return spaces.Dict({str(key): _space(space) for key, space in fields["spaces"].items()})
     raise FormatError(f"a space of kind {kind!r} is not known")
-
-
-def _old_filter(given: Mapping[str, Any]) -> Filter:
-    (stats,) = given["running_stats"]
-    return Filter.of(stats, given["clip"], given["demean"], given["destd"])
 
 
 def _network(weights: Mapping[str, Any], model: Mapping[str, Any], squashed: bool) -> nn.Module:

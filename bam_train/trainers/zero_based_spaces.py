@@ -21,8 +21,8 @@ class FromZero(gym.Wrapper[Any, Any, Any, Any]):
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
-        self.observation_space = _from_zero(env.observation_space)
-        self.action_space = _from_zero(env.action_space)
+        self.observation_space = space_from_zero(env.observation_space)
+        self.action_space = space_from_zero(env.action_space)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode."""
@@ -49,9 +49,10 @@ def less_start(space: spaces.Space[Any], value: Any) -> Any:
     return value - space.start if isinstance(space, _Counted) else value
 
 
-def _from_zero(space: spaces.Space[Any]) -> spaces.Space[Any]:
+def space_from_zero(space: spaces.Space[Any]) -> spaces.Space[Any]:
+    """The space with every Discrete and MultiDiscrete counted from 0; leaves of a Dict too."""
     if isinstance(space, spaces.Dict):
-        return spaces.Dict({key: _from_zero(leaf) for key, leaf in space.spaces.items()})
+        return spaces.Dict({key: space_from_zero(leaf) for key, leaf in space.spaces.items()})
     if not isinstance(space, _Counted):
         return space
     dtype: Any = np.dtype(space.dtype).type
