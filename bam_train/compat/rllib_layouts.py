@@ -244,7 +244,7 @@ def _old_policy(directory: Directory, state: Mapping[str, Any]) -> SavedPolicy:
     if after_names:
         does = {f"{one}_actions": f"{one.title()}ActionsConnector" in after_names for one in ("normalize", "clip")}
     filters = [
-        Filter.of(*one["running_stats"], one["clip"], one["demean"], one["destd"])
+        Filter.of(one["running_stats"][0], one["clip"], one["demean"], one["destd"])
         for name, one in before
         if name in _FILTERS
     ]
