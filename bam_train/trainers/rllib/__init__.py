@@ -8,22 +8,64 @@ Importing this registers every environment of ours with RLlib, so that a script 
     PPOConfig().environment("bam/pick", env_config={"randomize": True})
 
 RLlib's own runner makes n separate environments. `RobotEnvRunner`, which ``bam-train`` uses, steps all environments of
-a runner in one batched simulation: ``.env_runners(env_runner_cls=RobotEnvRunner)``.
-
-Ray is not started.
+a runner in one batched simulation: ``.env_runners(env_runner_cls=RobotEnvRunner)``. Ray is not started.
 """
 
+import functools
 import importlib.util
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+
+import bam_envs  # noqa: F401 - registers our environments with Gymnasium
+from bam_envs.core.registry import ENVIRONMENTS
+from bam_train.finite_envs import FiniteEnv
+from bam_train.trainers.zero_based_spaces import from_zero
 
 if TYPE_CHECKING:
     from bam_train.trainers.rllib.robot_env_runner import RobotEnvRunner
 
 __all__ = ["RobotEnvRunner"]
 
-if importlib.util.find_spec("ray") is not None:  # the old layout of RLlib's files is read without it
-    from bam_train.trainers.rllib.rllib_registration import register
 
+def register() -> None:
+    """Give RLlib every environment of ours, under its id and under its id without a version."""
+    for env_id in own_ids():
+        for name in {env_id, env_id.rpartition("-v")[0]}:
+            _register(name, env_id)
+
+
+def register_foreign(env_id: str) -> str:
+    """Give RLlib an environment that this process has registered with Gymnasium; its name there is `env_id`."""
+    if env_id not in own_ids():
+        module, _, name = env_id.rpartition(":")
+        if module:
+            importlib.import_module(module)  # which registers it
+        _register(env_id, gym.spec(name))  # a runner elsewhere may not know the id
+    return env_id
+
+
+def own_ids() -> list[str]:
+    """Ids of our environments: those of the table, and what else `bam_envs` registers."""
+    made_here = (spec.id for spec in gym.registry.values() if str(spec.entry_point).startswith("bam_envs."))
+    return sorted({*ENVIRONMENTS, *made_here})
+
+
+def _register(name: str, env: str | gym.envs.registration.EnvSpec) -> None:
+    """RLlib hands the function to its runners: one elsewhere imports this module, and with it our environments."""
+    from ray.tune.registry import register_env
+
+    register_env(name, functools.partial(create, env))
+
+
+def create(env: str | gym.envs.registration.EnvSpec, context: Mapping[str, Any]) -> gym.Env[Any, Any]:
+    """One environment, as RLlib's own runner takes it; `context` is what ``env_config`` was: keyword arguments."""
+    name = env if isinstance(env, str) else env.id
+    return from_zero(FiniteEnv(gym.make(env, disable_env_checker=True, **dict(context)), name))
+
+
+if importlib.util.find_spec("ray") is not None:  # the old layout of RLlib's files is read without it
     register()
 
 

@@ -15,10 +15,10 @@ from bam_train.environments import is_batched
 from bam_train.errors import BamTrainError, SettingsError
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
+from bam_train.trainers.rllib import register_foreign
 from bam_train.trainers.rllib.mean_std_filter import MeanStdFilter
 from bam_train.trainers.rllib.ray_resources import learners
 from bam_train.trainers.rllib.rllib_hyperparameters import training_arguments
-from bam_train.trainers.rllib.rllib_registration import register_foreign
 from bam_train.trainers.rllib.robot_env_runner import RobotEnvRunner, log_end
 from bam_train.trainers.rllib.runner_deaths import (
     PROBE_TIMEOUT,
@@ -77,7 +77,7 @@ def envs_each(settings: TrainSettings) -> int:
 def connectors(
     observation_space: Space[Any], normalize: bool | Mapping[str, Any], env: Any, spaces: Any, device: Any
 ) -> list[Any]:
-    """What lies between environment and module: one vector out of several inputs, normalised if asked for."""
+    """What lies between environment and module: several inputs become one vector, normalised if asked for."""
     pieces: list[Any] = [] if is_plain(observation_space) else [FlattenObservations()]
     if normalize:
         pieces.append(MeanStdFilter(**({} if normalize is True else normalize)))
@@ -98,7 +98,7 @@ _REFUSALS = (
 
 @contextlib.contextmanager
 def refusals(settings: TrainSettings) -> Iterator[None]:
-    """RLlib's errors about settings that cannot be, as our own error."""
+    """RLlib's errors about settings that cannot work, as our own."""
     try:
         yield
     except BamTrainError:

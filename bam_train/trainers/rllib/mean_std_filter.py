@@ -1,9 +1,8 @@
 """RLlib's `MeanStdFilter`, for a batch at once, and right where several runners are merged.
 
-A runner sends what it saw since the last merge as "deltas" that `RunningStat.update` takes for the count, mean and sum
-of squares of those observations alone. RLlib's own `RunningStat.push` keeps something else in them (how far the overall
-mean moved), so that with remote runners its merged mean goes towards 0. Here they are what the merge expects
-(Chan, Golub and LeVeque 1979: counts n, means m, sums of squares s of two sets combine exactly).
+A runner sends what it saw since the last merge as "deltas", which `RunningStat.update` takes for the count, mean and
+sum of squares of those observations alone. RLlib's own `RunningStat.push` writes into them how far the overall mean
+moved, so that with remote runners its merged mean goes towards 0. Here they are what the merge expects.
 """
 
 from typing import Any
@@ -24,12 +23,7 @@ class MeanStdFilter(_MeanStdFilter):  # type: ignore[misc]
     """RLlib's filter, which `normalize` runs over n observations of one array at once. Same name, state and files."""
 
     def normalize(self, observations: Array, update: bool = True) -> NDArray[np.float32]:
-        """Normalise observations, and count them in first.
-
-        Args:
-            observations: (n, ...).
-            update: Whether to count them in.
-        """
+        """Normalise observations, (n, ...), and count them in first unless `update` is False."""
         if self._filters is None:
             self._init_new_filters()
         own = self._filters[None]
@@ -77,7 +71,10 @@ def forget_deltas(stat: RunningStat) -> None:
 
 
 def push(stat: RunningStat, observations: Array) -> None:
-    """Count observations (n, ...) into the statistics and into what the next merge is sent."""
+    """Count observations (n, ...) into the statistics and into what the next merge is sent.
+
+    Counts, means and sums of squares of two sets combine exactly (Chan, Golub and LeVeque 1979).
+    """
     new = observations.astype(np.float64)
     n, new_mean = len(new), new.mean(axis=0)
     new_squares = np.square(new - new_mean).sum(axis=0)

@@ -29,9 +29,7 @@ def gpus(settings: TrainSettings) -> int:
 
 
 def learners(settings: TrainSettings) -> tuple[int, int]:
-    """RLlib's ``num_learners`` and ``num_gpus_per_learner``.
-
-    No learner is the trainer's own process, which can have one GPU; more GPUs make a learner each.
+    """RLlib's ``num_learners``, where 0 is the trainer's own process, and ``num_gpus_per_learner``.
 
     Raises:
         SettingsError: The GPUs cannot be shared out evenly among the learners asked for.
@@ -55,8 +53,7 @@ def cores() -> int:
 def require_resources(settings: TrainSettings) -> None:
     """Refuse a run that asks for more than there is, on the cluster that runs in this process, else on this computer.
 
-    Each runner and each learner without a GPU asks Ray for a CPU, a learner with one for a GPU. The trainer's own
-    process asks for nothing, and learns on a GPU of this computer.
+    Each runner and each learner without a GPU asks Ray for a CPU, a learner with one for a GPU.
 
     Raises:
         SettingsError: Says what was asked for, what there is, and what to do.

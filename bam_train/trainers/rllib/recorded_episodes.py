@@ -1,8 +1,7 @@
 """Recorded episodes for bc, marwil, cql and iql: Parquet files, one row a step.
 
-Columns: ``eps_id`` (text), ``obs``, ``actions``, ``rewards``, ``new_obs``, ``terminateds``, ``truncateds``; others
-are left alone. The rows of an episode follow one another. Actions are the environment's own; they are scaled
-to [-1, 1] here, as RLlib's modules take them.
+Columns: ``eps_id`` (text), ``obs``, ``actions`` (the environment's own), ``rewards``, ``new_obs``, ``terminateds``,
+``truncateds``; others are left alone. The rows of an episode follow one another.
 
 RLlib would send every row of every update through Ray Data as an episode of its own, at a few thousand rows a second.
 Here a learner reads the files into its memory once and draws its rows from there, a hundred times as fast. One update
@@ -29,7 +28,7 @@ from ray.rllib.utils.spaces.space_utils import normalize_action
 
 from bam_train.errors import SettingsError
 from bam_train.settings import TrainSettings
-from bam_train.trainers.rllib.rllib_registration import register_foreign
+from bam_train.trainers.rllib import register_foreign
 from bam_train.trainers.zero_based_spaces import less_start
 
 Array = NDArray[Any]
@@ -37,12 +36,11 @@ Array = NDArray[Any]
 COLUMNS = ("eps_id", "obs", "actions", "rewards", "new_obs", "terminateds", "truncateds")
 """What every file must have."""
 
-_MOST_UPDATES = 100
-"""Updates of an iteration."""
+_MOST_UPDATES = 100  # of an iteration
 
 
 def add_data(config: Any, settings: TrainSettings, observation_space: Space[Any], action_space: Space[Any]) -> Any:
-    """Let a configuration learn from the recorded episodes of a run; returns it.
+    """Let a configuration learn from recorded episodes; returns it.
 
     Raises:
         SettingsError: There are none, or they do not fit the environment.

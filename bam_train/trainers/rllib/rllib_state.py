@@ -2,9 +2,8 @@
 
 ``bam/resume/rllib/…`` is what ``Algorithm.save_to_path`` writes, so that ``Algorithm.from_checkpoint`` of the unpacked
 folder works for those who trust it. Ours builds the algorithm from its settings and sets the states in those files,
-which are read as arrays and plain values (`state_pickles.read_state`); ``class_and_ctor_args.pkl``, which says how
-objects are made, is never read. ``bam/resume/learner.json`` is what the tree leaves out: numbers of the learners that
-adapt themselves.
+read as arrays and plain values; ``class_and_ctor_args.pkl``, which says how objects are made, is never read.
+``bam/resume/learner.json`` has what the tree leaves out: numbers of the learners that adapt themselves.
 """
 
 import functools
@@ -61,7 +60,7 @@ def load(checkpoint: Checkpoint, algorithm: Any) -> None:
 
 
 def read(checkpoint: Checkpoint) -> dict[str, Any]:
-    """The nested state of the whole algorithm, arrays and plain values.
+    """The nested state of the whole algorithm: arrays and plain values.
 
     Raises:
         AlteredCheckpoint: A state cannot be read, or holds something else; names it.
@@ -89,8 +88,8 @@ def read(checkpoint: Checkpoint) -> dict[str, Any]:
 def hand_out(algorithm: Any) -> None:
     """Give the learner's weights and the observations' statistics to every runner, and wait until it has them.
 
-    RLlib's `sync_weights` leaves out a runner that has not answered the call before, and `set_state` makes two such
-    calls one after the other: runners would take their first samples with random weights.
+    RLlib's `sync_weights` leaves out a runner that has not answered the call before: after `set_state`, which makes
+    two, runners would take their first samples with random weights.
     """
     group = algorithm.env_runner_group
     if group is None:
@@ -103,11 +102,7 @@ def hand_out(algorithm: Any) -> None:
 
 
 def start_actions(algorithm: Any, log_std: float | None, scale: float) -> None:
-    """Change where the actions of a new algorithm start.
-
-    `log_std` is of the standard deviation, where that is a parameter of its own; None leaves it. The weights and
-    biases of the policy's last layer are multiplied by `scale`.
-    """
+    """Set the free standard deviation of a new algorithm's actions, and multiply the policy's last layer by `scale`."""
     if log_std is None and scale == 1.0:
         return
     group = algorithm.learner_group
@@ -124,7 +119,7 @@ def start_actions(algorithm: Any, log_std: float | None, scale: float) -> None:
 
 
 def require_version(checkpoint: Checkpoint) -> None:
-    """Refuse to go on from the state of another Ray than this one, major or minor: its layout is Ray's own affair.
+    """Refuse to go on from the state of another Ray than this one, major or minor.
 
     Raises:
         CheckpointMismatch: Names both versions.
@@ -140,9 +135,6 @@ def require_version(checkpoint: Checkpoint) -> None:
         )
 
 
-Extras = dict[str, dict[str, float]]
-"""What RLlib's learners keep beside their state: attribute of the learner to module to number."""
-
 _NAMES = (
     "curr_kl_coeffs_per_module",
     "curr_log_alpha",
@@ -152,28 +144,26 @@ _NAMES = (
     "entropy_coeff_schedulers_per_module",
 )
 """PPO's and APPO's KL coefficient, SAC's, TQC's and CQL's temperature, MARWIL's running mean of squared advantages,
-when the target networks of DQN, its relatives and APPO were updated last, and where a schedule of the entropy's weight
-is.
-``Learner.get_state`` of Ray 2.60 has none of them, so that a resumed run would begin them anew."""
+when target networks were updated last, and where a schedule of the entropy's weight is. ``Learner.get_state`` of
+Ray 2.60 has none of them."""
 
 
-def extras_of(algorithm: Any) -> Extras:
-    """What the learners keep beside their state; {} if there is nothing. All learners have the same."""
+def extras_of(algorithm: Any) -> dict[str, dict[str, float]]:
+    """What all learners alike keep beside their state: attribute of the learner to module to number."""
     results = list(algorithm.learner_group.foreach_learner(_take))
     return dict(results[0].get()) if results else {}
 
 
-def _take(learner: Any) -> Extras:
+def _take(learner: Any) -> dict[str, dict[str, float]]:
     tables = {name: getattr(learner, name) for name in _NAMES if hasattr(learner, name)}
-    return {name: {key: _number(table[key]) for key in learner.module.keys()} for name, table in tables.items()}  # noqa: SIM118 - no mapping
+    modules = list(learner.module.keys())
+    return {name: {key: _number(table[key]) for key in modules} for name, table in tables.items()}
 
 
-def _number(value: Any) -> float:
-    """A tensor of one number, or a number, or what a schedule is at, as a number that JSON keeps exactly."""
-    if isinstance(value, Scheduler):
-        value = value.get_current_value()
-    number: float = value.item() if isinstance(value, torch.Tensor) else value
-    return number
+def _number(value: Any) -> Any:
+    """Of a tensor of one number, or of what a schedule is at: a number that JSON keeps exactly."""
+    value = value.get_current_value() if isinstance(value, Scheduler) else value
+    return value.item() if isinstance(value, torch.Tensor) else value
 
 
 def _give(learner: Any, extras: Mapping[str, Mapping[str, float]]) -> None:

@@ -1,8 +1,8 @@
 """What a run does when an env runner dies: it goes on with the others while a new one takes its place.
 
-Lost is what the dead runner had sampled since its last delivery, no more: an update takes the samples that were
-delivered, and only those are counted. RLlib ends a runner whose environment fails, and keeps the cause in a log file on
-that computer; so a runner writes the cause into the cluster's key-value store before it ends.
+Lost is what the dead runner had sampled since its last delivery: an update takes and counts the samples that were
+delivered. RLlib keeps the cause in a log file on the runner's computer; so a runner writes it into the cluster's
+key-value store before it ends.
 """
 
 import time
@@ -25,10 +25,9 @@ SAMPLE_TIMEOUT = 60.0
 """How long an update waits for the samples of its slowest runner [s]."""
 
 PROBE_TIMEOUT = 0.25
-"""How long each update waits for a sign of life of the runners that are gone [s].
+"""How long each update waits for a sign of life of the runners that are gone [s]; RLlib's own is half a minute.
 
-RLlib asks them before every update, for as long as they are gone, and waits half a minute each time. They answer within
-milliseconds once they are back, and are asked again at the next update.
+They answer within milliseconds once they are back, and are asked again before the next update.
 """
 
 RESTART_DELAY = 1.0
@@ -45,10 +44,7 @@ LONGEST_ALONE = 180.0
 
 
 class FaultReporting:
-    """Beside a runner class, before it: what goes wrong in `sample` is reported, and raised as it was.
-
-    So is what goes wrong while it is made, such as its environment on a computer that lacks something.
-    """
+    """Before a runner class: what goes wrong while it is made, or in `sample`, is reported, and raised as it was."""
 
     def __init__(self, **named: Any) -> None:
         try:
@@ -113,11 +109,9 @@ def _own_cause(error: Exception) -> Exception:
 
 
 class RunnerWatch:
-    """Looks after the runners of an algorithm, before each of its training steps and after the last of an iteration.
+    """Looks after the runners of an algorithm of `make_config`, which is trained by `train` from now on.
 
-    Args:
-        algorithm: RLlib's, of a config of `make_config`; from now on it is trained by `train`.
-        clock: Monotonic time [s].
+    It looks before each training step and after the last of an iteration; `clock` is monotonic time [s].
     """
 
     def __init__(self, algorithm: Any, clock: Callable[[], float] = time.monotonic) -> None:

@@ -1,8 +1,8 @@
 """Read the states in RLlib's pickles: dicts, lists, tuples, text, numbers and arrays of numbers; nothing is run.
 
-A pickle is a program that can call any function of any module. Here no name in it is ever looked up: a handful of names
-have stand-ins below, and every other one is refused, or replaced by an inert `Unread`. Instructions are counted before
-they run, and values afterwards, so that a file can waste no more memory and time than its own size explains.
+A pickle is a program that can call any function of any module. Here no name in it is looked up: a handful of names have
+stand-ins below, and every other one is refused, or replaced by an inert `Unread`. Instructions are counted before they
+run, and values afterwards, so that a file wastes no more memory and time than its own size explains.
 """
 
 from __future__ import annotations
@@ -51,11 +51,7 @@ class Unread:
 
 
 def read_state(data: bytes, *, skip_objects: bool = False) -> Any:
-    """Read a state.
-
-    Args:
-        data: The pickle.
-        skip_objects: An object of any other kind becomes an `Unread`.
+    """Read a state; with `skip_objects`, an object of any other kind becomes an `Unread`.
 
     Raises:
         RefusedPickle: It names something else; nothing was looked up or called.
@@ -162,13 +158,9 @@ class _Scalar(_StandIn):
 
 
 class _Array(np.ndarray[Any, Any]):
-    """`numpy.ndarray`, as `numpy._core.multiarray._reconstruct` makes it: filled when its state is set.
-
-    `_Reconstruct` alone makes one, so that no memory is taken that the file does not fill.
-    """
+    """`numpy.ndarray`, which `_Reconstruct` alone makes, empty: its state fills it from the file."""
 
     def __new__(cls, *args: Any) -> Any:
-        """Refuse."""
         raise RefusedPickle("numpy.ndarray called")
 
     def __setstate__(self, state: Any) -> None:

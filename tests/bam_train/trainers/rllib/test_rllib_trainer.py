@@ -21,7 +21,7 @@ from bam_train.errors import BamTrainError, EnvironmentFailed, SettingsError
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.resolve_settings import resolve, resolve_resumed
-from bam_train.trainers.rllib.rllib_registration import own_ids
+from bam_train.trainers.rllib import own_ids
 from bam_train.trainers.rllib.rllib_trainer import RLlibTrainer
 
 pytestmark = [

@@ -17,8 +17,8 @@ from ray.rllib.connectors.env_to_module.mean_std_filter import MeanStdFilter as 
 from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 from ray.rllib.utils.filter import RunningStat
 
+from bam_train.trainers.rllib import register
 from bam_train.trainers.rllib.mean_std_filter import MeanStdFilter, forget_deltas, push
-from bam_train.trainers.rllib.rllib_registration import register
 from bam_train.trainers.rllib.robot_env_runner import RobotEnvRunner
 
 BOX = gym.spaces.Box(-10, 10, (2,), np.float32)
