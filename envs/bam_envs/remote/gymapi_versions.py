@@ -1,17 +1,5 @@
 """The versions of bam_msgs/GymAPI in the field, by the day on which they appeared, and what tells them apart.
 
-=====================  ==================  ============================================  ====================
-what                   2025-05-24          2025-06-17                                    2025-06-22 and later
-=====================  ==================  ============================================  ====================
-request header         force_if_busy       force_busy                                    as before
-response header        duration            process_duration, transport_duration,         as before
-                                           response_stamp
-color_img, depth_img,  one message each    one message each                              a list each
-camera_info
-what detectors saw     detections, masks   detections, masks                             segments
-shared observation     duplicate_obs_ns    duplicate_obs, duplicate_index                as before
-=====================  ==================  ============================================  ====================
-
 Where the types are compiled (ROS 2), a field that the version there lacks is refused, and not ignored.
 """
 

@@ -228,8 +228,13 @@ class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
         columns: Any = map(list, zip(*chain(*parts), strict=True))
         self._observations, rewards, terminated, truncated, infos = columns
         joined, space = join_infos(infos), self.single_observation_space
-        if "final_obs" in joined:
-            joined["final_obs"] = join_final(space, self._observations, infos)
+        if "final_obs" in joined and isinstance(space, spaces.Box):  # where an episode goes on, what is seen
+            seen = zip(infos, self._observations, strict=True)
+            joined["final_obs"] = stack(space, [info.get("final_obs", last) for info, last in seen])
+        elif "final_obs" in joined:
+            joined["final_obs"] = np.full(len(infos), None, dtype=object)
+            for i, info in enumerate(infos):
+                joined["final_obs"][i] = info.get("final_obs")
         return (
             stack(space, self._observations),
             np.array(rewards, np.float64),
@@ -278,13 +283,3 @@ def join_infos(each: Sequence[Info]) -> dict[str, Any]:
                 infos[key][i] = value
         infos["_" + key] = mask
     return infos
-
-
-def join_final(space: Space[Any], last: Sequence[Any], infos: Sequence[Info]) -> Any:
-    """``final_obs`` of a batch: the last observation of each episode that ended, or of the step where it goes on."""
-    if isinstance(space, spaces.Box):
-        return stack(space, [info.get("final_obs", seen) for info, seen in zip(infos, last, strict=True)])
-    column = np.full(len(infos), None, dtype=object)
-    for i, info in enumerate(infos):
-        column[i] = info.get("final_obs")
-    return column

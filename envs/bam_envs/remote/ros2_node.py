@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost
+from bam_envs.ros.interfaces import INTEGERS
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Bus, Handler, Listener, Message, deliver
 
 _log = logging.getLogger(__name__)
@@ -21,12 +22,7 @@ _KIND = re.compile(r"(?P<package>[A-Za-z]\w*)/(?:(?:msg|srv)/)?(?P<name>[A-Za-z]
 _LIST = re.compile(r"sequence<(?P<open>.+?)(?:, \d+)?>|(?P<fixed>.+)\[\d+\]")
 _BYTES = {"uint8", "octet", "byte"}
 _FLOATS = {"float": "f", "double": "d"}
-_INTEGERS = {
-    **{f"int{bits}": (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) for bits in (8, 16, 32, 64)},
-    **{f"uint{bits}": (0, 2**bits - 1) for bits in (8, 16, 32, 64)},
-    "octet": (0, 255),
-}
-"""The smallest and largest number of each type."""
+_INTEGERS = {**INTEGERS, "octet": (0, 255)}
 _INSTALL = "pip install 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-std-msgs ros-jazzy-sensor-msgs ros-jazzy-geometry-msgs"
 
 
@@ -51,31 +47,33 @@ class RclpyBus(Bus):
         self._caller: Any = None  # services, which may take long: a node of their own, so that no topic waits for them
         self._clients: dict[str, Any] = {}
         self._waiting: set[threading.Event] = set()  # of calls for their answers
-        self._executors: list[Any] = []
-        self._threads: list[threading.Thread] = []
+        self._spinning: list[tuple[Any, threading.Thread]] = []  # executors and their threads
 
     def start(self) -> None:
         """Create the node; raises InvalidValue if rclpy is not here. Signals stay the program's own."""
-        rclpy = need_rclpy("A ROS 2 node")
-        from rclpy.context import Context
-        from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
-        from rclpy.signals import SignalHandlerOptions
-
+        try:
+            import rclpy
+            from rclpy.context import Context
+            from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
+            from rclpy.signals import SignalHandlerOptions
+        except ModuleNotFoundError as error:
+            raise InvalidValue(
+                f"A ROS 2 node needs {error.name}, which this Python does not have. Source a ROS 2 installation, such "
+                f"as /opt/ros/jazzy/setup.bash, or run: {_INSTALL}"
+            ) from error
         self._context = Context()
         rclpy.init(context=self._context, domain_id=self._domain, signal_handler_options=SignalHandlerOptions.NO)
         try:
-            topics = SingleThreadedExecutor(context=self._context)
+            topics, services = (SingleThreadedExecutor(context=self._context) for _ in range(2))
             if self._serves:
                 services = MultiThreadedExecutor(_THREADS, context=self._context)
-            else:
-                services = SingleThreadedExecutor(context=self._context)
-            self._node = self._spinning(self.name, topics)
-            self._caller = self._spinning(f"{self.name}_services", services)
+            self._node = self._spin(self.name, topics)
+            self._caller = self._spin(f"{self.name}_services", services)
         except BaseException:
             self.close()
             raise
 
-    def _spinning(self, name: str, executor: Any) -> Any:
+    def _spin(self, name: str, executor: Any) -> Any:
         """Create a node whose callbacks `executor` runs."""
         import rclpy
         from rclpy.executors import ExternalShutdownException
@@ -90,8 +88,7 @@ class RclpyBus(Bus):
         executor.add_node(node)
         thread = threading.Thread(target=spin, name=name, daemon=True)
         thread.start()
-        self._executors.append(executor)
-        self._threads.append(thread)
+        self._spinning.append((executor, thread))
         return node
 
     def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
@@ -218,13 +215,10 @@ class RclpyBus(Bus):
             self._publishers, self._clients = {}, {}
             for answered in self._waiting:
                 answered.set()
-        executors, threads = self._executors, self._threads
-        self._executors, self._threads = [], []
-        for executor in executors:
+        spinning, self._spinning = self._spinning, []
+        for executor, thread in spinning:
             executor.shutdown()
-        for thread in threads:
             thread.join()
-        for executor in executors:
             # Its own shutdown leaves the threads of a MultiThreadedExecutor waiting for ever.
             if (workers := getattr(executor, "_executor", None)) is not None:
                 workers.shutdown()
@@ -232,17 +226,6 @@ class RclpyBus(Bus):
             node.destroy_node()
         if self._context is not None:
             self._context.try_shutdown()
-
-
-def need_rclpy(purpose: str) -> Any:
-    """The package rclpy; raises InvalidValue if it is not here."""
-    try:
-        return importlib.import_module("rclpy")
-    except ModuleNotFoundError as error:
-        raise InvalidValue(
-            f"{purpose} needs {error.name}, which this Python does not have. Source a ROS 2 installation, such as "
-            f"/opt/ros/jazzy/setup.bash, or run: {_INSTALL}"
-        ) from error
 
 
 def interface(kind: str, family: str) -> Any:

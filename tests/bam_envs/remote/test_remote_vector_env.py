@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from bam_envs.core.errors import InvalidValue, LinkLost, ResetNeeded
 from bam_envs.core.registry import ENVIRONMENTS
-from bam_envs.remote.remote_vector_env import RemoteVectorEnv, join_final, join_infos
+from bam_envs.remote.remote_vector_env import RemoteVectorEnv, join_infos
 from bam_envs.remote.serve.env_server import EnvServer, split_infos
 from bam_envs.remote.serve.local_transport import FakeEnv, FakeTransport, LocalTransport
 from bam_envs.remote.serve.tcp_server import TcpServer
@@ -305,8 +305,10 @@ def test_what_has_no_mask_or_no_rows_is_for_every_row():
     ]
 
 
-def test_last_observations():
-    infos = [{}, {"final_obs": np.float32([9])}]
-    box = join_final(spaces.Box(-9, 9, (1,)), [np.float32([1]), np.float32([2])], infos)
-    assert box.tolist() == [[1], [9]]
-    assert join_final(spaces.Text(3), ["a", "b"], [{}, {"final_obs": "z"}]).tolist() == [None, "z"]
+def test_last_observations_are_none_where_an_episode_goes_on_and_no_array_holds_them():
+    envs = RemoteVectorEnv([FakeTransport(FakeEnv(spaces.Text(3), episode_steps=steps)) for steps in (9, 1)])
+    envs.reset(seed=1)
+    going_on, ended = envs.step(np.zeros((2, 2), np.float32))[4]["final_obs"]
+    assert going_on is None
+    assert isinstance(ended, str)
+    envs.close()

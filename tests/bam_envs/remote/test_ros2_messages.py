@@ -1,4 +1,5 @@
 import math
+import sys
 from array import array
 from types import SimpleNamespace
 
@@ -7,7 +8,7 @@ import pytest
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.remote import ros2_node
-from bam_envs.remote.ros2_node import interface, need_rclpy, to_dict, to_message
+from bam_envs.remote.ros2_node import RclpyBus, interface, to_dict, to_message
 
 
 def message_class(types, **defaults):
@@ -147,12 +148,9 @@ def test_a_type_that_is_not_there(kind, text):
 
 
 def test_rclpy_is_not_there(monkeypatch):
-    def missing(name):
-        raise ModuleNotFoundError("No module named 'rclpy'", name="rclpy")
-
-    monkeypatch.setattr(ros2_node.importlib, "import_module", missing)
+    monkeypatch.setitem(sys.modules, "rclpy", None)
     with pytest.raises(InvalidValue) as error:
-        need_rclpy("A ROS 2 node")
+        RclpyBus().start()
     assert str(error.value).startswith(
         "A ROS 2 node needs rclpy, which this Python does not have. Source a ROS 2 installation, such as "
         "/opt/ros/jazzy/setup.bash, or run: pip install 'ros-jazzy-rclpy[fastrtps]' "

@@ -10,7 +10,7 @@ each of them.
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -64,12 +64,12 @@ class CommandSlot:
     def __init__(self) -> None:
         self._lock, self._order = threading.Lock(), Order()
 
-    def put(self, client: str, places: Iterable[int], values: Iterable[float], *, complete: bool, tag: str) -> None:
-        """Add a message's numbers [SI] for `places`; what was there for them, or of another client, is forgotten."""
-        new = dict(zip(places, values, strict=True))
+    def put(self, new: Order) -> None:
+        """Add what a message commands; what was there for the same places, or of another client, is forgotten."""
         with self._lock:
-            old = self._order if self._order.client == client else Order()
-            self._order = Order({**old.values, **new}, old.complete or complete, tag or old.tag, client)
+            old = self._order if self._order.client == new.client else Order()
+            values, complete = {**old.values, **new.values}, old.complete or new.complete
+            self._order = Order(values, complete, new.tag or old.tag, new.client)
 
     def take(self, *, complete: bool = False) -> Order:
         """What came, once; an order without values if nothing did, or with `complete` as long as it is not complete."""
@@ -159,9 +159,9 @@ class RobotService:
 
     def _on_command(self, topic: str, message: Message, caller: Caller) -> None:
         command = self._robot.spec.command
-        places, values, tag, content = decode_command(self._profile, self._robot.spec, topic, message)
-        received = values.tolist()
-        for place, value in zip(places, received, strict=True):  # the robot limits its speed itself
+        places, received, tag, content = decode_command(self._profile, self._robot.spec, topic, message)
+        values = dict(zip(places, received.tolist(), strict=True))
+        for place, value in values.items():  # the robot limits its speed itself
             low, high = command.low[place], command.high[place]
             if not low - _ROUNDING <= value <= high + _ROUNDING:
                 label, unit = command.labels[place], command.units[place]
@@ -173,7 +173,7 @@ class RobotService:
             caller = replace(caller, session=tag.session)
         self._lease.take(caller.client, shown=caller.shown, silence=caller.silence)
         echo, complete = "" if tag is None else tag.echo, topic in self._completing
-        self._slot.put(caller.client, places, received, complete=complete, tag=echo)
+        self._slot.put(Order(values, complete, echo, caller.client))
         if complete and self.info.lockstep:
             self.clock.wake()
 

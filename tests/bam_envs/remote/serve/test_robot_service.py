@@ -536,10 +536,10 @@ def test_a_base_stands_still_half_a_second_after_the_last_command(base, bus):
 
 def test_messages_of_one_command_come_together_and_the_newest_wins():
     slot = CommandSlot()
-    slot.put("b", [1], [0.08], complete=True, tag="of another client, which is forgotten")
-    slot.put("a", [6], [0.08], complete=False, tag="first")
-    slot.put("a", [6], [0.01], complete=False, tag="")
+    slot.put(Order({1: 0.08}, True, "of another client, which is forgotten", "b"))
+    slot.put(Order({6: 0.08}, False, "first", "a"))
+    slot.put(Order({6: 0.01}, False, "", "a"))
     assert slot.take(complete=True) == Order()
-    slot.put("a", [0], [1.0], complete=True, tag="second")
+    slot.put(Order({0: 1.0}, True, "second", "a"))
     assert slot.take(complete=True) == Order({6: 0.01, 0: 1.0}, True, "second", "a")
     assert slot.take(complete=True) == Order()
