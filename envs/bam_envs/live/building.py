@@ -1,6 +1,5 @@
 """The one function that builds a live robot: a `RosbridgeRobot` behind the guards of a `SafeRobot`."""
 
-from dataclasses import replace
 from pathlib import Path
 
 from bam_envs.core.errors import InvalidValue
@@ -53,8 +52,7 @@ def live_robot(
 
 def profile_limits(profile: RobotProfile) -> Limits:
     """How far the guards let the robot of `profile` go."""
-    limits = Limits.of(profile.limits)
-    return limits if limits.max_age is not None else replace(limits, max_age=profile.max_age)
+    return Limits.of({"max_age": profile.max_age, **profile.limits})
 
 
 def require_robot_address(url: str) -> None:

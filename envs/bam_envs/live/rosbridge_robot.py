@@ -379,10 +379,8 @@ class RosbridgeRobot:
         hold, sent = self._at_rest(signals), self._sent
         for sink in self._sinks:
             places = self._places(sink)
-            if sent is None and sink.hold == "last":
-                hold[places] = np.nan
-            elif sent is not None and (sink.hold == "last" or not np.isfinite(hold[places]).all()):
-                hold[places] = sent[places]
+            if sink.hold == "last" or not np.isfinite(hold[places]).all():
+                hold[places] = np.nan if sent is None else sent[places]
         if sent is not None and self._clock() - self._sent_at <= _CANNOT_BE_FAR:
             joints = np.array([unit == "rad" for unit in self.spec.command.units])
             if (np.abs(hold - sent)[joints] > _FAR).any():  # no guard lets it get so far: wrongly measured

@@ -85,19 +85,13 @@ class _Signal:
 def load_profile(name_or_path: str | Path) -> RobotProfile:
     """The shipped profile of that name, or the one in a TOML or YAML file, checked.
 
-    Raises:
-        UnknownName: No profile of that name is shipped; it carries the closest match.
-        InvalidValue: There is no such file, or something in it is not as it must be; it names file and key.
+    `UnknownName` carries the closest match to a name, `InvalidValue` names what is wrong in a file.
     """
     return _profile(*_read_file(str(name_or_path)))
 
 
 def profile_for(spec: RobotSpec) -> RobotProfile:
-    """The shipped profile that takes the commands of `spec`; else the first that takes more, narrowed to them.
-
-    Raises:
-        InvalidValue: There is none, or it would be sent a part of a message.
-    """
+    """The shipped profile that takes the commands of `spec`, else the first that takes more, narrowed to them."""
     labels, shipped = spec.command.labels, [load_profile(name) for name in shipped_profiles()]
     for profile in sorted(shipped, key=lambda one: one.command.labels != labels):
         if labels and set(labels) <= set(profile.command.labels):

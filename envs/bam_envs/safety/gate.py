@@ -11,7 +11,7 @@ import time
 import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NoReturn, cast, final
+from typing import Any, NoReturn, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -212,8 +212,8 @@ class SafeRobot(metaclass=Sealed):
 
     def not_ready(self) -> str | None:
         """Why a live robot cannot move now, as it says itself; None if it does not say so. May ask it: at rest only."""
-        ask = getattr(self._live, "not_ready", None)
-        return None if ask is None else cast("str | None", ask())
+        why: str | None = getattr(self._live, "not_ready", lambda: None)()
+        return why
 
     def age(self) -> float:
         """Age of the newest state of a live robot [s]; 0 for any other."""
@@ -264,7 +264,6 @@ class SafeRobot(metaclass=Sealed):
         before = np.full_like(measured, np.nan) if self._before is None else self._before
         self._before = measured
         time_passed = min(period, pause or period)
-        waiting = getattr(self._live, "waiting", None)
         return Tick(
             goal=goal,
             command=goal.copy(),
@@ -276,7 +275,7 @@ class SafeRobot(metaclass=Sealed):
             age=self.age(),
             period=time_passed,
             pause=pause,
-            waiting=0.0 if waiting is None else float(waiting()),
+            waiting=getattr(self._live, "waiting", lambda: 0.0)(),
             approach=approach,
         )
 
