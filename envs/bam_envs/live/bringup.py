@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from typing import Any
 
-from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, ProtocolError, RemoteError, StaleState
+from bam_envs.core.errors import BamEnvsError, LinkLost, ProtocolError, RemoteError, StaleState
 from bam_envs.core.timing import Deadline
 from bam_envs.live.state import LiveState, Mailbox
 from bam_envs.ros.codec import RobotInfo, has_room
@@ -59,19 +59,10 @@ def info_by_profile(url: str, profile: RobotProfile, unknown: Iterable[str] = ()
     return RobotInfo(profile.name, text=f"the robot at {url}, which does not describe itself ({known}{rest})")
 
 
-def tagged_sinks(profile: RobotProfile, mode: str | None, info: RobotInfo) -> tuple[Sink, ...]:
-    """The sinks whose messages have room for a tag, if the profile has such a mode; lockstep requires one."""
-    modes = list(profile.commands) if mode is None else [mode]
-    for one in modes:
-        sinks = profile.sinks(one)
-        if all(sink.tag and has_room(sink.type) for sink in sinks):
-            return sinks
-    if info.lockstep:
-        raise InvalidValue(
-            f"{info.name} goes on with each command, and its answers cannot be told apart: {modes[0]} of the profile "
-            f"of {profile.name} has no room for a tag. Give it a mode that has, such as stamped messages."
-        )
-    return profile.sinks(mode)
+def tagged_sinks(profile: RobotProfile, mode: str | None) -> tuple[Sink, ...] | None:
+    """The sinks of `mode`, or of the first mode, whose messages have room for a tag; None if there are none."""
+    modes = profile.commands.values() if mode is None else [profile.sinks(mode)]
+    return next((sinks for sinks in modes if all(sink.tag and has_room(sink.type) for sink in sinks)), None)
 
 
 class TopicTypes:

@@ -28,18 +28,9 @@ from bam_envs.core.errors import (
 )
 from bam_envs.core.robot import EnvIds, Initial, RobotSpec, RobotState
 from bam_envs.core.timing import Pacer
-from bam_envs.live.bringup import (
-    TIMEOUT,
-    DrivingSession,
-    LiveReadiness,
-    TopicTypes,
-    ask,
-    await_first,
-    info_by_profile,
-    tagged_sinks,
-)
+from bam_envs.live import bringup
 from bam_envs.live.state import Letter, LiveState
-from bam_envs.ros.codec import HALT_TOPIC, INFO_SERVICE, SCENE_TOPIC, RobotInfo, encode_sink, has_room, read_info
+from bam_envs.ros.codec import HALT_TOPIC, INFO_SERVICE, SCENE_TOPIC, RobotInfo, encode_sink, read_info
 from bam_envs.ros.freshness import Tag
 from bam_envs.ros.profile_tables import RobotProfile, Sink
 from bam_envs.rosbridge.client import RosbridgeLink
@@ -89,7 +80,7 @@ class RosbridgeRobot:
     ) -> None:
         self._endpoint = Endpoint(endpoint) if isinstance(endpoint, str) else endpoint
         self.url, self.namespace = self._endpoint.url, self._endpoint.address.namespace
-        self._timeout = self._endpoint.timeout or TIMEOUT
+        self._timeout = self._endpoint.timeout or bringup.TIMEOUT
         self._answer_timeout = self._endpoint.timeout or _ANSWER_TIMEOUT
         self._spec = profile.spec(spec, command)
         self.profile = profile.narrowed(self.spec.command.labels, command)
@@ -97,8 +88,8 @@ class RosbridgeRobot:
         self._info = RobotInfo(self.profile.name)
         self._describes_itself = False  # and so hears halts, and has sessions
         self._clock, self._state = clock, LiveState(self.profile, self.spec, clock)
-        self._readiness: LiveReadiness | None = None  # of a robot that is real
-        self._pacer, self._session = Pacer(self.spec.period, now=clock), DrivingSession()
+        self._readiness: bringup.LiveReadiness | None = None  # of a robot that is real
+        self._pacer, self._session = Pacer(self.spec.period, now=clock), bringup.DrivingSession()
         self._command_life = profile.command_life(self.spec.period)
         self._control: RosbridgeLink | None = None
         self._halting: RosbridgeLink | None = None
@@ -155,24 +146,29 @@ class RosbridgeRobot:
         control.connect()
         halting.connect()
         service = self.namespace + INFO_SERVICE
-        answer = ask(control, service)
+        answer = bringup.ask(control, service)
         said = None if answer is None else read_info(answer.get("message"), service)
-        self._describes_itself, self._info = said is not None, said or info_by_profile(self.url, self.profile)
+        self._describes_itself, self._info = said is not None, said or bringup.info_by_profile(self.url, self.profile)
         if said is not None:
-            self._sinks = tagged_sinks(self.profile, self._mode, said)
+            tagged = bringup.tagged_sinks(self.profile, self._mode)
+            self._sinks, self._answers = tagged or self._sinks, tagged is not None and not said.lockstep
+            if said.lockstep and tagged is None:
+                raise InvalidValue(
+                    f"{said.name} goes on with each command, and its answers cannot be told apart: "
+                    f"{self._mode or next(iter(self.profile.commands))} of the profile of {self.profile.name} has no "
+                    "room for a tag. Give it a mode that has, such as stamped messages."
+                )
             if said.lockstep and said.period is not None and said.period != self.spec.period:
                 raise InvalidValue(
                     f"{said.name} goes on {said.period:g} s with each command, and the task's period is "
                     f"{self.spec.period:g} s. Serve the environment that the task is of."
                 )
-            tagged = all(sink.tag and has_room(sink.type) for sink in self._sinks)
-            self._answers = tagged and not said.lockstep
         self._state.server_offset = lambda: control.clock_offset
-        types = TopicTypes(control, self.profile, self._timeout)
+        types = bringup.TopicTypes(control, self.profile, self._timeout)
         self._declare(control, halting, types)
-        self._readiness = LiveReadiness(self.profile, self._sinks, types) if said is None else None
+        self._readiness = bringup.LiveReadiness(self.profile, self._sinks, types) if said is None else None
 
-    def _declare(self, control: RosbridgeLink, halting: RosbridgeLink, types: TopicTypes) -> None:
+    def _declare(self, control: RosbridgeLink, halting: RosbridgeLink, types: bringup.TopicTypes) -> None:
         """Subscribe states and advertise commands, with the types that they have there."""
         shared = {source.topic for source in self.profile.state if source.partial}
         fewest = int(1000 * min(self.spec.period, self.profile.max_age) / _STATES)
@@ -196,10 +192,10 @@ class RosbridgeRobot:
         self._cut.clear()
         self._epoch = control.epoch
         self._state.forget_ages()
-        await_first(control, self._state, self.profile, self._timeout)
+        bringup.await_first(control, self._state, self.profile, self._timeout)
         if self._readiness is not None:
             self._readiness.begin(control)
-            self._info = info_by_profile(self.url, self.profile, self._readiness.unknown)
+            self._info = bringup.info_by_profile(self.url, self.profile, self._readiness.unknown)
         self._open_session(control)
         self._refusals.clear()
         self._state.read()

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import LinkLost
-from bam_envs.live import bringup
+from bam_envs.live import rosbridge_robot
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
@@ -162,7 +162,7 @@ def test_a_server_that_hangs_is_waited_for_as_long_as_one_wants(corridor, corrid
 
 
 def test_a_real_robot_is_shown_and_does_not_move_unasked(serve, run, monkeypatch):
-    monkeypatch.setattr(bringup, "read_info", lambda *said: replace(read_info(*said), simulated=False))
+    monkeypatch.setattr(rosbridge_robot, "read_info", lambda *said: replace(read_info(*said), simulated=False))
     served = serve(gym.make("bam/pick-v0", disable_env_checker=True), fast=True)
     status, out, err = run(deploy, PICK, "--episodes", 2, "--robot", served.bus.url)
     assert (status, out) == (1, "")
