@@ -109,8 +109,8 @@ def _foreign(config: EvalConfig, path: Path) -> _Subject:
         f"observations, these figures are wrong: the normaliser is not in such a file."
     )
     load = partial(load_trusted, path, config.algo, env)
-    env_kwargs, model = parity_if_needed(env, env_kwargs, load, lambda text: say(f"bam-eval: {text}"))
-    return _Subject(model.policy, env, env_kwargs, _facts(path, config.algo, model.steps, env_kwargs), None)
+    env_kwargs, (policy, steps) = parity_if_needed(env, env_kwargs, load, lambda text: say(f"bam-eval: {text}"))
+    return _Subject(policy, env, env_kwargs, _facts(path, config.algo, steps, env_kwargs), None)
 
 
 def _facts(path: Path, algorithm: str, steps: int, asked: dict[str, Any]) -> dict[str, Any]:

@@ -1,38 +1,24 @@
 """Spaces that count from another number than 0, as learning libraries take them: these ignore ``start``."""
 
+import functools
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.wrappers import TransformAction, TransformObservation
 
 _Counted = (spaces.Discrete, spaces.MultiDiscrete)
 
 
 def from_zero(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
     """The environment with every Discrete and MultiDiscrete counted from 0; itself if they all are already."""
-    wrapped = FromZero(env)
-    same = (wrapped.observation_space, wrapped.action_space) == (env.observation_space, env.action_space)
-    return env if same else wrapped
-
-
-class FromZero(gym.Wrapper[Any, Any, Any, Any]):
-    """Gives observations less their space's ``start``, and takes actions less its ``start``; leaves of a Dict too."""
-
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        super().__init__(env)
-        self.observation_space = space_from_zero(env.observation_space)
-        self.action_space = space_from_zero(env.action_space)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        return less_start(self.env.observation_space, observation), info
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Take an action that is counted from 0."""
-        observation, *rest = self.env.step(plus_start(self.env.action_space, action))
-        return less_start(self.env.observation_space, observation), *rest
+    seen, acted = env.observation_space, env.action_space
+    if (zero := space_from_zero(acted)) != acted:
+        env = TransformAction(env, functools.partial(plus_start, acted), zero)
+    if (zero := space_from_zero(seen)) != seen:
+        env = TransformObservation(env, functools.partial(less_start, seen), zero)
+    return env
 
 
 def plus_start(space: spaces.Space[Any], value: Any) -> Any:

@@ -5,7 +5,6 @@ import textwrap
 import zipfile
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +22,6 @@ _MISFIT = (ValueError, TypeError, KeyError, AttributeError, RuntimeError, Assert
 _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, pickle.UnpicklingError)
 
 
-@dataclass(frozen=True)
-class ForeignModel:
-    """A frozen policy out of a plain stable-baselines3 zip."""
-
-    policy: FrozenPolicy
-    steps: int
-    """Environment steps it was trained for."""
-
-
 def is_plain_sb3(path: Path) -> bool:
     """Whether the file is a zip as stable-baselines3 writes it, without our manifest; opens nothing in it."""
     try:
@@ -42,16 +32,19 @@ def is_plain_sb3(path: Path) -> bool:
     return "data" in names and MANIFEST not in names
 
 
-def load_trusted(path: Path, algo: str, env_id: str, env_kwargs: Mapping[str, Any] | None = None) -> ForeignModel:
-    """Load with stable-baselines3, UNPICKLING what the file holds, and freeze. Only for files whose maker is trusted.
-
-    Observations that were normalised by a VecNormalize are not the business of such a zip, and are not normalised here.
+def load_trusted(
+    path: Path, algo: str, env_id: str, env_kwargs: Mapping[str, Any] | None = None
+) -> tuple[FrozenPolicy, int]:
+    """Load with stable-baselines3, UNPICKLING what the file holds; only for files whose maker is trusted.
 
     Args:
-        path: The zip.
+        path: The zip; the statistics of a VecNormalize are not in it.
         algo: A name of `SB3_ALGORITHMS`.
         env_id: The environment it was trained on.
         env_kwargs: Its keyword arguments.
+
+    Returns:
+        The frozen policy, and the steps it was trained for.
 
     Raises:
         CheckpointMismatch: It is not of this algorithm, or not for this environment.
@@ -70,4 +63,4 @@ def load_trusted(path: Path, algo: str, env_id: str, env_kwargs: Mapping[str, An
         raise CheckpointMismatch(path, text) from error
     policy = FrozenPolicy.from_graph(graph, space_to_json(env.observation_space), space_to_json(env.action_space))
     env.close()  # type: ignore[no-untyped-call]
-    return ForeignModel(policy, int(model.num_timesteps))
+    return policy, int(model.num_timesteps)

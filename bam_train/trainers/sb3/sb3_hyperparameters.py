@@ -5,18 +5,16 @@ In settings they are JSON: a schedule is ``"lin_3e-4"`` (linear to 0), action no
 """
 
 import copy
-import functools
 import inspect
-import operator
-import re
 import typing
 import warnings
 from collections.abc import Container, Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from gymnasium import spaces
+from msgspec import Meta
 from stable_baselines3.common import noise, torch_layers, utils
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
@@ -54,8 +52,14 @@ CLASSES: dict[str, dict[str, type]] = {
 }
 """Policy arguments that are classes, by lower-case name."""
 
-_NOISE = re.compile(r"(?P<kind>normal|ornstein-uhlenbeck)_(?P<sigma>\d.*)")
-
+_NOISES = {"normal": noise.NormalActionNoise, "ornstein-uhlenbeck": noise.OrnsteinUhlenbeckActionNoise}
+_Noise = Annotated[
+    str,
+    Meta(
+        pattern=rf"^({'|'.join(_NOISES)})_\d+\.?\d*([eE][-+]?\d+)?$",
+        description='"normal_0.1" or "ornstein-uhlenbeck_0.1"',
+    ),
+]
 
 _EXPLORATION = ("exploration_fraction", "exploration_initial_eps", "exploration_final_eps")
 _COUNTS = ("n_steps", "batch_size", "n_epochs", "buffer_size", "train_freq", "target_update_interval", "policy_delay")
@@ -69,26 +73,20 @@ _RANGES = {
 
 
 def complete(algorithm: Algorithm, given: Mapping[str, Any], observation_space: spaces.Space[Any]) -> dict[str, Any]:
-    """Check hyperparameters by name and type and add the defaults of those that are not given.
-
-    Raises:
-        SettingsError: An unknown name (with the closest match) or a wrong type.
-    """
+    """Check hyperparameters by name, type and range, and add the defaults of those that are not given."""
     parameters = _parameters(algorithm.load(), ELSEWHERE)
     require_known(given, parameters, f"{algorithm.name} hyperparameter", ELSEWHERE, NAMES)
     values: dict[str, Any] = {"policy": default_policy(algorithm, observation_space)}
     for name, parameter in parameters.items():
         if name in given:
-            values[name] = fit(name, given[name], _written(parameter.annotation))
+            is_noise = noise.ActionNoise in typing.get_args(parameter.annotation)
+            values[name] = fit(name, given[name], _Noise | None if is_noise else parameter.annotation)
         elif name != "policy":
             values[name] = list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
     policies, policy = algorithm.load().policy_aliases, values["policy"]
     if policy not in policies:
         raise SettingsError(f"policy: unknown policy {policy!r} of {algorithm.name}. {did_you_mean(policy, policies)}")
     values["policy_kwargs"] = _checked_policy(policies[policy], values["policy_kwargs"] or {})
-    text = values.get("action_noise")
-    if text is not None and not _NOISE.fullmatch(text):
-        raise SettingsError(f'action_noise: expected "normal_0.1" or "ornstein-uhlenbeck_0.1", found {text!r}')
     _check_ranges(values)
     return values
 
@@ -129,14 +127,10 @@ def build(values: Mapping[str, Any], action_space: spaces.Space[Any]) -> dict[st
             arguments[name] = schedule(start, 0.0, 1.0)
         elif isinstance(value, list) and len(value) == 2 and value[1] in ("step", "episode"):
             arguments[name] = tuple(value)
-    text = arguments.get("action_noise")
-    if text is not None:
-        match = _NOISE.fullmatch(text)
-        if match is None or action_space.shape is None:
-            raise SettingsError(f"action_noise: {text!r} does not fit a {type(action_space).__name__} action space")
-        mean, sigma = np.zeros(action_space.shape), np.full(action_space.shape, float(match["sigma"]))
-        kind = noise.NormalActionNoise if match["kind"] == "normal" else noise.OrnsteinUhlenbeckActionNoise
-        arguments["action_noise"] = kind(mean, sigma)
+    if arguments.get("action_noise") is not None:
+        kind, _, sigma = arguments["action_noise"].rpartition("_")
+        shape = action_space.shape or ()
+        arguments["action_noise"] = _NOISES[kind](np.zeros(shape), np.full(shape, float(sigma)))
     policy = arguments["policy_kwargs"]
     for name, table in CLASSES.items():
         if name in policy:
@@ -148,12 +142,6 @@ def _parameters(kind: Any, but: Container[str]) -> dict[str, inspect.Parameter]:
     """Parameters of a class's constructor by name, other than some."""
     parameters = inspect.signature(kind.__init__).parameters
     return {name: parameter for name, parameter in parameters.items() if name not in but}
-
-
-def _written(hint: Any) -> Any:
-    """The annotation of a value as it is written in settings: action noise is text too."""
-    parts = [str if one is noise.ActionNoise else one for one in typing.get_args(hint)]
-    return functools.reduce(operator.or_, parts) if noise.ActionNoise in typing.get_args(hint) else hint
 
 
 def _check_ranges(values: Mapping[str, Any]) -> None:
@@ -169,7 +157,7 @@ def _checked_policy(policy: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     parameters, values = _parameters(policy, _POLICY_ELSEWHERE), {}
     require_known(given, parameters, "policy_kwargs argument", ELSEWHERE)
     for name, value in given.items():
-        values[name] = fit(f"policy_kwargs.{name}", value, _written(parameters[name].annotation))
+        values[name] = fit(f"policy_kwargs.{name}", value, parameters[name].annotation)
         if name in CLASSES and values[name].lower() not in CLASSES[name]:
             close = did_you_mean(value.lower(), CLASSES[name])
             raise SettingsError(f"policy_kwargs.{name}: unknown {value!r}. {close}")
@@ -183,8 +171,7 @@ _REFUSALS = (AssertionError, ValueError, TypeError, RuntimeError, ZeroDivisionEr
 def make_model(settings: TrainSettings, venv: VecEnv) -> tuple[Any, list[str]]:
     """The algorithm's model, whose constructor seeds everything, and what it warns of, a line each.
 
-    Raises:
-        SettingsError: The library refuses the settings, or there is no such device.
+    Raises SettingsError if the library refuses the settings, or there is no such device.
     """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
@@ -199,7 +186,14 @@ def make_model(settings: TrainSettings, venv: VecEnv) -> tuple[Any, list[str]]:
         except _REFUSALS as error:
             why = " ".join(str(error).split())
             raise SettingsError(f"{settings.algo} on {settings.env} cannot be set up: {why}") from error
-    return model, [" ".join(str(one.message).split()) for one in caught]
+    notices = [" ".join(str(one.message).split()) for one in caught]
+    if any(text.startswith("You have specified a mini-batch size") for text in notices):  # in words of settings
+        steps, batch = model.n_steps * model.n_envs, model.batch_size
+        notices = [
+            f"batch_size {batch} does not divide a rollout of n_steps {model.n_steps} x num_envs {model.n_envs} = "
+            f"{steps} steps: its last batch has {steps % batch}"
+        ]
+    return model, notices
 
 
 def _normalised(venv: VecEnv, given: bool | dict[str, Any]) -> VecNormalize:
@@ -217,11 +211,7 @@ def _normalised(venv: VecEnv, given: bool | dict[str, Any]) -> VecNormalize:
 
 
 def _device(name: str, policy: str) -> str:
-    """Where to compute: what was asked for if it is there.
-
-    Raises:
-        SettingsError: There is no such device.
-    """
+    """Where to compute: what was asked for, if it is there."""
     if name == "auto":
         # Copies to a GPU cost more than a small network computes.
         return "cuda" if torch.cuda.is_available() and not policy.startswith("Mlp") else "cpu"

@@ -2,7 +2,7 @@
 
 import functools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,18 +16,14 @@ from bam_train.env_location import HERE, Place
 from bam_train.environments import is_batched, make_env, make_vector_env
 from bam_train.errors import SettingsError
 from bam_train.finite_envs import FiniteEnv, FiniteVectorEnv
-from bam_train.trainers.zero_based_spaces import FromZero, from_zero
+from bam_train.trainers.zero_based_spaces import from_zero
 
 Observations = Any
 """An array (n, …), or a mapping of them."""
 
 
 def make_training_env(env_id: str, env_kwargs: Mapping[str, Any], num_envs: int, place: Place = HERE) -> VecEnv:
-    """`num_envs` environments to train on; our own can save and restore their state.
-
-    Raises:
-        SettingsError: The environment cannot be made.
-    """
+    """`num_envs` environments to train on; our own can save and restore their state."""
     if is_batched(env_id) or place.transport:
         return BatchVecEnv(make_vector_env(env_id, env_kwargs, num_envs, place), env_id)
     envs = (FiniteEnv(make_env(env_id, env_kwargs), env_id, index) for index in range(num_envs))
@@ -39,7 +35,7 @@ def one_env(venv: VecEnv) -> Any:
     if isinstance(venv, BatchVecEnv):
         return venv.batch
     env = venv.envs[0]
-    while isinstance(env, (Monitor, FromZero)):
+    while not isinstance(env, FiniteEnv):
         env = env.env
     return env
 
@@ -65,7 +61,6 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
             raise SettingsError(f"{batch}: expected actions that count from 0, found {batch.single_action_space}")
         self.batch = FiniteVectorEnv(batch, env_id)
         super().__init__(batch.num_envs, batch.single_observation_space, batch.single_action_space)
-        self._dict = isinstance(batch.single_observation_space, spaces.Dict)
         self._returns = np.zeros(self.num_envs)
         self._lengths = np.zeros(self.num_envs, dtype=np.int64)
         self._started = time.monotonic()
@@ -84,7 +79,7 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         self._reset_seeds()
         self._returns[:], self._lengths[:] = 0, 0
         self._interrupted = None
-        return self._own(observations)
+        return self._copy(observations)
 
     def interrupt(self, last: Observations) -> None:
         """An evaluation used the environments: at the next step the running episodes are truncated, and new ones begin.
@@ -103,7 +98,7 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         if self._interrupted is not None:  # the actions are not sent, and no episode is counted
             last, observations = self._interrupted, self.reset()
             for row, info in enumerate(infos):
-                info |= {"terminal_observation": self._of(last, row), "TimeLimit.truncated": True}
+                info |= {"terminal_observation": self._copy(last, row), "TimeLimit.truncated": True}
             return observations, np.zeros(self.num_envs, np.float32), np.ones(self.num_envs, dtype=bool), infos
         observations, rewards, terminated, truncated, extra = self.batch.step(self._actions)
         done = terminated | truncated
@@ -111,12 +106,12 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         self._lengths += 1
         for index in np.flatnonzero(done):
             infos[index] = self._end(int(index), bool(terminated[index]), extra)
-        return self._own(observations), np.asarray(rewards, dtype=np.float32), done, infos
+        return self._copy(observations), np.asarray(rewards, dtype=np.float32), done, infos
 
     def _end(self, index: int, terminated: bool, extra: Mapping[str, Any]) -> dict[str, Any]:
         """The info of an environment whose episode ended, in the words of stable-baselines3; its sums begin again."""
         info = {
-            "terminal_observation": self._of(extra["final_obs"], index),
+            "terminal_observation": self._copy(extra["final_obs"], index),
             "TimeLimit.truncated": not terminated,
             "episode": {
                 "r": float(self._returns[index]),
@@ -130,14 +125,9 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         self._returns[index], self._lengths[index] = 0, 0
         return info
 
-    def _own(self, observations: Observations) -> Observations:
-        """A copy: the environment may write its next observation into the same array."""
-        if self._dict:
-            return {key: np.array(value) for key, value in observations.items()}
-        return np.array(observations)
-
-    def _of(self, observations: Observations, index: int) -> Any:
-        if self._dict:
+    def _copy(self, observations: Observations, index: Any = ...) -> Any:
+        """A copy, of one environment or all: the environment may write its next observation into the same array."""
+        if isinstance(self.observation_space, spaces.Dict):
             return {key: np.array(value[index]) for key, value in observations.items()}
         return np.array(observations[index])
 
@@ -159,23 +149,19 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         self.batch.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute of the vector environment, once for each environment asked for."""
+        """The vector environment's attribute, for each environment asked for."""
         value = getattr(self.batch, attr_name)
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of the vector environment; it has one for all environments."""
+        """Set the vector environment's attribute, whichever environments are asked for."""
         setattr(self.batch, attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Call a method of the vector environment once; its result for each environment asked for."""
+        """Call the vector environment's method once; its result for each environment asked for."""
         value = getattr(self.batch, method_name)(*method_args, **method_kwargs)
         return [value for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         """No environment has a wrapper of its own."""
         return [False for _ in self._get_indices(indices)]
-
-    def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        """No pictures: training is not watched."""
-        return [None] * self.num_envs

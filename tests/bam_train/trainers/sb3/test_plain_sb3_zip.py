@@ -78,12 +78,10 @@ def test_a_damaged_member_is_one_line(plain, tmp_path):
 
 def test_the_frozen_policy_acts_as_the_model(plain):
     model, path = plain
-    foreign = load_trusted(path, "ppo", "CartPole-v1")
+    policy, steps = load_trusted(path, "ppo", "CartPole-v1")
     observations = np.random.default_rng(0).normal(size=(200, 4)).astype(np.float32)
-    assert foreign.steps == load_trusted(path, "a2c", "CartPole-v1").steps == 64  # the same policy in the same file
-    assert (
-        foreign.policy.act_batch(observations).tolist() == model.predict(observations, deterministic=True)[0].tolist()
-    )
+    assert steps == load_trusted(path, "a2c", "CartPole-v1")[1] == 64  # the same policy in the same file
+    assert policy.act_batch(observations).tolist() == model.predict(observations, deterministic=True)[0].tolist()
 
 
 @pytest.mark.parametrize(

@@ -118,7 +118,6 @@ def test_one_value_for_all_rows(rows):
     assert venv.get_attr("mark", indices=[1]) == [7]
     assert venv.env_method("state_dict", indices=0)[0]["elapsed"].tolist() == [0, 0, 0]
     assert venv.env_is_wrapped(gym.Wrapper) == [False] * 3
-    assert venv.get_images() == [None] * 3
 
 
 def test_other_environments_take_turns(corridor):
