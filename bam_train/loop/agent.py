@@ -124,24 +124,16 @@ class Agent(_Base):  # type: ignore[misc]
 
     def get(self, index: str | tuple[str, int]) -> Any:
         """All times of a variable, T x B x ..., or with (name, t) its value at t, B x ...."""
-        workspace = self.workspace
-        if workspace is None:
-            workspace = self._workspace()
-        if type(index) is tuple:  # quicker than isinstance
-            return workspace.get(index[0], index[1])
-        return workspace.get_full(index) if isinstance(index, str) else workspace.get(*index)
+        workspace = self._workspace()
+        return workspace.get_full(index) if isinstance(index, str) else workspace.get(index[0], index[1])
 
     def set(self, index: str | tuple[str, int], value: Any) -> None:
         """Write all times of a variable, T x B x ..., or with (name, t) its value at t, B x ...."""
-        workspace = self.workspace
-        if workspace is None:
-            workspace = self._workspace()
-        if type(index) is tuple:  # quicker than isinstance
-            workspace.set(index[0], index[1], value)
-        elif isinstance(index, str):
+        workspace = self._workspace()
+        if isinstance(index, str):
             workspace.set_full(index, value)
         else:
-            workspace.set(*index, value)
+            workspace.set(index[0], index[1], value)
 
     def get_time_truncated(self, name: str, from_time: int, to_time: int) -> Any:
         """Times [from_time, to_time) of a variable."""

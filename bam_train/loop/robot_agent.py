@@ -1,6 +1,6 @@
 """What a deployment runs on, on NumPy arrays: one environment, usually a robot's, and a policy that is no agent."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -79,29 +79,26 @@ class RobotAgent(Agent):
             self._closed = False
             observation, info = self.env.reset(seed=seed)
             self._kinds = kinds(flat(observation), self.env.observation_space, for_torch=False)
-            self._total, self._steps, self._running = 0.0, 0, True
-            self._write(t, observation, 0.0, (False, False), info)
-            return
-        if not self._running:
+            reward, terminated, truncated = 0.0, False, False
+            self._total, self._steps = 0.0, 0
+        elif not self._running:
             raise LoopError(
                 f"No episode is running in {self.env.spec.id if self.env.spec else self.env}; begin at t=0."
             )
-        action = self.get((self.input, t - 1))[0].copy()  # the environment may change it
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        self._total += float(reward)
-        self._steps += 1
+        else:
+            action = self.get((self.input, t - 1))[0].copy()  # the environment may change it
+            observation, reward, terminated, truncated, info = self.env.step(action)
+            self._total += float(reward)
+            self._steps += 1
         self._running = not (terminated or truncated)
-        self._write(t, observation, float(reward), (bool(terminated), bool(truncated)), info)
-
-    def _write(self, t: int, observation: Any, reward: float, ends: tuple[bool, bool], info: Mapping[str, Any]) -> None:
         values = {
             **pack(self._kinds, [observation]),
-            "reward": np.array([reward]),
+            "reward": np.array([float(reward)]),
             "cumulated_reward": np.array([self._total]),
             "timestep": np.array([self._steps]),
-            "terminated": np.array([ends[0]]),
-            "truncated": np.array([ends[1]]),
-            "done": np.array([ends[0] or ends[1]]),
+            "terminated": np.array([bool(terminated)]),
+            "truncated": np.array([bool(truncated)]),
+            "done": np.array([not self._running]),
             SUCCESS: np.array([bool(info.get("is_success", False))]),
             SAYS_SUCCESS: np.array(["is_success" in info]),
         }

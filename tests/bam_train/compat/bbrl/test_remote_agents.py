@@ -410,6 +410,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("killed", "code"), [(True, -signal.SIGKILL), (False, 0)])
 def test_processes_end_with_their_parent(killed, code):
     run = run_program("-c", SCRIPT.format(killed=killed))
@@ -437,11 +438,13 @@ finally:
 """
 
 
+@pytest.mark.slow
 def test_a_process_that_is_closed_while_it_forks_does_not_run_the_program_again():
     run = run_program("-c", HANDLER)
     assert (run.returncode, run.stdout, run.stderr) == (0, "the end of the program\n", "")
 
 
+@pytest.mark.slow
 def test_a_script_without_main_guard(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
