@@ -79,7 +79,8 @@ class RobotAgent(Agent):
             self._closed = False
             observation, info = self.env.reset(seed=seed)
             self._kinds = kinds(flat(observation), self.env.observation_space, for_torch=False)
-            reward, terminated, truncated = 0.0, False, False
+            reward: Any = 0.0
+            terminated = truncated = False
             self._total, self._steps = 0.0, 0
         elif not self._running:
             raise LoopError(
