@@ -46,12 +46,15 @@ LAYOUT_CONNECTORS = frozenset(
 
 @dataclass(frozen=True)
 class Filter:
-    """A `MeanStdFilter` that has stopped learning: clip((x - offset) / divisor, -limit, limit), in float64."""
+    """A `MeanStdFilter` that has stopped learning: clip((x - offset) / divisor, -limit, limit), in float64.
+
+    Its arrays have the observation's shape.
+    """
 
     offset: Array
-    """Mean of the observations seen, or zeros, float64. Shape: the observation's."""
+    """Mean of the observations seen, or zeros."""
     divisor: Array
-    """Their deviation + 1e-6, or ones, float64. Shape: the observation's."""
+    """Their deviation + 1e-6, or ones."""
     limit: float | None
     """`clip_by_value`; 0 and None do not clip."""
     center: bool
@@ -61,14 +64,14 @@ class Filter:
 
     @classmethod
     def of(cls, stats: Mapping[str, Any], limit: float | None, center: bool, scale: bool) -> Filter:
-        """The filter with these statistics, RLlib's `RunningStat` as a state; it computes the deviation in float32."""
+        """The filter of a state of RLlib's `RunningStat`, which computes the deviation in float32."""
         count = int(stats["num_pushes"])
-        mean, squares = (unpacked_array(stats[name]) for name in ("mean_array", "sum_sq_diff_array"))
+        mean, squares = (unpacked_array(stats[name]).astype(np.float64) for name in ("mean_array", "sum_sq_diff_array"))
         variance = squares / (count - 1.0) if count > 1 else np.zeros(squares.shape)
         deviation = np.sqrt(np.maximum(variance.astype(np.float32), 0)) + np.float32(_SMALL_NUMBER)
         offset = mean if center else np.zeros(mean.shape)
-        divisor = deviation if scale else np.ones(mean.shape)
-        return cls(offset.astype(np.float64), divisor.astype(np.float64), limit, bool(center), bool(scale))
+        divisor = deviation.astype(np.float64) if scale else np.ones(mean.shape)
+        return cls(offset, divisor, limit, bool(center), bool(scale))
 
 
 @dataclass(frozen=True)
@@ -136,7 +139,7 @@ def _preprocessing(connectors: list[Any]) -> dict[str, Any]:
 
 
 def require_layout_only(piece: Any, known: Sequence[str] = ()) -> None:
-    """Refuse a connector that changes values in another way than the `known` ones."""
+    """Refuse a connector that changes values, except the `known` ones."""
     name = type(piece).__name__
     if name not in LAYOUT_CONNECTORS and name not in known:
         raise PolicyError(f"connector {name} cannot be frozen; expected FlattenObservations or MeanStdFilter")

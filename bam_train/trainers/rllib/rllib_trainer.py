@@ -12,7 +12,7 @@ import warnings
 from collections import deque
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -53,7 +53,8 @@ class RLlibTrainer:
             describe = getattr(env.unwrapped, "describe", None)
             self._signals, self._period = describe() if describe else {}, control_period(env)
         self._ends = {name: deque[float](maxlen=_EPISODES) for name in ("return", "length", "success")}
-        self._result: dict[str, Any] = {}
+        self._learnt: dict[str, Any] = {}
+        """What RLlib's learner said of the last iteration."""
         self._steps = 0
         self._tensorboard: TensorBoardFiles | None = None
         self._spare: Any = None
@@ -126,8 +127,7 @@ class RLlibTrainer:
         algorithm = RLLIB_ALGORITHMS[settings.algo]
         if not algorithm.offline:
             lost = "running episodes" if algorithm.on_policy else "running episodes and replay buffers"
-            text = f"RLlib saves no {lost}: new ones begin, so the rest differs from an unbroken run"
-            trainer.notices.append(text)
+            trainer.notices.append(f"RLlib saves no {lost}: new ones begin, so the rest differs from an unbroken run")
         return trainer
 
     @contextlib.contextmanager
@@ -158,11 +158,12 @@ class RLlibTrainer:
     def _iterate(self) -> None:
         with warnings.catch_warnings():  # TQC compares every quantile with every other, which torch takes for a mistake
             warnings.filterwarnings("ignore", "Using a target size", UserWarning)
-            self._result, news = self._watch.train()
+            result, news = self._watch.train()
         self.notices += news
-        before, sampled = self._steps, self._result.get("env_runners", {})
+        before, sampled = self._steps, result.get("env_runners", {})
+        self._learnt = result.get("learners", {}).get(DEFAULT_MODULE_ID, {})
         if RLLIB_ALGORITHMS[self.settings.algo].offline:
-            self._steps = int(self._learnt().get("num_module_steps_trained_lifetime", before))
+            self._steps = int(self._learnt.get("num_module_steps_trained_lifetime", before))
         else:
             self._steps = int(sampled.get("num_env_steps_sampled_lifetime", before))
         if self._steps == before:  # every runner was gone
@@ -179,13 +180,9 @@ class RLlibTrainer:
         means = {f"episodes/{name}": float(np.mean(values)) for name, values in self._ends.items() if values}
         self.log(self._metrics() | means)
 
-    def _learnt(self) -> dict[str, Any]:
-        found: dict[str, Any] = self._result.get("learners", {}).get(DEFAULT_MODULE_ID, {})
-        return found
-
     def _metrics(self) -> dict[str, float]:
         """The learner's own numbers, finite ones only."""
-        arrays = {f"train/{name}": np.asarray(value) for name, value in self._learnt().items()}
+        arrays = {f"train/{name}": np.asarray(value) for name, value in self._learnt.items()}
         numbers = {name: float(one) for name, one in arrays.items() if one.ndim == 0 and one.dtype.kind in "fiu"}
         return {name: number for name, number in numbers.items() if math.isfinite(number)}
 
@@ -242,8 +239,7 @@ class RLlibTrainer:
     def exploring(self) -> RLlibPolicy:
         """The policy as it is now, drawing its actions as in training."""
         with self.undisturbed():
-            policy: RLlibPolicy = self._of(RLlibPolicy, self._module(), explore=True)
-            return policy
+            return cast(RLlibPolicy, self._of(RLlibPolicy, self._module(), explore=True))
 
     @contextlib.contextmanager
     def undisturbed(self) -> Iterator[None]:
@@ -274,11 +270,7 @@ class RLlibTrainer:
 
 
 def _require_fitting(settings: TrainSettings) -> None:
-    """Refuse settings that RLlib's trainer has no use for.
-
-    Raises:
-        SettingsError: Names the setting and the remedy.
-    """
+    """Refuse settings that RLlib's trainer has no use for."""
     if settings.transport:
         raise SettingsError(
             "transport: the rllib trainer makes its environments in its own runners. Leave --transport out and put "

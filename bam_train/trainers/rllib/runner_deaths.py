@@ -111,11 +111,17 @@ def _own_cause(error: Exception) -> Exception:
 class RunnerWatch:
     """Looks after the runners of an algorithm of `make_config`, which is trained by `train` from now on.
 
-    It looks before each training step and after the last of an iteration; `clock` is monotonic time [s].
+    It looks before each training step and after the last of an iteration; `clock` is monotonic time [s], and `cause_of`
+    says why the runner of an index died.
     """
 
-    def __init__(self, algorithm: Any, clock: Callable[[], float] = time.monotonic) -> None:
-        self._algorithm, self._clock = algorithm, clock
+    def __init__(
+        self,
+        algorithm: Any,
+        clock: Callable[[], float] = time.monotonic,
+        cause_of: Callable[[int], str | None] = cause_of_death,
+    ) -> None:
+        self._algorithm, self._clock, self._cause_of = algorithm, clock, cause_of
         self._group = algorithm.env_runner_group
         self._all = set(range(1, 1 + (self._group.num_remote_env_runners() if self._group else 0)))
         self._gone: set[int] = set()
@@ -170,7 +176,7 @@ class RunnerWatch:
             return
         self._gone |= died
         for index in sorted(died):
-            why = cause_of_death(index)
+            why = self._cause_of(index)
             self._cause = f" ({why})" if why else ""
             self._lines.append(f"env runner {index} died{self._cause}: what it had not delivered yet is lost")
             deaths = self._deaths[index]

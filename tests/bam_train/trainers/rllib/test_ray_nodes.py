@@ -84,6 +84,7 @@ class Plan:
 
     def __call__(self, progress):
         self.steps.append(progress.steps)
+        self.metrics = progress.statistics().metrics
         if time.monotonic() - self.since > PATIENCE:
             pytest.fail(f"{len(self.stages)} stages are left; {self.trainer.notices}")
         if self.stages[0]():
@@ -137,8 +138,7 @@ def test_a_runner_and_a_node_die_in_mid_training(nodes, tmp_path):
             f"env runner {second_index} died: what it had not delivered yet is lost",
             "training goes on with 1 of 2 env runners",
         ]
-        learnt = trainer._result["learners"]["default_policy"]["num_module_steps_trained_lifetime"]
-        assert learnt >= trainer.steps
+        assert plan.metrics["train/num_module_steps_trained_lifetime"] >= trainer.steps
         saved = trainer.save(tmp_path / "one.zip", {}, {})
         assert Checkpoint.open(saved.path).manifest.steps == trainer.steps
 

@@ -9,20 +9,19 @@ import pytest
 
 pytest.importorskip("ray.rllib")
 
-from ray._private import utils as ray_utils
-
 from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.trainers.rllib import ray_cluster
 from bam_train.trainers.rllib.ray_cluster import find, reach, reason
 
 
 @pytest.fixture
-def started_here(monkeypatch):
+def started_here(monkeypatch, tmp_path):
     """What ``ray start`` on this computer wrote."""
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    found = ["10.0.0.5:6379"]
-    monkeypatch.setattr(ray_utils, "read_ray_address", lambda: found[0])
-    return found
+    monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
+    (tmp_path / "ray").mkdir()
+    (tmp_path / "ray" / "ray_current_cluster").write_text("10.0.0.5:6379\n")
+    return tmp_path / "ray" / "ray_current_cluster"
 
 
 @pytest.mark.parametrize("place", ["10.0.0.5:6379", "head.local:1234", "[::1]:6379"])
@@ -43,7 +42,7 @@ def test_auto_is_the_cluster_of_this_computer_or_the_variables(started_here, mon
 
 
 def test_auto_without_a_cluster(started_here):
-    started_here[0] = None
+    started_here.unlink()
     with pytest.raises(TrainingFailed) as caught:
         find("auto")
     assert str(caught.value) == (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -11,7 +12,6 @@ pytest.importorskip("ray.rllib")
 from ray.exceptions import RayError
 
 from bam_train.errors import ProcessesLost, TrainingFailed
-from bam_train.trainers.rllib import runner_deaths
 from bam_train.trainers.rllib.runner_deaths import RunnerWatch
 
 
@@ -41,31 +41,29 @@ class Algorithm:
 QUIET = [((), [])]
 
 
-@pytest.fixture(autouse=True)
-def causes(monkeypatch):
-    """What runners said before they died."""
-    said = {}
-    monkeypatch.setattr(runner_deaths, "cause_of_death", lambda index: said.pop(index, None))
-    return said
+def watched(algorithm, causes=(), clock=time.monotonic):
+    """Its runners said these `causes`, by index, before they died."""
+    said = dict(causes)
+    return RunnerWatch(algorithm, clock, lambda index: said.pop(index, None))
 
 
 def test_nothing_happens():
-    watch = RunnerWatch(Algorithm([QUIET] * 3))
+    watch = watched(Algorithm([QUIET] * 3))
     assert [watch.train() for _ in range(3)] == [({"iterations left": left}, []) for left in (2, 1, 0)]
     without = Algorithm([[]], runners=0)
-    assert RunnerWatch(without).train() == ({"iterations left": 0}, [])
+    assert watched(without).train() == ({"iterations left": 0}, [])
 
 
 def test_runners_of_others_are_left_alone():
     algorithm = Algorithm([QUIET])
-    RunnerWatch(algorithm)
+    watched(algorithm)
     algorithm.back, algorithm.healthy = [7], set()
     assert algorithm.restore_env_runners(SimpleNamespace()) == [7]
 
 
-def test_one_dies_and_comes_back(causes):
-    causes[2] = "ConnectionError: the simulator is gone"
-    watch = RunnerWatch(Algorithm([[([2], [])], QUIET, [((), [2])], QUIET]))
+def test_one_dies_and_comes_back():
+    causes = {2: "ConnectionError: the simulator is gone"}
+    watch = watched(Algorithm([[([2], [])], QUIET, [((), [2])], QUIET]), causes)
     assert [watch.train()[1] for _ in range(4)] == [
         [
             "env runner 2 died (ConnectionError: the simulator is gone): what it had not delivered yet is lost",
@@ -78,7 +76,7 @@ def test_one_dies_and_comes_back(causes):
 
 
 def test_within_one_update_and_in_the_last():
-    watch = RunnerWatch(Algorithm([[([1], []), ((), [1])]], last=[1, 2]))
+    watch = watched(Algorithm([[([1], []), ((), [1])]], last=[1, 2]))
     assert watch.train()[1] == [
         "env runner 1 died: what it had not delivered yet is lost",
         "training goes on with 1 of 2 env runners",
@@ -91,16 +89,16 @@ def test_within_one_update_and_in_the_last():
 
 def test_all_are_gone_for_a_while():
     now = [0.0]
-    watch = RunnerWatch(Algorithm([[((1, 2), [])], QUIET, [((), [1])], [([1], [])], [((), [2])]]), lambda: now[0])
+    watch = watched(Algorithm([[((1, 2), [])], QUIET, [((), [1])], [([1], [])], [((), [2])]]), clock=lambda: now[0])
     for now[0] in (0.0, 180.0, 181.0, 361.0, 600.0):
         _, lines = watch.train()
     assert lines == ["env runner 2 is back"]
 
 
-def test_all_are_gone_for_good(causes):
-    causes |= {1: "ConnectionError: no simulator", 2: "ConnectionError: no simulator"}
+def test_all_are_gone_for_good():
+    causes = {1: "ConnectionError: no simulator", 2: "ConnectionError: no simulator"}
     now = [0.0]
-    watch = RunnerWatch(Algorithm([[((1, 2), [])], QUIET]), lambda: now[0])
+    watch = watched(Algorithm([[((1, 2), [])], QUIET]), causes, lambda: now[0])
     watch.train()
     now[0] = 180.4
     with pytest.raises(ProcessesLost) as caught:
@@ -108,22 +106,22 @@ def test_all_are_gone_for_good(causes):
     assert str(caught.value) == ("all 2 env runners died (ConnectionError: no simulator), and none came back in 180 s")
 
 
-def test_one_dies_again_and_again(causes):
-    watch = RunnerWatch(Algorithm([[([2], [2])]] * 6))
+def test_one_dies_again_and_again():
+    causes = dict.fromkeys(range(1, 7), "RuntimeError: out of licences")
+    watch = RunnerWatch(Algorithm([[([2], [2])]] * 6), cause_of=lambda _: causes.popitem()[1])
     for _ in range(5):
         watch.train()
-    causes[2] = "RuntimeError: out of licences"
     with pytest.raises(ProcessesLost) as caught:
         watch.train()
     assert str(caught.value) == "env runner 2 died 6 times within 6 updates (RuntimeError: out of licences)"
 
 
 def test_rare_deaths_and_deaths_of_many_are_borne():
-    watch = RunnerWatch(Algorithm([[([2], [2])] if step % 5 == 0 else QUIET for step in range(60)]))
+    watch = watched(Algorithm([[([2], [2])] if step % 5 == 0 else QUIET for step in range(60)]))
     for _ in range(60):
         watch.train()
     everybody = list(range(1, 31))
-    watch = RunnerWatch(Algorithm([[(everybody, everybody)], QUIET], runners=30))
+    watch = watched(Algorithm([[(everybody, everybody)], QUIET], runners=30))
     assert len(watch.train()[1]) == 61
 
 
@@ -135,7 +133,7 @@ def test_rare_deaths_and_deaths_of_many_are_borne():
     ],
 )
 def test_the_only_runner_dies_again_and_again(iterations, quiet, within):
-    watch = RunnerWatch(Algorithm(iterations, runners=1))
+    watch = watched(Algorithm(iterations, runners=1))
     for _ in range(quiet):
         watch.train()
     with pytest.raises(ProcessesLost, match=rf"^env runner 1 died 6 times within {within}$"):
@@ -150,6 +148,6 @@ def test_a_cluster_that_is_gone():
 
     algorithm.train = die
     with pytest.raises(TrainingFailed) as caught:
-        RunnerWatch(algorithm).train()
+        watched(algorithm).train()
     assert not isinstance(caught.value, ProcessesLost)
     assert str(caught.value) == ("a process of the cluster that training needs is gone (The actor died: the learner)")
