@@ -24,8 +24,6 @@ from bam_train.checkpoint.manifest import WHERE
 from bam_train.env_location import HERE, Place
 from bam_train.errors import CheckpointMismatch, SettingsError
 
-_OWN = ("bam_envs", "bam_train", "gymnasium")
-
 ENTRY_POINTS = "bam_train.environments"
 """Group of entry points whose modules a checkpoint may name: whoever installed the package trusts it."""
 
@@ -38,10 +36,7 @@ def environment_of(
 ) -> tuple[str, dict[str, Any]]:
     """The environment that a checkpoint belongs to, and its arguments; a file alone makes nothing be imported.
 
-    Args:
-        checkpoint: May be untrusted.
-        named: The environment that the user expects; its module is imported.
-        elsewhere: It runs on another computer, and nothing is imported here.
+    The module of the environment that is `named`, by the user, is imported, unless it runs `elsewhere`.
 
     Raises:
         CheckpointMismatch: It was trained on another than `named`, or in a module that was neither named nor installed.
@@ -73,15 +68,12 @@ def must_be_named(env_id: str) -> bool:
     """Whether an id has a module that no installed package registers: it is imported only if the user names it."""
     module = env_id.rpartition(":")[0]
     installed = {point.module for point in metadata.entry_points(group=ENTRY_POINTS)}
-    return bool(module) and module.partition(".")[0] not in _OWN and module not in installed
+    own = module.partition(".")[0] in ("bam_envs", "bam_train", "gymnasium")
+    return bool(module) and not own and module not in installed
 
 
 def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
-    """Refuse an argument that one of our environments does not take; others check theirs when they are made.
-
-    Raises:
-        SettingsError: An unknown name, with the closest match; or a value of the wrong kind.
-    """
+    """Refuse an argument that one of our environments does not take; others check theirs when they are made."""
     limit = given.get("max_episode_steps")  # Gymnasium's: None for the usual one, -1 for none
     if limit not in (None, -1) and (isinstance(limit, bool) or not isinstance(limit, int) or limit < 1):
         raise SettingsError(f"env_kwargs.max_episode_steps: expected a whole number from 1 on, found {limit!r}")
@@ -123,11 +115,7 @@ def make_env(
 ) -> gym.Env[Any, Any]:
     """One environment, with its time limit and without Gymnasium's (slow) checker; nothing is connected yet.
 
-    Args:
-        env_id: Its full id.
-        env_kwargs: Its keyword arguments; those of an environment elsewhere are its own.
-        render_mode: What `render` shows.
-        place: Where it runs.
+    The keyword arguments of an environment elsewhere are its own.
 
     Raises:
         SettingsError: It cannot be made: a package is missing, or it does not take these arguments.
@@ -149,18 +137,10 @@ def make_env(
 def parity_if_needed(
     env_id: str, env_kwargs: Mapping[str, Any], use: Callable[[dict[str, Any]], T], tell: Callable[[str], None]
 ) -> tuple[dict[str, Any], T]:
-    """`use` of `env_kwargs`, or of them with ``parity=True`` where only so `env_id` has the spaces of a foreign policy.
+    """The keyword arguments that fit, and what `use` makes of them: `env_kwargs`, or those with ``parity=True``.
 
-    robo-gym's own checkpoints do not say it.
-
-    Args:
-        env_id: An environment.
-        env_kwargs: Its keyword arguments, as far as they are known.
-        use: Makes it with keyword arguments, and raises `CheckpointMismatch` where the policy does not fit it.
-        tell: Told when it is tried and fits.
-
-    Returns:
-        The keyword arguments that fit, and what `use` returned.
+    robo-gym's own checkpoints do not say that only with parity `env_id` has their policy's spaces. `use` raises
+    `CheckpointMismatch` where the policy does not fit; `tell` is told when parity is needed.
     """
     given = dict(env_kwargs)
     try:
@@ -183,9 +163,6 @@ def make_vector_env(
 
     Ours are one batched simulation; of others, `num_envs` Python environments take turns (their own vector forms differ
     in resets and seeds). Elsewhere there are as many as the servers have.
-
-    Raises:
-        SettingsError: It cannot be made.
     """
     if place.transport:
         from bam_envs.remote.remote_env import make_remote_vector_env
@@ -210,8 +187,7 @@ def control_period(env: gym.Env[Any, Any]) -> float | None:
 def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: Place = HERE) -> None:
     """Prove that `env` takes and gives what the checkpoint's policy was trained with.
 
-    Compared: both spaces, the labels and units of every signal, and the control period, as far as both sides say. An
-    environment that runs elsewhere is asked over its link.
+    Compared: both spaces, the labels and units of every signal, and the control period, as far as both sides say.
 
     Raises:
         CheckpointMismatch: Names the first thing that differs, and both values.
@@ -219,8 +195,8 @@ def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: Place = HERE) -> Non
     manifest = checkpoint.manifest
     single = "single_" if isinstance(env, VectorEnv) else ""
     pairs = [
-        ("observation_space", manifest.observation_space, space_to_json(getattr(env, f"{single}observation_space"))),
-        ("action_space", manifest.action_space, space_to_json(getattr(env, f"{single}action_space"))),
+        (name, getattr(manifest, name), space_to_json(getattr(env, single + name)))
+        for name in ("observation_space", "action_space")
     ]
     describe = getattr(env.unwrapped, "describe", None)
     signals = {} if describe is None else describe()

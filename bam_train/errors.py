@@ -36,11 +36,7 @@ class BamTrainError(Exception):
 
 
 class CheckpointError(BamTrainError):
-    """A checkpoint that cannot be used.
-
-    Attributes:
-        path: The file.
-    """
+    """A checkpoint that cannot be used; `path` is the file."""
 
     def __init__(self, path: str | Path, message: str) -> None:
         self.path = Path(path)
@@ -52,11 +48,7 @@ class NotACheckpoint(CheckpointError):  # noqa: N818 - reads as what happened
 
 
 class AlteredCheckpoint(CheckpointError):  # noqa: N818
-    """A member is not what the manifest says.
-
-    Attributes:
-        member: The name of that member.
-    """
+    """A member is not what the manifest says; `member` is its name."""
 
     def __init__(self, path: str | Path, member: str, message: str) -> None:
         self.member = member
@@ -88,16 +80,7 @@ class LoopError(BamTrainError):
 
 
 class UnknownVariable(LoopError, LookupError):  # noqa: N818 - reads as what happened
-    """A variable that no agent wrote; the text has the closest match.
-
-    Args:
-        name: As it was asked for.
-        known: Names that there are.
-        role: What it was asked for as, such as ``"stop_variable"``.
-
-    Attributes:
-        name: As it was asked for.
-    """
+    """A variable, `name`, that no agent wrote, asked for as a `role` such as ``"stop_variable"``."""
 
     def __init__(self, name: str, known: Iterable[str], role: str = "") -> None:
         from bam_envs.core.wording import closest  # not above: a policy alone needs no environments
@@ -127,12 +110,7 @@ class WiringError(LoopError):
 
 
 class RemoteAgentError(LoopError):
-    """An agent in another process failed, or its process ended.
-
-    Attributes:
-        traceback: The traceback there; None if there is none.
-        exit_code: How the process ended, the negative number of a signal; None if it did not end.
-    """
+    """An agent in another process failed, with its `traceback` there, or its process ended, with an `exit_code`."""
 
     def __init__(self, message: str, traceback: str | None = None, exit_code: int | None = None) -> None:
         self.traceback, self.exit_code = traceback, exit_code

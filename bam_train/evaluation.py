@@ -1,8 +1,7 @@
 """Seeded evaluation of a policy: success, return and length over a fixed list of episodes; and videos of some.
 
-Episode k starts from ``reset(seed=seed + k)`` however many environments run side by side. They are run in waves, each a
-run of one `TemporalAgent` (environment, policy) until all have ended: every environment plays one episode, and what it
-does after its end is not counted (it keeps stepping only because others are not done).
+Episode k starts from ``reset(seed=seed + k)`` however many environments run side by side. They are run in waves: every
+environment plays one episode, and what it does after its end, because others are not done, is not counted.
 """
 
 import math
@@ -129,16 +128,16 @@ def evaluate(
     env: VectorEnv[Any, Any, Any] | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> EvaluationReport:
-    """Run `episodes` seeded episodes of `env_id` under `policy` and summarise them.
+    """Run `episodes` seeded episodes of the environment `env_id` under `policy` and summarise them.
 
     Args:
         policy: What acts; its recurrent state is forgotten at every start of an episode.
-        env_id: Gymnasium id of the environment, e.g. ``"bam/pick-v0"``.
-        env_kwargs: Its keyword arguments.
-        episodes: How many episodes count; at least 1.
-        seed: Seed of the first episode; episode k gets ``seed + k``.
+        env_id: Gymnasium id.
+        env_kwargs: Keyword arguments of the environment.
+        episodes: At least 1.
+        seed: Of the first episode; episode k gets ``seed + k``.
         num_envs: Environments stepped side by side; by default as many as is quick and not more than `episodes`.
-        env: A vector environment made by `make_vector_env` to use instead of making one; it is left open.
+        env: What `make_vector_env` made, to use instead of making one; it is left open.
         on_progress: Called after every wave of environments with the episodes done and the episodes wanted.
 
     Raises:
@@ -167,10 +166,7 @@ def evaluate(
 
 
 def play_wave(env: VectorEnv[Any, Any, Any], policy: BatchPolicy, seed: int, count: int) -> list[Episode]:
-    """One episode in each of the first `count` environments; environment i is seeded ``seed + i``.
-
-    The surplus environments of a last, smaller wave run too (a vector environment steps all) and are ignored.
-    """
+    """One episode in each of the first `count` environments; environment i is seeded ``seed + i``, also beyond them."""
     batch = _Batch(lambda: env, auto_reset=False, arrays="numpy", info_keys=("is_success",))
     acting = PolicyAgent(policy, [f"env/{name}" for name in names(env.single_observation_space)])
     workspace = Workspace(window=2)
@@ -195,7 +191,7 @@ def record_video(env: gym.Env[Any, Any], policy: Any, add: Callable[[Frame], Any
         policy: Has ``reset()`` and ``act(observation)``: a `FrozenPolicy`.
         add: Takes a picture, such as what `bam_train.video.open_video` gives.
         episodes: How many.
-        seed: Seed of the first.
+        seed: Of the first.
 
     Returns:
         How many pictures.

@@ -99,7 +99,7 @@ def _of(observations: Any, which: int) -> Any:
 
 
 def _not_finite(name: str, value: Any) -> tuple[str, list[int], float] | None:
-    """The first number that is not finite: the name of its array, its index there, and what it is."""
+    """The first number that is not finite: the name of its array, its index there, and its value."""
     if isinstance(value, (Mapping, tuple)):
         parts = value.items() if isinstance(value, Mapping) else enumerate(value)
         return next((found for key, one in parts if (found := _not_finite(f"{name}[{key!r}]", one))), None)
@@ -111,7 +111,7 @@ def _not_finite(name: str, value: Any) -> tuple[str, list[int], float] | None:
 
 
 def _require_finite(env: Any, env_id: str, signal: str, value: Any, steps: Any, which: int | None = None) -> None:
-    """Refuse the first number that is not finite; a label of the environment's own names it, if there is one.
+    """Refuse the first number of an observation or a reward that is not finite, by the environment's own label of it.
 
     Args:
         env: The environment.
@@ -120,9 +120,6 @@ def _require_finite(env: Any, env_id: str, signal: str, value: Any, steps: Any, 
         value: Of one environment, or of a batch.
         steps: Of its episode, or an array of them for a batch.
         which: The environment that `value` is of; None for one that is alone, and for a whole batch.
-
-    Raises:
-        EnvironmentFailed: With the number and its place.
     """
     found = _not_finite(signal, value)
     if found is None:

@@ -88,15 +88,7 @@ class TrainSettings:
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any], source: str = "settings") -> TrainSettings:
-        """Check names, types and ranges of top-level settings.
-
-        Args:
-            values: Setting to JSON value.
-            source: Where they come from, as errors name it.
-
-        Raises:
-            SettingsError: An unknown name (with the closest match), a wrong type, or a value out of range.
-        """
+        """The settings of JSON values, whose names, types and ranges are checked; errors name their `source`."""
         check_names(values, source)
         for name in ("env", "algo"):
             if values.get(name) is None:
@@ -160,9 +152,6 @@ def parse_assignment(text: str, example: str) -> tuple[list[str], Any]:
 
     A value is JSON, Python's True, False or None, or else the text itself: ``64`` is an int, ``3e-4`` a float,
     ``[64,64]`` a list, ``true`` a bool, ``lin_3e-4`` text.
-
-    Raises:
-        SettingsError: There is no ``=``, or no name before it.
     """
     name, equals, typed = (part.strip() for part in text.partition("="))
     path = name.split(".")
@@ -193,11 +182,7 @@ def read_assignments(texts: Sequence[str]) -> dict[str, Any]:
 
 
 def read_env_kwargs(texts: Sequence[str]) -> dict[str, Any]:
-    """Arguments of an environment out of ``--set env_kwargs.NAME=VALUE`` texts, where nothing else can be set.
-
-    Raises:
-        SettingsError: One of them sets something else.
-    """
+    """Arguments of an environment out of ``--set env_kwargs.NAME=VALUE`` texts, where nothing else can be set."""
     for text in texts:
         path, _ = parse_assignment(text, "env_kwargs.NAME=VALUE")
         if path[0] != "env_kwargs" or len(path) == 1:
@@ -217,11 +202,7 @@ def merge(*layers: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_config(path: str | Path) -> dict[str, Any]:
-    """Read a ``.toml`` or ``.json`` file of settings, such as ``--print-config`` writes.
-
-    Raises:
-        SettingsError: No such file, not readable, not a table, or an unknown setting.
-    """
+    """Read a ``.toml`` or ``.json`` file of settings, such as ``--print-config`` writes."""
     path = Path(path).expanduser()
     if path.suffix not in (".toml", ".json"):
         raise SettingsError(f"{path}: expected a .toml or .json file, found {path.suffix or 'no suffix'}")
@@ -238,15 +219,12 @@ def read_config(path: str | Path) -> dict[str, Any]:
 
 
 def parse_config(name: str, text: str) -> dict[str, Any]:
-    """Read settings from the text of a file called `name`, whose suffix says the format.
-
-    Raises:
-        SettingsError: Truncated or not a table, or an unknown setting.
-    """
+    """Read settings from the text of a file called `name`, whose suffix says the format."""
     try:
         values = json.loads(text) if name.endswith(".json") else tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise SettingsError(f"{name}: is not whole {name.rpartition('.')[2].upper()}: {error}") from error
+        kind = name.rpartition(".")[2].upper()
+        raise SettingsError(f"{name}: is not whole {kind}: {error}. Correct that, or see --print-config") from error
     if not isinstance(values, dict):
         raise SettingsError(f"{name}: expected a table of settings, found a {type(values).__name__}")
     check_names(values, name)

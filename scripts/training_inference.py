@@ -15,12 +15,12 @@ from bam_train.cli.experiment import (
     ScriptParser,
     environment_of,
     open_env,
-    require_cpus,
     require_place,
     signals_ask,
     whole,
 )
 from bam_train.cli.program import guarded
+from bam_train.errors import SettingsError
 from bam_train.evaluation import FIRST_SEED
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers import load_trainer
@@ -50,7 +50,13 @@ def train(args: argparse.Namespace, experiment: Experiment) -> tuple[Checkpoint,
     }
     runners = max(0, args.num_cpus - 1)
     settings = resolve({**given, "seed": args.seed, "steps": args.stop_timesteps, "num_env_runners": runners})
-    require_cpus(args.num_cpus)
+    from bam_train.trainers.rllib.ray_resources import cores
+
+    if runners > cores():
+        raise SettingsError(
+            f"--num-cpus: expected at most {cores() + 1}, one to learn and one for each CPU of this computer, "
+            f"found {args.num_cpus}"
+        )
     require_place(settings.env, args.robot, args.render)
     output, iterations = choose_output(settings, args.out, False, None), 0
 

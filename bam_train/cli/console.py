@@ -1,4 +1,4 @@
-"""What the programs print, on standard output, standard error or a rich console, and the question before a robot moves.
+"""What the programs print, on standard output, standard error or a rich console.
 
 What is printed may come from a file or from the network: every text passes `shown`, so that nothing in it acts on a
 terminal.
@@ -6,12 +6,12 @@ terminal.
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import os
 import sys
 import traceback
-from collections.abc import Mapping, Sequence
-from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -35,6 +35,14 @@ def say(text: str = "") -> None:
 def tell(*lines: str) -> None:
     """Print the results of a program on standard output, line by line."""
     print("\n".join(map(shown, lines)), flush=True)
+
+
+def drop(stream: TextIO) -> None:
+    """From now on what is written to the stream is dropped, and what its buffer still holds."""
+    with contextlib.suppress(OSError):  # a stream that is no file
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, stream.fileno())
+        os.close(null)
 
 
 def is_terminal() -> bool:
@@ -69,8 +77,8 @@ class ShownFormatter(logging.Formatter):
 def show_logs_and_tracebacks() -> None:
     """Pass what Python itself prints through `shown`: unhandled logs, and the traceback of an error in our code."""
 
-    def say_traceback(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-        for line in "".join(traceback.format_exception(kind, error, trace)).rstrip("\n").split("\n"):
+    def say_traceback(*error: Any) -> None:
+        for line in "".join(traceback.format_exception(*error)).rstrip("\n").split("\n"):
             say(line)
 
     if logging.lastResort is not None:
@@ -106,62 +114,3 @@ def percent(share: float | None) -> str:
 def number(value: float | None) -> str:
     """A measured value to four digits; a dash if it is not known."""
     return "-" if value is None else f"{value:.4g}"
-
-
-# Before a real robot moves
-
-
-def guards_of(env: Any) -> dict[str, dict[str, Any]]:
-    """What the guards of an environment's live robot did; empty for a simulated one."""
-    report = getattr(getattr(env.unwrapped, "robot", None), "report", None)
-    return {} if report is None else dict(report())
-
-
-def plan_lines(env: Any, env_id: str, address: str, episodes: int) -> list[str]:
-    """What a person should know of the episodes to come."""
-    from bam_envs.core.robot import RobotSpec
-    from bam_envs.safety.guard import is_base
-
-    spec = getattr(getattr(env.unwrapped, "robot", None), "spec", None)
-    planned = "1 episode" if episodes == 1 else f"{episodes} episodes, one after the other without a pause"
-    begin = "where the base stands"
-    if isinstance(spec, RobotSpec) and not is_base(spec):
-        gripper = "opening the gripper and " if "m" in spec.command.units else ""
-        begin = f"by {gripper}going to the start pose"
-    return [f"  address: {address}", f"  {env_id}: {planned}", f"  each begins {begin}"]
-
-
-def require_consent(env: Any, who: str, *, yes: bool, plan: Sequence[str] = ()) -> None:
-    """Ask once before a real robot moves; it is connected, and stands still.
-
-    Args:
-        env: The environment, single or vector; without a real robot there is no question.
-        who: What will move it, as the first line begins.
-        yes: Show it, and do not ask.
-        plan: Lines that say what it will do.
-
-    Raises:
-        SettingsError: The robot says that it cannot move now, the answer is not yes, or there is nobody to ask.
-    """
-    from bam_train.errors import SettingsError
-
-    robot = getattr(env.unwrapped, "robot", None)
-    info = getattr(robot, "info", None)
-    if robot is None or info is None or info.simulated:
-        return
-    what = [f"{who} will move {info.text}:", *plan, "within"] if plan else [f"{who} will move {info.text}, within"]
-    guards: Mapping[str, Mapping[str, Any]] = guards_of(env)
-    limited = [(name, guard) for name, guard in guards.items() if guard["limit"] not in (None, "")]
-    for line in what + [f"  {name} ({one['number']}): {one['limit']:.3g} {one['unit']}" for name, one in limited]:
-        say(line.rstrip())
-    why = robot.not_ready()
-    if why is not None:
-        raise SettingsError(f"not ready: {why}; nothing has moved")
-    if yes:
-        return
-    if not sys.stdin.isatty():
-        raise SettingsError("a real robot would move, and there is nobody to ask; give --yes to go on without asking")
-    question = "Is the robot clear of people, and a hand on its emergency stop? Type yes to go on: "
-    print(question, end="", file=sys.stderr, flush=True)
-    if sys.stdin.readline().strip().lower() != "yes":
-        raise SettingsError("the answer was not yes; nothing has moved")

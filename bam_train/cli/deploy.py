@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import json as json_module
 import math
-import os
-import sys
 from contextlib import nullcontext
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from bam_train.cli.console import guards_of, is_terminal, make_console, plan_lines, require_consent, say, tell
+from bam_train.cli.console import is_terminal, make_console, say, tell
 from bam_train.cli.program import run_program
 from bam_train.signals import SignalMemory
 
@@ -32,27 +30,21 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     place = _checked_place(config)
     from bam_envs.core.timing import Pacer
     from bam_train.checkpoint import Checkpoint
+    from bam_train.cli.consent import connected_env
     from bam_train.deploy.deployment import Deployment
     from bam_train.deploy.journal import Journal
-    from bam_train.environments import environment_of, make_env, require_fit
     from bam_train.policy import FrozenPolicy
 
-    signals.raise_again()
     checkpoint = Checkpoint.open(config.checkpoint)
     policy = FrozenPolicy.from_checkpoint(checkpoint)
-    env_id, env_kwargs = environment_of(checkpoint, config.env, elsewhere=bool(place.transport))
-    env = make_env(env_id, env_kwargs, render_mode="human" if config.render else None, place=place)
+    asked: Any = {"episodes": config.episodes, "yes": config.yes, "render": config.render, "named": config.env}
+    env = connected_env(checkpoint, place, signals, who="bam-deploy", **asked)
     try:
-        require_fit(checkpoint, env, place)
-        deployment = Deployment(env, policy, Pacer(_period(config, checkpoint, env)), Journal(config.episodes))
-        signals.raise_again()
-        deployment.connect()
-        signals.raise_again()
-        plan = plan_lines(env, env_id, place.text, config.episodes)
-        require_consent(env, f"bam-deploy: {config.checkpoint}", yes=config.yes, plan=plan)
+        pacer = Pacer(_period(config, checkpoint, env))
     except BaseException:
         env.close()  # type: ignore[no-untyped-call]
         raise
+    deployment = Deployment(env, policy, pacer, Journal(config.episodes))
     return _run(config, checkpoint, place, deployment, signals)
 
 
@@ -60,6 +52,7 @@ def _run(
     config: DeployConfig, checkpoint: Checkpoint, place: Place, deployment: Deployment, signals: SignalMemory
 ) -> int:
     """Run the deployment and report it, also after a signal; returns the exit status."""
+    from bam_train.cli.consent import guards_of
     from bam_train.cli.deploy_display import PlainDisplay, live_display
     from bam_train.deploy.journal import DeployReport
 
@@ -98,27 +91,10 @@ def _checked_place(config: DeployConfig) -> Place:
             "a live robot is driven at the rate that its policy was made for; leave out --rate and --fast"
         )
     if config.render:
+        from bam_train.cli.consent import require_screen
+
         require_screen(remote=place.is_remote)
     return place
-
-
-def require_screen(*, remote: bool) -> None:
-    """Refuse ``--render`` where there is nothing to show, or nowhere to show it.
-
-    Raises:
-        SettingsError: The robot is elsewhere, or there is no screen.
-    """
-    from bam_train.errors import SettingsError
-
-    if remote:
-        raise SettingsError(
-            "--render shows the simulation here, and there is none with --robot or --transport; leave it out"
-        )
-    if sys.platform == "linux" and not (os.environ.keys() & {"DISPLAY", "WAYLAND_DISPLAY"}):
-        raise SettingsError(
-            "--render needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set; "
-            "leave it out, or make a video: bam-eval CHECKPOINT --video video.gif"
-        )
 
 
 def _period(config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> float | None:

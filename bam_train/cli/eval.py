@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json as json_module
 from contextlib import closing
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from bam_train.cli.console import say, tell
 from bam_train.cli.program import run_program
@@ -19,15 +18,16 @@ if TYPE_CHECKING:
     from bam_train.policy import FrozenPolicy
 
 
-@dataclass(frozen=True)
-class _Subject:
+class _Subject(NamedTuple):
     """What is evaluated, and where."""
 
     policy: FrozenPolicy
     env: str
     env_kwargs: dict[str, Any]
-    facts: dict[str, Any]
-    """For the report: checkpoint, algorithm, steps, and arguments of the environment that were asked for."""
+    algorithm: str
+    steps: int
+    asked: dict[str, Any]
+    """Arguments of the environment that are not the checkpoint's own."""
     checkpoint: Checkpoint | None
     """None for a plain stable-baselines3 zip."""
 
@@ -41,7 +41,7 @@ def evaluate_checkpoint(config: EvalConfig) -> None:
 
     video = None if config.video is None else require_video_path(config.video)
     path = config.checkpoint.expanduser()
-    subject = _foreign(config, path) if is_plain_sb3(path) else _own(config, path)
+    subject = (_foreign if is_plain_sb3(path) else _own)(config, path)
     if video is not None:  # one picture, before the work is done
         with closing(make_env(subject.env, subject.env_kwargs, render_mode="rgb_array")) as env:
             env.reset(seed=0)
@@ -59,9 +59,11 @@ def evaluate_checkpoint(config: EvalConfig) -> None:
             subject.policy, subject.env, episodes=config.episodes, seed=config.seed, env=envs, on_progress=on_progress
         )
     if config.json:
-        tell(json_module.dumps({**report.to_json(), **subject.facts}, allow_nan=False))
+        facts = {"checkpoint": str(path), "algorithm": subject.algorithm, "steps": subject.steps}
+        asked = {"env_kwargs": subject.asked} if subject.asked else {}
+        tell(json_module.dumps({**report.to_json(), **facts, **asked}, allow_nan=False))
     else:
-        tell(*_table(report, subject.facts))
+        tell(*_table(report, subject, path))
     if video is not None:
         _record(config, subject, video)
 
@@ -80,8 +82,8 @@ def _own(config: EvalConfig, path: Path) -> _Subject:
     if config.algo not in (None, manifest.algorithm):
         raise CheckpointMismatch(path, f"was trained by {manifest.algorithm}, not by {config.algo}")
     require_env_kwargs(env_id, asked)
-    facts = _facts(path, manifest.algorithm, manifest.steps, asked)
-    return _Subject(FrozenPolicy.from_checkpoint(checkpoint), env_id, {**env_kwargs, **asked}, facts, checkpoint)
+    policy = FrozenPolicy.from_checkpoint(checkpoint)
+    return _Subject(policy, env_id, {**env_kwargs, **asked}, manifest.algorithm, manifest.steps, asked, checkpoint)
 
 
 def _foreign(config: EvalConfig, path: Path) -> _Subject:
@@ -110,16 +112,12 @@ def _foreign(config: EvalConfig, path: Path) -> _Subject:
     )
     load = partial(load_trusted, path, config.algo, env)
     env_kwargs, (policy, steps) = parity_if_needed(env, env_kwargs, load, lambda text: say(f"bam-eval: {text}"))
-    return _Subject(policy, env, env_kwargs, _facts(path, config.algo, steps, env_kwargs), None)
+    return _Subject(policy, env, env_kwargs, config.algo, steps, env_kwargs, None)
 
 
-def _facts(path: Path, algorithm: str, steps: int, asked: dict[str, Any]) -> dict[str, Any]:
-    return {"checkpoint": str(path), "algorithm": algorithm, "steps": steps, **({"env_kwargs": asked} if asked else {})}
-
-
-def _table(report: EvaluationReport, facts: dict[str, Any]) -> list[str]:
+def _table(report: EvaluationReport, subject: _Subject, path: Path) -> list[str]:
     """The report for people, line by line."""
-    given = ", ".join(f"{name}={value!r}" for name, value in facts.get("env_kwargs", {}).items())
+    given = ", ".join(f"{name}={value!r}" for name, value in subject.asked.items())
     success = "unknown: the environment does not report is_success"
     if report.success_rate is not None and report.success_interval is not None:
         interval = "95 % interval {:.1%} to {:.1%}".format(*report.success_interval)
@@ -128,9 +126,9 @@ def _table(report: EvaluationReport, facts: dict[str, Any]) -> list[str]:
     extremes = "range not finite"
     if report.return_min is not None and report.return_max is not None:
         extremes = f"from {report.return_min:.2f} to {report.return_max:.2f}"
+    what = f"{path} ({subject.algorithm}, {subject.steps:,} steps) on {report.env}"
     return [
-        f"{facts['checkpoint']} ({facts['algorithm']}, {facts['steps']:,} steps) on {report.env}"
-        + (f" with {given}" if given else ""),
+        what + (f" with {given}" if given else ""),
         f"  success   {success}",
         f"  return    {returns}, {extremes}",
         f"  length    {report.length_mean:.2f} ± {report.length_std:.2f} steps",

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from bam_train.cli.console import plan_lines, require_consent, say
+from bam_train.cli.console import say
 from bam_train.signals import SignalMemory, handled, interrupt
 
 if TYPE_CHECKING:
@@ -74,22 +74,6 @@ def whole(least: int) -> Callable[[str], int]:
     return read
 
 
-def require_cpus(number: int) -> None:
-    """Refuse ``--num-cpus``, of which one learns and the others run episodes, where there are fewer.
-
-    Raises:
-        SettingsError: With the most that there can be; the one that learns counts as none.
-    """
-    from bam_train.errors import SettingsError
-    from bam_train.trainers.rllib.ray_resources import cores
-
-    if number - 1 > cores():
-        raise SettingsError(
-            f"--num-cpus: expected at most {cores() + 1}, one to learn and one for each CPU of this computer, "
-            f"found {number}"
-        )
-
-
 def environment_of(args: argparse.Namespace, own: str, own_kwargs: Mapping[str, Any]) -> dict[str, Any]:
     """The settings ``env`` and ``env_kwargs`` of ``--env`` and ``--parity``; without ``--env`` the script's own."""
     kwargs = dict(own_kwargs) if args.env is None else {}
@@ -97,12 +81,7 @@ def environment_of(args: argparse.Namespace, own: str, own_kwargs: Mapping[str, 
 
 
 def require_place(env_id: str, robot: str | None, render: bool) -> None:
-    """Refuse a ``--robot`` that cannot be and a ``--render`` without a screen; nothing is made or connected.
-
-    Raises:
-        InvalidValue: Says what address was expected.
-        SettingsError: The environment has no robot, or there is nothing to show, or no screen.
-    """
+    """Refuse a ``--robot`` that cannot be and a ``--render`` without a screen; nothing is made or connected."""
     if robot is not None:
         from bam_envs.live.building import require_robot_address
         from bam_train.env_location import Place
@@ -110,7 +89,7 @@ def require_place(env_id: str, robot: str | None, render: bool) -> None:
         require_robot_address(robot)
         Place(robot).robot_kwargs(env_id, {})
     if render:
-        from bam_train.cli.deploy import require_screen
+        from bam_train.cli.consent import require_screen
 
         require_screen(remote=robot is not None)
 
@@ -120,9 +99,6 @@ def signals_ask() -> Iterator[Callable[[], bool]]:
     """Within, the first Ctrl-C, SIGTERM or SIGHUP interrupts nothing, and what this gives says that it came.
 
     A second one interrupts, and leaving raises what the first one asked for.
-
-    Raises:
-        KeyboardInterrupt: A signal came; of SIGTERM and SIGHUP, `Terminated`.
     """
     came: list[int] = []
 
@@ -153,33 +129,14 @@ def open_env(
     """The environment that a checkpoint was trained in, fresh; within, a live robot is connected and may be moved.
 
     However it is left, the robot is halted and the link dropped. Of a live robot, each `step` waits for the end of its
-    period.
-
-    Args:
-        checkpoint: What is going to act; the environment is proved to fit it.
-        robot: Address of a live robot behind rosbridge, such as ``ws://10.0.0.5:9090``; None for the simulated one.
-        who: What will move it, as the question to a person begins.
-        episodes: How many are planned, for the same question.
-        yes: Do not ask before a real robot moves.
-        render: Show the simulation in a window.
-        env_kwargs: Arguments of the environment; they win over the checkpoint's.
-
-    Raises:
-        CheckpointMismatch: The environment is another than the checkpoint was trained in.
-        SettingsError: It cannot be made or shown, or nobody agreed that the real robot moves.
+    period. The arguments are those of `bam_train.cli.consent.connected_env`, and the address of a live robot.
     """
+    from bam_train.cli.consent import connected_env
     from bam_train.env_location import Place
-    from bam_train.environments import environment_of, make_env, require_fit
 
-    place = Place(robot=robot)
-    env_id, own = environment_of(checkpoint)
-    require_place(env_id, robot, render)
-    mode, kwargs = "human" if render else None, {**own, **(env_kwargs or {})}
-    with SignalMemory() as signals, contextlib.closing(make_env(env_id, kwargs, render_mode=mode, place=place)) as env:
-        require_fit(checkpoint, env, place)
-        if robot is not None:
-            env.unwrapped.robot.connect()  # type: ignore[attr-defined]
-            plan = plan_lines(env, env_id, place.text, episodes)
-            require_consent(env, f"{who}: {checkpoint.path}", yes=yes, plan=plan)
-        signals.raise_again()  # one whose exception Python discarded: nothing may move after it
-        yield env
+    require_place(checkpoint.manifest.env, robot, render)
+    given: Any = {"who": who, "episodes": episodes, "yes": yes, "render": render, "env_kwargs": env_kwargs}
+    with SignalMemory() as signals:
+        env = connected_env(checkpoint, Place(robot), signals, **given)
+        with contextlib.closing(env):
+            yield env

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar, get_args
 
-from bam_train.cli.console import say, show_logs_and_tracebacks
+from bam_train.cli.console import drop, say, show_logs_and_tracebacks
 from bam_train.signals import SignalMemory, Terminated
 
 Config = TypeVar("Config")
@@ -94,7 +94,7 @@ def guarded(main: Callable[[], int | None], prog: str, signals: SignalMemory | N
             _complain(prog, str(error))
         elif isinstance(error, BrokenPipeError) or (isinstance(error, OSError) and error.errno == errno.ENOSPC):
             # Standard output is closed, as by head, or full; Python would complain about what its buffer still holds.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            drop(sys.stdout)
             if error.errno == errno.ENOSPC:
                 _complain(prog, "standard output cannot be written: no space left on its device")
         else:

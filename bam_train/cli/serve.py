@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from bam_train.cli.console import ShownFormatter, require_consent, say
+from bam_train.cli.console import ShownFormatter, say
 from bam_train.cli.program import run_program
 from bam_train.signals import SignalMemory
 
@@ -56,6 +56,7 @@ def _consented_env(config: ServeConfig) -> Any:
         UnknownName: Nothing of that name is registered.
     """
     from bam_envs.core.registry import MAKE_OPTIONS, resolve_id
+    from bam_train.cli.consent import require_consent
     from bam_train.environments import make_env, make_vector_env, require_env_kwargs
 
     env_id, kwargs = resolve_id(config.env), _env_kwargs(config.set)

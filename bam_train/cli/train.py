@@ -8,11 +8,11 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
-from bam_train.cli.console import count, tell
+from bam_train.cli.console import count, is_terminal, tell
 from bam_train.cli.program import run_program
 from bam_train.signals import before_quitting, handled
 
@@ -48,7 +48,7 @@ def train(config: TrainConfig) -> int:
 
 def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint | None) -> int:
     """Train with complete settings, and say how it went; returns the exit status."""
-    from bam_train.cli.train_display import make_display, stderr_may_close, summarise
+    from bam_train.cli.train_display import LiveDisplay, MayClose, PlainDisplay, summarise
     from bam_train.settings import file_stem
     from bam_train.trainers import load_trainer
     from bam_train.trainers.best_checkpoint import choose_output
@@ -63,15 +63,16 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
     kind = load_trainer(settings.trainer)
     copies = None if config.copy_to is None else Copies(config.copy_to)
     trainer = kind.create(settings) if checkpoint is None else kind.load(checkpoint, settings)
-    with stderr_may_close(), contextlib.ExitStack() as signals:
+    came: list[int] = []
+    with contextlib.redirect_stderr(MayClose(sys.stderr)), contextlib.ExitStack() as handlers:
         try:
             settings = trainer.settings  # as the trainer completed them
             folder = RunFolder(runs, file_stem(settings.env, settings.algo, settings.trainer))
             folder.write_config(settings.to_mapping())
             trainer.log_to(folder.tensorboard)
-            display = make_display(title)
+            display = (LiveDisplay if is_terminal() else PlainDisplay)(title)
             run = TrainingRun(trainer, folder, output.path, display, output.best, copies=copies)
-            came = signals.enter_context(_stopped_by_signals(run))
+            handlers.enter_context(handled(_stop_on_signals(run, came)))
             with display:
                 for notice in [*output.notices, *trainer.notices]:
                     display.note(notice)
@@ -79,18 +80,15 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
         finally:
             trainer.close()
         summarise(settings, outcome, folder, time.monotonic() - _STARTED)
+        if came:
+            _KEPT.append(handlers.pop_all())  # the handlers of before return as soon as this is collected
     if outcome.failure is not None:
         raise outcome.failure
     return 128 + came[0] if came else 0
 
 
-@contextlib.contextmanager
-def _stopped_by_signals(run: TrainingRun) -> Iterator[list[int]]:
-    """Within this, the first signal asks `run` to stop after its update, the second ends the process there and then.
-
-    Gives the signals that came.
-    """
-    came: list[int] = []
+def _stop_on_signals(run: TrainingRun, came: list[int]) -> Callable[[int], None]:
+    """What handles signals: the first one asks `run` to stop after its update, the second ends the process."""
 
     def write(line: str) -> None:
         """To standard error, not by print: the signal may have come in the middle of one."""
@@ -111,11 +109,7 @@ def _stopped_by_signals(run: TrainingRun) -> Iterator[list[int]]:
         again = "Ctrl-C again" if number == signal.SIGINT else "another signal"
         write(f"{doing}; {again} quits at once\n")
 
-    with contextlib.ExitStack() as handlers:
-        handlers.enter_context(handled(stop))
-        yield came
-        if came:
-            _KEPT.append(handlers.pop_all())  # the handlers of before return as soon as this is collected
+    return stop
 
 
 main = partial(run_program, "bam-train", "bam_train.cli.flags:TrainConfig", lambda config, _: train(config))

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import shlex
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from bam_train.cli.console import count, duration, is_terminal, make_console, number, percent, rich_text, say
+from bam_train.cli.console import count, drop, duration, make_console, number, percent, rich_text, say
 from bam_train.errors import OutputError
 
 if TYPE_CHECKING:
@@ -25,7 +22,7 @@ LINE_EVERY = 1.0
 """Seconds between two plain lines about training at least."""
 
 
-class _Droppable:
+class MayClose:
     """A text stream that may go away, as a closed pipe or terminal does: from then on, what is written is dropped."""
 
     def __init__(self, stream: TextIO) -> None:
@@ -35,30 +32,13 @@ class _Droppable:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        self._try(lambda: self._stream.write(text))
-        return len(text)
-
-    def flush(self) -> None:
-        self._try(self._stream.flush)
-
-    def _try(self, call: Callable[[], object]) -> None:
+        """Write through: the buffer stays empty, so that a flush does nothing."""
         try:
-            call()
+            self._stream.write(text)
+            self._stream.flush()
         except OSError:
-            with contextlib.suppress(OSError):  # a stream that is no file
-                null = os.open(os.devnull, os.O_WRONLY)  # where what is still buffered goes, too
-                os.dup2(null, self._stream.fileno())
-                os.close(null)
-
-
-def stderr_may_close() -> contextlib.AbstractContextManager[Any]:
-    """Within this, the run goes on also after standard error was closed."""
-    return contextlib.redirect_stderr(_Droppable(sys.stderr))
-
-
-def make_display(title: str) -> PlainDisplay:
-    """A live display where standard error is a terminal, else a plain one."""
-    return LiveDisplay(title) if is_terminal() else PlainDisplay(title)
+            drop(self._stream)
+        return len(text)
 
 
 class PlainDisplay:
@@ -93,7 +73,7 @@ class PlainDisplay:
         self.note(f"{_steps(progress)}  {speed}  {success}return {number(statistics.return_mean)}  {left}")
 
     def evaluated(self, steps: int, report: EvaluationReport, best: bool) -> None:
-        """Say what an evaluation found."""
+        """Say how well the policy does."""
         success = "" if report.success_rate is None else f"success {percent(report.success_rate)}, "
         rest = f"return {number(report.return_mean)}, {report.length_mean:.0f} steps an episode"
         newest = ", the best so far" if best else ""
@@ -157,14 +137,7 @@ _REASONS = {"steps": "all steps done", "success": "success reached", "stopped": 
 
 
 def summarise(settings: TrainSettings, outcome: Outcome, folder: RunFolder, seconds: float) -> None:
-    """Draw the learning curve and say how the run went.
-
-    Args:
-        settings: Of the run.
-        outcome: How it ended.
-        folder: Its files.
-        seconds: Wall time since the program started [s].
-    """
+    """Draw the learning curve and say how the run went, `seconds` [s] after the program started."""
     from bam_train.trainers.run_folder import draw_curve
 
     try:

@@ -199,18 +199,17 @@ class _JournalAgent(Agent):
     def __init__(self, journal: Journal, pacer: Pacer) -> None:
         super().__init__()
         self._journal, self._pacer = journal, pacer
-        self._record = EpisodeRecord(0)
 
     def forward(self, t: int, seed: int, watcher: Watcher, **kwargs: Any) -> None:
         if t == 0:
-            self._record = self._journal.begin(seed)
+            self._journal.begin(seed)
             self._pacer.start()
         else:  # the step that led to time t
-            record, says = self._record, self.get((f"env/{SAYS_SUCCESS}", t))[0]
-            record.add(self.get(("env/reward", t))[0], self.get((f"env/{SUCCESS}", t))[0] if says else None)
-            record.end = next((end for end in _ENDS if self.get((f"env/{end}", t))[0]), "stopped")
+            success = self.get((f"env/{SUCCESS}", t))[0] if self.get((f"env/{SAYS_SUCCESS}", t))[0] else None
+            end = next((end for end in _ENDS if self.get((f"env/{end}", t))[0]), "stopped")
+            record = self._journal.step(self.get(("env/reward", t))[0], success, end)
             watcher.ticked(record, self.get(("action", t - 1))[0], self._pacer)
-            if record.complete:
+            if end != "stopped":
                 watcher.ended(record)
         if not self.get(("env/done", t))[0]:
             self._pacer.wait()

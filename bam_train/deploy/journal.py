@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -28,17 +28,6 @@ class EpisodeRecord:
     end: str = "stopped"
     """``"terminated"`` (the task's end), ``"truncated"`` (the time limit) or ``"stopped"`` (cut short)."""
 
-    @property
-    def complete(self) -> bool:
-        """Whether the environment ended it."""
-        return self.end != "stopped"
-
-    def add(self, reward: float, success: bool | None) -> None:
-        """Count one step."""
-        self.total += float(reward)
-        self.length += 1
-        self.success = self.success if success is None else bool(success)
-
     def to_json(self) -> dict[str, Any]:
         """Plain values; a return that is not finite is None."""
         total = self.total if math.isfinite(self.total) else None
@@ -59,36 +48,35 @@ class Journal:
     """The last `KEPT` episodes."""
     begun: int = 0
     """Episodes begun."""
+    completed: int = 0
+    """Episodes that the environment ended."""
+    successes: int | None = 0
+    """How many of those succeeded; None if the environment does not say."""
     startup: float | None = None
     """CPU time of this process from its start to the first observation [s]; None before it."""
-    _earlier: Counter[str] = field(default_factory=Counter)  # of all episodes but the last one
 
     def begin(self, seed: int) -> EpisodeRecord:
-        """A new episode, appended and returned; the one before does not change any more."""
+        """A new episode, appended and returned."""
         if self.startup is None:
             self.startup = time.process_time()
-        self._earlier = self._counts()
         self.records.append(EpisodeRecord(seed))
         self.begun += 1
         return self.records[-1]
 
-    @property
-    def completed(self) -> int:
-        """Episodes that the environment ended."""
-        return self._counts()["completed"]
-
-    @property
-    def successes(self) -> int | None:
-        """How many complete episodes succeeded; None if the environment does not say, 0 before the first."""
-        counts = self._counts()
-        return counts["succeeded"] if counts["said"] or not counts["completed"] else None
-
-    def _counts(self) -> Counter[str]:
-        counts = self._earlier.copy()
-        if self.records and self.records[-1].complete:
-            success = self.records[-1].success
-            counts.update(completed=1, said=int(success is not None), succeeded=int(bool(success)))
-        return counts
+    def step(self, reward: float, success: bool | None, end: str = "stopped") -> EpisodeRecord:
+        """Count a step of the newest episode, which is returned; it is the last one unless `end` is ``"stopped"``."""
+        record = self.records[-1]
+        record.total += float(reward)
+        record.length += 1
+        record.success = record.success if success is None else bool(success)
+        record.end = end
+        if end != "stopped":
+            self.completed += 1
+            if record.success is not None:
+                self.successes = (self.successes or 0) + record.success
+            elif self.completed == 1:
+                self.successes = None
+        return record
 
 
 @dataclass(frozen=True)

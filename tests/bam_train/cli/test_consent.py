@@ -9,7 +9,7 @@ import pytest
 from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.ur import ur_model, ur_spec
 from bam_envs.robots.ur5e import arm_spec
-from bam_train.cli.console import plan_lines, require_consent
+from bam_train.cli.consent import plan_lines, require_consent
 from bam_train.errors import SettingsError
 
 GUARDS = {

@@ -98,9 +98,9 @@ def test_a_signal_still_gives_the_report(corridor_checkpoint, corridor, run, mon
     "during",
     [
         "tyro.cli",
-        "bam_train.environments.require_fit",
-        "bam_train.deploy.deployment.Deployment.connect",
-        "bam_train.cli.deploy.require_consent",
+        "bam_train.cli.consent.require_fit",
+        "bam_train.cli.consent.require_consent",
+        "bam_train.deploy.deployment.Deployment",
         "bam_train.cli.deploy_display.PlainDisplay",
     ],
 )

@@ -89,7 +89,7 @@ def test_panel_fits_a_screen_and_says_it_all():
     pacer.wait()
     with live_display(console, env, "pick.zip on bam/pick-v0", journal) as display:
         record = journal.begin(4)
-        record.add(0.25, False)
+        journal.step(0.25, False)
         display.ticked(record, np.zeros(5, np.float32), pacer)
     env.close()
     lines = [line.rstrip() for line in screen.getvalue().replace("\x1b[2K", "").splitlines()]

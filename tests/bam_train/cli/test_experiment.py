@@ -13,6 +13,7 @@ import pytest
 from bam_envs.core.errors import InvalidValue, LinkLost
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.experiment import ScriptParser, environment_of, open_env, require_place, signals_ask, whole
+from bam_train.environments import make_env
 from bam_train.errors import SettingsError
 from bam_train.signals import Terminated
 
@@ -132,10 +133,8 @@ def test_an_address_that_does_not_answer_or_is_none(address):
 
 def test_a_real_robot_does_not_move_unasked(monkeypatch, capsys):
     """Nobody is there to ask: it is connected, and closed again."""
-    import bam_train.environments as environments
-
-    made = environments.make_env("bam/pick-v0")
-    monkeypatch.setattr(environments, "make_env", lambda *arguments, **options: made)
+    made = make_env("bam/pick-v0")
+    monkeypatch.setattr("bam_train.cli.consent.make_env", lambda *arguments, **options: made)
     robot, closed = made.unwrapped.robot, []
     robot.info, robot.not_ready = SimpleNamespace(simulated=False, text="a real robot"), lambda: None
     monkeypatch.setattr(robot, "close", lambda: closed.append(True))
@@ -161,5 +160,5 @@ def test_nothing_moves_after_a_signal_whose_exception_is_discarded(monkeypatch, 
             pytest.fail("it went on")
 
     monkeypatch.setattr(sys, "unraisablehook", lambda _: None)
-    monkeypatch.setattr("bam_train.environments.require_fit", lose)
+    monkeypatch.setattr("bam_train.cli.consent.require_fit", lose)
     assert guarded(use, "try.py") == 0

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from bam_train.cli.train_display import PlainDisplay, make_display
+from bam_train.cli.train_display import LiveDisplay, PlainDisplay
 from bam_train.evaluation import EvaluationReport
 from bam_train.trainers.base import Progress, Statistics
 
@@ -57,7 +57,7 @@ def test_a_terminal_gets_a_panel(monkeypatch):
     monkeypatch.setattr(sys, "stderr", stream)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "90")
-    with make_display("ppo on bam/pick-v0, seed 0") as display:
+    with LiveDisplay("ppo on bam/pick-v0, seed 0") as display:
         display.training(progress(12_288), statistics(0.5), 5164.3, 55.7)
         display.evaluated(12_288, REPORT, best=True)
     shown = stream.getvalue()

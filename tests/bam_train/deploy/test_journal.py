@@ -1,6 +1,8 @@
 import json
 import math
 
+import numpy as np
+
 from bam_envs.core.timing import Pacer
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.journal import (
@@ -39,9 +41,8 @@ def driven_pacer(period):
 def journal():
     journal = Journal(3, startup=0.75)
     for success, end in ((True, "terminated"), (False, "truncated"), (False, "stopped")):
-        record = journal.begin(len(journal.records))
-        record.add(1.5, success)
-        record.end = end
+        journal.begin(len(journal.records))
+        journal.step(1.5, success, end)
     return journal
 
 
@@ -123,8 +124,8 @@ def test_old_records_are_counted_and_forgotten():
     journal = Journal(10**6)
     assert journal.successes == 0
     for seed in range(KEPT + 10):
-        record = journal.begin(seed)
-        record.end, record.success = "terminated", seed % 2 == 0
+        journal.begin(seed)
+        journal.step(0.0, seed % 2 == 0, "terminated")
     assert (journal.begun, journal.completed, journal.successes) == (KEPT + 10, KEPT + 10, KEPT // 2 + 5)
     assert len(journal.records) == KEPT
     assert journal.records[0].seed == 10
@@ -132,7 +133,6 @@ def test_old_records_are_counted_and_forgotten():
 
 def test_one_success_is_a_number():
     journal = Journal(1)
-    record = journal.begin(0)
-    record.add(1.0, True)
-    record.end = "terminated"
+    journal.begin(0)
+    journal.step(1.0, np.True_, "terminated")
     assert repr(journal.successes) == "1"

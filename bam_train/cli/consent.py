@@ -1,0 +1,132 @@
+"""Before a robot moves: its environment is proved to fit the policy, its limits are shown, and a person is asked."""
+
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+
+from bam_envs.core.robot import RobotSpec
+from bam_envs.safety.guard import is_base
+from bam_train.checkpoint import Checkpoint
+from bam_train.cli.console import say
+from bam_train.env_location import Place
+from bam_train.environments import environment_of, make_env, require_fit
+from bam_train.errors import SettingsError
+from bam_train.signals import SignalMemory
+
+
+def connected_env(
+    checkpoint: Checkpoint,
+    place: Place,
+    signals: SignalMemory,
+    *,
+    who: str,
+    episodes: int,
+    yes: bool,
+    render: bool = False,
+    named: str | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+) -> gym.Env[Any, Any]:
+    """The environment of a checkpoint, which its robot may move in; a robot is connected, and has not moved.
+
+    Args:
+        checkpoint: Of the policy that is going to act.
+        place: Where the environment runs.
+        signals: One whose exception Python discarded is raised again before anything moves.
+        who: What will move the robot, as the question to a person begins.
+        episodes: How many are planned.
+        yes: Do not ask before a real robot moves.
+        render: Show the simulation in a window.
+        named: The environment that the user expects.
+        env_kwargs: Arguments of the environment; they win over the checkpoint's.
+
+    Raises:
+        CheckpointMismatch: The environment is another than the checkpoint was trained in.
+        SettingsError: It cannot be made or shown, or nobody agreed that the real robot moves.
+    """
+    env_id, own = environment_of(checkpoint, named, elsewhere=bool(place.transport))
+    env = make_env(env_id, {**own, **(env_kwargs or {})}, render_mode="human" if render else None, place=place)
+    try:
+        require_fit(checkpoint, env, place)
+        signals.raise_again()
+        robot: Any = getattr(env.unwrapped, "robot", None)
+        if robot is not None:
+            robot.connect()
+            signals.raise_again()
+        plan = plan_lines(env, env_id, place.text, episodes)
+        require_consent(env, f"{who}: {checkpoint.path}", yes=yes, plan=plan)
+        signals.raise_again()
+    except BaseException:
+        env.close()  # type: ignore[no-untyped-call]
+        raise
+    return env
+
+
+def guards_of(env: Any) -> dict[str, dict[str, Any]]:
+    """What the guards of an environment's live robot did; empty for a simulated one."""
+    report = getattr(getattr(env.unwrapped, "robot", None), "report", None)
+    return {} if report is None else dict(report())
+
+
+def plan_lines(env: Any, env_id: str, address: str, episodes: int) -> list[str]:
+    """What a person should know of the episodes to come."""
+    spec = getattr(getattr(env.unwrapped, "robot", None), "spec", None)
+    planned = "1 episode" if episodes == 1 else f"{episodes} episodes, one after the other without a pause"
+    begin = "where the base stands"
+    if isinstance(spec, RobotSpec) and not is_base(spec):
+        gripper = "opening the gripper and " if "m" in spec.command.units else ""
+        begin = f"by {gripper}going to the start pose"
+    return [f"  address: {address}", f"  {env_id}: {planned}", f"  each begins {begin}"]
+
+
+def require_consent(env: Any, who: str, *, yes: bool, plan: Sequence[str] = ()) -> None:
+    """Ask once before the real robot of `env`, if it has one, moves; it is connected, and stands still.
+
+    Args:
+        env: The environment, single or vector.
+        who: What will move it, as the first line begins.
+        yes: Show the lines, and do not ask.
+        plan: Lines that say what it will do.
+
+    Raises:
+        SettingsError: The robot says that it cannot move now, the answer is not yes, or there is nobody to ask.
+    """
+    robot: Any = getattr(env.unwrapped, "robot", None)
+    info = getattr(robot, "info", None)
+    if info is None or info.simulated:
+        return
+    begin = f"{who} will move {info.text}"
+    for line in [f"{begin}:", *plan, "within"] if plan else [f"{begin}, within"]:
+        say(line)
+    for name, guard in guards_of(env).items():
+        if guard["limit"] not in (None, ""):
+            say(f"  {name} ({guard['number']}): {guard['limit']:.3g} {guard['unit']}".rstrip())
+    if (why := robot.not_ready()) is not None:
+        raise SettingsError(f"not ready: {why}; nothing has moved")
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise SettingsError("a real robot would move, and there is nobody to ask; give --yes to go on without asking")
+    question = "Is the robot clear of people, and a hand on its emergency stop? Type yes to go on: "
+    print(question, end="", file=sys.stderr, flush=True)
+    if sys.stdin.readline().strip().lower() != "yes":
+        raise SettingsError("the answer was not yes; nothing has moved")
+
+
+def require_screen(*, remote: bool) -> None:
+    """Refuse ``--render`` where there is nothing to show, or nowhere to show it.
+
+    Raises:
+        SettingsError: The robot is elsewhere, or there is no screen.
+    """
+    if remote:
+        raise SettingsError(
+            "--render shows the simulation here, and there is none with --robot or --transport; leave it out"
+        )
+    if sys.platform == "linux" and not (os.environ.keys() & {"DISPLAY", "WAYLAND_DISPLAY"}):
+        raise SettingsError(
+            "--render needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set; "
+            "leave it out, or make a video: bam-eval CHECKPOINT --video video.gif"
+        )
