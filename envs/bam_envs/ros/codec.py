@@ -6,7 +6,6 @@ Command types that hold a list of numbers have their own lines here; all others 
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -117,12 +116,6 @@ def _from_si(entry: Content, values: Array) -> list[float]:
     return list(((values - entry.offset) / entry.scale).tolist())
 
 
-@cache
-def _places(labels: tuple[str, ...], command: tuple[str, ...]) -> list[int]:
-    """Where `labels` are among those of a command."""
-    return [command.index(label) for label in labels]
-
-
 def encode_state(
     profile: RobotProfile, state: RobotState, env_id: int, stamp: Mapping[str, int], tag: str = ""
 ) -> list[Envelope]:
@@ -185,7 +178,7 @@ def encode_sink(
     sink: Sink, spec: RobotSpec, command: Array, tag: Tag | None, *, sign: Sign | None = None, ros1: bool = False
 ) -> Envelope:
     """The message that sends the part of `command` (m,) that goes to `sink`. Arguments as of `encode_command`."""
-    raw, text = _from_si(sink, command[_places(sink.labels, spec.command.labels)]), ""
+    raw, text = _from_si(sink, command[_places(sink, spec)]), ""
     if tag is not None and sink.tag:
         content: list[float] | Array = raw
         if any("(" in path for path in sink.fields):  # an angle is written as a quaternion, and read with rounding
@@ -217,6 +210,10 @@ def _write_command(sink: Sink, values: list[float], text: str, period: float, *,
     return {"header": header, "joint_names": names, "points": [point]}
 
 
+def _places(sink: Sink, spec: RobotSpec) -> list[int]:
+    return [spec.command.labels.index(label) for label in sink.labels]
+
+
 def _signed(raw: list[float] | Array) -> bytes:
     """What is signed of a command: its raw numbers (k,) in 32 bits, since some types have no more."""
     with np.errstate(over="ignore"):
@@ -240,7 +237,7 @@ def decode_command(profile: RobotProfile, spec: RobotSpec, topic: str, message: 
     content = require_message(message, topic)
     raw, tag = _read_command(sink, content), read_tag(tag_text(content))
     signed = _signed(raw) if tag is not None and tag.mac else b""
-    return Decoded(list(_places(sink.labels, spec.command.labels)), _to_si(sink, raw), tag, signed)
+    return Decoded(_places(sink, spec), _to_si(sink, raw), tag, signed)
 
 
 def _read_command(sink: Sink, message: Message) -> Array:

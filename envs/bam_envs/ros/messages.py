@@ -49,7 +49,7 @@ def require_message(message: object, where: str) -> Message:
 
 def value_at(message: Message, path: str, where: str) -> Any:
     """What is at `path`, e.g. ``pose.position.x``; inside of what is stamped where the message is."""
-    steps = _steps(path)
+    steps = path.split(".")
     value: Any = message
     if steps[0] not in message and len(message) == 2 and "header" in message:  # a PoseStamped: a header and a Pose
         body = next(part for name, part in message.items() if name != "header")
@@ -60,11 +60,6 @@ def value_at(message: Message, path: str, where: str) -> Any:
             raise ProtocolError(f"{where}: the field {path} is missing; found: {found}.")
         value = value[name]
     return value
-
-
-@cache
-def _steps(path: str) -> tuple[str, ...]:
-    return tuple(path.split("."))
 
 
 @cache
@@ -172,7 +167,7 @@ def put_at(message: dict[str, Any], path: str, value: float) -> None:
         for axis, part in zip(quaternion, (0.0, 0.0, math.sin(value / 2), math.cos(value / 2)), strict=True):
             put_at(message, axis, part)
         return
-    *above, name = _steps(path)
+    *above, name = path.split(".")
     for step in above:
         message = message.setdefault(step, {})
     message[name] = value

@@ -8,7 +8,6 @@ import logging
 import os
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -19,12 +18,6 @@ from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Bus, Handler, Listener, deliv
 _LOG = logging.getLogger(__name__)
 
 
-@dataclass
-class _Subscription:
-    request: dict[str, Any]
-    listeners: dict[object, Listener] = field(default_factory=dict)
-
-
 class Declarations(Bus):
     """The half of a link that declares; a subclass tells the server of `url`, and may be used in this process only."""
 
@@ -32,7 +25,7 @@ class Declarations(Bus):
         self.url = url
         self._pid, self._lock = os.getpid(), threading.Lock()
         self._topics: dict[str, dict[str, Any]] = {}
-        self._subscriptions: dict[str, _Subscription] = {}
+        self._subscriptions: dict[str, tuple[dict[str, Any], dict[object, Listener]]] = {}
         self._services: dict[str, tuple[dict[str, Any], Handler]] = {}
 
     @property
@@ -80,22 +73,22 @@ class Declarations(Bus):
             request["compression"] = compression
         key = object()
         with self._lock:
-            entry = self._subscriptions.setdefault(topic, _Subscription(request))
-            known = _same_type(entry.request, topic, kind)
-            entry.request = {**known, **{name: min(known[name], value) for name, value in wish.items()}}
+            known, listeners = self._subscriptions.get(topic, (request, {}))
+            request = {**_same_type(known, topic, kind), **{name: min(known[name], wish[name]) for name in wish}}
             # A new table each time, so that the fan-out can walk over the old one without a lock.
-            entry.listeners = {**entry.listeners, key: listener}
-            self._announce(entry.request)
+            self._subscriptions[topic] = request, {**listeners, key: listener}
+            self._announce(request)
         return partial(self._unsubscribe, topic, key)
 
     def _unsubscribe(self, topic: str, key: object) -> None:
         self._require_process()
         with self._lock:
-            entry = self._subscriptions.get(topic)
-            if entry is None or key not in entry.listeners:
+            request, listeners = self._subscriptions.get(topic, ({}, {}))
+            if key not in listeners:
                 return
-            entry.listeners = {other: listener for other, listener in entry.listeners.items() if other is not key}
-            if not entry.listeners:
+            left = {other: listener for other, listener in listeners.items() if other is not key}
+            self._subscriptions[topic] = request, left
+            if not left:
                 del self._subscriptions[topic]
                 self._announce({"op": "unsubscribe", "id": f"subscribe:{topic}", "topic": topic})
 
@@ -122,8 +115,7 @@ class Declarations(Bus):
 
     def _deliver(self, topic: str, message: Mapping[str, Any]) -> None:
         """Give a message to each listener of `topic`."""
-        entry = self._subscriptions.get(topic)
-        for listener in () if entry is None else entry.listeners.values():
+        for listener in self._subscriptions.get(topic, ({}, {}))[1].values():
             if refusal := deliver(listener, message, UNKNOWN_CALLER, topic):
                 _LOG.info("a message was refused: %s", refusal)
 
@@ -131,7 +123,7 @@ class Declarations(Bus):
         """Everything, for a server that knows nothing yet."""
         with self._lock:
             services = (request for request, _ in self._services.values())
-            return [*self._topics.values(), *services, *(entry.request for entry in self._subscriptions.values())]
+            return [*self._topics.values(), *services, *(request for request, _ in self._subscriptions.values())]
 
     def _farewell(self) -> list[dict[str, Any]]:
         """What to take back before leaving: some servers keep a service whose client has left."""

@@ -8,7 +8,6 @@ import contextlib
 import logging
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, ProtocolError
@@ -19,10 +18,12 @@ from bam_envs.rosbridge.bus import Caller, Handler, Listener, Message, deliver, 
 from bam_envs.rosbridge.encoding import Id, decode_frame, read_id
 from bam_envs.rosbridge.server.client_session import (
     LEVELS,
+    Call,
     Event,
     Publication,
     Send,
     ServerOptions,
+    Service,
     Session,
     canonical,
     pack,
@@ -31,7 +32,7 @@ from bam_envs.rosbridge.server.client_session import (
     read_text,
     read_wish,
 )
-from bam_envs.rosbridge.server.services import Request, Service, Services, checked, packed_response
+from bam_envs.rosbridge.server.services import Services, checked, packed_response
 from bam_envs.rosbridge.server.topics import Stream, Topic, Topics
 
 _logger = logging.getLogger(__name__)
@@ -72,10 +73,7 @@ class Bridge:
         self._leave: list[Callable[[Caller], None]] = []
         rosapi: dict[str, tuple[str, Handler]] = {
             "get_time": ("GetTime", lambda *_: {"time": _time_of_day(clock())}),
-            "topics": (
-                "Topics",
-                lambda *_: {"topics": [*self.topics], "types": self.topics.kinds},
-            ),
+            "topics": ("Topics", lambda *_: {"topics": [*self.topics], "types": self.topics.kinds}),
             "topic_type": ("TopicType", lambda request, _: _type_of(self.topics, request, "topic")),
             "services": ("Services", lambda *_: {"services": [*self.services]}),
             "service_type": ("ServiceType", lambda request, _: _type_of(self.services, request, "service")),
@@ -275,19 +273,19 @@ class Bridge:
 
     def _call_service(self, session: Session, incoming: Incoming, now: float) -> None:
         message = incoming.message
-        number, spelling = read_id(message), message.get("service")
-        request = Request(session, number, spelling if isinstance(spelling, str) else "")
+        spelling = message.get("service")
+        call = Call(session, read_id(message), spelling if isinstance(spelling, str) else "")
         # A call is answered by a response also when it is wrong: who called waits for nothing else.
         try:
             name = read_name(message, "service")
             service = self.services.get(name)
             if service is None:
                 raise ProtocolError(f"Service {name} does not exist")
-            limit = read_number(message, "timeout", 0) or None
-            values = incoming.content_of(request_type(service.kind))
-            self.services.call(service, replace(request, wish=read_wish(message), timeout=limit), values, now)
+            call.timeout, values = read_number(message, "timeout", 0), incoming.content_of(request_type(service.kind))
+            call.wish = read_wish(message)
+            self.services.call(call, service, values, now)
         except BamEnvsError as error:
-            self._events.append(Send(session, packed_response(request, str(error), False)))
+            self._events.append(Send(session, packed_response(call, str(error), False)))
 
     def _advertise_service(self, session: Session, incoming: Incoming, now: float) -> None:
         message = incoming.message

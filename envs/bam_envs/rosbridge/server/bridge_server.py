@@ -25,7 +25,7 @@ from bam_envs.core.errors import InvalidValue, LinkLost, ProtocolError
 from bam_envs.rosbridge.bus import Bus, Caller, Handler, Listener, Message
 from bam_envs.rosbridge.server.admission import Admission, listening_error, tls_context
 from bam_envs.rosbridge.server.bridge import Bridge, Incoming
-from bam_envs.rosbridge.server.client_session import Invoke, Send, ServerOptions, Session
+from bam_envs.rosbridge.server.client_session import Call, Send, ServerOptions, Session
 from bam_envs.rosbridge.server.server_connection import BridgeConnection
 from bam_envs.rosbridge.threads import LoopThread, Workers
 from bam_envs.rosbridge.tokens import Tokens
@@ -277,10 +277,10 @@ class BridgeServer(Bus):
         # The loop's clock is the monotonic one.
         self._timer = asyncio.get_running_loop().call_at(deadline, self._tick)
 
-    def _work(self, invoke: Invoke) -> None:
+    def _work(self, call: Call) -> None:
         """In a thread of the pool: answer one call."""
-        packet = self._bridge.services.packed_answer(invoke)
-        self._post(lambda: self._bridge.services.finish(invoke, packet))
+        packet = self._bridge.services.packed_answer(call)
+        self._post(lambda: self._bridge.services.finish(call, packet))
 
     def _tick(self) -> None:
         self._timer = None

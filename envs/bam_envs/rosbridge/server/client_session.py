@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections import deque
 from collections.abc import Mapping
@@ -119,16 +120,36 @@ class Send:
 
 
 @dataclass(frozen=True)
-class Invoke:
-    """To do: call `Services.packed_answer` off the network's thread, and give what it returns to `Services.finish`."""
+class Service:
+    """A service, and who offers it."""
+
+    name: str  # with a leading slash
+    kind: str  # normal name of its type
+    spelling: str  # its name as its provider spells it
+    provider: Session | None = None  # the client that offers it; None for this process
+    handler: Handler | None = None  # what answers it in this process
+    inline: bool = False  # whether the handler is quick and may run in the thread of the network
+
+
+@dataclass(eq=False)
+class Call:
+    """What a client asks of a service; the rest is known once it is one of `Services`.
+
+    To do, as an event: `Services.packed_answer` off the network's thread; `Services.finish` takes what it returns.
+    """
 
     session: Session
-    number: int
-    handler: Handler
-    request: Message
+    id: Id
+    name: str  # of the service, as the client spells it
+    wish: Wish = field(default_factory=Wish)
+    timeout: float = 0.0  # after which time it is answered in any case [s]; 0: the usual time
+    deadline: float = math.inf  # when that is [s], clock of `Bridge`
+    number: int = 0
+    service: Service = field(init=False)
+    values: Message = field(init=False)  # its arguments, complete
 
 
-Event = Send | Invoke
+Event = Send | Call
 
 
 @dataclass(eq=False)
@@ -144,7 +165,7 @@ class Session:
     services: set[str] = field(default_factory=set)
     calls: set[int] = field(default_factory=set)  # numbers of its unanswered calls
     running: int = 0  # how many of its calls are with handlers
-    waiting: deque[Invoke] = field(default_factory=deque)  # its calls that wait for their turn
+    waiting: deque[Call] = field(default_factory=deque)  # its calls that wait for their turn
 
     def __post_init__(self) -> None:
         self.fragments = Fragments(self.options.max_incoming, self.options.fragment_lifetime)

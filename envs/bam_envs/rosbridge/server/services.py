@@ -6,53 +6,17 @@ Every end that a call can have is in this file, which shows that none is missing
 import itertools
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, ProtocolError
 from bam_envs.core.wording import brief
 from bam_envs.ros.interfaces import complete, request_type, response_type, variants
-from bam_envs.rosbridge.bus import Handler, answer
-from bam_envs.rosbridge.encoding import Id
-from bam_envs.rosbridge.server.client_session import Event, Invoke, Packet, Send, Session, Wish, pack
+from bam_envs.rosbridge.bus import Message, answer
+from bam_envs.rosbridge.server.client_session import Call, Event, Packet, Send, Service, Session, pack
 
 _LENIENT = ("bam_msgs/GymAPI",)
 """Types that are still growing: fields of a newer version are ignored, as every transport does."""
 _LONGEST_NUMBER = 20  # digits of the number of a call
-
-
-@dataclass(frozen=True)
-class Service:
-    """A service, and who offers it."""
-
-    name: str  # with a leading slash
-    kind: str  # normal name of its type
-    spelling: str  # its name as its provider spells it
-    provider: Session | None = None  # the client that offers it; None for this process
-    handler: Handler | None = None  # what answers it in this process
-    inline: bool = False  # whether the handler is quick and may run in the thread of the network
-
-
-@dataclass(frozen=True)
-class Request:
-    """What a client asks of a service."""
-
-    session: Session
-    id: Id
-    name: str  # of the service, as the client spells it
-    wish: Wish = field(default_factory=Wish)
-    timeout: float | None = None  # how long it waits [s]; None for the usual time
-
-
-@dataclass(frozen=True)
-class Call:
-    """An unanswered request."""
-
-    number: int
-    service: Service
-    request: Request
-    timeout: float  # after which time it is answered in any case [s]
-    deadline: float  # when that is [s], clock of `Bridge`
 
 
 class Services(dict[str, Service]):
@@ -95,56 +59,53 @@ class Services(dict[str, Service]):
         for name in list(session.services):
             self.withdraw(self[name])
 
-    def call(self, service: Service, request: Request, values: Mapping[str, Any], now: float) -> None:
-        """Pass a request with complete `values` on to who offers `service`; a client may have so many unanswered."""
-        session, options = request.session, request.session.options
+    def call(self, call: Call, service: Service, values: Message, now: float) -> None:
+        """Pass a call with complete `values` on to who offers `service`; a client may have so many unanswered."""
+        session, options = call.session, call.session.options
         if max(len(session.calls), len(session.waiting)) >= options.calls:
             raise ProtocolError(f"At most {options.calls} calls may be unanswered; wait for an answer first.")
         usual = options.service_timeout if service.provider is not None else options.handler_timeout
-        timeout = usual if request.timeout is None else request.timeout
-        call = Call(next(self._numbers), service, request, timeout, now + timeout)
+        call.number, call.service, call.values = next(self._numbers), service, values
+        call.timeout = call.timeout or usual
+        call.deadline = now + call.timeout
         self._calls[call.number] = call
         session.calls.add(call.number)
         self.deadline = min(self.deadline, call.deadline)
         if service.provider is not None:
             message = {"op": "call_service", "id": str(call.number), "service": service.spelling, "args": values}
             self._emit(Send(service.provider, pack(message)))
-        elif service.handler is not None:
-            invoke = Invoke(session, call.number, service.handler, values)
-            packet = self.packed_answer(invoke) if service.inline else None
-            if packet is not None:
-                self._answer(call, packet)
-            else:
-                session.waiting.append(invoke)
-                self._start_waiting(session)
+        elif service.inline:
+            self._answer(call, self.packed_answer(call))
+        else:
+            session.waiting.append(call)
+            self._start_waiting(session)
 
     def _start_waiting(self, session: Session) -> None:
         while session.waiting and session.running < session.options.at_once:
-            invoke = session.waiting.popleft()
-            if invoke.number in self._calls:
+            call = session.waiting.popleft()
+            if call.number in self._calls:
                 session.running += 1
-                self._emit(invoke)
+                self._emit(call)
 
-    def packed_answer(self, invoke: Invoke) -> Packet | None:
+    def packed_answer(self, call: Call) -> Packet | None:
         """What the handler answers, as a packet; None if the call is answered already. From any thread."""
-        call = self._calls.get(invoke.number)
-        if call is None:
+        handler, service = call.service.handler, call.service
+        if handler is None or call.number not in self._calls:
             return None
         try:
-            values = answer(invoke.handler, invoke.request, invoke.session.caller, f"Service {call.service.name}")
-            if not call.service.inline:  # what /rosapi/get_time answers spells the time for ROS 1 and for ROS 2
-                values = checked(call.service.kind, response_type, values)
+            values = answer(handler, call.values, call.session.caller, f"Service {service.name}")
+            if not service.inline:  # what /rosapi/get_time answers spells the time for ROS 1 and for ROS 2
+                values = checked(service.kind, response_type, values)
             return _packed(call, values, True)
         except BamEnvsError as error:
             return _packed(call, str(error), False)
 
-    def finish(self, invoke: Invoke, packet: Packet | None) -> None:
+    def finish(self, call: Call, packet: Packet | None) -> None:
         """Send what `packed_answer` returned, if the call is still unanswered; the next call's turn."""
-        call = self._calls.get(invoke.number)
-        if call is not None and packet is not None:
+        if call.number in self._calls:
             self._answer(call, packet)
-        invoke.session.running -= 1
-        self._start_waiting(invoke.session)
+        call.session.running -= 1
+        self._start_waiting(call.session)
 
     def call_named(self, name: object) -> Call | None:
         """The unanswered call with the id `name`. From any thread."""
@@ -179,25 +140,26 @@ class Services(dict[str, Service]):
     def _fail(self, call: Call, reason: str) -> None:
         self._answer(call, _packed(call, reason, False))
 
-    def _answer(self, call: Call, packet: Packet) -> None:
-        del self._calls[call.number]
-        call.request.session.calls.discard(call.number)
-        self._emit(Send(call.request.session, packet))
+    def _answer(self, call: Call, packet: Packet | None) -> None:
+        if packet is not None:
+            del self._calls[call.number]
+            call.session.calls.discard(call.number)
+            self._emit(Send(call.session, packet))
 
 
 def _packed(call: Call, values: Any, result: bool) -> Packet:
-    packet = packed_response(call.request, values, result)
-    most = call.request.session.options.max_message
+    packet = packed_response(call, values, result)
+    most = call.session.options.max_message
     if packet.size <= most:
         return packet
     reason = f"The response of {call.service.name} has {packet.size} bytes, and {most} is the most."
-    return packed_response(call.request, reason, False)
+    return packed_response(call, reason, False)
 
 
-def packed_response(request: Request, values: Any, result: bool) -> Packet:
+def packed_response(call: Call, values: Any, result: bool) -> Packet:
     """A message ``service_response``; of a failed one, `values` is the reason."""
-    message = {"op": "service_response", "service": request.name, "values": values, "result": result}
-    return pack(message if request.id is None else {**message, "id": request.id}, request.wish)
+    message = {"op": "service_response", "service": call.name, "values": values, "result": result}
+    return pack(message if call.id is None else {**message, "id": call.id}, call.wish)
 
 
 def checked(kind: str, part: Callable[[str], str], values: Any) -> dict[str, Any]:

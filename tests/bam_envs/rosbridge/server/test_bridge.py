@@ -11,7 +11,7 @@ from bam_envs.core.errors import InvalidValue, NotInCommand, RemoteError
 from bam_envs.rosbridge.bus import Caller
 from bam_envs.rosbridge.encoding import split
 from bam_envs.rosbridge.server.bridge import Bridge
-from bam_envs.rosbridge.server.client_session import Invoke, Send, ServerOptions
+from bam_envs.rosbridge.server.client_session import Call, Send, ServerOptions
 
 JOINTS, FLOATS, TEXT, TRIGGER, SET_BOOL = (
     "sensor_msgs/JointState",
@@ -61,15 +61,15 @@ class Peers:
                 if event.session in self.got:
                     self.got[event.session].append(event.packet)
             else:
-                assert isinstance(event, Invoke)
+                assert isinstance(event, Call)
                 self.pending.append(event)
 
     def run(self):
         """Let the handlers answer."""
         self.work()
         while self.pending:
-            invoke = self.pending.pop(0)
-            self.bridge.services.finish(invoke, self.bridge.services.packed_answer(invoke))
+            call = self.pending.pop(0)
+            self.bridge.services.finish(call, self.bridge.services.packed_answer(call))
             self.work()
 
     def call(self, session, **more):
