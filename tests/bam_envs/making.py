@@ -4,6 +4,7 @@ import numpy as np
 
 from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.core.robot import RobotState
+from bam_envs.ros.codec import encode_sink
 
 
 def make_task(env_id, num_envs=1, **options):
@@ -16,3 +17,8 @@ def arm_state(joints, velocity=(0.0,) * 6, collision=False, obstacle=(0.0, 0.0, 
     signals = {"joint_position": joints, "joint_velocity": np.array([velocity], dtype=float)}
     signals |= {"object_position": np.array([obstacle], dtype=float), "object_quaternion": np.array([[1.0, 0, 0, 0]])}
     return RobotState(signals, np.zeros(1), joints, {"collision": np.array([collision])})
+
+
+def encode_command(profile, spec, command, tag, mode=None, **options):
+    """The messages that send `command` in `mode`, in the order in which they must be sent."""
+    return [encode_sink(sink, spec, command, tag, **options) for sink in profile.sinks(mode)]

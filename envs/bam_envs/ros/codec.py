@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.core.errors import InvalidValue, ProtocolError
+from bam_envs.core.errors import ProtocolError
 from bam_envs.core.robot import RobotSpec, RobotState
 from bam_envs.core.validation import Positive, read_table
 from bam_envs.core.wording import brief
@@ -148,36 +148,10 @@ def encode_state(
     return [envelope for envelope in messages.values() if envelope is not stamped[0]] + [stamped[0]]
 
 
-def encode_command(
-    profile: RobotProfile,
-    spec: RobotSpec,
-    command: Array,
-    tag: Tag | None,
-    mode: str | None = None,
-    *,
-    sign: Sign | None = None,
-    ros1: bool = False,
-) -> list[Envelope]:
-    """The messages that send `command` in `mode` (None: the default), in the order in which they must be sent.
-
-    Args:
-        profile: The robot.
-        spec: Labels of the command, and the period.
-        command: Finite numbers [SI], else `InvalidValue`. Shape: (m,).
-        tag: Who sends it when, for how long it means anything.
-        mode: One of the profile's.
-        sign: Makes the text of `tag`; None: without a signature.
-        ros1: Whether stamps are spelled as in ROS 1.
-    """
-    if command.shape != (len(spec.command.labels),) or not np.isfinite(command).all():
-        raise InvalidValue(f"A command must be {len(spec.command.labels)} finite numbers, not {command.tolist()}.")
-    return [encode_sink(sink, spec, command, tag, sign=sign, ros1=ros1) for sink in profile.sinks(mode)]
-
-
 def encode_sink(
     sink: Sink, spec: RobotSpec, command: Array, tag: Tag | None, *, sign: Sign | None = None, ros1: bool = False
 ) -> Envelope:
-    """The message that sends the part of `command` (m,) that goes to `sink`. Arguments as of `encode_command`."""
+    """The message that sends the part of `command` (m,) [SI] that goes to `sink`, with `tag` as `sign` signs it."""
     raw, text = _from_si(sink, command[_places(sink, spec)]), ""
     if tag is not None and sink.tag:
         content: list[float] | Array = raw

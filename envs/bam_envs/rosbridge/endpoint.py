@@ -71,17 +71,11 @@ class Endpoint:
 
     @classmethod
     def with_token_file(
-        cls,
-        url: str,
-        *,
-        ca_file: str | Path | None = None,
-        token_file: str | Path | None = None,
-        connect_timeout: float = 3.0,
-        timeout: float | None = None,
+        cls, url: str, *, ca_file: str | Path | None = None, token_file: str | Path | None = None
     ) -> Endpoint:
         """The endpoint whose token is in `token_file`, as commands and ``gym.make`` take it."""
         token = None if token_file is None else read_token(token_file)
-        return cls(url, None if ca_file is None else str(ca_file), token, connect_timeout, timeout)
+        return cls(url, None if ca_file is None else str(ca_file), token)
 
     @cached_property
     def address(self) -> Address:

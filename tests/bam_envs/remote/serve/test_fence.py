@@ -8,10 +8,10 @@ import pytest
 
 from bam_envs.core.errors import RemoteError
 from bam_envs.robots.profile import load_profile
-from bam_envs.ros.codec import encode_command
 from bam_envs.ros.freshness import Tagger, read_echo, read_tag
 from bam_envs.ros.messages import tag_text
 from bam_envs.rosbridge.client import RosbridgeLink
+from tests.bam_envs.making import encode_command
 
 UR5E = load_profile("ur5e")
 ACTION = np.array([0.3, -0.4, 0.4, 0.1, -0.2], np.float32)

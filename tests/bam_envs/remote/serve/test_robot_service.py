@@ -16,10 +16,11 @@ from bam_envs.robots.physics.kinematic_arm import reach_arm
 from bam_envs.robots.physics.kinematic_base import SimulatedBase
 from bam_envs.robots.physics.mujoco_arm import SimulatedArm
 from bam_envs.robots.profile import load_profile
-from bam_envs.ros.codec import RobotInfo, encode_command, read_info
+from bam_envs.ros.codec import RobotInfo, read_info
 from bam_envs.ros.freshness import Tagger, read_echo
 from bam_envs.rosbridge.bus import Caller
 from bam_envs.rosbridge.sessions import LEASE_TOPIC, read_session
+from tests.bam_envs.making import encode_command
 
 HOME = np.array([[0.0, -1.2, 1.6, -2.0, -1.57, 0.0]])
 ARM, GRIPPER = "/forward_position_controller/commands", "/gripper/commands"

@@ -12,11 +12,11 @@ from bam_envs.remote.serve.served_robot import ServedRobot
 from bam_envs.remote.tcp_transport import TcpTransport
 from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import arm_spec
-from bam_envs.ros.codec import encode_command
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.testing.transports import assert_same_value
+from tests.bam_envs.making import encode_command
 
 UR5E = load_profile("ur5e")
 ARM = arm_spec("ur5e", with_object=True)
