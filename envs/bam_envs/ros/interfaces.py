@@ -4,8 +4,6 @@ A message of a known type (`definitions`) comes out complete: what it leaves out
 type only plain values are taken. Values that are not finite and nulls are refused in both cases.
 """
 
-from __future__ import annotations
-
 import base64
 import math
 import re
@@ -46,7 +44,7 @@ class _Misfit(Exception):  # noqa: N818 - becomes an InvalidValue
     def __init__(self, expected: str, found: object, said: str = "") -> None:
         self.expected, self.found, self.path = expected, said or brief(found), ""
 
-    def under(self, step: str) -> _Misfit:
+    def under(self, step: str) -> "_Misfit":
         self.path = step + self.path
         return self
 

@@ -1,7 +1,5 @@
 """What a robot profile holds: sources of its signals, sinks of its commands, cameras, ages and limits."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -218,7 +216,7 @@ class RobotProfile:
             raise UnknownName(f"command mode of {self.name}", mode, self.commands)
         return self.commands[mode]
 
-    def narrowed(self, labels: tuple[str, ...], mode: str | None = None) -> RobotProfile:
+    def narrowed(self, labels: tuple[str, ...], mode: str | None = None) -> "RobotProfile":
         """The same robot, for a task that commands only the numbers `labels`, in their order.
 
         Sinks that take none of them are not in it: nothing is ever sent there. Nor are modes that would cut a message,

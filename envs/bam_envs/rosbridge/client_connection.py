@@ -4,8 +4,6 @@ A connection never comes back: what was handed to it and not sent when it ended 
 over the next one. What could not be opened says why: each reason has its own remedy.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging
@@ -36,7 +34,6 @@ _PINGS = 5  # how often a server is asked for a sign of life before its silence 
 _MOST_UNSENT = 1024 * 1024  # bytes that wait for the server to read, from which on nothing more is sent
 _MOST_PASSED_OVER = 20  # meaningless messages of one connection, after which it is ended
 _TOO_LARGE = 1009  # WebSocket's close code for a message above the limit
-_NOT_KEPT = "Nothing was sent, and nothing is kept."
 _DEAD_NODE = "context is invalid"  # what rosbridge_suite answers to everything after its node was told to end
 _HOST_MISMATCH = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
 
@@ -59,8 +56,8 @@ class Connection:
         epoch: int,
         max_message: int,
         lost_after: float,
-        on_message: Callable[[Connection, dict[str, Any]], None],
-        on_end: Callable[[Connection, BamEnvsError], None],
+        on_message: Callable[["Connection", dict[str, Any]], None],
+        on_end: Callable[["Connection", BamEnvsError], None],
     ) -> None:
         self.url, self.epoch = endpoint.address.url, epoch
         self.error: BamEnvsError | None = None  # why it ended; None before
@@ -146,11 +143,9 @@ class Connection:
     def send(self, *frames: str) -> None:
         """Write frames to the socket now, all or none; `LinkLost` if it cannot, `InvalidValue` for one too large."""
         socket = self._socket
-        if socket is None or self.error is not None:
-            why = "not open" if self.error is None else bare_reason(self.url, self.error)
-            raise LinkLost(f"{self.url}: the link is down ({why}). {_NOT_KEPT}")
-        if not self.is_open or socket.transport.is_closing():
-            raise LinkLost(f"{self.url}: the link is being closed. {_NOT_KEPT}")
+        if socket is None or not self.is_open or socket.transport.is_closing():
+            why = "it is being closed" if self.error is None else bare_reason(self.url, self.error)
+            raise LinkLost(f"{self.url}: the link is down ({why}). Nothing was sent, and nothing is kept.")
         if socket.transport.get_write_buffer_size() > _MOST_UNSENT:
             raise LinkLost(f"{self.url}: the server does not read what it is sent. Nothing more was sent.")
         largest = max(map(len, frames), default=0)

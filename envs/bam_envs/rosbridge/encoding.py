@@ -83,8 +83,6 @@ def _object(data: str | bytes, most_items: int, decoder: json.JSONDecoder) -> di
         value = decoder.decode(data.decode())
     except UnicodeDecodeError as error:
         raise ProtocolError(f"Message: expected text in UTF-8: {error.reason} at byte {error.start}.") from None
-    except RecursionError:
-        raise ProtocolError("Message: too deeply nested.") from None
     except ValueError as error:  # JSONDecodeError, and Python's own limit for the digits of an integer
         if str(error).startswith("Extra data"):
             raise ProtocolError("Message: expected one in a frame, found more behind it.") from None

@@ -1,7 +1,5 @@
 """Where a server is, and what a client needs to be let in: one frozen value that is passed whole."""
 
-from __future__ import annotations
-
 import re
 import ssl
 from dataclasses import dataclass, field
@@ -72,7 +70,7 @@ class Endpoint:
     @classmethod
     def with_token_file(
         cls, url: str, *, ca_file: str | Path | None = None, token_file: str | Path | None = None
-    ) -> Endpoint:
+    ) -> "Endpoint":
         """The endpoint whose token is in `token_file`, as commands and ``gym.make`` take it."""
         token = None if token_file is None else read_token(token_file)
         return cls(url, None if ca_file is None else str(ca_file), token)

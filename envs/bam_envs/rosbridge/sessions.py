@@ -9,10 +9,9 @@ import hmac
 import json
 import secrets
 import threading
-import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from bam_envs.core.errors import ProtocolError, RemoteError
 from bam_envs.ros.freshness import Freshness, Tag, Tagger, new_session, signature
@@ -27,18 +26,17 @@ _NOT_OPEN, _ELSEWHERE = "is not open here", "is of another connection"
 _MOST = 64  # sessions of one caller; the oldest is closed for a new one
 
 
-class _Session:
-    def __init__(self, caller: str, clock: Callable[[], float]) -> None:
-        self.caller, self.key, self.fresh = caller, secrets.token_bytes(32), Freshness(clock)
+class _Session(NamedTuple):
+    caller: str
+    key: bytes
+    fresh: Freshness
 
 
 class Sessions:
     """The robot's side: every open session; one that `is_driving` is never closed for a new one. Thread-safe."""
 
-    def __init__(
-        self, is_driving: Callable[[str], bool] = lambda name: False, clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        self._is_driving, self._clock, self._lock = is_driving, clock, threading.Lock()
+    def __init__(self, is_driving: Callable[[str], bool] = lambda name: False) -> None:
+        self._is_driving, self._lock = is_driving, threading.Lock()
         self._sessions: OrderedDict[str, _Session] = OrderedDict()
 
     def open(self, request: Message, caller: Caller) -> Message:
@@ -48,7 +46,7 @@ class Sessions:
             mine = [one for one, session in self._sessions.items() if session.caller == caller.name]
             if len(mine) >= _MOST:
                 del self._sessions[next(one for one in mine if not self._is_driving(one))]
-            self._sessions[name] = session = _Session(caller.name, self._clock)
+            self._sessions[name] = session = _Session(caller.name, secrets.token_bytes(32), Freshness())
         return {"success": True, "message": json.dumps({"session": name, "key": session.key.hex()})}
 
     def prove(self, tag: Tag, channel: str, content: bytes, caller: Caller, *, anywhere: bool = False) -> Freshness:

@@ -6,8 +6,6 @@ Every ROS graph has std_msgs, and a topic pair goes through a bridge several tim
 clients send it, is executed too; one whose tag is signed belongs to its session.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time
@@ -126,7 +124,7 @@ class StringRpcService:
         self._room = threading.BoundedSemaphore(_MOST_WAITING)
         self._unsubscribe: Callable[[], None] | None = None
 
-    def start(self) -> StringRpcService:
+    def start(self) -> "StringRpcService":
         """Advertise and listen; itself, so that one line makes and starts it."""
         self._bus.advertise(f"{self.name}/reply", _STRING)
         self._unsubscribe = self._bus.subscribe(f"{self.name}/request", _STRING, self._on_request)

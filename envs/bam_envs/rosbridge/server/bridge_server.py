@@ -4,8 +4,6 @@ The network thread runs the protocol and the listeners; handlers of services run
 are read in a thread of their own, so that no halt waits for them.
 """
 
-from __future__ import annotations
-
 import asyncio
 import functools
 import itertools
@@ -102,7 +100,7 @@ class BridgeServer(Bus):
         sockets = list(self._sockets)
         return sum(one.unfinished for one in sockets), sum(one.outbox.size for one in sockets)
 
-    def start(self) -> BridgeServer:
+    def start(self) -> "BridgeServer":
         """Listen; returns when clients can connect. `InvalidValue` if port, address or certificate cannot be used."""
         if self._thread.was_started:
             raise InvalidValue("A server starts once; make a new one.")
@@ -121,7 +119,7 @@ class BridgeServer(Bus):
         self._workers.close()
         self._reader.close()
 
-    def __enter__(self) -> BridgeServer:
+    def __enter__(self) -> "BridgeServer":
         return self.start()
 
     def __exit__(self, *error: object) -> None:

@@ -1,7 +1,5 @@
 """One client of the rosbridge server: what it may use, declared and asked, how its fields are read, what it is sent."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import re
@@ -114,7 +112,7 @@ class Publication:
 class Send:
     """To do: send a packet to a client."""
 
-    session: Session
+    session: "Session"
     packet: Packet
     keep: int = 0  # most packets of the same stream that may wait for a slow client; 0: as many as there is room for
 
@@ -126,7 +124,7 @@ class Service:
     name: str  # with a leading slash
     kind: str  # normal name of its type
     spelling: str  # its name as its provider spells it
-    provider: Session | None = None  # the client that offers it; None for this process
+    provider: "Session | None" = None  # the client that offers it; None for this process
     handler: Handler | None = None  # what answers it in this process
     inline: bool = False  # whether the handler is quick and may run in the thread of the network
 
@@ -138,7 +136,7 @@ class Call:
     To do, as an event: `Services.packed_answer` off the network's thread; `Services.finish` takes what it returns.
     """
 
-    session: Session
+    session: "Session"
     id: Id
     name: str  # of the service, as the client spells it
     wish: Wish = field(default_factory=Wish)
@@ -161,7 +159,7 @@ class Session:
     level: str = "error"  # the status messages it wants: this one of LEVELS and those before it
     advertised: dict[str, set[Id]] = field(default_factory=dict)
     """Its topics, with the ids of its advertisements of each."""
-    streams: dict[str, Stream] = field(default_factory=dict)  # what it has subscribed, by topic
+    streams: "dict[str, Stream]" = field(default_factory=dict)  # what it has subscribed, by topic
     services: set[str] = field(default_factory=set)
     calls: set[int] = field(default_factory=set)  # numbers of its unanswered calls
     running: int = 0  # how many of its calls are with handlers

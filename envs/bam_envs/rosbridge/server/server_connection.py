@@ -1,7 +1,5 @@
 """One WebSocket connection of the rosbridge server: written to at once, or through its bounded outbox."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections import Counter, deque
@@ -77,7 +75,7 @@ class Outbox:
 class BridgeConnection(ServerConnection):
     """A connection with an `Outbox`, that knows what it holds and is one of `sockets`, all open ones of the server."""
 
-    def __init__(self, *args: Any, sockets: set[BridgeConnection], limits: ServerOptions, **options: Any) -> None:
+    def __init__(self, *args: Any, sockets: set["BridgeConnection"], limits: ServerOptions, **options: Any) -> None:
         super().__init__(*args, **options)
         self._sockets, self._most_unfinished = sockets, limits.unfinished
         self._most_unsent = limits.max_message + limits.outbox_size
