@@ -40,19 +40,9 @@ Trees = dict[str, Any]
 Values = dict[Path, Any]
 DEFAULT = 1
 """The action_type of an action that is none of the rack's own."""
-WAYPOINT = {
-    "kp_scale": 1.0,
-    "kd_scale": 1.0,
-    "max_velocity": 10.0,
-    "max_effort": 1.0,
-    "target_link": "tcp_world",
-    "planner": "ptp",
-    "vel_scale": 1.0,
-    "accel_scale": 1.0,
-    "blend_radius": 0.0,
-    "goal_tol": 0.2,
-    "path_tol": 0.2,
-}
+WAYPOINT = {"target_link": "tcp_world", "planner": "ptp", "max_velocity": 10.0, "blend_radius": 0.0}
+WAYPOINT |= dict.fromkeys(("kp_scale", "kd_scale", "max_effort", "vel_scale", "accel_scale"), 1.0)
+WAYPOINT |= dict.fromkeys(("goal_tol", "path_tol"), 0.2)
 """How a rack's own client goes to a pose."""
 
 

@@ -235,17 +235,16 @@ def write_failure(error: BamEnvsError, duration: float, stamp: Message, version:
 def read_response(message: object) -> GymResponse:
     """The answer in `message`, of any server. Raises ProtocolError if a field is of the wrong kind."""
     received = message.get("feedback") if isinstance(message, Mapping) else None
-    received = received if isinstance(received, (list, tuple)) else ()
-    given = {**message, "feedback": [_without_nulls(one) for one in received]} if received else message  # type: ignore[dict-item]
+    parts = [_without_nulls(one) for one in received] if isinstance(received, (list, tuple)) else []
+    given = {**message, "feedback": [one for one, _ in parts]} if parts else message  # type: ignore[dict-item]
     try:
         whole = complete(response_type(KIND), given, lenient=True)
     except InvalidValue as error:
         raise ProtocolError(str(error)) from error
-    # NaN in place of each null: no space takes that.
-    feedback = [
-        {**checked, **_filled(checked, one, math.nan, _NOWHERE)}
-        for checked, one in zip(whole["feedback"], received, strict=True)
-    ]
+    feedback = whole["feedback"]
+    for checked, (_, gaps) in zip(feedback, parts, strict=True):
+        for field, place in gaps:  # NaN: no space takes that
+            checked[field][place] = math.nan if field == "observation" else _NOWHERE
     read = [read_info(one["info"]) for one in feedback]
     infos, ours = tuple(info for info, _ in read), tuple(bam for _, bam in read)
     code, text, failure = whole["header"]["error_code"]["value"], whole["header"]["error_msg"], None
@@ -261,26 +260,21 @@ def read_response(message: object) -> GymResponse:
     return GymResponse(failure, filled, infos, ours, version_of_response(message))
 
 
-def _without_nulls(feedback: Any) -> Any:
-    """A feedback as it came, with zeros for numbers and poses that are null: every rosbridge writes NaN as null.
+def _without_nulls(feedback: Any) -> tuple[Any, list[tuple[str, int]]]:
+    """A feedback with zeros for numbers and poses that are null, and the fields and places of these.
 
-    Whether it is a fault that a sensor or a cup was not there depends on what the space needs.
+    Every rosbridge writes NaN as null. Whether it is a fault that a sensor or a cup was not there depends on what the
+    space needs.
     """
     if not isinstance(feedback, Mapping):
-        return feedback
+        return feedback, []
     kept = {name: value for name, value in feedback.items() if name not in _UNREAD}
-    return {**kept, **_filled(feedback, feedback, 0.0, {})}
-
-
-def _filled(values: Message, received: Message, number: float, pose: Message) -> dict[str, Any]:
-    """The lists of `values` with a number or pose in place of each entry that was received as null, or holds one."""
-    filled: dict[str, Any] = {}
-    for field, unknown in (("observation", number), ("pose", pose)):
-        entries = received.get(field)
-        gaps = [_has_null(one) for one in entries] if isinstance(entries, list) else []
-        if any(gaps):
-            filled[field] = [unknown if gap else value for value, gap in zip(values[field], gaps, strict=True)]
-    return filled
+    gaps = []
+    for field, nothing in (("observation", 0.0), ("pose", {})):
+        if isinstance(entries := kept.get(field), list):
+            kept[field] = [nothing if _has_null(one) else one for one in entries]
+            gaps += [(field, place) for place, one in enumerate(entries) if _has_null(one)]
+    return kept, gaps
 
 
 def _has_null(value: Any, depth: int = 3) -> bool:

@@ -23,7 +23,7 @@ class CommandLease:
 
     def __init__(self, seconds: float = LEASE_SECONDS, clock: Callable[[], float] = time.monotonic) -> None:
         self.seconds = seconds
-        self._clock, self._lock = clock, threading.Lock()
+        self._clock, self._lock = clock, threading.RLock()
         self._holder: str | None = None
         self._shown: str | None = None  # what the holder is called where others read it
         self._heard, self._silence = 0.0, UNKNOWN_CALLER.silence
@@ -81,18 +81,15 @@ class CommandLease:
     def require(self, client: str) -> None:
         """Record a sign of life of `client`; raises NotInCommand if it is not in command."""
         with self._lock:
-            self._require(client)
-
-    def _require(self, client: str) -> None:
-        if self._holder != client:
-            raise NotInCommand(self._refusal(client))
-        self._heard = self._clock()
+            if self._holder != client:
+                raise NotInCommand(self._refusal(client))
+            self._heard = self._clock()
 
     @contextmanager
     def busy(self, client: str) -> Iterator[None]:
         """While a request of `client` runs, however long it takes, it does not count as silent."""
         with self._lock:
-            self._require(client)
+            self.require(client)
             self._running += 1
         try:
             yield
