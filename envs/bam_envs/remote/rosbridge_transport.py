@@ -129,11 +129,8 @@ class RosbridgeTransport:
         with self._lock:
             there = self._there
             if there is None or self._closed or self._known_epoch != self._link.epoch or os.getpid() != self._pid:
-                reason = "the link was lost, so what the environment did since is unknown"
-                if self._closed:
-                    reason = "this transport is closed"
-                elif there is None or os.getpid() != self._pid:
-                    reason = "the link is not open"
+                lost = "the link was lost, or is not open, so what the environment did since is unknown"
+                reason = "this transport is closed" if self._closed else lost
                 raise LinkLost(f"{self.url}: {reason}, and nothing was sent. Call reset() first.")
             result = there.read_result(self._ask(RequestType.STEP, actions=there.write_actions(action)))
             june = self._version is not None and self._version.june

@@ -55,7 +55,7 @@ def test_after_a_time_out_nothing_is_sent_before_a_reset(served, open_to, channe
     with pytest.raises(LinkLost, match=r"did not answer in 0\.3 s"):
         transport.step(1)
     assert begun.is_set()
-    text = "the link was lost, so what the environment did since is unknown, and nothing was sent. Call reset"
+    text = "so what the environment did since is unknown, and nothing was sent. Call reset"
     with pytest.raises(LinkLost, match=text):
         transport.step(2)
     go_on.set()

@@ -12,8 +12,8 @@ from gymnasium import spaces
 from msgspec.msgpack import Ext
 
 from bam_envs.core.errors import LinkLost, NotInCommand, ProtocolError, RemoteError, ResetNeeded
-from bam_envs.remote import tcp_wire
 from bam_envs.remote.tcp_wire import (
+    MAX_FRAME,
     ForeignPeer,
     FrameSocket,
     Greeting,
@@ -98,11 +98,10 @@ def test_what_cannot_be_sent():
     )
 
 
-def test_what_is_too_large_is_refused(monkeypatch):
-    monkeypatch.setattr(tcp_wire, "MAX_FRAME", 1000)
+def test_what_is_too_large_is_refused():
     with pytest.raises(ProtocolError) as caught:
-        encode(np.zeros(1008, np.uint8))
-    assert str(caught.value) == "A message of 1021 bytes is too large; 1000 are allowed."
+        encode(np.zeros(MAX_FRAME, np.uint8))
+    assert str(caught.value) == f"A message of {MAX_FRAME + 15} bytes is too large; {MAX_FRAME} are allowed."
 
 
 @pytest.mark.parametrize(

@@ -118,9 +118,8 @@ class ServedEnvironment:
             self.endpoints.append(f"{name} on {node}, {pace}: {offered}")
         if options.tcp is not None:
             token, operator = self._token, self._operator_token
-            self.tcp = TcpServer(server, options.bind, options.tcp, token=token, operator_token=operator)
-            started.callback(self.tcp.close)
-            self.tcp.start()
+            tcp = TcpServer(server, options.bind, options.tcp, token=token, operator_token=operator)
+            self.tcp = started.enter_context(tcp)
             self.endpoints.append(f"{name} on {self.tcp.url}, the environment alone")
 
     @property

@@ -8,7 +8,6 @@ import threading
 import time
 from collections import Counter
 from contextlib import suppress
-from typing import TYPE_CHECKING
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, ProtocolError, RemoteError
 from bam_envs.remote.serve.env_server import EnvServer
@@ -29,9 +28,6 @@ from bam_envs.remote.values import Tree
 from bam_envs.ros.freshness import FreshnessCheck, Tag
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
 from bam_envs.rosbridge.tokens import Guesses, Tokens
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 _LOG = logging.getLogger(__name__)
 _POLL = 0.2  # seconds between two looks at whether the server is closing
@@ -113,7 +109,7 @@ class TcpServer:
         for connection in connections:
             connection.thread.join()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> TcpServer:
         self.start()
         return self
 
