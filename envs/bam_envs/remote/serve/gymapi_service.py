@@ -137,13 +137,7 @@ class GymApiService:
                     if len(self._connections) > _MOST_CLIENTS:
                         self._connections.popitem(last=False)
             begun = self.env.reset(
-                client,
-                request.seed,
-                request.options,
-                take=request.take,
-                deadline=deadline,
-                caller=caller,
-                shown=shown,
+                client, request.seed, request.options, take=request.take, deadline=deadline, caller=caller, shown=shown
             )
             return self._codec.write_result(begun, self._stamp(), version)
         if request.type is RequestType.CLOSE:

@@ -21,14 +21,7 @@ from bam_envs.core.errors import LinkLost, ProtocolError, RemoteError, RobotFaul
 from bam_envs.core.timing import Ticker
 from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.served_robot import ServedRobot
-from bam_envs.ros.codec import (
-    HALT_TOPIC,
-    INFO_SERVICE,
-    SCENE_TOPIC,
-    RobotInfo,
-    decode_command,
-    encode_state,
-)
+from bam_envs.ros.codec import HALT_TOPIC, INFO_SERVICE, SCENE_TOPIC, RobotInfo, decode_command, encode_state
 from bam_envs.ros.freshness import read_tag
 from bam_envs.ros.messages import numbers, write_stamp
 from bam_envs.ros.profile_tables import RobotProfile
@@ -81,7 +74,7 @@ class CommandSlot:
 
 
 class RobotService:
-    """Puts one robot on a bus.
+    """Puts one simulated robot on a bus.
 
     Args:
         robot: Everything else that moves it does so through this object, too.
@@ -89,29 +82,18 @@ class RobotService:
         bus: Carries them.
         lease: Who is in command; shared with everything else that moves the robot.
         namespace: Before every topic, such as ``/cell_1``; or nothing.
-        simulated: Whether nothing real moves; then a scene can be set.
-        clock: Wall clock [s], for stamps.
     """
 
     def __init__(
-        self,
-        robot: ServedRobot,
-        profile: RobotProfile,
-        bus: Bus,
-        lease: CommandLease,
-        *,
-        namespace: str = "",
-        simulated: bool = True,
-        clock: Callable[[], float] = time.time,
+        self, robot: ServedRobot, profile: RobotProfile, bus: Bus, lease: CommandLease, *, namespace: str = ""
     ) -> None:
         profile = profile.narrowed(robot.spec.command.labels)
         self._robot, self._profile, self._bus, self._lease = robot, profile, bus, lease
-        self._namespace, self._clock = namespace, clock
-        lockstep = not robot.realtime
+        self._namespace, lockstep = namespace, not robot.realtime
         text = f"{profile.name}, served in real time; it rests {robot.command_timeout:g} s after the last command"
         if lockstep:
             text = f"{profile.name}, served in lockstep: its time goes on with commands, {robot.spec.period:g} s each"
-        self.info = RobotInfo(profile.name, simulated, lockstep, robot.spec.period, text)
+        self.info = RobotInfo(profile.name, True, lockstep, robot.spec.period, text)
         """Its description for clients."""
         self._slot = CommandSlot()
         self._sessions = Sessions(lambda name: lease.holder == Caller("", session=name).client)
@@ -121,9 +103,7 @@ class RobotService:
         self._connected = True
         self._moving = threading.Lock()  # an order that was taken is begun before a halt, or not at all
         self._unsubscribe: list[Callable[[], None]] = []
-        self._scene = (
-            StringRpcService(bus, namespace + SCENE_TOPIC, self._set_scene, self._sessions) if simulated else None
-        )
+        self._scene = StringRpcService(bus, namespace + SCENE_TOPIC, self._set_scene, self._sessions)
         self.clock = Ticker(self.tick, IDLE_PERIOD if lockstep else robot.tick_period)
         """Moves the robot and publishes."""
 
@@ -141,8 +121,7 @@ class RobotService:
         self._bus.serve(self._namespace + INFO_SERVICE, "std_srvs/Trigger", lambda request, caller: answer)
         self._bus.on_leave(self._on_leave)
         self._lease.on_change(self._on_change)
-        if self._scene is not None:
-            self._scene.start()
+        self._scene.start()
         self.clock.start()
 
     def close(self) -> None:
@@ -151,8 +130,7 @@ class RobotService:
             self._unsubscribe.pop()()
         self.clock.stop()
         self._robot.halt()
-        if self._scene is not None:
-            self._scene.close()
+        self._scene.close()
 
     def _listen(self, topic: str, kind: str, listener: Listener) -> None:
         self._unsubscribe.append(self._bus.subscribe(self._namespace + topic, kind, listener))
@@ -260,7 +238,7 @@ class RobotService:
             return
         stamp: Callable[[float], Mapping[str, int]] = getattr(self._bus, "stamp", write_stamp)
         try:
-            envelopes = encode_state(self._profile, state, 0, stamp(self._clock()), self._answered)
+            envelopes = encode_state(self._profile, state, 0, stamp(time.time()), self._answered)
             self._bus.publish_all([(self._namespace + topic, message) for topic, _, message in envelopes])
             self._connected = True
         except LinkLost as error:  # nobody hears it, and the command timeout holds the robot

@@ -65,7 +65,7 @@ class ServedRobot:
         self._orders = self._begun = self._done = 0  # commands given, begun, executed over a whole period
 
     def __getattr__(self, name: str) -> Any:
-        """Whatever else the robot has, such as `render` and `state_dict`."""
+        """Whatever else the robot has, such as `connect`, `render` and `state_dict`."""
         if name.startswith("_"):
             raise AttributeError(name)
         value = getattr(self._robot, name)
@@ -75,11 +75,6 @@ class ServedRobot:
                 return value(*arguments, **options)
 
         return call if callable(value) else value
-
-    def connect(self) -> None:
-        """Make the robot ready for `reset`."""
-        with self._changed:
-            self._robot.connect()
 
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
         """Bring the robot to `initial`; ends what was being executed, and clears a fault."""

@@ -434,11 +434,6 @@ def test_only_the_client_in_command_sets_the_scene(serve, bus):
     bus.wait_for("/bam/scene/reply", lambda message: text in message["data"])
 
 
-def test_a_real_robot_has_no_scene(serve, bus):
-    serve(simulated=False)
-    assert "/bam/scene/request" not in bus.listeners
-
-
 class Failing(FakeRobot):
     def step(self, command):
         raise PhysicsDiverged("The simulated state of environments [0] is not finite. Reset them.")
