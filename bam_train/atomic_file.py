@@ -20,15 +20,7 @@ except ImportError:  # Windows: files that were left stay
 
 @contextlib.contextmanager
 def replacing(target: Path, suffix: str = ".tmp") -> Iterator[Path]:
-    """A private file beside `target`, to be written: then it becomes `target` in one step, and on an error it is gone.
-
-    Args:
-        target: The file.
-        suffix: End of the private file's name.
-
-    Raises:
-        OSError: It cannot be made or moved there.
-    """
+    """A private file beside `target`, to be written: then it becomes `target` in one step; on an error it is gone."""
     descriptor, path = _locked(target, suffix)
     try:
         yield path

@@ -14,13 +14,7 @@ from bam_train.errors import EnvironmentFailed
 
 
 class FiniteEnv(gym.Wrapper[Any, Any, Any, Any]):
-    """One environment whose observations and rewards are finite.
-
-    Args:
-        env: The environment.
-        env_id: How errors name it.
-        which: Which of several it is; None if it is alone.
-    """
+    """One environment whose observations and rewards are finite; errors call it `env_id`, and say `which` it is."""
 
     def __init__(self, env: gym.Env[Any, Any], env_id: str, which: int | None = None) -> None:
         super().__init__(env)
@@ -30,7 +24,7 @@ class FiniteEnv(gym.Wrapper[Any, Any, Any, Any]):
         """Begin an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._steps = 0
-        _require_finite(self, self._name, "observation", observation, self._steps, self._index)
+        _require_finite(self, self._name, "observation", observation, 0, self._index)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -45,18 +39,14 @@ class FiniteEnv(gym.Wrapper[Any, Any, Any, Any]):
 class FiniteVectorEnv(VectorWrapper):
     """A vector environment whose observations and rewards are finite; its environments restart in the same step.
 
-    Args:
-        envs: The environment.
-        env_id: How errors name it; None for the name of its class.
-
-    Attributes:
-        episode_steps: Steps of each running episode. Shape: (n,).
+    Errors call it `env_id`, or by its class.
     """
 
     def __init__(self, envs: VectorEnv[Any, Any, Any], env_id: str | None = None) -> None:
         super().__init__(envs)
         self._name = env_id or type(envs.unwrapped).__name__
         self.episode_steps = np.zeros(envs.num_envs, np.int64)
+        """Steps of each running episode. Shape: (n,)."""
 
     def __getattr__(self, name: str) -> Any:
         """Whatever else is asked for is the environment's own."""
@@ -111,15 +101,9 @@ def _not_finite(name: str, value: Any) -> tuple[str, list[int], float] | None:
 
 
 def _require_finite(env: Any, env_id: str, signal: str, value: Any, steps: Any, which: int | None = None) -> None:
-    """Refuse the first number of an observation or a reward that is not finite, by the environment's own label of it.
+    """Refuse the first number of an observation or a reward (`signal`) that is not finite, by its label if it has one.
 
-    Args:
-        env: The environment.
-        env_id: How the error names it.
-        signal: ``"observation"`` or ``"reward"``.
-        value: Of one environment, or of a batch.
-        steps: Of its episode, or an array of them for a batch.
-        which: The environment that `value` is of; None for one that is alone, and for a whole batch.
+    `value` is of the environment `which` at step `steps`; or of one alone, or of a batch with an array of steps.
     """
     found = _not_finite(signal, value)
     if found is None:

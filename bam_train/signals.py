@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from types import FrameType
-from typing import Any, NoReturn
+from typing import NoReturn
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 """What asks a program to end; Windows has no SIGHUP."""
@@ -24,11 +24,7 @@ and then to its group. Ctrl-C is a person's, and counts each time."""
 
 
 class Terminated(KeyboardInterrupt):
-    """A signal other than Ctrl-C asked for the end; Ray, waiting in C++, passes on KeyboardInterrupt alone.
-
-    Attributes:
-        signal: Which.
-    """
+    """Another `signal` than Ctrl-C asked for the end; Ray, waiting in C++, passes on KeyboardInterrupt alone."""
 
     def __init__(self, number: int) -> None:
         self.signal = signal.Signals(number)
@@ -36,11 +32,7 @@ class Terminated(KeyboardInterrupt):
 
 
 def interrupt(number: int) -> NoReturn:
-    """Raise what the signal `number` stands for.
-
-    Raises:
-        KeyboardInterrupt: For Ctrl-C; for any other signal `Terminated`, which is one too.
-    """
+    """Raise KeyboardInterrupt for Ctrl-C, and `Terminated` for any other signal."""
     raise KeyboardInterrupt if number == signal.SIGINT else Terminated(number)
 
 
@@ -95,7 +87,7 @@ def waiting() -> Iterator[None]:
         signal.raise_signal(came[0])
 
 
-class SignalMemory:
+class SignalMemory(contextlib.ExitStack):
     """Within this, signals interrupt, and are remembered.
 
     Python discards what is raised in callbacks such as ``__del__`` and those of an import, so a program asks again
@@ -103,16 +95,13 @@ class SignalMemory:
     """
 
     def __init__(self) -> None:
+        super().__init__()
         self.came: list[int] = []
         """The signals that came, in order."""
-        self._handled = handled(self._handle)
 
     def __enter__(self) -> SignalMemory:
-        self._handled.__enter__()
+        self.enter_context(handled(self._handle))
         return self
-
-    def __exit__(self, *error: Any) -> None:
-        self._handled.__exit__(*error)
 
     def _handle(self, number: int) -> None:
         self.came.append(number)
@@ -144,11 +133,7 @@ _CALLS: list[Callable[[], None]] = []
 
 @contextlib.contextmanager
 def at_quit(call: Callable[[], None]) -> Iterator[None]:
-    """Within, `call` is to be called before the process quits at once.
-
-    Args:
-        call: Short, and fit for a signal handler, as it may come in the middle of anything.
-    """
+    """Within, `call` is called before the process quits at once; it is short, and fit for a signal handler."""
     _CALLS.append(call)
     try:
         yield

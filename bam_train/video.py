@@ -44,11 +44,7 @@ def require_video_path(path: Path) -> Path:
 
 
 def picture(env: gym.Env[Any, Any]) -> Frame:
-    """What `env` shows now.
-
-    Raises:
-        SettingsError: It gives no picture.
-    """
+    """What `env` shows now; SettingsError if it gives no picture."""
     name = env.spec.id if env.spec else env
     try:
         image: Any = env.render()
@@ -61,15 +57,9 @@ def picture(env: gym.Env[Any, Any]) -> Frame:
 
 @contextmanager
 def open_video(path: Path, rate: float) -> Iterator[Callable[[Frame], None]]:
-    """A video to add frames to, all of one size; it is there at the end, whole, or not at all after an exception.
+    """A ``.gif`` or ``.mp4`` video of `rate` pictures a second, to which frames of one size are added.
 
-    Args:
-        path: Ends in ``.gif`` or ``.mp4``.
-        rate: Pictures a second.
-
-    Raises:
-        SettingsError: No picture was added.
-        OutputError: No space or no permission.
+    It is there at the end, whole, or not at all after an exception.
     """
     count = 0
 
@@ -95,11 +85,8 @@ def _gif(path: Path, rate: float) -> Iterator[Callable[[Frame], None]]:
     pictures: list[Image.Image] = []
 
     def add(frame: Frame) -> None:
-        image = Image.fromarray(frame)
-        plain = {"dither": Image.Dither.NONE}
-        pictures.append(
-            image.quantize(palette=pictures[0], **plain) if pictures else image.quantize(colors=256, **plain)
-        )
+        palette: Any = {"palette": pictures[0]} if pictures else {"colors": 256}
+        pictures.append(Image.fromarray(frame).quantize(**palette, dither=Image.Dither.NONE))
 
     yield add
     # GIF counts in hundredths of a second, and players slow down what is faster than 2 of them.

@@ -29,7 +29,7 @@ def connected_env(
     named: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
 ) -> gym.Env[Any, Any]:
-    """The environment of a checkpoint, which its robot may move in; a robot is connected, and has not moved.
+    """The environment of a checkpoint; its robot is connected, has not moved, and may now be moved.
 
     Args:
         checkpoint: Of the policy that is going to act.
@@ -41,10 +41,6 @@ def connected_env(
         render: Show the simulation in a window.
         named: The environment that the user expects.
         env_kwargs: Arguments of the environment; they win over the checkpoint's.
-
-    Raises:
-        CheckpointMismatch: The environment is another than the checkpoint was trained in.
-        SettingsError: It cannot be made or shown, or nobody agreed that the real robot moves.
     """
     env_id, own = environment_of(checkpoint, named, elsewhere=bool(place.transport))
     env = make_env(env_id, {**own, **(env_kwargs or {})}, render_mode="human" if render else None, place=place)
@@ -116,11 +112,7 @@ def require_consent(env: Any, who: str, *, yes: bool, plan: Sequence[str] = ()) 
 
 
 def require_screen(*, remote: bool) -> None:
-    """Refuse ``--render`` where there is nothing to show, or nowhere to show it.
-
-    Raises:
-        SettingsError: The robot is elsewhere, or there is no screen.
-    """
+    """Refuse ``--render`` where there is nothing to show, or no screen to show it on."""
     if remote:
         raise SettingsError(
             "--render shows the simulation here, and there is none with --robot or --transport; leave it out"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -49,17 +48,14 @@ def _tell(line: str) -> None:
 
 
 def _consented_env(config: ServeConfig) -> Any:
-    """The environment that is asked for; if its robot is a real one, somebody agreed that clients move it.
-
-    Raises:
-        SettingsError: It cannot be made, or nobody agreed.
-        UnknownName: Nothing of that name is registered.
-    """
+    """The environment that is asked for; if its robot is a real one, somebody agreed that clients move it."""
     from bam_envs.core.registry import MAKE_OPTIONS, resolve_id
     from bam_train.cli.consent import require_consent
     from bam_train.environments import make_env, make_vector_env, require_env_kwargs
+    from bam_train.settings import parse_assignment
 
-    env_id, kwargs = resolve_id(config.env), _env_kwargs(config.set)
+    given = [parse_assignment(text, "randomize=true") for text in config.set]
+    env_id, kwargs = resolve_id(config.env), {".".join(path): value for path, value in given}
     # What says where it runs, such as robot=, may be given here.
     require_env_kwargs(env_id, {name: value for name, value in kwargs.items() if name not in MAKE_OPTIONS})
     many = config.num_envs > 1
@@ -73,20 +69,6 @@ def _consented_env(config: ServeConfig) -> Any:
         env.close()
         raise
     return env
-
-
-def _env_kwargs(assignments: Sequence[str]) -> dict[str, Any]:
-    """Keyword arguments out of ``name=value``."""
-    from bam_train.errors import SettingsError
-    from bam_train.settings import parse_assignment
-
-    kwargs = {}
-    for text in assignments:
-        path, value = parse_assignment(text, "randomize=true")
-        if len(path) > 1:
-            raise SettingsError(f"--set {text}: expected the name of an argument, found one with a dot")
-        kwargs[path[0]] = value
-    return kwargs
 
 
 main = partial(run_program, "bam-serve", "bam_train.cli.flags:ServeConfig", serve)

@@ -42,12 +42,7 @@ class MayClose:
 
 
 class PlainDisplay:
-    """One line for each evaluation and each note, and about one a second for training.
-
-    Args:
-        title: What is being trained.
-        clock: Monotonic time [s].
-    """
+    """One line for each evaluation and each note, and about one a second for training."""
 
     def __init__(self, title: str, clock: Callable[[], float] = time.monotonic) -> None:
         self._title, self._clock = title, clock
@@ -60,17 +55,15 @@ class PlainDisplay:
     def __exit__(self, *_: object) -> None:
         return
 
-    def training(
-        self, progress: Progress, statistics: Statistics, steps_per_second: float, seconds_left: float | None
-    ) -> None:
+    def training(self, progress: Progress, statistics: Statistics, speed: float, left: float | None) -> None:
         """Say how training goes, unless that was said less than a second ago."""
         if self._clock() - self._said < LINE_EVERY:
             return
         self._said = self._clock()
         success = "" if statistics.success_rate is None else f"success {percent(statistics.success_rate)}  "
-        left = "" if seconds_left is None else f"{duration(max(0.0, seconds_left))} left"
-        speed = f"{steps_per_second:,.0f} steps/s"
-        self.note(f"{_steps(progress)}  {speed}  {success}return {number(statistics.return_mean)}  {left}")
+        rest = "" if left is None else f"{duration(max(0.0, left))} left"
+        what = f"{success}return {number(statistics.return_mean)}"
+        self.note(f"{_steps(progress)}  {speed:,.0f} steps/s  {what}  {rest}")
 
     def evaluated(self, steps: int, report: EvaluationReport, best: bool) -> None:
         """Say how well the policy does."""
@@ -101,9 +94,7 @@ class LiveDisplay(PlainDisplay):
     def __exit__(self, *_: object) -> None:
         self._live.stop()
 
-    def training(
-        self, progress: Progress, statistics: Statistics, steps_per_second: float, seconds_left: float | None
-    ) -> None:
+    def training(self, progress: Progress, statistics: Statistics, speed: float, left: float | None) -> None:
         """Change the panel."""
         from rich.panel import Panel
         from rich.progress_bar import ProgressBar
@@ -111,10 +102,10 @@ class LiveDisplay(PlainDisplay):
 
         columns = {
             "steps": _steps(progress),
-            "speed": f"{steps_per_second:,.0f} steps/s",
+            "speed": f"{speed:,.0f} steps/s",
             "success": percent(statistics.success_rate),
             "return": number(statistics.return_mean),
-            "time left": duration(None if seconds_left is None else max(0.0, seconds_left)),
+            "time left": duration(None if left is None else max(0.0, left)),
         }
         figures = Table.grid(padding=(0, 3))
         figures.add_row(*columns, style="dim")

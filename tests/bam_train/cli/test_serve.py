@@ -82,7 +82,8 @@ def test_it_says_who_is_in_command_and_one_line_for_each_way_in(start):
             ["--bind", "0.0.0.0:9091"],
             "--bind: expected an address without a port, found '0.0.0.0:9091'; give --bind 0.0.0.0 --port 9091",
         ),
-        (["--set", "a.b=1"], "--set a.b=1: expected the name of an argument, found one with a dot"),
+        (["--set", "a.b=1"], "env_kwargs: unknown setting 'a.b' of bam/pick-v0. "),
+        (["--set", "nope"], "--set nope: expected name=value, such as --set randomize=true, found 'nope'"),
         (["--namespace", "a b"], "--namespace must be letters, digits and _, such as bam_001, not 'a b'."),
     ],
 )
