@@ -52,14 +52,13 @@ class FakeRobot:
         now["position"][env_ids, :6], now["position"][env_ids, 6] = initial.signals["joint_position"], GRIPPER_OPEN
         now["velocity"][env_ids], now["stamp"][env_ids] = 0.0, 0.0
         now["command"][env_ids] = now["position"][env_ids]
-        return self._place(env_ids, initial.signals.get("object_pose"))
+        return self.place_object(initial.signals.get("object_pose"), initial.seeds, env_ids)
 
-    def place_object(self, pose: Array | None, seeds: NDArray[np.int64]) -> RobotState:
-        """Put the object at x, y [m] and yaw [rad] of `pose` (n, 3), or leave it; nothing is drawn from `seeds`."""
+    def place_object(
+        self, pose: Array | None, seeds: NDArray[np.int64], env_ids: EnvIds | slice = slice(None)
+    ) -> RobotState:
+        """Put the objects at x, y [m] and yaw [rad] of `pose` (k, 3), or leave them; nothing is drawn from `seeds`."""
         self._require_link()
-        return self._place(np.arange(self.num_robots), pose)
-
-    def _place(self, env_ids: EnvIds, pose: Array | None) -> RobotState:
         if pose is not None:
             self._now["object"] = placed = self._now["object"].copy()
             placed[env_ids, :2], placed[env_ids, 2] = pose[:, :2], OBJECT_HEIGHT
@@ -91,7 +90,7 @@ class FakeRobot:
             yield self.measure()
 
     def measure(self) -> RobotState:
-        """The state now; `ResetNeeded` if it is not connected."""
+        """The state now."""
         self._require_link()
         position, place = self._now["position"], self._now["object"]
         values = [position[:, :6], self._now["velocity"], position[:, 6:], place[:, :3], place[:, 3:]]
