@@ -5,7 +5,7 @@ import io
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 from rich.console import Console
@@ -40,63 +40,59 @@ def progress_display(
         t: The time of the first step.
         description: What is written in front of the bar.
     """
-    text = f"{description} from t={t}" if t else description
+    shown: AbstractContextManager[Any] = nullcontext()
     if isinstance(progress, Progress):
-        with _task(progress, n_steps, text, redraw=_nothing) as advance:
-            yield advance
-        return
-    console = Console(stderr=True)
-    display = Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        StepsPerSecond(),
-        TimeRemainingColumn(elapsed_when_finished=True),
-        console=console,
-        auto_refresh=False,  # no thread: the loop itself redraws
-        redirect_stdout=sys.stdout.isatty(),  # what is printed goes above the bar; into a file it goes as always
-    )
-    if progress and console.is_jupyter:
-        with _task(display, n_steps, text, _notebook_line(display)) as advance:
-            yield advance
-    elif progress and console.is_terminal:
-        with display, _task(display, n_steps, text, display.refresh) as advance:
-            yield advance
+        display, redraw = progress, _nothing
     else:
-        yield _nothing
+        console = Console(stderr=True)
+        display = Progress(
+            TextColumn("{task.description}", markup=False),
+            BarColumn(),
+            MofNCompleteColumn(),
+            StepsPerSecond(),
+            TimeRemainingColumn(elapsed_when_finished=True),
+            console=console,
+            auto_refresh=False,  # no thread: the loop itself redraws
+            redirect_stdout=sys.stdout.isatty(),  # what is printed goes above the bar; into a file it goes as always
+            disable=not (console.is_terminal or console.is_jupyter),
+        )
+        if console.is_jupyter:
+            redraw = _notebook_line(display)
+        else:
+            shown, redraw = display, display.refresh
+    with shown, _task(display, n_steps, f"{description} from t={t}" if t else description, redraw) as advance:
+        yield advance
 
 
-def _nothing(*steps: int) -> None:
-    """Nobody is looking."""
+def _nothing() -> None:
+    """Draw nothing: the caller does."""
 
 
 @contextmanager
 def _task(progress: Progress, n_steps: int | None, text: str, redraw: Callable[[], None]) -> Iterator[Advance]:
     """One task of a display, updated every REDRAW_SECONDS."""
-    task = progress.add_task(text, total=n_steps)
-    clock = time.perf_counter
-    done, due = 0, clock() + REDRAW_SECONDS
+    task, done = progress.add_task(text, total=n_steps), 0
+    due = time.perf_counter() + REDRAW_SECONDS
 
     def show(total: int | None = None) -> None:
         progress.update(task, completed=done, total=total)  # a total of None leaves it as it is
         redraw()
 
-    def advance(steps: int = 1) -> None:
+    def advance(steps: int) -> None:
         nonlocal done, due
         done += steps
-        if clock() >= due:
+        if time.perf_counter() >= due:
             show()
-            due = clock() + REDRAW_SECONDS
+            due = time.perf_counter() + REDRAW_SECONDS
 
     redraw()
+    total = None
     try:
         yield advance
-    except BaseException:
+        total = done
+    finally:
         progress.stop_task(task)
-        show()
-        raise
-    progress.stop_task(task)
-    show(total=done)
+        show(total)
 
 
 def _notebook_line(display: Progress) -> Callable[[], None]:

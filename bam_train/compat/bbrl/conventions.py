@@ -18,10 +18,6 @@ from bam_train.loop.agents import SeedableAgent
 class TimeAgent(Agent):
     """An agent whose ``forward`` takes the time t."""
 
-    def forward(self, t: int, *args: Any, **kwargs: Any) -> Any:
-        """What it does at time t; to be overridden."""
-        raise NotImplementedError(f"{type(self).__name__} must override forward(self, t, **kwargs).")
-
 
 class SeedableAgentLast(SeedableAgent):
     """An agent that has the last seed it was given."""
