@@ -107,10 +107,7 @@ def test_what_is_too_large_is_refused():
 @pytest.mark.parametrize(
     ("prefix", "text"),
     [
-        (
-            b"HTTP/1.1 400",
-            "not a bam-serve TCP server: it says b'HTTP/1.1 400'; rosbridge servers have ws:// URLs",
-        ),
+        (b"HTTP/1.1 400", "not a bam-serve TCP server: it says b'HTTP/1.1 400'; rosbridge servers have ws:// URLs"),
         (b"SSH-2.0-Open", "not a bam-serve TCP server: it says b'SSH-2.0-Open'"),
         (b"bam\x02" + bytes(8), "version 2 of the protocol there, 1 here; install one bam-train on both sides"),
     ],

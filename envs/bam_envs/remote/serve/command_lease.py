@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from bam_envs.core.errors import NotInCommand
-from bam_envs.rosbridge.bus import UNKNOWN_CALLER
+from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
 
 Change = Callable[[str | None, str | None], None]
 """Called with the names, as others see them, of the client that was in command and of the one that is, or None."""
@@ -26,7 +26,7 @@ class CommandLease:
         self._clock, self._lock = clock, threading.RLock()
         self._holder: str | None = None
         self._shown: str | None = None  # what the holder is called where others read it
-        self._heard, self._silence = 0.0, UNKNOWN_CALLER.silence
+        self._heard, self._caller = 0.0, UNKNOWN_CALLER  # the connection on which it was taken
         self._running = 0
         self._listeners: list[Change] = []
 
@@ -40,30 +40,25 @@ class CommandLease:
         self._listeners.append(listener)
 
     def take(
-        self,
-        client: str,
-        *,
-        force: bool = False,
-        shown: str | None = None,
-        silence: Callable[[], float] = UNKNOWN_CALLER.silence,
+        self, client: str, caller: Caller = UNKNOWN_CALLER, *, force: bool = False, shown: str | None = None
     ) -> bool:
         """Put `client` in command; whether it was not before.
 
         Args:
             client: Its name.
+            caller: The connection on which it asks.
             force: Take it from the client that has it.
             shown: What other clients see instead of its name, where that is a secret.
-            silence: How long its connection has given no sign of life [s].
 
         Raises:
             NotInCommand: Another client has it, and gave a sign of life within `seconds`.
         """
         with self._lock:
             if self._holder not in (None, client) and not force:
-                silent = min(self._clock() - self._heard, self._silence())
+                silent = min(self._clock() - self._heard, self._caller.silence())
                 if self._running or silent <= self.seconds:
                     raise NotInCommand(self._refusal(shown or client))
-            self._heard, self._silence = self._clock(), silence
+            self._heard, self._caller = self._clock(), caller
             if self._holder == client:
                 return False
             before, self._shown = self._shown, shown or client
@@ -98,10 +93,11 @@ class CommandLease:
                 if self._holder == client:
                     self._running, self._heard = max(0, self._running - 1), self._clock()
 
-    def release(self, client: str) -> bool:
-        """Take command from `client`; whether it had it."""
+    def release(self, client: str | None = None, connection: str = "") -> bool:
+        """Take command from `client`, or from who took it on the `connection` of that name; whether it had it."""
         with self._lock:
-            if self._holder != client:
+            its_own = bool(connection) and connection == self._caller.name
+            if self._holder is None or not (its_own or client == self._holder):
                 return False
             before, self._shown = self._shown, None
             self._holder, self._running = None, 0

@@ -164,7 +164,7 @@ class EnvServer:
         """
         before = self.lease.holder
         try:
-            changed = self.lease.take(client, force=take and caller.operator, shown=shown, silence=caller.silence)
+            changed = self.lease.take(client, caller, force=take and caller.operator, shown=shown)
         except NotInCommand as error:
             raise NotInCommand(f"{error} {_NO_FORCE}") if take else error from None
         if changed and before is not None:
@@ -217,9 +217,9 @@ class EnvServer:
         """Whether `client` is in command, and its last episode came to its end."""
         return self._over == client
 
-    def leave(self, client: str) -> None:
-        """Release command, if `client` has it: the robot halts and another client may take command."""
-        if self.lease.release(client):
+    def leave(self, client: str | None = None, connection: str = "") -> None:
+        """Release command as `CommandLease.release`: the robot halts and another client may take command."""
+        if self.lease.release(client, connection):
             self._halt()
 
     def end(self) -> None:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -35,7 +33,6 @@ from bam_envs.rosbridge.sessions import Sessions
 from bam_envs.rosbridge.string_rpc import StringRpcService
 
 _log = logging.getLogger(__name__)
-_MOST_CLIENTS = 1024
 _LONGEST_NAME = 100
 """Characters of a client's name that are kept and shown to others."""
 
@@ -72,8 +69,6 @@ class GymApiService:
         self._clock = clock
         self._version = None if version is None else version_named(version)
         self._freshness = FreshnessCheck()
-        self._lock = threading.Lock()
-        self._connections: OrderedDict[str, str] = OrderedDict()
         self._leaving = ThreadPoolExecutor(1, "bam-gymapi-leaving")
         self._sessions = Sessions()
         # Everybody can read what is published: the tag in it proves nothing.
@@ -130,12 +125,6 @@ class GymApiService:
             stepped = self.env.step(client, action, deadline=deadline)
             return self._codec.write_result(stepped, self._stamp(), version)
         if request.type is RequestType.RESET:
-            if caller.name:  # it leaves when the connection ends on which it began its episode
-                with self._lock:
-                    self._connections[client] = caller.name
-                    self._connections.move_to_end(client)
-                    if len(self._connections) > _MOST_CLIENTS:
-                        self._connections.popitem(last=False)
             begun = self.env.reset(
                 client, request.seed, request.options, take=request.take, deadline=deadline, caller=caller, shown=shown
             )
@@ -151,11 +140,6 @@ class GymApiService:
 
     def _on_leave(self, caller: Caller) -> None:
         self._sessions.left(caller)
-        # A client that is back on another connection stays: the end of the old one may come late.
-        with self._lock:
-            clients = [client for client, name in self._connections.items() if name == caller.name]
-            for client in clients:
-                del self._connections[client]
-                # In another thread: it waits for a step that runs, and this is the thread of the network.
-                with suppress(RuntimeError):  # closed meanwhile
-                    self._leaving.submit(self.env.leave, client)
+        # In another thread: it waits for a step that runs, and this is the thread of the network.
+        with suppress(RuntimeError):  # closed meanwhile
+            self._leaving.submit(self.env.leave, connection=caller.name)

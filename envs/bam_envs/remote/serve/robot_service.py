@@ -149,7 +149,7 @@ class RobotService:
         if tag is not None:
             self._sessions.prove(tag, topic, content, caller).require(tag, topic)
             caller = replace(caller, session=tag.session)
-        self._lease.take(caller.client, shown=caller.shown, silence=caller.silence)
+        self._lease.take(caller.client, caller, shown=caller.shown)
         echo, complete = "" if tag is None else tag.echo, topic in self._completing
         self._slot.put(Order(values, complete, echo, caller.client))
         if complete and self.info.lockstep:
@@ -185,9 +185,8 @@ class RobotService:
         return order
 
     def _on_leave(self, caller: Caller) -> None:
-        for name in self._sessions.left(caller):
-            self._lease.release(replace(caller, session=name).client)
-        self._lease.release(caller.client)
+        self._sessions.left(caller)
+        self._lease.release(connection=caller.name)
 
     def _on_change(self, before: str | None, after: str | None) -> None:
         if before is not None:  # what it sent is not to go on under another one
@@ -205,7 +204,7 @@ class RobotService:
         seed = 0 if seeds is None else _only_one(seeds)
         if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
             raise ProtocolError(f"seeds must be one number, 0 or more, not {seeds!r}.")
-        self._lease.take(caller.client, shown=caller.shown, silence=caller.silence)
+        self._lease.take(caller.client, caller, shown=caller.shown)
         self._robot.place_object(pose, np.array([seed], dtype=np.int64))
         return {}
 

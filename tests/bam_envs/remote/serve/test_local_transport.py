@@ -53,13 +53,7 @@ def test_it_notes_calls_and_raises_faults_once():
     assert str(caught.value) == "the cable is out"
     assert transport.step(action)[4]["elapsed"] == 1
     transport.close()
-    assert transport.calls == [
-        ("connect",),
-        ("reset", 3, {"a": 1}),
-        ("step", action),
-        ("step", action),
-        ("close",),
-    ]
+    assert transport.calls == [("connect",), ("reset", 3, {"a": 1}), ("step", action), ("step", action), ("close",)]
 
 
 def test_its_environment_is_seeded_and_ends():
