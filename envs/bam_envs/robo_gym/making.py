@@ -31,41 +31,30 @@ _WINDOWS = ("gui", "gazebo_gui", "rviz_gui")
 _SIMULATED = (*_MANAGER, *_WINDOWS)
 PLACES = frozenset({*_SIMULATED, "rs_address"})
 """Options that say where an environment of robo-gym's ran, and nothing of what it is."""
-_OTHER_TARGETS = "give the target itself: ee_target_pose=[x, y, z, roll, pitch, yaw], here or to each reset"
 _OF_ENVIRONMENT = frozenset(MAKE_OPTIONS) | {"max_episode_steps"}
+_RANGES = [f"ee_rotation_{one}_range" for one in ("pos_x", "pos_y", "pos_z", "roll", "pitch", "yaw")]
 _NOT_HERE = {
     "max_velocity_scale_factor": "the arm's speed belongs to the environment, which would be another one",
     "action_rate": "the rate belongs to the environment, which would be another one",
-    "ee_rotation_matters": "bam/isaac-reach-v0 (IsaacReachURSim-v0) has targets with an orientation",
-    "ee_rotation_threshold": "bam/isaac-reach-v0 (IsaacReachURSim-v0) has targets with an orientation",
-    "ee_distance_threshold": "it has no target of the flange",
-    "ee_target_pose": "it has no target of the flange",
-    "ee_target_volume_bounding_box": _OTHER_TARGETS,
-    "ee_rotation_pos_x_range": _OTHER_TARGETS,
-    "ee_rotation_pos_y_range": _OTHER_TARGETS,
-    "ee_rotation_pos_z_range": _OTHER_TARGETS,
-    "ee_rotation_roll_range": _OTHER_TARGETS,
-    "ee_rotation_pitch_range": _OTHER_TARGETS,
-    "ee_rotation_yaw_range": _OTHER_TARGETS,
-    "randomize_start": "give reset the start itself: options={'joint_positions': [...]}",
-    "random_joint_offset": "give reset the start itself: options={'joint_positions': [...]}",
-    "continue_on_success": "give reset the start itself: options={'joint_positions': [...]}",
-    "continue_except_collision": "give reset the start itself: options={'joint_positions': [...]}",
+    **dict.fromkeys(
+        ["ee_rotation_matters", "ee_rotation_threshold"],
+        "bam/isaac-reach-v0 (IsaacReachURSim-v0) has targets with an orientation",
+    ),
+    **dict.fromkeys(["ee_distance_threshold", "ee_target_pose"], "it has no target of the flange"),
+    **dict.fromkeys(
+        ["ee_target_volume_bounding_box", *_RANGES],
+        "give the target itself: ee_target_pose=[x, y, z, roll, pitch, yaw], here or to each reset",
+    ),
+    **dict.fromkeys(
+        ["randomize_start", "random_joint_offset", "continue_on_success", "continue_except_collision"],
+        "give reset the start itself: options={'joint_positions': [...]}",
+    ),
 }
 """Options of robo-gym's modular environments that are none of ours, and what to do instead."""
 
 
 def make_env(env_id: str, **options: Any) -> gym.Env[Any, Any]:
-    """One robot and its task, with robo-gym's constructor options beside our own.
-
-    Args:
-        env_id: Key of `ROBO_GYM`.
-        options: Those of robo-gym's class of that id, and those of `bam_envs.make_env.make_env`.
-
-    Raises:
-        UnknownName: An option that neither has.
-        InvalidValue: An option that cannot be had.
-    """
+    """One robot and its task; `options` are robo-gym's for its class of that id, and our own. Raises as `translate`."""
     entry = ROBO_GYM[env_id]
     arguments = translate(entry, options)
     if arguments.get("transport") is not None:
@@ -77,10 +66,7 @@ def make_env(env_id: str, **options: Any) -> gym.Env[Any, Any]:
 
 
 def make_vector_env(env_id: str, num_envs: int = 1, **options: Any) -> RobotVectorEnv | RemoteVectorEnv:
-    """Simulated robots and their task, stepped together; of ``rs_state`` in the infos only where it is asked for.
-
-    robo-gym has no such thing. Raises what `make_env` does.
-    """
+    """Simulated robots and their task, stepped together; of ``rs_state`` in the infos only where it is asked for."""
     entry = ROBO_GYM[env_id]
     if entry.is_live and options.get("transport") is None:
         raise InvalidValue(
@@ -97,7 +83,7 @@ def make_vector_env(env_id: str, num_envs: int = 1, **options: Any) -> RobotVect
 
 
 class RoboGymEnv(RobotEnv):
-    """One robot and one task under one of robo-gym's ids, with the methods that robo-gym's environments add.
+    """A `RobotEnv` under one of robo-gym's ids, with the methods that robo-gym's environments add.
 
     Args:
         robot: A robot with ``num_robots == 1``.
@@ -111,10 +97,7 @@ class RoboGymEnv(RobotEnv):
         self.is_live = is_live
 
     def get_rs_state(self) -> dict[str, float] | list[float] | None:
-        """The newest state as robo-gym's robot servers send it: of an arm by key, of a base as a list of 1030 numbers.
-
-        None before the first `reset`.
-        """
+        """The newest wire state: of an arm by key, of a base a list of 1030 numbers; None before the first `reset`."""
         task: Any = self.task
         return None if self.last_state is None else task.rs_state(self.last_state)[0]
 
@@ -131,11 +114,7 @@ class RoboGymEnv(RobotEnv):
         self.close()
 
     def restart_sim(self) -> None:
-        """End the simulation and begin it anew; `reset` comes next.
-
-        Raises:
-            InvalidValue: The robot is live.
-        """
+        """`kill_sim`, and begin the simulation anew; `reset` comes next."""
         self.kill_sim()
         self.robot.connect()
 
@@ -159,29 +138,16 @@ def translate(entry: RoboGymId, given: Mapping[str, Any]) -> dict[str, Any]:
             raise UnknownName(f"argument of {entry.id}", name, known, meant=in_our_words(name))
     require_values(entry, given)
     options = {name: value for name, value in given.items() if name not in PLACES}
-    robot, address, transport = (given.get(name) for name in ("robot", "rs_address", "transport"))
-    if address is not None and not entry.is_live:
-        raise InvalidValue(f"rs_address={address!r} names a live robot; it belongs to {entry.twin}.")
-    if entry.is_live and transport is None:
-        if robot is not None and address is not None:
-            raise InvalidValue(f"rs_address={address!r} and robot={robot!r} name the same thing; leave one out.")
-        if robot is None and address is None:
-            raise InvalidValue(
-                f"{entry.id} is a live robot, and it has no address: give robot='ws://IP:PORT' of the rosbridge in "
-                f"front of it (rs_address='IP:PORT' is the same), or use {entry.twin} for the simulated one."
-            )
-        options["robot"] = robot = _rosbridge_address(address) if robot is None else robot
-    without_effect: tuple[str, ...] = _SIMULATED
+    robot, transport = _robot(entry, given), given.get("transport")
     if robot is not None:
+        options["robot"] = robot
         why = f"The robot of this {entry.id} is a live one: it has no window here, and no Server Manager."
     else:
-        without_effect = (*_MANAGER, "rviz_gui")
         why = (
             "The robot is simulated in this process; there is no Server Manager and no Gazebo, and nothing to be "
             "started first."
         )
-        if transport is None:
-            options |= _window(given)
+    without_effect = (*_MANAGER, "rviz_gui") if robot is None else _SIMULATED
     said = ", ".join(f"{name}={given[name]!r}" for name in without_effect if given.get(name))
     if said:
         say_once(f"{said}: accepted, and without effect. {why}")
@@ -193,37 +159,26 @@ def translate(entry: RoboGymId, given: Mapping[str, Any]) -> dict[str, Any]:
             "trajectory='.../robo_gym/envs/ur/robot_trajectories/trajectory_raad_2022.json' of an installed robo-gym "
             "is that one."
         )
-    return {**entry.defaults, **options}
+    return {**entry.defaults, **options, **(_window(given) if robot is None else {})}
 
 
-def constructor_options(entry: RoboGymId) -> tuple[frozenset[str], frozenset[str]]:
-    """What robo-gym's constructors take and ours do not: what is taken here too, and what is refused with a reason.
-
-    Its other options are those of our tasks.
-    """
-    taken = frozenset({*_SIMULATED, "rs_address"} if entry.is_live else _SIMULATED)
-    return taken, frozenset({"rs_address", *_NOT_HERE}) - taken - _task_options(entry).keys()
-
-
-def require_values(entry: RoboGymId, given: Mapping[str, Any]) -> None:
-    """Refuse options of the wrong kind.
-
-    Raises:
-        InvalidValue: A flag is neither True nor False, or a number is none.
-    """
-    said = {name: value for name, value in given.items() if value is not None or name not in _WINDOWS}
-    require_kinds(entry.id, _task_options(entry) | dict.fromkeys(("randomize", *_WINDOWS), False), said)
-
-
-def _task_options(entry: RoboGymId) -> dict[str, Any]:
-    return ENVIRONMENTS[entry.env_id].options()
-
-
-def _rosbridge_address(address: Any) -> str:
-    """``"IP:PORT"`` as the address of a rosbridge server."""
+def _robot(entry: RoboGymId, given: Mapping[str, Any]) -> Any:
+    """The address of the live robot, if there is one."""
+    robot, address = given.get("robot"), given.get("rs_address")
+    if address is not None and not entry.is_live:
+        raise InvalidValue(f"rs_address={address!r} names a live robot; it belongs to {entry.twin}.")
+    if not entry.is_live or given.get("transport") is not None:
+        return robot
+    if robot is not None and address is not None:
+        raise InvalidValue(f"rs_address={address!r} and robot={robot!r} name the same thing; leave one out.")
+    if robot is None and address is None:
+        raise InvalidValue(
+            f"{entry.id} is a live robot, and it has no address: give robot='ws://IP:PORT' of the rosbridge in "
+            f"front of it (rs_address='IP:PORT' is the same), or use {entry.twin} for the simulated one."
+        )
     text = str(address)
-    if text.startswith(("ws://", "wss://")):
-        return text
+    if robot is not None or text.startswith(("ws://", "wss://")):
+        return text if robot is None else robot
     host, _, port = text.rpartition(":")
     if not host or set(host) & set(" /") or not port.isdecimal() or not 0 < int(port) < 65536:
         raise InvalidValue(f"rs_address must be 'IP:PORT', such as '10.0.0.5:9090', not {address!r}.")
@@ -232,6 +187,22 @@ def _rosbridge_address(address: Any) -> str:
         "it was given another), and not through a robot server of robo-gym's."
     )
     return f"ws://{text}"
+
+
+def constructor_options(entry: RoboGymId) -> tuple[frozenset[str], frozenset[str]]:
+    """What robo-gym's constructors take and our tasks do not: what is taken here, and what is refused with a reason."""
+    taken = frozenset({*_SIMULATED, "rs_address"} if entry.is_live else _SIMULATED)
+    return taken, frozenset({"rs_address", *_NOT_HERE}) - taken - _task_options(entry).keys()
+
+
+def require_values(entry: RoboGymId, given: Mapping[str, Any]) -> None:
+    """`require_kinds` for robo-gym's options; windows may be None."""
+    said = {name: value for name, value in given.items() if value is not None or name not in _WINDOWS}
+    require_kinds(entry.id, _task_options(entry) | dict.fromkeys(("randomize", *_WINDOWS), False), said)
+
+
+def _task_options(entry: RoboGymId) -> dict[str, Any]:
+    return ENVIRONMENTS[entry.env_id].options()
 
 
 def _window(given: Mapping[str, Any]) -> dict[str, Any]:

@@ -203,7 +203,7 @@ class UrTrackParity(UrObstacleParity, UrTrackTask):
     def sample_initial(
         self, env_ids: EnvIds, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] | None = None
     ) -> Initial:
-        """The first waypoint, and an obstacle on a path or staying."""
+        """The first waypoint, whatever `options` say of the joints."""
         initial = super().sample_initial(env_ids, rngs, options)
         return Initial({**initial.signals, "joint_position": self.reference[env_ids]}, initial.seeds)
 
@@ -239,7 +239,7 @@ class DriveParity(DriveTask):
         self._previous[env_ids] = np.nan
 
     def _columns(self, state: RobotState) -> list[Array]:
-        return [*self.distance_and_bearing(state), *state.signals["base_velocity"].T]
+        return [self.distance(state), self.bearing(state), *state.signals["base_velocity"].T]
 
     def _bounded(self, observation: Floats) -> Floats:
         return require_inside(observation, self.observation_space, self.observation_labels)

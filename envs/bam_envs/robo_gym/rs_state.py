@@ -1,12 +1,9 @@
 """Wire states of robo-gym's robot servers, read: one state of theirs to a `RobotState` of one robot.
 
-The other way is the task's: ``task.rs_state(state)`` gives one wire state for each environment. What a task
-knows and a robot does not (a target) is in the wire state too; `read_mir_target` and `read_object` give it.
+The other way is ``task.rs_state(state)``. `read_mir_target` and `read_object` give a target, which no robot measures.
 """
 
-import math
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,17 +16,13 @@ from bam_envs.tasks.ur_arm import POSITIONS, VELOCITIES, frame_keys
 Array = NDArray[np.float64]
 
 _OBJECT, _FLANGE, _FOREARM = frame_keys("object_0"), frame_keys("ee"), frame_keys("forearm")
-_ONLY_ROBOT = (*POSITIONS, *VELOCITIES, *_FLANGE, "in_collision")
-UR_KEYS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "only_robot": _ONLY_ROBOT,
-        "1object": (*_OBJECT, *_ONLY_ROBOT),
-        "1moving2points": (*_OBJECT, *POSITIONS, *VELOCITIES, *_FLANGE, *_FOREARM, "in_collision"),
-    }
-)
+UR_KEYS = {
+    "only_robot": (*POSITIONS, *VELOCITIES, *_FLANGE, "in_collision"),
+    "1object": (*_OBJECT, *POSITIONS, *VELOCITIES, *_FLANGE, "in_collision"),
+    "1moving2points": (*_OBJECT, *POSITIONS, *VELOCITIES, *_FLANGE, *_FOREARM, "in_collision"),
+}
 """The keys of an arm's wire state by robo-gym's ``rs_mode``: 20, 27 and 34 of them."""
-
-_TARGET, _POSE, _TWIST = slice(0, 3), slice(3, 6), slice(6, 8)
+_POSE, _TWIST = slice(3, 6), slice(6, 8)
 _FRONT = slice(8, 8 + FRONT_RAYS)
 _BACK = slice(_FRONT.stop, _FRONT.stop + BACK_RAYS)
 _COLLISION = _BACK.stop
@@ -55,7 +48,7 @@ def read_mir(wire: Sequence[float]) -> RobotState:
 
 def read_mir_target(wire: Sequence[float]) -> Array:
     """The target's x, y [m] and yaw [rad] of a base's wire state. Shape: (3,)."""
-    return np.nan_to_num(_numbers(wire)[_TARGET])
+    return np.nan_to_num(_numbers(wire)[:3])
 
 
 def _numbers(wire: Sequence[float]) -> Array:
@@ -86,10 +79,9 @@ def read_ur(wire: Mapping[str, float]) -> RobotState:
         "1moving2points" if wire.keys() & set(_FOREARM) else "1object" if wire.keys() & set(_OBJECT) else "only_robot"
     )
     keys = UR_KEYS[mode]
-    for key in (*keys, *sorted(wire)):
-        if key not in wire or key not in keys:
-            what = f"lacks {key!r}" if key in keys else f"has {key!r}, which robo-gym's has not"
-            raise InvalidValue(f"The wire state of a UR ({mode}: {len(keys)} keys) {what}; it has {len(wire)} keys.")
+    for key in sorted(wire.keys() ^ set(keys)):
+        what = f"lacks {key!r}" if key in keys else f"has {key!r}, which robo-gym's has not"
+        raise InvalidValue(f"The wire state of a UR ({mode}: {len(keys)} keys) {what}; it has {len(wire)} keys.")
     signals = {"joint_position": _take(wire, POSITIONS), "joint_velocity": _take(wire, VELOCITIES)}
     if mode != "only_robot":
         signals["object_position"], signals["object_quaternion"] = read_object(wire)
@@ -105,7 +97,7 @@ def read_object(wire: Mapping[str, float]) -> tuple[Array, Array]:
 def _take(wire: Mapping[str, float], keys: Sequence[str]) -> Array:
     values = np.array([wire[key] for key in keys], dtype=np.float64)  # None is NaN
     for key, value in zip(keys, values, strict=True):
-        if not math.isfinite(value):
+        if not np.isfinite(value):
             raise InvalidValue(f"{key} of the wire state of a UR must be finite, not {wire[key]}.")
     return values
 

@@ -11,6 +11,7 @@ from bam_envs.core.kinematics import angle_between, from_angles, quaternions
 from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.task import Array, Flags, Floats, Label, Score
 from bam_envs.core.validation import Positive, check
+from bam_envs.robots.ur import JOINTS
 from bam_envs.tasks.ur_arm import AboveZero, UrTask, collisions, frame_keys, joint_labels, joint_option, wire_states
 
 DEFAULT = (0.0, -1.712, 1.712, 0.0, 0.0, 0.0)
@@ -59,7 +60,6 @@ class IsaacReachTask(UrTask):
         or "max_steps_exceeded".
 
     Args:
-        num_envs: How many environments are scored together.
         ur_model: ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e; the smallest do not reach every target.
         isaac_scale: With ``parity``, the joint angle of an action of 1 [rad].
         continue_except_collision: Whether episodes begin where the last one ended.
@@ -119,10 +119,7 @@ class IsaacReachTask(UrTask):
         box = "in the targets' box"
         return (
             *joint_labels("", "joint position from the default pose", "rad", "/ pi", 2.0),
-            *(
-                Label(f"{one.name}_speed", "joint velocity", "rad/s", "/ 0.2 of the fastest")
-                for one in self.action_labels
-            ),
+            *(Label(f"{joint}_speed", "joint velocity", "rad/s", "/ 0.2 of the fastest") for joint in JOINTS),
             *(Label(f"target_{axis}", f"target, {axis}", "m", box, -5.0, 5.0) for axis in "xyz"),
             *self._pose_and_action_labels(),
         )
@@ -144,8 +141,7 @@ class IsaacReachTask(UrTask):
         draws = np.stack([rng.random(4) for rng in rngs])
         self.target[env_ids] = TARGETS[0] + draws[:, :3] * (TARGETS[1] - TARGETS[0])
         yaw = (2 * draws[:, 3] - 1) * self.yaw
-        angles = np.stack([np.zeros(len(env_ids)), np.full(len(env_ids), PITCH), yaw], axis=1)
-        self.quaternion[env_ids] = from_angles(angles)
+        self.quaternion[env_ids] = from_angles(np.stack([0.0 * yaw, 0.0 * yaw + PITCH, yaw], axis=1))
         given = _target(options.get("ee_target_pose"))
         pose = self._default_target if given is None else given
         if pose is not None:
@@ -166,7 +162,7 @@ class IsaacReachTask(UrTask):
         middle = TARGETS.mean(axis=0)
         return [
             joints / SPAN,
-            speeds / (self.velocity_scale * self.model.max_velocity),
+            speeds / self.speed,
             (self.target - middle) / (TARGETS[1] - middle),
             self.quaternion[:, [3, 0, 1, 2]],
             self._last_action,
@@ -191,16 +187,9 @@ class IsaacReachTask(UrTask):
         goes_on = ((success | late) & ~collision)[:, None] & self.continue_except_collision
         self._ended = np.where(goes_on, state.signals["joint_position"], np.nan)
         terminated, status = self.ends(collision, success, late)
-        info = self.info(
-            state,
-            final_status=status,
-            distance=distance,
-            dist_coord=distance.copy(),
-            dist_rot=angle,
-            target_coord=self.target.copy(),
-            target_rot=self.quaternion.copy(),
-        )
-        return Score(reward, terminated, success, info)
+        told = {"final_status": status, "distance": distance, "dist_coord": distance.copy(), "dist_rot": angle}
+        told |= {"target_coord": self.target.copy(), "target_rot": self.quaternion.copy()}
+        return Score(reward, terminated, success, self.info(state, **told))
 
     def _tool(self, state: RobotState, frame: Array) -> tuple[Array, Array]:
         """Pose of a `frame` at the flange. Shapes: (n, 3), (n, 3, 3)."""

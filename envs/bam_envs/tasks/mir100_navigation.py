@@ -42,7 +42,6 @@ class DriveTask(Memory):
     """Drive to within `ARRIVED` of a target; the heading there does not matter.
 
     Args:
-        num_envs: How many environments are scored together.
         rs_state_to_info: ``info["rs_state"]`` is the state as robo-gym's robot server would send it.
     """
 
@@ -70,7 +69,7 @@ class DriveTask(Memory):
         self._draws, self._asked = np.zeros((num_envs, self.draws)), np.full((num_envs, 2, 3), np.nan)
 
     def labels(self) -> tuple[Label, ...]:
-        """Hook: what each number of an observation means."""
+        """What each number of an observation means."""
         return (
             Label("target_distance", "target from the base", "m", f"/ {DISTANCE_SCALE:g}", 0.0, 6.0),
             Label("target_bearing", "where the target is, seen from the base", "rad", "/ pi"),
@@ -89,13 +88,9 @@ class DriveTask(Memory):
     def scene(
         self, env_ids: EnvIds, draws: Array, start: Array, rngs: Sequence[np.random.Generator]
     ) -> dict[str, Array]:
-        """Hook: start values of other signals than the pose.
+        """Hook: start values of other signals than the pose, of the environments that begin.
 
-        Args:
-            env_ids: Environments that begin. Shape: (k,).
-            draws: Their numbers from [0, 1). Shape: (k, draws).
-            start: Poses that were asked for, NaN where none was; what is there may be drawn anew. Shape: (k, 3).
-            rngs: Their generators.
+        `draws` may be drawn anew where something is at a pose of `start` (k, 3) that was asked for; NaN where none was.
         """
         return {}
 
@@ -130,7 +125,7 @@ class DriveTask(Memory):
         """
         pose = state.signals["base_pose"][env_ids]
         off = self._asked[env_ids, 0] - pose
-        off[:, 2] = np.mod(off[:, 2] + math.pi, 2 * math.pi) - math.pi
+        off[:, 2] = half_turn(off[:, 2])
         wrong = np.flatnonzero((np.abs(off) > START_TOLERANCE).any(axis=1))
         if len(wrong):
             there, here = self._asked[env_ids[wrong[0]], 0].tolist(), np.round(pose[wrong[0]], 3).tolist()
@@ -150,26 +145,23 @@ class DriveTask(Memory):
         distance: Array = np.sqrt(dx * dx + dy * dy)
         return distance
 
-    def distance_and_bearing(self, state: RobotState) -> tuple[Array, Array]:
-        """Distance [m] and bearing from -pi to pi [rad] of the target, seen from the base. Shape: (n,) each."""
+    def bearing(self, state: RobotState) -> Array:
+        """Bearing of the target, seen from the base, from -pi to pi [rad]. Shape: (n,)."""
         pose = state.signals["base_pose"]
-        bearing = np.arctan2(self.target[:, 1] - pose[:, 1], self.target[:, 0] - pose[:, 0]) - pose[:, 2]
-        return self.distance(state), np.mod(bearing + math.pi, 2 * math.pi) - math.pi
+        return half_turn(np.arctan2(self.target[:, 1] - pose[:, 1], self.target[:, 0] - pose[:, 0]) - pose[:, 2])
 
     def _columns(self, state: RobotState) -> list[Array]:
         """The first four numbers of an observation. Shape: (n,) each."""
-        (distance, bearing), (v, w) = self.distance_and_bearing(state), state.signals["base_velocity"].T
-        return [distance / DISTANCE_SCALE, bearing / math.pi, v / FASTEST[0], w / FASTEST[1]]
+        v, w = state.signals["base_velocity"].T
+        return [self.distance(state) / DISTANCE_SCALE, self.bearing(state) / math.pi, v / FASTEST[0], w / FASTEST[1]]
 
     def observe(self, state: RobotState) -> Floats:
         """See `observation_labels`. Shape: (n, k) float32."""
-        observation = np.stack(self._columns(state), axis=1).astype(np.float32)
-        observation = np.concatenate([observation, *self.seen(state)], axis=1)
-        return self._bounded(observation)
+        driving = np.stack(self._columns(state), axis=1).astype(np.float32)
+        return self._bounded(np.concatenate([driving, *self.seen(state)], axis=1))
 
     def _bounded(self, observation: Floats) -> Floats:
-        clipped: Floats = np.clip(observation, self.observation_space.low, self.observation_space.high)
-        return clipped
+        return np.clip(observation, self.observation_space.low, self.observation_space.high)
 
     def command(self, action: Floats, state: RobotState) -> Array:
         """Speeds forward [m/s] and of turning [rad/s]. Shape: (n, 2)."""
@@ -199,13 +191,8 @@ class DriveTask(Memory):
         return Score(reward, terminated, success, info)
 
     def rs_state(self, state: RobotState) -> list[list[float]]:
-        """The states as robo-gym's robot server sends them: 1030 numbers each.
-
-        Target and base (x, y [m], yaw [rad]), speeds [m/s, rad/s], 501 ranges of the front and 511 of the back scanner
-        [m], 1 for a collision, three obstacles (x, y [m], yaw [rad]; zeros where they are not known).
-        """
-        n = self.num_envs
-        obstacles = self._wire_obstacles(state)
+        """The states as robo-gym's robot server sends them, 1030 numbers each: what `bam_envs.robo_gym.rs_state` reads."""
+        n, obstacles = self.num_envs, self._wire_obstacles(state)
         columns = [
             self.target,
             state.signals["base_pose"],
@@ -276,14 +263,15 @@ def spread(draws: Array, low: float, high: float) -> Array:
     return low + draws * (high - low)
 
 
-def floor_pose(name: str, value: Any) -> Array:
-    """The reset option `name` as a pose, x, y [m] and yaw from -pi to pi [rad]. Shape: (3,).
+def half_turn(angles: Array) -> Array:
+    """The same angles, from -pi to pi [rad]."""
+    return np.mod(angles + math.pi, 2 * math.pi) - math.pi
 
-    Raises:
-        InvalidValue: It is no pose, or not on the floor.
-    """
+
+def floor_pose(name: str, value: Any) -> Array:
+    """The reset option `name` as a pose on the floor, x, y [m] and yaw from -pi to pi [rad]. Shape: (3,)."""
     pose = finite_numbers(value, 3, f"{name} (x, y [m], yaw [rad])")
     if np.abs(pose[:2]).max() > BOUNDARY:
         raise InvalidValue(f"{name} must be within {BOUNDARY:g} m of the origin along x and y, not {pose.tolist()}.")
-    pose[2] = np.mod(pose[2] + math.pi, 2 * math.pi) - math.pi
+    pose[2:] = half_turn(pose[2:])
     return pose

@@ -38,7 +38,6 @@ class UrTask(Memory):
     """A task of UR arms: it has the arm's options, steps it counts, and infos.
 
     Args:
-        num_envs: How many environments are scored together.
         ur_model: ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e.
         fix_base: Take the joint out of the action: it stays where the task wants it. So do the next five.
         fix_shoulder: See above.
@@ -89,6 +88,7 @@ class UrTask(Memory):
         self.observation_space: spaces.Box = labelled_box(self.observation_labels)
         self.elapsed = np.zeros(num_envs, dtype=np.int64)
         """Steps since each episode began. Shape: (n,)."""
+        self._held = np.zeros((num_envs, 6))  # normalised start, where fixed joints stay
 
     def _action_labels(self) -> tuple[Label, ...]:
         return tuple(Label(JOINTS[joint], *self.action_meaning) for joint in self.free)
@@ -105,13 +105,9 @@ class UrTask(Memory):
         observation = np.concatenate(self._columns(state), axis=1).astype(np.float32)
         return np.clip(observation, self.observation_space.low, self.observation_space.high)
 
-    def full_action(self, action: Floats, held: Array | float = 0.0) -> Array:
-        """The action of all joints, cut to [-1, 1]: `action` of the free ones (n, a), `held` of the fixed ones.
-
-        Shape: (n, 6).
-        """
-        full = np.empty((self.num_envs, 6))
-        full[:] = held
+    def full_action(self, action: Floats, held: Array) -> Array:
+        """Of all joints, cut to [-1, 1]: `action` of the free ones, `held` of the fixed ones. Shape: (n, 6)."""
+        full: Array = held.copy()
         full[:, self.free] = np.clip(action, -1.0, 1.0)
         return full
 
@@ -120,19 +116,25 @@ class UrTask(Memory):
         measured, sent = state.signals["joint_position"], state.command
         joints = np.where(np.abs(sent - measured).max(axis=1, keepdims=True) <= LEASH, sent, measured)
         way = target - joints
-        speed = self.velocity_scale * self.model.max_velocity
-        duration = np.maximum((np.abs(way) / speed).max(axis=1), SHORTEST)
+        duration = np.maximum((np.abs(way) / self.speed).max(axis=1), SHORTEST)
         step = way * ((1.0 / self.rate) / duration)[:, None]
         command: Array = np.clip(joints + step, *self.model.joint_limits)
         return command
+
+    @property
+    def speed(self) -> Array:
+        """How fast the joints go [rad/s]. Shape: (6,)."""
+        speed: Array = self.velocity_scale * self.model.max_velocity
+        return speed
 
     def initial(self, joints: Array, rngs: Sequence[np.random.Generator], **signals: Array) -> Initial:
         """Start at `joints` (k, 6) [rad]; each generator draws the seed of its robot now."""
         return Initial({"joint_position": joints, **signals}, draw_seeds(rngs))
 
     def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
-        """The steps are counted anew."""
+        """The steps are counted anew; fixed joints stay where they are measured."""
         self.elapsed[env_ids] = 0
+        self._held[env_ids] = normalised(self.model, state.signals["joint_position"][env_ids])
 
     def ends(self, collision: Flags, success: Flags, late: Flags) -> tuple[Flags, Any]:
         """Which episodes are over, and what `final_status` says: here, success and collision end one. Shapes: (n,)."""
@@ -187,11 +189,7 @@ def joint_labels(prefix: str, meaning: str, unit: str, scale: str, bound: float 
 
 
 def joint_option(options: Mapping[str, Any], default: Sequence[float], model: UrModel) -> Array:
-    """Joint positions [rad] that the reset option ``joint_positions`` gives, else `default`. Shape: (6,).
-
-    Raises:
-        InvalidValue: They are not six finite numbers inside the joint limits.
-    """
+    """Joint positions [rad] inside their limits: those of the option ``joint_positions``, or `default`. Shape: (6,)."""
     given = options.get("joint_positions")
     joints = finite_numbers(default if given is None else given, 6, "The reset option joint_positions")
     for label, value, least, most in zip(JOINTS, joints, *model.joint_limits, strict=True):
@@ -204,10 +202,8 @@ def joint_option(options: Mapping[str, Any], default: Sequence[float], model: Ur
 
 def frame_keys(frame: str) -> tuple[str, ...]:
     """Seven keys of a frame's pose: translation x, y, z, rotation x, y, z, w."""
-    return (
-        *(f"{frame}_to_ref_translation_{axis}" for axis in "xyz"),
-        *(f"{frame}_to_ref_rotation_{axis}" for axis in "xyzw"),
-    )
+    axes = (*(f"translation_{axis}" for axis in "xyz"), *(f"rotation_{axis}" for axis in "xyzw"))
+    return tuple(f"{frame}_to_ref_{axis}" for axis in axes)
 
 
 def wire_states(
@@ -215,11 +211,7 @@ def wire_states(
 ) -> list[dict[str, float]]:
     """The states under robo-gym's names, a dict for each: 20 keys, 7 more with an object, 7 more with the forearm.
 
-    Args:
-        model: Which arm.
-        state: What was measured.
-        object_position: Where the target or obstacle is [m]; its orientation is that of ``base_link``. Shape: (n, 3).
-        with_forearm: Whether the pose of ``forearm_link`` is in it.
+    `object_position` (n, 3) is where the target or obstacle is [m]; its orientation is that of ``base_link``.
     """
     joints = state.signals["joint_position"]
     keys, columns = [*POSITIONS, *VELOCITIES], [joints, state.signals["joint_velocity"]]

@@ -144,14 +144,14 @@ class UrObstacleTask(UrTask):
 
     def command(self, action: Floats, state: RobotState) -> Array:
         """One period on the way to the reference plus `action` [rad]; fixed joints keep to it. Shape: (n, 6)."""
-        return self.toward(self.reference + self.full_action(action), state)
+        return self.toward(self.reference + self.full_action(action, np.zeros((self.num_envs, 6))), state)
 
     def effort(self, action: Floats, weight: float, rapid: float) -> Array:
         """Worth of acting little, and the price of each joint whose action jumps by more than `rapid`. Shape: (n,).
 
         It also notes the action as the last one.
         """
-        full = self.full_action(action)
+        full = self.full_action(action, np.zeros((self.num_envs, 6)))
         jumps = (np.abs(full - self._last_action) > rapid).sum(axis=1)
         self._last_action = full
         effort: Array = (weight * (1 - np.einsum("ij,ij->i", full, full) / 6) - 0.2 * jumps) / 1000
@@ -170,10 +170,8 @@ class UrObstacleTask(UrTask):
         if collision_reward is not None:
             reward = np.where(collision, collision_reward, reward)
         sense = self.sense(state)
-        info = self.info(
-            state, final_status=status, target_coord=sense.obstacle.copy(), distance=sense.nearest.copy(), **told
-        )
-        return Score(reward, terminated, success, info)
+        told |= {"final_status": status, "target_coord": sense.obstacle.copy(), "distance": sense.nearest.copy()}
+        return Score(reward, terminated, success, self.info(state, **told))
 
     def rs_state(self, state: RobotState) -> list[dict[str, float]]:
         """robo-gym's wire state of each environment: 34 named numbers."""

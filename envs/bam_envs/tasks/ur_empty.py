@@ -37,10 +37,6 @@ class UrEmptyTask(UrTask):
     rate, velocity_scale, max_steps = 20.0, 0.2, 300
     memory: Mapping[str, str] = {"elapsed": "elapsed", "held": "_held"}
 
-    def __init__(self, num_envs: int = 1, **options: Any) -> None:
-        super().__init__(num_envs, **options)
-        self._held = np.zeros((num_envs, 6))  # normalised start, where fixed joints stay
-
     def _observation_labels(self) -> tuple[Label, ...]:
         speed = f"/ {self.velocity_scale:g} of its fastest"
         return (
@@ -55,14 +51,8 @@ class UrEmptyTask(UrTask):
         joints = joint_option(options or {}, START, self.model)
         return self.initial(np.tile(joints, (len(env_ids), 1)), rngs)
 
-    def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
-        """Fixed joints stay where they are measured."""
-        super().on_reset(env_ids, state)
-        self._held[env_ids] = normalised(self.model, state.signals["joint_position"][env_ids])
-
     def _columns(self, state: RobotState) -> list[Array]:
-        speed = self.velocity_scale * self.model.max_velocity
-        return [normalised(self.model, state.signals["joint_position"]), state.signals["joint_velocity"] / speed]
+        return [normalised(self.model, state.signals["joint_position"]), state.signals["joint_velocity"] / self.speed]
 
     def command(self, action: Floats, state: RobotState) -> Array:
         """Joint positions [rad] on the way to the action's. Shape: (n, 6)."""

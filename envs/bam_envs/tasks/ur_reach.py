@@ -63,7 +63,6 @@ class UrReachTask(UrTask):
         `target_coord` [m], `distance` [m], at the end `final_status`: "success", "collision" or "max_steps_exceeded".
 
     Args:
-        num_envs: How many environments are scored together.
         restrict_wrist_1: The action of wrist 1 means -3.48 to 0.31 rad.
         ee_distance_threshold: Distance that counts as success [m].
         ee_target_pose: What the reset option of that name is where a reset does not give it. So are the next two.
@@ -82,12 +81,7 @@ class UrReachTask(UrTask):
     must_be_in_reach = True
     """Whether a target that the arm cannot reach is refused."""
     memory: Mapping[str, str] = {
-        "target": "target",
-        "elapsed": "elapsed",
-        "_held": "_held",
-        "_actions": "_actions",
-        "_continues": "_continues",
-        "_last_end": "_last_end",
+        name: name for name in ("target", "elapsed", "_held", "_actions", "_continues", "_last_end")
     }
 
     def __init__(
@@ -108,13 +102,9 @@ class UrReachTask(UrTask):
         self._restrict = restrict_wrist_1 and _WRIST_1 in self.free
         self.target = np.zeros((num_envs, 3))
         """Where the flange is to be [m]. Shape: (n, 3)."""
-        self._held = np.zeros((num_envs, 6))  # normalised start, where fixed joints stay
         self._actions = np.zeros((2, num_envs, 6))  # the last one and the one before, of all joints
-        self._defaults = {
-            "ee_target_pose": ee_target_pose,
-            "randomize_start": randomize_start,
-            "continue_on_success": continue_on_success,
-        }
+        self._defaults = {"ee_target_pose": ee_target_pose, "randomize_start": randomize_start}
+        self._defaults["continue_on_success"] = continue_on_success
         self._given_target(self._defaults)
         self._continues = np.zeros(num_envs, dtype=bool)  # whether the last episode was a success, which ended ...
         self._last_end = np.tile(START, (num_envs, 1))  # ... here
@@ -139,9 +129,8 @@ class UrReachTask(UrTask):
     ) -> Initial:
         """The start pose, or what the options say; a target in the workspace."""
         options = self._defaults | {name: value for name, value in (options or {}).items() if value is not None}
-        randomize, goes_on = (
-            check(options[name], bool, f"reset option {name}") for name in ("randomize_start", "continue_on_success")
-        )
+        randomize = check(options["randomize_start"], bool, "reset option randomize_start")
+        goes_on = check(options["continue_on_success"], bool, "reset option continue_on_success")
         joints = np.tile(joint_option(options, self.start, self.model), (len(env_ids), 1))
         target = self._given_target(options)
         for k, (env, rng) in enumerate(zip(env_ids, rngs, strict=True)):
@@ -169,19 +158,18 @@ class UrReachTask(UrTask):
         return target
 
     def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
-        """Fixed joints stay where they are measured."""
+        """No action has been yet."""
         super().on_reset(env_ids, state)
-        self._held[env_ids] = normalised(self.model, state.signals["joint_position"][env_ids])
         self._actions[:, env_ids] = 0.0
 
     def _columns(self, state: RobotState) -> list[Array]:
         joints, velocity = state.signals["joint_position"], state.signals["joint_velocity"]
         place, axes = self.model.geometry.flange_pose(joints)
-        radius, speed = self.model.workspace_radius, self.velocity_scale * self.model.max_velocity
+        radius = self.model.workspace_radius
         return [
             in_frame(self.target, place, axes) / radius,
             normalised(self.model, joints),
-            velocity / speed,
+            velocity / self.speed,
             self.target / radius,
             place / radius,
             self._actions[0][:, self._seen_actions()],
