@@ -191,7 +191,7 @@ class DriveTask(Memory):
         return Score(reward, terminated, success, info)
 
     def rs_state(self, state: RobotState) -> list[list[float]]:
-        """The states as robo-gym's robot server sends them, 1030 numbers each: what `bam_envs.robo_gym.rs_state` reads."""
+        """The states as robo-gym's robot server sends them, 1030 numbers each; see `bam_envs.robo_gym.rs_state`."""
         n, obstacles = self.num_envs, self._wire_obstacles(state)
         columns = [
             self.target,

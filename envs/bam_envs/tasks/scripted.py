@@ -22,19 +22,12 @@ DAMPING = 0.05
 """Keeps the joints slow where the arm is nearly stretched [m/rad]."""
 PUT_DOWN = 0.004
 """An object lower than this is let go of [m]."""
-
-
 Take = Callable[..., Array]
 """Gives the numbers of the observations with these names, side by side. Shape: (n, names)."""
 
 
 class ScriptedPolicy:
-    """The part of a frozen policy that evaluation uses.
-
-    Args:
-        labels: Of the numbers of an observation.
-        act: Makes the actions, shape (n, a), of the observations' numbers by name.
-    """
+    """The part of a frozen policy that evaluation uses: `act` makes the actions (n, a) of an observation's `labels`."""
 
     def __init__(self, labels: Sequence[Label], act: Callable[[Take], Floats]) -> None:
         self._columns, self._act = {label.name: column for column, label in enumerate(labels)}, act
@@ -51,38 +44,28 @@ def reach(take: Take) -> Floats:
     """Turn the joints along the damped pseudo-inverse of the arm's Jacobian."""
     joints = take(*JOINTS) + HOME
     offset = 0.3 * take("goal_dx", "goal_dy", "goal_dz")
-    jacobian = numeric_jacobian(joints)
+    step = 1e-6 * np.eye(joints.shape[1])
+    ahead = [GEOMETRY.tool_position(joints + one) - GEOMETRY.tool_position(joints - one) for one in step]
+    jacobian = np.stack(ahead, axis=2) / 2e-6  # how the tool moves when each joint turns [m/rad]; shape (n, 3, 6)
     square = jacobian @ jacobian.transpose(0, 2, 1) + DAMPING**2 * np.eye(3)
     turn = (jacobian.transpose(0, 2, 1) @ np.linalg.solve(square, offset[:, :, None]))[:, :, 0]
     actions: Floats = (turn / np.maximum(np.abs(turn).max(axis=1, keepdims=True), JOINT_STEP)).astype(np.float32)
     return actions
 
 
-def numeric_jacobian(joints: Array) -> Array:
-    """How the tool moves when each joint turns [m/rad]. Shape: (n, 6) -> (n, 3, 6)."""
-    step = 1e-6 * np.eye(joints.shape[1])
-    ahead = [GEOMETRY.tool_position(joints + one) - GEOMETRY.tool_position(joints - one) for one in step]
-    return np.stack(ahead, axis=2) / 2e-6
-
-
 class Sight:
     """What an observation says of hand and object, in SI units, in n environments."""
 
     def __init__(self, take: Take) -> None:
-        self.offset = 0.1 * take("object_dx", "object_dy", "object_dz")
-        """Object from the tool [m]. Shape: (n, 3)."""
-        self.lead = LEASH * take("target_dx", "target_dy", "target_dz")
-        """Tool target from the tool [m]. Shape: (n, 3)."""
-        self.lift = 0.1 * take("object_lift")[:, 0]
-        """Object above where it lay [m]. Shape: (n,)."""
+        self.offset = 0.1 * take("object_dx", "object_dy", "object_dz")  # object from the tool [m] (n, 3)
+        self.lead = LEASH * take("target_dx", "target_dy", "target_dz")  # tool target from the tool [m] (n, 3)
+        self.lift = 0.1 * take("object_lift")[:, 0]  # object above where it lay [m] (n,)
         cosine, sine = take("object_yaw_cos", "object_yaw_sin").T
-        self.turn: Array = np.arctan2(sine, cosine) / 4
-        """Object's yaw from the gripper's, the nearest of four [rad]. Shape: (n,)."""
+        self.turn: Array = np.arctan2(sine, cosine) / 4  # object's yaw from the gripper's, the nearest of four [rad]
         grip, width = take("grip", "gripper_width").T
+        # Whether the gripper was told to close on the object, and whether it has stopped at the object's width. (n,)
         self.closed: Flags = (grip > 0) & (np.linalg.norm(self.offset, axis=1) < 0.03)
-        """Whether the gripper was told to close on the object. Shape: (n,)."""
         self.holding: Flags = self.closed & (width < 0.1)
-        """Whether it has stopped at the width of the object. Shape: (n,)."""
 
 
 def grasp(sight: Sight) -> tuple[Array, Array, Array]:
@@ -146,12 +129,7 @@ SCRIPTED: dict[str, tuple[type[ReachTask | PickTask], Callable[[Take], Floats]]]
 
 
 def scripted_policy(env_id: str) -> ScriptedPolicy:
-    """The scripted policy for `env_id`.
-
-    Raises:
-        InvalidValue: The environment has none.
-        UnknownName: There is no such environment.
-    """
+    """The scripted policy for `env_id`; `InvalidValue` if the environment has none, `UnknownName` if there is none."""
     if env_id in ENVIRONMENTS and env_id not in SCRIPTED:
         raise InvalidValue(f"{env_id} has no scripted policy. These have one: {', '.join(SCRIPTED)}.")
     if env_id not in SCRIPTED:

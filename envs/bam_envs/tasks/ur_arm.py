@@ -105,9 +105,10 @@ class UrTask(Memory):
         observation = np.concatenate(self._columns(state), axis=1).astype(np.float32)
         return np.clip(observation, self.observation_space.low, self.observation_space.high)
 
-    def full_action(self, action: Floats, held: Array) -> Array:
+    def full_action(self, action: Floats, held: Array | float = 0.0) -> Array:
         """Of all joints, cut to [-1, 1]: `action` of the free ones, `held` of the fixed ones. Shape: (n, 6)."""
-        full: Array = held.copy()
+        full: Array = np.empty((self.num_envs, 6))
+        full[:] = held
         full[:, self.free] = np.clip(action, -1.0, 1.0)
         return full
 

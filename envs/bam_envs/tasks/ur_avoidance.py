@@ -32,7 +32,7 @@ FAR = 2.0
 OFFSET = 0.1
 """Share of the joint limits off the reference that is 1 in observations."""
 COLLISION = -0.1
-"""Reward of a collision; robo-gym's BasicAvoidanceUR has none, and charges this in its other task with an obstacle."""
+"""Reward of a collision."""
 POSE = (-1.57, -1.31, -1.31, -2.18, 1.57, 0.0)
 """Joint positions to stay at [rad]; the obstacle's way goes past the flange."""
 NEAREST = 0.30
@@ -115,11 +115,7 @@ class UrObstacleTask(UrTask):
         )
 
     def begin(self, env_ids: EnvIds, options: Mapping[str, Any], joints: Array) -> tuple[Array, Array | None]:
-        """Begin an episode at `joints` (6,), or where the options say.
-
-        Returns:
-            Joint positions [rad], shape (k, 6), and where the obstacle stays [m], shape (k, 3), or None if it moves.
-        """
+        """Where arms begin, at `joints` (6,) or as the options say (k, 6) [rad]; where obstacles stay, if so (k, 3)."""
         start = joint_option(options, joints.tolist(), self.model)
         place = _place(options.get("fixed_object_position"))
         place = self._place if place is None else place
@@ -144,14 +140,11 @@ class UrObstacleTask(UrTask):
 
     def command(self, action: Floats, state: RobotState) -> Array:
         """One period on the way to the reference plus `action` [rad]; fixed joints keep to it. Shape: (n, 6)."""
-        return self.toward(self.reference + self.full_action(action, np.zeros((self.num_envs, 6))), state)
+        return self.toward(self.reference + self.full_action(action), state)
 
     def effort(self, action: Floats, weight: float, rapid: float) -> Array:
-        """Worth of acting little, and the price of each joint whose action jumps by more than `rapid`. Shape: (n,).
-
-        It also notes the action as the last one.
-        """
-        full = self.full_action(action, np.zeros((self.num_envs, 6)))
+        """Worth of acting little, less for each joint whose action jumps by more than `rapid`; notes the action."""
+        full = self.full_action(action)
         jumps = (np.abs(full - self._last_action) > rapid).sum(axis=1)
         self._last_action = full
         effort: Array = (weight * (1 - np.einsum("ij,ij->i", full, full) / 6) - 0.2 * jumps) / 1000

@@ -25,8 +25,7 @@ from bam_envs.tasks.ur_avoidance import COLLISION, UrObstacleTask
 
 RECORDED = "ur_track.json"
 """The trajectory that is shipped; ``scripts/make_ur_track.py`` makes it."""
-_MOST_BYTES = 2**24
-"""Size of a file at most: which file it is may come from a stranger's checkpoint."""
+_MOST_BYTES = 2**24  # which file it is may come from a stranger's checkpoint
 _Waypoint = Annotated[tuple[Finite, Finite, Finite, Finite, Finite, Finite], Meta(description="six joint positions")]
 _Segment = Annotated[list[_Waypoint], Meta(min_length=1, description="a list of waypoints")]
 _Segments = Annotated[list[_Segment], Meta(min_length=1, description="a list of segments")]
@@ -51,13 +50,10 @@ FIXED_PATHS, FIXED_AROUND = 50, 4000
 
 
 def draw_path(rng: np.random.Generator, samples: int) -> Array:
-    """Ten points of a closed path whose `samples` points all keep away from the z axis and the base. Shape: (10, 3).
-
-    Points are uniform in `AREA`; the first, which is also the last, has x and y of 0.5 to 1 m either way.
-    """
+    """Ten points of a closed path whose `samples` points all keep away from the z axis and the base. Shape: (10, 3)."""
     while True:
         points = AREA[0] + rng.random((1, PATH_POINTS, 3)) * (AREA[1] - AREA[0])
-        points[0, 0, :2] = rng.uniform(0.5, 1.0, 2) * rng.choice((-1.0, 1.0), 2)
+        points[0, 0, :2] = rng.uniform(0.5, 1.0, 2) * rng.choice((-1.0, 1.0), 2)  # also the last point
         points[0, -1] = points[0, 0]
         # A coarse look first: about one path in seven is good.
         if _keeps_away(points, 200) and _keeps_away(points, samples):
@@ -118,10 +114,7 @@ class UrTrackTask(UrObstacleTask):
 
     memory: Mapping[str, str] = {
         **UrObstacleTask.memory,
-        "segment": "segment",
-        "step_in_segment": "step_in_segment",
-        "waits": "waits",
-        "targets_reached": "targets_reached",
+        **{name: name for name in ("segment", "step_in_segment", "waits", "targets_reached")},
         "episodes": "_episodes",
     }
 
@@ -137,13 +130,10 @@ class UrTrackTask(UrObstacleTask):
         super().__init__(num_envs, include_polar_to_elbow=include_polar_to_elbow, **options)
         self._waypoints, self._lengths = load_trajectory(trajectory, self.model.joint_limits)
         self.fixed_paths = fixed_paths
-        self.segment, self.step_in_segment = np.zeros(num_envs, dtype=np.int64), np.zeros(num_envs, dtype=np.int64)
-        """Which segment is followed, and how many steps of it have been. Shape: (n,)."""
+        self.segment, self.step_in_segment, self.targets_reached, self._episodes = np.zeros((4, num_envs), np.int64)
+        """Which segment is followed, how many steps of it have been, how many ends were reached. Shape: (n,) each."""
         self.waits = np.zeros(num_envs, dtype=bool)
         """Whether the reference is a segment's last waypoint, waiting for the arm. Shape: (n,)."""
-        self.targets_reached = np.zeros(num_envs, dtype=np.int64)
-        """Ends of segments that were reached. Shape: (n,)."""
-        self._episodes = np.zeros(num_envs, dtype=np.int64)
 
     def _observation_labels(self) -> tuple[Label, ...]:
         return (*super()._observation_labels(), *self._waypoint_labels())
@@ -172,7 +162,6 @@ class UrTrackTask(UrObstacleTask):
         return self.initial(joints, rngs, obstacle_path=np.stack(paths), obstacle_samples=around)
 
     def _path_numbers(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> list[int]:
-        """Which of the fixed paths the obstacles are on."""
         return [int(rng.integers(FIXED_PATHS)) for rng in rngs]
 
     def _columns(self, state: RobotState) -> list[Array]:
@@ -212,11 +201,7 @@ class UrTrackTask(UrObstacleTask):
 
 
 def load_trajectory(file: str | Path | None, limits: Array) -> tuple[Array, EnvIds]:
-    """The trajectory in `file`, or the shipped one: segments of waypoints; after the last segment comes the first.
-
-    Args:
-        file: A JSON file of robo-gym's form.
-        limits: Lowest and highest joint positions [rad]. Shape: (2, 6).
+    """The trajectory in a JSON file of robo-gym's form, or the shipped one; `limits` (2, 6) are of the joints [rad].
 
     Returns:
         Joint positions [rad], short segments filled up with their last waypoint, shape (segments, longest, 6), and how

@@ -39,12 +39,20 @@ def assert_same_state(one: RobotState, two: RobotState, env_ids: Sequence[int] |
     np.testing.assert_array_equal(one.command[chosen], two.command[chosen], err_msg="command")
 
 
-def assert_same_tree(one: Any, two: Any, name: str = "state_dict") -> None:
-    """Nested dicts, lists, arrays and plain values are equal."""
-    assert type(one) is type(two), f"{name}: {type(one).__name__} and {type(two).__name__}"
-    if isinstance(one, dict):
-        assert list(one) == list(two), f"{name}: keys {list(one)} and {list(two)}"
-        for key, value in one.items():
-            assert_same_tree(value, two[key], f"{name}[{key!r}]")
+def assert_same_value(one: Any, two: Any, name: str = "value") -> None:
+    """Nested dicts, lists and tuples are equal: arrays and numbers bit for bit, with the same dtypes."""
+    if isinstance(two, dict):
+        assert set(one) == set(two), f"{name}: keys {list(one)} and {list(two)}"
+        for key, value in two.items():
+            assert_same_value(one[key], value, f"{name}[{key!r}]")
+    elif isinstance(two, (tuple, list)):
+        assert type(one) is type(two), f"{name}: {type(one).__name__} and {type(two).__name__}"
+        assert len(one) == len(two), f"{name}: {len(one)} and {len(two)} items"
+        for i, value in enumerate(two):
+            assert_same_value(one[i], value, f"{name}[{i}]")
     else:
-        np.testing.assert_array_equal(one, two, err_msg=name)
+        one, two = np.asarray(one), np.asarray(two)
+        kinds = (one.dtype, one.shape), (two.dtype, two.shape)
+        assert kinds[0] == kinds[1], f"{name}: {one!r} ({kinds[0]}) and {two!r} ({kinds[1]})"
+        same = np.array_equal(one, two) if one.dtype == object else one.tobytes() == two.tobytes()
+        assert same, f"{name}: {one!r} and {two!r}"

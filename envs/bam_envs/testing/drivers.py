@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue
-from bam_envs.core.robot import EnvIds, Initial, Robot, RobotSpec, RobotState
+from bam_envs.core.robot import EnvIds, Initial, Robot, RobotState
 from bam_envs.safety.gate import ClearedCommand
 from bam_envs.safety.guard import is_base
 
@@ -19,12 +19,9 @@ _ROUNDING = 1e-9
 
 
 class DrivenRobot:
-    """What a live robot is to a `SafeRobot`: it takes cleared commands, and `reset` moves nothing.
+    """One simulated `robot` as a live one is to a `SafeRobot`: it takes cleared commands, and `reset` moves nothing.
 
     ``SafeRobot(driven, clock=driven.clock)`` is its gate; `place` it before the first `reset`.
-
-    Args:
-        robot: One simulated robot.
     """
 
     needs_clearance = True
@@ -32,7 +29,7 @@ class DrivenRobot:
     info = None
 
     def __init__(self, robot: Robot) -> None:
-        self.robot = robot
+        self.robot, self.spec = robot, robot.spec
         self.now = 0.0
         """Simulated time [s]."""
         self.fastest = 0.0
@@ -43,32 +40,19 @@ class DrivenRobot:
         self._late: deque[tuple[float, Array]] = deque()
         self._is_base = is_base(robot.spec)
 
-    @property
-    def spec(self) -> RobotSpec:
-        """Of the simulated robot."""
-        return self.robot.spec
-
     def clock(self) -> float:
         """Simulated time [s]."""
         return self.now
 
     def misbehave(self, fault: str, seconds: float, number: float = 0.0, after: float = 0.0) -> None:
-        """For some time the driver does not follow commands; then the newest one counts at once.
+        """In `after` [s] and for so many `seconds` commands are not followed; then the newest one counts at once.
 
-        Args:
-            fault: ``"ignore"``: the robot stands where it is. ``"slow"``: it is no faster than `number`, a joint
-                [rad/s], a base [m/s, rad/s]. ``"delay"``: commands arrive `number` [s] late.
-            seconds: For how long [s].
-            number: See `fault`.
-            after: In what time it begins [s].
-
-        Raises:
-            InvalidValue: There is no such fault.
+        The `fault` is ``"ignore"``: the robot stands where it is; ``"slow"``: it is no faster than `number`, a joint
+        [rad/s], a base [m/s, rad/s]; or ``"delay"``: commands arrive `number` [s] late.
         """
         if fault not in FAULTS:
             raise InvalidValue(f"A driver can {', '.join(FAULTS)}, not {fault!r}.")
-        self._fault, self._number = fault, number
-        self._begins = self.now + after
+        self._fault, self._number, self._begins = fault, number, self.now + after
         self._ends = self._begins + seconds
         self._late.clear()
 
@@ -121,8 +105,7 @@ class DrivenRobot:
             return told
         if self._fault == "slow":
             reach, about = (self._number, 0.0) if self._is_base else (self._number * self.spec.period, self._told)
-            slow: Array = np.clip(command, about - reach, about + reach)
-            return slow
+            return np.clip(command, about - reach, about + reach)
         if self.now < self._begins + self.spec.period - _ROUNDING:
             self._stand()
         return self._told
@@ -132,8 +115,7 @@ class DrivenRobot:
         if self._is_base:
             self._told = np.zeros_like(self._told)
         elif self._state is not None:
-            self._told = self._told.copy()
-            self._told[:, :6] = self._state.signals["joint_position"]
+            self._told = np.concatenate([self._state.signals["joint_position"], self._told[:, 6:]], axis=1)
 
     def halt(self) -> None:
         """Stand where it is; commands on their way do not arrive."""

@@ -13,7 +13,7 @@ from bam_envs.core.robot import EnvIds, Robot, RobotState
 from bam_envs.core.task import Task
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.ur5e import GEOMETRY
-from bam_envs.testing.assertions import assert_same_state, assert_same_tree
+from bam_envs.testing.assertions import assert_same_state, assert_same_value
 
 Array = NDArray[np.float64]
 
@@ -183,7 +183,7 @@ class TaskContract:
         """The same seeds begin the same episodes."""
         with self.running(2, seed=5) as (task, _, state), self.running(2, seed=5) as (other, _, same):
             np.testing.assert_array_equal(task.observe(state), other.observe(same))
-            assert_same_tree(task.state_dict(), other.state_dict())
+            assert_same_value(task.state_dict(), other.state_dict())
 
     def test_memory_is_saved_and_restored(self) -> None:
         """What `state_dict` returned stays as it was, and another task goes on from it exactly."""
@@ -200,8 +200,8 @@ class TaskContract:
                 command = task.command(action, state)
                 np.testing.assert_array_equal(command, other.command(action, state))
                 state = robot.step(command)
-                assert_same_tree(vars(task.score(state, action)), vars(other.score(state, action)), "score")
-            assert_same_tree(saved, kept)
+                assert_same_value(vars(task.score(state, action)), vars(other.score(state, action)), "score")
+            assert_same_value(saved, kept)
 
     def test_handed_out_is_left_alone(self) -> None:
         """Beginning other episodes does not reach into observations, scores and memory that were handed out."""
@@ -213,7 +213,7 @@ class TaskContract:
                 said = {"score": vars(score), "observation": task.observe(state), "memory": task.state_dict()}
                 kept = copy.deepcopy(said)
                 _start(task, robot, np.array(again), seed=9)
-                assert_same_tree(said, kept)
+                assert_same_value(said, kept)
 
     def test_marks_are_places_and_colours(self) -> None:
         """For pictures."""

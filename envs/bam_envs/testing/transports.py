@@ -15,7 +15,7 @@ from bam_envs.core.spaces import space_to_json
 from bam_envs.remote.remote_env import RemoteEnv, RemoteVectorEnv
 from bam_envs.remote.serve.env_server import Env
 from bam_envs.remote.transport import EnvSpecMessage, Info, Transport
-from bam_envs.testing.assertions import raised
+from bam_envs.testing.assertions import assert_same_value, raised
 
 _INF = np.inf
 _INT64 = np.iinfo(np.int64)
@@ -252,23 +252,3 @@ class TransportContract:
                     np.testing.assert_array_equal(mine["_final_obs"], theirs["_final_obs"])
                     np.testing.assert_array_equal(mine["final_info"]["elapsed"], theirs["final_info"]["elapsed"])
         alone.close()
-
-
-def assert_same_value(one: Any, two: Any, name: str) -> None:
-    """Two values of a space are equal bit for bit, with the same dtypes."""
-    if isinstance(two, dict):
-        assert set(one) == set(two), f"{name}: keys {list(one)} and {list(two)}"
-        for key, value in two.items():
-            assert_same_value(one[key], value, f"{name}[{key!r}]")
-    elif isinstance(two, tuple):
-        assert isinstance(one, tuple), f"{name}: {type(one).__name__} and tuple"
-        assert len(one) == len(two), f"{name}: {len(one)} and {len(two)} items"
-        for i, value in enumerate(two):
-            assert_same_value(one[i], value, f"{name}[{i}]")
-    elif isinstance(two, str):
-        assert one == two, f"{name}: {one!r} and {two!r}"
-    else:
-        one, two = np.asarray(one), np.asarray(two)
-        kinds = (one.dtype, one.shape), (two.dtype, two.shape)
-        assert kinds[0] == kinds[1], f"{name}: {kinds[0]} and {kinds[1]}"
-        assert one.tobytes() == two.tobytes(), f"{name}: {one!r} and {two!r}"

@@ -16,7 +16,7 @@ from bam_envs.make_env import make_env
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.scripted import SCRIPTED, scripted_policy
-from bam_envs.testing.assertions import assert_same_tree
+from bam_envs.testing.assertions import assert_same_value
 
 ONE_OF_EACH = ("bam/pick-v0", "bam/mir100-avoidance-v0", "bam/ur-empty-v0")
 """An arm with a gripper, a base, an arm alone: for what does not depend on the task."""
@@ -42,7 +42,7 @@ def assert_same(one, two):
     for left, right in zip(one, two, strict=True):
         np.testing.assert_array_equal(left[0], right[0])
         assert left[1:-1] == right[1:-1]
-        assert_same_tree(left[-1], right[-1], "info")
+        assert_same_value(left[-1], right[-1], "info")
 
 
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
@@ -113,7 +113,7 @@ def test_infos_are_plain_and_can_be_pickled(make, env_id, wire):
     for name, shape in PLACES.items():
         place = info.get(name, np.zeros(shape))
         assert (type(place), place.shape, place.dtype) == (np.ndarray, shape, np.float64)
-    assert_same_tree(pickle.loads(pickle.dumps(info)), info, "info")
+    assert_same_value(pickle.loads(pickle.dumps(info)), info, "info")
     plain = {name: value for name, value in info.items() if name not in PLACES}
     assert json.loads(json.dumps(plain)) == plain
     assert ("rs_state" in plain) == (wire and bool(ENVIRONMENTS[env_id].variants))

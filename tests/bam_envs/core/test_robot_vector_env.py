@@ -15,7 +15,7 @@ from bam_envs.core.robot_env import RobotVectorEnv
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.scripted import SCRIPTED, scripted_policy
-from bam_envs.testing.assertions import assert_same_tree
+from bam_envs.testing.assertions import assert_same_value
 
 ONE_OF_EACH = ("bam/pick-v0", "bam/mir100-avoidance-v0", "bam/ur-empty-v0")
 """An arm with a gripper, a base, an arm alone: for what does not depend on the task."""
@@ -223,9 +223,9 @@ def test_another_one_goes_on_exactly(make_rows, actions_of, env_id):
     kept = copy.deepcopy(saved)
     np.testing.assert_array_equal(two.unwrapped.load_state_dict(saved), observation)
     assert_same_steps(one, two, actions[37:])
-    assert_same_tree(saved, kept)  # what was saved has not changed since
+    assert_same_value(saved, kept)  # what was saved has not changed since
     three.unwrapped.load_state_dict(saved)
-    assert_same_tree(three.unwrapped.state_dict(), kept)
+    assert_same_value(three.unwrapped.state_dict(), kept)
     one.unwrapped.load_state_dict(kept)
     assert_same_steps(one, three, actions[37:80])
 

@@ -61,7 +61,7 @@ def marked(marks: Sequence[tuple[Array, Colour]], radius: float = 0.02) -> list[
 
 
 class Drawn:
-    """A robot simulated in NumPy, which says what it looks like, and so has pictures."""
+    """A robot simulated in NumPy that has pictures; a subclass defines `slices`, `halt` and `picture`."""
 
     floor: float = 0.0
     """Height of the floor [m]."""
