@@ -25,8 +25,7 @@ from bam_train.video import Frame
 FIRST_SEED = 1_000_000
 """The default seed of the first episode: far from the small seeds that training uses."""
 
-_Z95 = 1.959963984540054
-"""97.5 % quantile of the normal distribution, for a two-sided 95 % interval."""
+_Z95 = 1.959963984540054  # 97.5 % quantile of the normal distribution, for a two-sided 95 % interval
 
 
 class BatchPolicy(Protocol):
@@ -138,7 +137,7 @@ def evaluate(
         seed: Of the first episode; episode k gets ``seed + k``.
         num_envs: Environments stepped side by side; by default as many as is quick and not more than `episodes`.
         env: What `make_vector_env` made, to use instead of making one; it is left open.
-        on_progress: Called after every wave of environments with the episodes done and the episodes wanted.
+        on_progress: Called after every wave with the episodes done and the episodes wanted.
 
     Raises:
         SettingsError: `episodes`, `seed` or `num_envs` out of range.
@@ -194,7 +193,7 @@ def record_video(env: gym.Env[Any, Any], policy: Any, add: Callable[[Frame], Any
         seed: Of the first.
 
     Returns:
-        How many pictures.
+        How many pictures there are.
     """
     robot, video = RobotAgent(env), VideoAgent(env, add)
     loop = TemporalAgent(Agents(robot, video, PolicyAgent(policy, robot.observation_names, single=True)))

@@ -24,7 +24,7 @@ def connected_env(
     *,
     who: str,
     episodes: int,
-    yes: bool,
+    yes: bool = False,
     render: bool = False,
     named: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,

@@ -45,11 +45,6 @@ def drop(stream: TextIO) -> None:
         os.close(null)
 
 
-def is_terminal() -> bool:
-    """Whether standard error is a terminal."""
-    return sys.stderr.isatty()
-
-
 def make_console() -> Console:
     """A rich console on standard error; standard output is kept for results that programs read."""
     from rich.console import Console

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import json as json_module
 import math
+import sys
 from contextlib import nullcontext
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from bam_train.cli.console import is_terminal, make_console, say, tell
+from bam_train.cli.console import make_console, say, tell
 from bam_train.cli.program import run_program
 from bam_train.signals import SignalMemory
 
@@ -61,7 +62,7 @@ def _run(
     with deployment.handles_signals():  # a second Ctrl-C must not lose the report
         deployment.switch.came += signals.came  # one that was lost: the deployment ends before it begins
         plain = nullcontext(PlainDisplay(journal, say))
-        with live_display(make_console(), env, title, journal) if is_terminal() else plain as watcher:
+        with live_display(make_console(), env, title, journal) if sys.stderr.isatty() else plain as watcher:
             ending = deployment.run(watcher, seed=config.seed)
         if ending.status:
             halted = ending.reason == "interrupted" and hasattr(env.unwrapped, "robot")

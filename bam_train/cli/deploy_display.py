@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import zip_longest
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -25,12 +25,7 @@ _MOST_NUMBERS = 16
 
 
 class PlainDisplay:
-    """One line for each episode.
-
-    Args:
-        journal: Says how many episodes are wanted.
-        write: Takes a line.
-    """
+    """Writes one line for each episode."""
 
     def __init__(self, journal: Journal, write: Callable[[str], None]) -> None:
         self._journal, self._write = journal, write
@@ -49,12 +44,7 @@ class PlainDisplay:
 class LiveDisplay(PlainDisplay):
     """A panel below those lines, redrawn ten times a second at most, and only when there is time until a deadline.
 
-    Args:
-        live: Rich's live area, without a thread of its own.
-        env: The environment, for the labels and the measured state.
-        title: First line.
-        journal: The episodes so far.
-        now: Clock of the redraws [s].
+    Rich's live area has no thread of its own; `now` is the clock of the redraws [s].
     """
 
     EVERY = 0.1
@@ -68,11 +58,10 @@ class LiveDisplay(PlainDisplay):
         env: gym.Env[Any, Any],
         title: str,
         journal: Journal,
-        now: Callable[[], float] = time.monotonic,
+        now: Callable[[], float] = monotonic,
     ) -> None:
         super().__init__(journal, lambda line: live.console.print(rich_text(line)))
-        self._live, self._env, self._title, self._now = live, env, title, now
-        self._drawn = -math.inf
+        self._live, self._env, self._title, self._now, self._drawn = live, env, title, now, -math.inf
 
     def ticked(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> None:
         """Redraw if it is time and there is time."""

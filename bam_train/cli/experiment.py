@@ -19,19 +19,14 @@ if TYPE_CHECKING:
 
 
 class ScriptParser(argparse.ArgumentParser):
-    """An `argparse` parser whose errors are one line each, with the closest match for a typo.
-
-    Args:
-        file: The script.
-        description: Its docstring, shown as it is.
-    """
+    """Parses the options of the script `file`, described by its docstring; an error is one line, with status 2."""
 
     def __init__(self, file: str, description: str | None) -> None:
         kind, name = argparse.RawDescriptionHelpFormatter, Path(file).stem
         super().__init__(name, "%(prog)s.py [options]", description, formatter_class=kind, allow_abbrev=False)
 
     def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
-        """Read the command line, or `args`; an error in it ends the program with status 2."""
+        """Read the command line, or `args`; an unknown option has the closest match."""
         known, rest = self.parse_known_args(args, namespace)
         if rest:
             from bam_envs.core.wording import did_you_mean
@@ -63,13 +58,10 @@ def whole(least: int) -> Callable[[str], int]:
     """What reads a whole number that is at least `least`, as an argument's type."""
 
     def read(text: str) -> int:
-        try:
-            value = int(text.replace("_", ""))
-        except ValueError:
-            value = least - 1
-        if value < least:
-            raise argparse.ArgumentTypeError(f"expected a whole number from {least}, found {text!r}")
-        return value
+        with contextlib.suppress(ValueError):
+            if int(text) >= least:
+                return int(text)
+        raise argparse.ArgumentTypeError(f"expected a whole number from {least}, found {text!r}")
 
     return read
 
@@ -117,26 +109,18 @@ def signals_ask() -> Iterator[Callable[[], bool]]:
 
 @contextlib.contextmanager
 def open_env(
-    checkpoint: Checkpoint,
-    robot: str | None = None,
-    *,
-    who: str,
-    episodes: int,
-    yes: bool = False,
-    render: bool = False,
-    env_kwargs: Mapping[str, Any] | None = None,
+    checkpoint: Checkpoint, robot: str | None = None, *, render: bool = False, **asked: Any
 ) -> Iterator[gym.Env[Any, Any]]:
     """The environment that a checkpoint was trained in, fresh; within, a live robot is connected and may be moved.
 
     However it is left, the robot is halted and the link dropped. Of a live robot, each `step` waits for the end of its
-    period. The arguments are those of `bam_train.cli.consent.connected_env`, and the address of a live robot.
+    period. `robot` is its address; what is `asked` is as of `bam_train.cli.consent.connected_env`.
     """
     from bam_train.cli.consent import connected_env
     from bam_train.env_location import Place
 
     require_place(checkpoint.manifest.env, robot, render)
-    given: Any = {"who": who, "episodes": episodes, "yes": yes, "render": render, "env_kwargs": env_kwargs}
     with SignalMemory() as signals:
-        env = connected_env(checkpoint, Place(robot), signals, **given)
+        env = connected_env(checkpoint, Place(robot), signals, render=render, **asked)
         with contextlib.closing(env):
             yield env

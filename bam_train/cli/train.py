@@ -12,7 +12,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
-from bam_train.cli.console import count, is_terminal, tell
+from bam_train.cli.console import count, tell
 from bam_train.cli.program import run_program
 from bam_train.signals import before_quitting, handled
 
@@ -70,7 +70,7 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
             folder = RunFolder(runs, file_stem(settings.env, settings.algo, settings.trainer))
             folder.write_config(settings.to_mapping())
             trainer.log_to(folder.tensorboard)
-            display = (LiveDisplay if is_terminal() else PlainDisplay)(title)
+            display = (LiveDisplay if sys.stderr.isatty() else PlainDisplay)(title)
             run = TrainingRun(trainer, folder, output.path, display, output.best, copies=copies)
             handlers.enter_context(handled(_stop_on_signals(run, came)))
             with display:

@@ -80,8 +80,8 @@ class PlainDisplay:
 class LiveDisplay(PlainDisplay):
     """A panel that changes in place, below the lines about evaluations."""
 
-    def __init__(self, title: str, clock: Callable[[], float] = time.monotonic) -> None:
-        super().__init__(title, clock)
+    def __init__(self, title: str) -> None:
+        super().__init__(title)
         from rich.live import Live
 
         self._console = make_console()

@@ -1,9 +1,8 @@
 """The deployment: a chain of agents that moves a robot at absolute deadlines, and what ends it.
 
 Robot, journal and policy are agents of one `TemporalAgent`, which waits for each deadline before the policy acts; your
-own agents join the same chain. What they read and write is checked when the chain is built, before the robot is
-connected. However the deployment ends (all episodes done, Ctrl-C, SIGTERM, a fault), the robot is halted and closed
-before anything is reported.
+own agents join the same chain. However it ends (all episodes done, Ctrl-C, SIGTERM, a fault), the robot is halted and
+closed before anything is reported.
 """
 
 from __future__ import annotations
