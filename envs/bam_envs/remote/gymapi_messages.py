@@ -97,11 +97,6 @@ class GymResponse:
     version: Version | None = None
     """The version of the messages that the server uses; None if that does not show."""
 
-    @property
-    def ours(self) -> bool:
-        """Whether one of our servers made it, as far as one can see."""
-        return any(self.exact)
-
 
 def base_name(namespace: str = "") -> str:
     """What the service, and the topics ``request`` and ``reply``, are under."""

@@ -235,7 +235,7 @@ class RosbridgeTransport:
                 questions -= 1
                 if not questions:
                     raise NoServer(self.url, f"rosbridge is there, and {self._where()} is silent: {error}") from error
-        if response.error is not None and response.ours:
+        if response.error is not None and any(response.exact):  # of our server
             raise NoServer(self.url, str(response.error)) from response.error
         spec = response.exact[0].get("spec") if response.exact else None
         if spec is None:

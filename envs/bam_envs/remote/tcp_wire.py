@@ -13,16 +13,14 @@ header        any    MessagePack of a tree; an array in it is its dtype, shape a
 body          any    the arrays, each at a multiple of 16
 ============  =====  ========================================================================
 
-=========  ==========================================  =========================================
-message    tree                                        content of the answer
-=========  ==========================================  =========================================
-hello      ["hello", {session, epoch, name, token,     the description of the environment
-           env_id, end}]
-reset      ["reset", tag, seed, options, take]         [observation, info]
-step       ["step", tag, action]                       [observation, reward, terminated,
-                                                       truncated, info]
-leave      ["leave", tag]                              None
-=========  ==========================================  =========================================
+===================================  ====================================================
+message                              content of the answer
+===================================  ====================================================
+["hello", {session, epoch, …}]       the description of the environment
+["reset", tag, seed, options, take]  [observation, info]
+["step", tag, action]                [observation, reward, terminated, truncated, info]
+["leave", tag]                       None
+===================================  ====================================================
 
 An answer is [number of the request, "ok", content] or [number, kind of the error, its text]. Of a batch of
 environments, each value has one entry for each.
@@ -96,13 +94,12 @@ class TagMessage(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fi
 
 
 class Reset(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="reset"):
-    """Request: begin an episode."""
+    """Request: begin an episode, and, with `take`, take command from the client that has it."""
 
     tag: TagMessage
     seed: Any
     options: Any
     take: Any
-    """Whether to take command from the client that has it."""
 
 
 class Step(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="step"):

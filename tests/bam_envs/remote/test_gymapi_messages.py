@@ -195,7 +195,7 @@ def test_our_failures_come_back_as_they_were(kind):
     response = read_response(message)
     assert type(response.error) is kind
     assert str(response.error) == "no, because"
-    assert response.ours
+    assert any(response.exact)
     assert response.feedback[0]["color_img"] == []
 
 
@@ -212,7 +212,7 @@ def test_failures_of_other_racks(code, text, expected):
     response = read_response({"header": {"error_code": {"value": code}, "error_msg": text}})
     assert type(response.error) is RemoteError
     assert str(response.error) == expected
-    assert not response.ours
+    assert not any(response.exact)
 
 
 def test_an_answer_without_a_code_is_no_success():

@@ -68,15 +68,6 @@ def describe_env(env: Env, env_id: str | None = None) -> EnvSpecMessage:
     )
 
 
-def same_name(one: str, other: str) -> bool:
-    """Whether two names are of one environment: namespace, version, case and punctuation do not count.
-
-    ``PickPlace`` and ``bam/pick-place-v0`` are one; so are robo-gym's names and ours of one environment.
-    """
-    one, other = (_other_names().get(name, name) for name in (_plain_name(one), _plain_name(other)))
-    return one == other
-
-
 def _plain_name(name: str) -> str:
     last = re.split("[/:]", name)[-1]
     return re.sub("[^a-z0-9]", "", re.sub(r"-v\d+$", "", last).lower())
@@ -132,8 +123,13 @@ class EnvServer:
         return self._spec
 
     def require_name(self, name: str) -> None:
-        """Raise RemoteError unless `name` is "" or a name of what is served; see `same_name`."""
-        if name and not same_name(name, self._spec.env_id):
+        """Raise RemoteError unless `name` is "" or a name of what is served.
+
+        Namespace, version, case and punctuation do not count: ``PickPlace`` and ``bam/pick-place-v0`` are one name; so
+        are robo-gym's name and ours.
+        """
+        wanted, served = (_other_names().get(one, one) for one in (_plain_name(name), _plain_name(self._spec.env_id)))
+        if name and wanted != served:
             raise RemoteError(f"There is no environment {name!r} here; {self._spec.env_id} is served.")
 
     def reset(

@@ -1,5 +1,6 @@
 """One environment, several clients: turns, command, errors, real time."""
 
+import contextlib
 import threading
 
 import gymnasium as gym
@@ -10,7 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from bam_envs.core.errors import InvalidValue, NotInCommand, RemoteError, ResetNeeded, UnknownName
 from bam_envs.remote.serve.command_lease import CommandLease
-from bam_envs.remote.serve.env_server import EnvServer, describe_env, same_name
+from bam_envs.remote.serve.env_server import EnvServer, describe_env
 from bam_envs.remote.serve.local_transport import FakeEnv
 from bam_envs.rosbridge.bus import Caller
 from bam_envs.testing.transports import MirrorEnv
@@ -293,7 +294,9 @@ def test_wrapped_environments_are_served():
     ],
 )
 def test_names_of_one_environment(name, other, same):
-    assert same_name(name, other) is same
+    server = EnvServer(FakeEnv(), env_id=other)
+    with contextlib.nullcontext() if same else pytest.raises(RemoteError, match="There is no environment"):
+        server.require_name(name)
 
 
 def test_another_one_says_less():
