@@ -204,18 +204,12 @@ def _environment(
             warn(f"the env_config of its own environment ({names:.200}) is not given to {env}")
         return env, {}
     try:
-        kwargs = json.loads(json.dumps(dict(saved.env_kwargs), allow_nan=False, default=_of_numpy))
-    except (TypeError, ValueError, RecursionError) as error:
+        own_kwargs = json.dumps(dict(saved.env_kwargs), allow_nan=False, default=lambda array: array.tolist())
+    except (TypeError, ValueError, RecursionError, AttributeError) as error:
         text = f"its env_config holds more than plain values ({names}), which cannot be kept; train with plain ones"
         raise CheckpointMismatch(given, text) from error
-    return env, {name: kwargs[name] for name in kwargs if entry_of(env) is None or name not in PLACES}
-
-
-def _of_numpy(value: Any) -> Any:
-    """NumPy's numbers and arrays as Python's."""
-    if not isinstance(value, (np.ndarray, np.generic)):
-        raise TypeError(type(value).__name__)
-    return value.tolist()
+    kept = json.loads(own_kwargs).items()
+    return env, {name: value for name, value in kept if entry_of(env) is None or name not in PLACES}
 
 
 def _own_environment(saved: SavedPolicy, asked: str | None, trust: bool) -> str | None:

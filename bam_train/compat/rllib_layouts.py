@@ -137,8 +137,7 @@ def training_settings(saved: SavedPolicy, parts: PolicyParts, env: str, env_kwar
     """
     if saved.module is None:
         raise SettingsError("it is not of RLlib's present API")
-    from bam_train.trainers.rllib.algorithm_config import is_plain
-    from bam_train.trainers.rllib.rllib_hyperparameters import complete
+    from bam_train.trainers.rllib.rllib_hyperparameters import complete, is_plain
 
     algorithm, name = RLLIB_ALGORITHMS.get(parts.algorithm), saved.directory.name
     own_module = type(saved.module).__module__.startswith("ray.rllib.algorithms.")

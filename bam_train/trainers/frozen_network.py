@@ -109,9 +109,6 @@ class _Continuous(Layer):
         x = self.low + to(0.5 * (x + 1.0), self.dtype) * (self.high - self.low) if self.scale else to(x, self.dtype)
         return torch.maximum(torch.minimum(x, self.high), self.low) if self.clip else x
 
-    def margin(self, scores: torch.Tensor) -> torch.Tensor:
-        return torch.ones(len(scores))
-
 
 class _Choice(Layer):
     """The best of each group of scores, counted from ``start``: Discrete gives (n,), MultiDiscrete (n, k)."""
@@ -209,7 +206,7 @@ class FrozenNetwork(Layer):
         """
         size = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in self.leaves.values())
         n, rng = min(n, max(4, _BUDGET // (size or 1))), np.random.default_rng(0)
-        if self.state:
+        if self.state or isinstance(self.head, _Continuous):
             return self.draw(n, rng)
         drawn = self.draw(2 * n, rng)
         with torch.no_grad():

@@ -30,10 +30,15 @@ from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
 from bam_train.trainers.base import OnProgress, Progress, Statistics, manifest
 from bam_train.trainers.resolve_settings import own_settings
 from bam_train.trainers.rllib import rllib_state
-from bam_train.trainers.rllib.algorithm_config import envs_each, make_config, refusals
 from bam_train.trainers.rllib.ray_cluster import cluster
 from bam_train.trainers.rllib.rllib_freezing import FrozenModule, RLlibPolicy, golden, parts_of
-from bam_train.trainers.rllib.rllib_hyperparameters import complete, complete_normalize
+from bam_train.trainers.rllib.rllib_hyperparameters import (
+    complete,
+    complete_normalize,
+    envs_each,
+    make_config,
+    refusals,
+)
 from bam_train.trainers.rllib.robot_env_runner import ENDS
 from bam_train.trainers.rllib.runner_deaths import RunnerWatch
 from bam_train.trainers.tensorboard_files import TensorBoardFiles

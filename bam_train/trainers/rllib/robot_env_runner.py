@@ -73,7 +73,7 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
         """What the module sees next, (n, ...)."""
         self._running = [_Running() for _ in range(self.num_envs)]
         pieces = list(self._env_to_module.connectors)
-        filters = [piece for piece in pieces if type(piece).__module__ == MeanStdFilter.__module__]
+        filters = [piece for piece in pieces if isinstance(piece, MeanStdFilter)]
         self._filter: MeanStdFilter | None = filters[0] if filters else None
         others = [type(piece).__name__ for piece in pieces if piece not in filters]
         found = ", ".join(name for name in others if name not in LAYOUT_CONNECTORS)

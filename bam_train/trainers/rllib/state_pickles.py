@@ -115,9 +115,6 @@ class _Reader(pickle.Unpickler):
             raise RefusedPickle(f"{module}.{name}")
         return known or Unread
 
-    def persistent_load(self, pid: Any) -> Any:
-        raise RefusedPickle(f"the outside object {pid!r:.40}")
-
 
 class _StandIn:
     """A class in place of a function of NumPy's: a pickle can call it, and change nothing about it."""

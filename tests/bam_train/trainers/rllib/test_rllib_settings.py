@@ -12,7 +12,6 @@ from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
 from bam_train.trainers.resolve_settings import resolve
 from bam_train.trainers.rllib import rllib_hyperparameters as hyperparameters
-from bam_train.trainers.rllib.algorithm_config import envs_each
 from bam_train.trainers.rllib.recorded_episodes import load
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*:DeprecationWarning:ray")  # Ray's own, of its data library
@@ -20,7 +19,12 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*:DeprecationWarning:ray")  # R
 
 @pytest.mark.parametrize(("number", "runners", "each"), [(64, 0, 64), (64, 2, 32), (64, 3, 21), (5, 2, 2), (1, 4, 1)])
 def test_runners_share_the_environments(number, runners, each):
-    assert envs_each(TrainSettings(env="bam/reach-v0", algo="ppo", num_envs=number, num_env_runners=runners)) == each
+    assert (
+        hyperparameters.envs_each(
+            TrainSettings(env="bam/reach-v0", algo="ppo", num_envs=number, num_env_runners=runners)
+        )
+        == each
+    )
 
 
 SCHEDULE = "{}: expected a number or a schedule [[0, value], [step, value]"

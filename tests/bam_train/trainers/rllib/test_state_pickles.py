@@ -86,7 +86,7 @@ MANY_ZEROS = "names an array whose data are a int, which is not read"  # as many
         (b"", "is not a whole pickle of RLlib's: pickle exhausted before seeing STOP"),
         (b"not a pickle", "is not a whole pickle of RLlib's: "),
         (dumped({"a": np.zeros(100)})[:-50], "is not a whole pickle of RLlib's: "),
-        (b"\x80\x04K\x01Q.", "names the outside object 1, which is not read without running it"),
+        (b"\x80\x04K\x01Q.", "is not a whole pickle of RLlib's: A load persistent id instruction"),
         (b"\x80\x04\x82\x01.", "is not a whole pickle of RLlib's: unregistered extension code 1"),
         (b"\x80\x02K\x01r" + struct.pack("<I", 2**31) + b".", "numbers a value 2147483648 after 3 instructions"),
         (dumped(range(3)), "names builtins.range, which is not read without running it"),
