@@ -28,11 +28,7 @@ class ArraySpec:
     high: np.ndarray | None = None
 
     def checked(self, value: Any, batch: tuple[int, ...]) -> np.ndarray:
-        """Return the value, (*batch, *shape), as an array that can be copied into this one; the batch is () or (n,).
-
-        Raises:
-            PolicyError: The shape or the kind of number does not fit, or a Discrete is not in its range.
-        """
+        """Return the value as an array (*batch, *shape) that can be copied into this one; the batch is () or (n,)."""
         shape = (*batch, *self.shape)
         try:
             array = np.asarray(value)
@@ -50,11 +46,7 @@ class ArraySpec:
 
 
 def observation_arrays(space: Mapping[str, Any]) -> list[ArraySpec]:
-    """List the arrays of an observation space in JSON form; those of a Dict are named observation.<key>.
-
-    Raises:
-        PolicyError: The space is of another kind than a policy takes.
-    """
+    """List the arrays of an observation space in JSON form; those of a Dict are named observation.<key>."""
     if space.get("type") != "Dict":
         return [array_spec("observation", space)]
     return [array_spec(f"observation.{key}", inner) for key, inner in dict(space["spaces"]).items()]

@@ -23,7 +23,7 @@ _SINGLE = 8  # golden observations that are acted on one by one too
 
 
 class FrozenPolicy:
-    """The policy of a checkpoint; used by one thread at a time.
+    """The policy of a checkpoint, made by `load` or `from_graph`; used by one thread at a time.
 
     Attributes:
         observation_space: JSON form, as in the manifest.
@@ -34,11 +34,6 @@ class FrozenPolicy:
     def __init__(
         self, session: OnnxSession, observation_space: Mapping[str, Any], action_space: Mapping[str, Any]
     ) -> None:
-        """Join a graph and its spaces; use `load` or `from_graph`.
-
-        Raises:
-            PolicyError: The graph's inputs and outputs do not fit the spaces.
-        """
         self.observation_space, self.action_space = dict(observation_space), dict(action_space)
         self._arrays, self._action = observation_arrays(observation_space), array_spec("action", action_space)
         self._is_dict = observation_space.get("type") == "Dict"
@@ -89,13 +84,10 @@ class FrozenPolicy:
     def from_graph(
         cls, onnx: bytes, observation_space: Mapping[str, Any], action_space: Mapping[str, Any]
     ) -> FrozenPolicy:
-        """Make a policy of an ONNX file.
+        """Make a policy of an ONNX file; the spaces are in JSON form.
 
-        Args:
-            onnx: Inputs ``observation`` or ``observation.<key>``, ``state.<name>``; outputs ``action``,
-                ``next_state.<name>``; the first axis of each is the batch.
-            observation_space: JSON form.
-            action_space: JSON form.
+        Inputs are ``observation`` or ``observation.<key>``, and ``state.<name>``; outputs ``action`` and
+        ``next_state.<name>``; the first axis of each is the batch.
 
         Raises:
             PolicyError: Not ONNX, or its inputs and outputs do not fit the spaces.
@@ -110,11 +102,7 @@ class FrozenPolicy:
         return cls(OnnxSession(onnx), observation_space, action_space)
 
     def reset(self, env_ids: Any = None) -> None:
-        """Forget what was observed, at the start of an episode; it only matters if `recurrent`.
-
-        Args:
-            env_ids: Indices or a mask of the environments whose episode starts; None for all.
-        """
+        """Forget what was observed, at the start of an episode of `env_ids` (indices or a mask) or of all."""
         if env_ids is None:
             self._state = None
         elif self._state is not None:
@@ -126,13 +114,10 @@ class FrozenPolicy:
                 raise PolicyError(text) from error
 
     def act(self, observation: Any) -> Any:
-        """Return the action for one observation.
-
-        Args:
-            observation: In the observation space: an array, or a mapping of arrays for a Dict.
+        """Return the action for one observation: an array, or a mapping of arrays for a Dict.
 
         Returns:
-            A new array in the action space, float for a Box; an np.int64 for a Discrete.
+            A new array in the action space; an np.int64 for a Discrete.
 
         Raises:
             PolicyError: The observation does not fit; names the input, what was expected and what was found.
@@ -147,15 +132,9 @@ class FrozenPolicy:
         return _int64(self._session.run(self._inputs, self._outputs)[0])[0]
 
     def act_batch(self, observations: Any) -> np.ndarray:
-        """Return the actions for the observations of n environments.
+        """Return a new array of actions, (n, ...), for the observations of n environments, (n, ...) each.
 
         A recurrent policy keeps a state for each environment: give the same environments until `reset`.
-
-        Args:
-            observations: (n, ...) each.
-
-        Returns:
-            A new array, (n, ...).
         """
         first = observations
         if self._is_dict and isinstance(observations, Mapping) and observations:
@@ -189,16 +168,10 @@ class FrozenPolicy:
         return _int64(action)
 
     def worst_difference(self, golden: Mapping[str, np.ndarray]) -> tuple[float, int]:
-        """Act on recorded observations, and compare with the recorded actions; what was seen before is forgotten.
+        """Act on recorded observations; return the largest difference from the recorded actions and its row.
 
         Args:
             golden: ``action`` and the observations by name, (n, ...) each; of a recurrent policy one episode's steps.
-
-        Returns:
-            The largest difference and its row.
-
-        Raises:
-            PolicyError: The arrays do not fit the policy.
         """
         names = {"action", *(part.name for part in self._arrays)}
         if set(golden) != names:

@@ -40,18 +40,12 @@ class Tensor:
 
 
 class OnnxSession:
-    """A graph in onnxruntime.
-
-    Args:
-        onnx: The file, accepted by `require_policy`.
+    """A graph that `require_policy` accepted, in onnxruntime; raises PolicyError if that cannot run it.
 
     Attributes:
         inputs: Its inputs, by name.
         outputs: Names of its outputs.
         most_seconds: Longest time for the first run.
-
-    Raises:
-        PolicyError: onnxruntime cannot run it.
     """
 
     def __init__(self, onnx: bytes) -> None:
@@ -99,11 +93,7 @@ def _load(onnx: bytes) -> onnxruntime.InferenceSession:
 
 
 def _within(seconds: float, call: Callable[[], T], stop: Callable[[], None] = lambda: None) -> T:
-    """Return what `call` returns in another thread: Ctrl-C interrupts waiting for a thread, but not C++.
-
-    Raises:
-        PolicyError: It takes longer.
-    """
+    """Return what `call` returns in another thread: Ctrl-C interrupts waiting for a thread, but not C++."""
     results: list[T] = []
     errors: list[BaseException] = []
     done = threading.Event()  # Ctrl-C in Thread.join makes the thread look ended in Python 3.11

@@ -45,11 +45,7 @@ class Algorithm:
         return pkgutil.resolve_name(self.reference)
 
     def require_actions(self, env: str, kind: str) -> None:
-        """Refuse `env` if this algorithm cannot learn on its `kind` of action space, such as ``Box``.
-
-        Raises:
-            SettingsError: Names the algorithms of the same trainer that can, from the same source of episodes.
-        """
+        """Refuse `env` if this algorithm cannot learn on its `kind` of action space, such as ``Box``."""
         if kind in self.actions:
             return
         table = next(table for table in ALGORITHMS.values() if self in table.values())
@@ -98,12 +94,7 @@ ALGORITHMS = {"rllib": RLLIB_ALGORITHMS, "sb3": SB3_ALGORITHMS}
 
 
 def load_trainer(name: str) -> type[Trainer]:
-    """The class of a trainer; this imports its library.
-
-    Raises:
-        SettingsError: No trainer has this name.
-        MissingExtra: A package that its library needs is not installed.
-    """
+    """The class of a trainer; this imports its library, or raises MissingExtra."""
     if name not in TRAINERS:
         raise SettingsError(f"Unknown trainer {name!r}. {did_you_mean(name, TRAINERS)}")
     try:
@@ -114,11 +105,7 @@ def load_trainer(name: str) -> type[Trainer]:
 
 
 def require_algorithm(trainer: str, algorithm: str) -> None:
-    """Refuse an algorithm that the trainer does not have.
-
-    Raises:
-        SettingsError: Carries the closest match, or the other trainer that has it.
-    """
+    """Refuse an algorithm that the trainer does not have, with the closest match or the trainer that has it."""
     if trainer not in ALGORITHMS:
         raise SettingsError(f"Unknown trainer {trainer!r}. {did_you_mean(trainer, ALGORITHMS)}")
     table = ALGORITHMS[trainer]

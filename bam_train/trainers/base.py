@@ -67,11 +67,7 @@ class Trainer(Protocol):
 
     @classmethod
     def complete(cls, settings: TrainSettings) -> TrainSettings:
-        """Check the algorithm's own settings and fill in its defaults; no training is set up.
-
-        Raises:
-            SettingsError: An unknown name (closest match), a wrong type, or an algorithm that does not fit the actions.
-        """
+        """Check the algorithm's own settings and fill in its defaults; no training is set up."""
 
     @classmethod
     def create(cls, settings: TrainSettings) -> Self:
@@ -91,8 +87,7 @@ class Trainer(Protocol):
     def train(self, steps: int, on_progress: OnProgress) -> None:
         """Train until the run has at least `steps` steps, or `on_progress` returns False.
 
-        Raises:
-            TrainingFailed: The loss or a weight is no longer finite.
+        Raises TrainingFailed when the loss or a weight is no longer finite.
         """
 
     def save(self, path: Path, scores: Mapping[str, Any], notes: Mapping[str, Any]) -> Checkpoint:
@@ -120,10 +115,7 @@ class Trainer(Protocol):
 def manifest(
     settings: TrainSettings, spaces: tuple[Space[Any], Space[Any]], known: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The manifest's fields; `known` has those that only the trainer knows: signals, period, steps and scores.
-
-    The spaces are the environment's own, of observations and of actions.
-    """
+    """The manifest's fields; `known` has those that only the trainer knows: signals, period, steps and scores."""
     return {
         "env": settings.env,
         "env_kwargs": settings.env_kwargs,
@@ -143,8 +135,8 @@ _PACKAGES = ("bam-train", "gymnasium", "numpy", "mujoco", "torch", "stable-basel
 
 def origin() -> dict[str, Any]:
     """The software that made a checkpoint, and the time (UTC, ISO 8601)."""
-    created = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
     versions, commit = _software()
+    created = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
     return {"versions": dict(versions), "git_commit": commit, "created": created}
 
 

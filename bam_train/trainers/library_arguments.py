@@ -28,11 +28,7 @@ def linear_start(text: str) -> float | None:
 
 
 def fit(name: str, value: Any, hint: Any) -> Any:
-    """Return the JSON `value` if the library's annotation takes it; a whole float (``1e6``) becomes an int for it.
-
-    Raises:
-        SettingsError: It does not fit; carries `name`, the expected and the found.
-    """
+    """Return the JSON `value` if the library's annotation takes it; a whole float (``1e6``) becomes an int for it."""
     if fits(value, hint):
         return value
     if isinstance(value, float) and value.is_integer() and fits(int(value), hint):
