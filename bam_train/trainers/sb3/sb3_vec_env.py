@@ -1,7 +1,6 @@
 """Environments as stable-baselines3 takes them: `BatchVecEnv` over our batched ones, `DummyVecEnv` over all others."""
 
 import functools
-import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -61,9 +60,7 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
             raise SettingsError(f"{batch}: expected actions that count from 0, found {batch.single_action_space}")
         self.batch = FiniteVectorEnv(batch, env_id)
         super().__init__(batch.num_envs, batch.single_observation_space, batch.single_action_space)
-        self._returns = np.zeros(self.num_envs)
-        self._lengths = np.zeros(self.num_envs, dtype=np.int64)
-        self._started = time.monotonic()
+        self._returns = np.zeros(self.num_envs)  # of the running episodes
         self._actions: NDArray[Any] = np.empty(0)
         self._interrupted: Observations = None
 
@@ -77,7 +74,7 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         seeds: Any = None if all(seed is None for seed in self._seeds) else list(self._seeds)
         observations, _ = self.batch.reset(seed=seeds)
         self._reset_seeds()
-        self._returns[:], self._lengths[:] = 0, 0
+        self._returns[:] = 0
         self._interrupted = None
         return self._copy(observations)
 
@@ -100,30 +97,20 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
             for row, info in enumerate(infos):
                 info |= {"terminal_observation": self._copy(last, row), "TimeLimit.truncated": True}
             return observations, np.zeros(self.num_envs, np.float32), np.ones(self.num_envs, dtype=bool), infos
+        lengths = self.batch.episode_steps + 1
         observations, rewards, terminated, truncated, extra = self.batch.step(self._actions)
         done = terminated | truncated
         self._returns += rewards
-        self._lengths += 1
-        for index in np.flatnonzero(done):
-            infos[index] = self._end(int(index), bool(terminated[index]), extra)
+        for index in np.flatnonzero(done).tolist():  # in the words of stable-baselines3
+            infos[index] = {
+                "terminal_observation": self._copy(extra["final_obs"], index),
+                "TimeLimit.truncated": not terminated[index],
+                "episode": {"r": float(self._returns[index]), "l": int(lengths[index])},
+            }
+            if (success := extra["final_info"].get("is_success")) is not None:
+                infos[index]["is_success"] = bool(success[index])
+        self._returns[done] = 0
         return self._copy(observations), np.asarray(rewards, dtype=np.float32), done, infos
-
-    def _end(self, index: int, terminated: bool, extra: Mapping[str, Any]) -> dict[str, Any]:
-        """The info of an environment whose episode ended, in the words of stable-baselines3; its sums begin again."""
-        info = {
-            "terminal_observation": self._copy(extra["final_obs"], index),
-            "TimeLimit.truncated": not terminated,
-            "episode": {
-                "r": float(self._returns[index]),
-                "l": int(self._lengths[index]),
-                "t": round(time.monotonic() - self._started, 6),
-            },
-        }
-        success = extra["final_info"].get("is_success")
-        if success is not None:
-            info["is_success"] = bool(success[index])
-        self._returns[index], self._lengths[index] = 0, 0
-        return info
 
     def _copy(self, observations: Observations, index: Any = ...) -> Any:
         """A copy, of one environment or all: the environment may write its next observation into the same array."""
@@ -134,15 +121,14 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
     def state_dict(self) -> dict[str, Any]:
         """Everything their future depends on, as arrays and plain values."""
         batch: Any = self.batch
-        return {"rows": batch.state_dict(), "returns": self._returns.copy(), "lengths": self._lengths.copy()}
+        return {"rows": batch.state_dict(), "returns": self._returns.copy(), "lengths": self.batch.episode_steps.copy()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go to what `state_dict` returned."""
         batch: Any = self.batch
         batch.reset()  # builds what a first episode needs before it is overwritten
         batch.load_state_dict(state["rows"])
-        self._returns, self._lengths = np.array(state["returns"]), np.array(state["lengths"])
-        self.batch.episode_steps = self._lengths.copy()
+        self._returns, self.batch.episode_steps = np.array(state["returns"]), np.array(state["lengths"])
 
     def close(self) -> None:
         """Close the environments."""

@@ -48,9 +48,7 @@ RUNS = {
 
 
 def everything(trainer: SB3Trainer) -> dict[str, bytes]:
-    """All that training goes on from, but for wall times."""
-    for episode in trainer.model.ep_info_buffer:
-        episode["t"] = 0
+    """All that training goes on from."""
     return resume.members(trainer.model, trainer.venv, trainer.model.get_vec_normalize_env(), None, {})
 
 
@@ -134,8 +132,6 @@ from bam_train.trainers.sb3.sb3_trainer import SB3Trainer
 for path in sys.argv[1:]:
     trainer = SB3Trainer.load(Checkpoint.open(path))
     trainer.train(trainer.settings.steps, lambda progress: True)
-    for episode in trainer.model.ep_info_buffer:
-        episode["t"] = 0
     state = resume.members(trainer.model, trainer.venv, None, None, {})
     print(trainer.steps, hashlib.sha256(b"".join(state.values())).hexdigest())
 """
