@@ -174,13 +174,3 @@ def write_checkpoint(path: str | Path, manifest_fields: Mapping[str, Any], membe
         why = error.strerror or error
         raise OutputError(f"{path}: cannot be written: {why}. Choose another place with --out") from error
     return Checkpoint(path, parse_manifest(path, manifest))
-
-
-def next_free_path(path: str | Path) -> Path:
-    """Return the path itself if nothing is there, else the first free of name-2.zip, name-3.zip and so on."""
-    path = Path(path).expanduser()
-    free, number = path, 1
-    while os.path.lexists(free):
-        number += 1
-        free = path.with_name(f"{path.stem}-{number}{path.suffix}")
-    return free

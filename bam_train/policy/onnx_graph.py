@@ -53,11 +53,7 @@ _TO_WEIGHTS: dict[int, Any] = {7: {1: {5: {5: {9: {}}}}, 5: {9: {}}}}
 
 
 def require_policy(data: bytes) -> None:
-    """Refuse an ONNX file that is not a policy.
-
-    Raises:
-        FormatError: Not ONNX, damaged, too large, or with something that no policy has; names it.
-    """
+    """Refuse an ONNX file that is damaged, too large, or has something that no policy has (FormatError)."""
     try:
         _require_small(memoryview(data), _TO_WEIGHTS, MOST_STRUCTURE)
         model = _MODEL.FromString(data)
@@ -85,7 +81,7 @@ def _require_graph(graph: Any) -> None:
 
 
 def _require_node(node: Any, varying: set[str]) -> None:
-    """Refuse an operation that is not known, or one of whose result `varying` inputs say the size."""
+    """Refuse an unknown operation, and one of whose result `varying` inputs say the size."""
     op = f"{node.domain}.{node.op_type}" if node.domain else node.op_type
     for attribute in node.attribute:
         inner = [attribute.g, attribute.tensors, attribute.graphs, attribute.sparse_tensor, attribute.sparse_tensors]

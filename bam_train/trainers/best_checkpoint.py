@@ -1,5 +1,7 @@
 """The place of a run's best checkpoint: it overwrites no other run's, and can be written before training begins."""
 
+import itertools
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,7 +10,7 @@ import msgspec
 from msgspec import Struct
 
 from bam_train.atomic_file import remove_orphans
-from bam_train.checkpoint import Checkpoint, next_free_path
+from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import AGAIN
 from bam_train.errors import AlteredCheckpoint, CheckpointError, OutputError
 from bam_train.settings import TrainSettings, file_stem, read_config
@@ -55,7 +57,8 @@ def choose_output(settings: TrainSettings, out: Path | None, force: bool, resume
         return Output(wanted, own.best)
     if force or not wanted.exists():
         return Output(wanted, None)
-    free = next_free_path(wanted)
+    numbered = (wanted.with_name(f"{wanted.stem}-{number}.zip") for number in itertools.count(2))
+    free = next(path for path in numbered if not os.path.lexists(path))
     return Output(free, None, (f"{wanted} exists: the checkpoint goes to {free} (--force overwrites)",))
 
 

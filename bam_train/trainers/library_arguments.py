@@ -64,14 +64,9 @@ def require_known(
     elsewhere: Mapping[str, str],
     others: Iterable[str] = (),
 ) -> None:
-    """Refuse names that are not known.
+    """Refuse names that are not known, with the closest match among `known` and `others`.
 
-    Args:
-        given: The names.
-        known: What may be given.
-        what: The kind of name, for the message.
-        elsewhere: Names of the library that are none here, and why or what to do instead.
-        others: More names to look for the closest match in.
+    `elsewhere` has names of the library that are none here, and why or what to do instead; `what` is the kind of name.
     """
     for name in given:
         if name in known:

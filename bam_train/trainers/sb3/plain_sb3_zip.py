@@ -37,11 +37,7 @@ def load_trusted(
 ) -> tuple[FrozenPolicy, int]:
     """Load with stable-baselines3, UNPICKLING what the file holds; only for files whose maker is trusted.
 
-    Args:
-        path: The zip; the statistics of a VecNormalize are not in it.
-        algo: A name of `SB3_ALGORITHMS`.
-        env_id: The environment it was trained on.
-        env_kwargs: Its keyword arguments.
+    The statistics of a VecNormalize are not in such a file.
 
     Returns:
         The frozen policy, and the steps it was trained for.

@@ -6,8 +6,7 @@ It is taken between two updates: no rollout is half collected, no gradient half 
 import json
 import random
 from collections import deque
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -60,14 +59,9 @@ class Waiting:
 def members(
     model: Any, venv: Any, normaliser: VecNormalize | None, waiting: Waiting | None, notes: Mapping[str, Any]
 ) -> dict[str, bytes]:
-    """The members of a checkpoint from which a run continues.
+    """The members of a checkpoint from which a run of `model` on `venv` continues.
 
-    Args:
-        model: The model, between two updates.
-        venv: Its environments, without wrappers.
-        normaliser: Its `VecNormalize`, if any.
-        waiting: State that a loaded run has not restored yet.
-        notes: JSON values to keep.
+    A loaded run has not restored the `waiting` state yet; the `notes` are JSON values.
     """
     _, loose = model._get_torch_save_params()  # such as SAC's entropy coefficient
     weights = {"states": model.get_parameters(), "loose": {name: recursive_getattr(model, name) for name in loose}}
@@ -216,13 +210,3 @@ def load_random_states(model: Any, tree: Mapping[str, Any]) -> None:
     if tree["cuda"] and model.device.type == "cuda":
         torch.cuda.set_rng_state_all([state.cpu() for state in tree["cuda"]])
     model.action_space.np_random.bit_generator.state = tree["actions"]
-
-
-@contextmanager
-def undisturbed(model: Any) -> Iterator[None]:
-    """Do something between two updates that leaves training's random numbers as they were."""
-    before = random_states(model)
-    try:
-        yield
-    finally:
-        load_random_states(model, before)

@@ -33,7 +33,6 @@ from bam_train.trainers.resolve_settings import own_settings
 from bam_train.trainers.sb3 import sb3_hyperparameters as hyperparameters
 from bam_train.trainers.sb3 import sb3_resume as resume
 from bam_train.trainers.sb3.sb3_freezing import freeze, golden
-from bam_train.trainers.sb3.sb3_resume import undisturbed
 from bam_train.trainers.sb3.sb3_vec_env import BatchVecEnv, make_training_env, one_env
 from bam_train.trainers.tensorboard_files import TensorBoardFiles
 
@@ -56,9 +55,8 @@ class SB3Trainer:
         describe = getattr(env.unwrapped, "describe", None)
         self._signals, self._period = describe() if describe else {}, control_period(env)
         # The environment's own, before normalisation, image transposition and counting from 0.
-        self._spaces: tuple[Any, Any] = env.observation_space, env.action_space
-        if isinstance(venv, BatchVecEnv):
-            self._spaces = env.single_observation_space, env.single_action_space
+        own = "single_" if isinstance(venv, BatchVecEnv) else ""
+        self._spaces: tuple[Any, Any] = getattr(env, f"{own}observation_space"), getattr(env, f"{own}action_space")
         self._normaliser: VecNormalize | None = model.get_vec_normalize_env()
         self._waiting: resume.Waiting | None = None
         self._on_progress: OnProgress = lambda progress: True
@@ -67,7 +65,7 @@ class SB3Trainer:
 
     @classmethod
     def complete(cls, settings: TrainSettings) -> TrainSettings:
-        """Check the algorithm's own settings and fill in its defaults; where servers run it, count its environments."""
+        """Fill in the algorithm's defaults; where servers run the environments, count them."""
         if settings.transport:
             with contextlib.closing(make_vector_env(settings.env, {}, 1, settings.place)) as envs:
                 num_envs, seen, acted = envs.num_envs, envs.single_observation_space, envs.single_action_space
@@ -148,7 +146,7 @@ class SB3Trainer:
             raise TrainingFailed(text) from error
 
     def _roll_out(self, collect: Any, *arguments: Any, **named: Any) -> Any:
-        """Called in place of the algorithm's own `collect_rollouts`: between two updates."""
+        """In place of the algorithm's own `collect_rollouts`: between two updates."""
         if self._waiting is not None:
             waiting, self._waiting = self._waiting, None
             waiting.restore(self.model)
@@ -191,7 +189,7 @@ class SB3Trainer:
     def save(self, path: Path, scores: Mapping[str, Any], notes: Mapping[str, Any]) -> Checkpoint:
         """Write a checkpoint that can be resumed and deployed."""
         self._require_finite_weights()
-        with undisturbed(self.model), self._finite_distributions():
+        with self.undisturbed(), self._finite_distributions():
             theirs = io.BytesIO()  # what stable-baselines3 writes, so that its own `load` opens the checkpoint
             self.model.save(theirs, exclude=["collect_rollouts"])
             with zipfile.ZipFile(theirs) as archive:
@@ -205,15 +203,18 @@ class SB3Trainer:
     def freeze(self) -> FrozenPolicy:
         """The policy as it is now."""
         self._require_finite_weights()
-        with undisturbed(self.model):
+        with self.undisturbed():
             graph = freeze(self.model, self._normaliser, *self._spaces)
         return FrozenPolicy.from_graph(graph, *map(space_to_json, self._spaces))
 
     @contextlib.contextmanager
     def undisturbed(self) -> Iterator[None]:
         """Do something between two updates that leaves training's random numbers as they were."""
-        with undisturbed(self.model):
+        before = resume.random_states(self.model)
+        try:
             yield
+        finally:
+            resume.load_random_states(self.model, before)
 
     @contextlib.contextmanager
     def evaluation_envs(self) -> Iterator[VectorEnv[Any, Any, Any] | None]:

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from bam_train.atomic_file import remove_orphans, replacing
-from bam_train.checkpoint import MANIFEST, Checkpoint, next_free_path, safetensors_file, write_checkpoint
+from bam_train.checkpoint import MANIFEST, Checkpoint, safetensors_file, write_checkpoint
 from bam_train.checkpoint.manifest import WHERE
 from bam_train.errors import (
     AlteredCheckpoint,
@@ -435,14 +435,6 @@ def test_something_in_the_way_is_named(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(tempfile, "mkstemp", denied)
     with pytest.raises(OutputError, match="cannot be written: Permission denied"):
         write_checkpoint(tmp_path / "a.zip", FIELDS, MEMBERS)
-
-
-def test_the_next_free_path(tmp_path: Path):
-    path = tmp_path / "pick-ppo.zip"
-    assert next_free_path(path) == path
-    for number in (2, 3, 4):
-        next_free_path(path).write_text("taken")
-        assert next_free_path(path) == tmp_path / f"pick-ppo-{number}.zip"
 
 
 def test_killed_while_writing_leaves_the_old_file_whole(path: Path):
