@@ -33,14 +33,10 @@ from bam_envs.ros.profile_tables import Content, RobotProfile, Sink, Source
 
 Array = NDArray[np.float64]
 Message = Mapping[str, Any]
-Envelope = tuple[str, str, dict[str, Any]]
-"""Topic, type, message."""
-Sign = Callable[[Tag, str, bytes], str]
-"""The text of a tag on a topic with that content; `Tagger.sign` is one."""
-INFO_SERVICE = "/bam/robot"
-"""Where a served robot says what it is (std_srvs/Trigger; `RobotInfo` in its message)."""
-HALT_TOPIC = "/bam/halt"
-"""Where a served robot is told to stop (std_msgs/Empty)."""
+Envelope = tuple[str, str, dict[str, Any]]  # topic, type, message
+Sign = Callable[[Tag, str, bytes], str]  # the text of a tag on a topic with that content; `Tagger.sign` is one
+INFO_SERVICE = "/bam/robot"  # where a served robot says what it is (std_srvs/Trigger; `RobotInfo` in its message)
+HALT_TOPIC = "/bam/halt"  # where a served robot is told to stop (std_msgs/Empty)
 SCENE_TOPIC = "/bam/scene"
 """Where a simulated robot is told how an episode begins, by requests on ``request`` and replies on ``reply`` below."""
 _ARRAYS = ("std_msgs/Float64MultiArray", "std_msgs/Float32MultiArray")
@@ -59,15 +55,10 @@ class RobotInfo:
     """What a robot says of itself."""
 
     name: str
-    """Its name."""
-    simulated: bool = False
-    """Whether nothing real moves."""
-    lockstep: bool = False
-    """Whether its time goes on only with commands, one period each."""
-    period: Positive | None = None
-    """Time between two commands [s], if it says."""
-    text: str = ""
-    """One line for people."""
+    simulated: bool = False  # whether nothing real moves
+    lockstep: bool = False  # whether its time goes on only with commands, one period each
+    period: Positive | None = None  # time between two commands [s], if it says
+    text: str = ""  # one line for people
 
     def to_json(self) -> str:
         """As it travels."""

@@ -26,18 +26,12 @@ _LONGEST = 256  # characters of a tag: what is read is kept for a while
 class Tag:
     """Who sent a message, and until when it is valid."""
 
-    session: str
-    """One client, from its start to its end; without blanks."""
-    epoch: int
-    """Counts the connections of the session."""
-    sequence: int
-    """Counts its messages over all epochs."""
-    sent: float
-    """When it was sent [s], on the sender's steady clock; the receiver estimates the offset."""
-    deadline: float
-    """Time after which it must not be executed [s], same clock."""
-    mac: str = ""
-    """The signature that came with it; empty without one."""
+    session: str  # one client, from its start to its end; without blanks
+    epoch: int  # counts the connections of the session
+    sequence: int  # counts its messages over all epochs
+    sent: float  # when it was sent [s], on the sender's steady clock; the receiver estimates the offset
+    deadline: float  # time after which it must not be executed [s], same clock
+    mac: str = ""  # the signature that came with it; empty without one
 
     def to_text(self) -> str:
         """The tag as it travels, without a signature."""

@@ -17,17 +17,14 @@ from bam_envs.core.errors import InvalidValue
 from bam_envs.core.wording import brief
 from bam_envs.ros.definitions import DEFINITIONS
 
-MAX_DEPTH = 32
-"""How deep lists and objects may be nested in one another."""
+MAX_DEPTH = 32  # how deep lists and objects may be nested in one another
 INTEGERS = {
     **{f"int{bits}": (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) for bits in (8, 16, 32, 64)},
     **{f"uint{bits}": (0, 2**bits - 1) for bits in (8, 16, 32, 64)},
     "byte": (0, 255),
     "char": (0, 255),
-}
-"""Least and largest value of each integer type."""
-FLOATS = {"float32": 3.4028234663852886e38, "float64": sys.float_info.max}
-"""Largest value of each floating-point type."""
+}  # least and largest value of each integer type
+FLOATS = {"float32": 3.4028234663852886e38, "float64": sys.float_info.max}  # largest value of each floating-point type
 _BYTES = ("uint8", "byte", "char")  # the types whose arrays are `bytes`
 _OBJECT = (dict, Mapping)  # dict first: asking whether something is a Mapping takes ten times as long
 _MISSING: Any = object()  # stands for a field that a message leaves out

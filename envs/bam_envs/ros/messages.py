@@ -180,13 +180,8 @@ def read_stamp(message: Message, where: str) -> float | None:
     if stamp is None:
         return None
     require_message(stamp, f"{where}: header.stamp")
-    parts = []
-    for ros2, ros1 in (("sec", "secs"), ("nanosec", "nsecs")):
-        name = ros2 if ros2 in stamp else ros1
-        if name not in stamp:
-            raise ProtocolError(f"{where}: header.stamp has no {ros2}; found: {', '.join(stamp)}.")
-        parts.append(number(stamp[name], f"{where}: header.stamp.{name}"))
-    seconds, nano = parts
+    names = ("secs" if "secs" in stamp else "sec", "nsecs" if "nsecs" in stamp else "nanosec")
+    seconds, nano = (number_at(message, f"header.stamp.{name}", where) for name in names)
     if seconds < 0 or not 0 <= nano < _NANO:
         raise ProtocolError(f"{where}: header.stamp must be seconds and nanoseconds, not {brief(stamp)}.")
     return seconds + nano / _NANO or None

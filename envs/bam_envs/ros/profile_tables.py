@@ -18,7 +18,6 @@ MessageType = Annotated[
     str,
     Meta(pattern=r"^[A-Za-z]\w*/(msg/)?[A-Za-z]\w*\Z", description="a message type such as sensor_msgs/JointState"),
 ]
-"""``pkg/Type``."""
 ImageType = Literal["sensor_msgs/CompressedImage", "sensor_msgs/Image"]
 """What a camera may send: JPEG or PNG, or raw pixels, which come on a CBOR connection of their own."""
 IMAGE_TYPES = get_args(ImageType)
@@ -153,29 +152,19 @@ class RobotProfile:
     """A live robot, as one file describes it."""
 
     name: str
-    """What it is called."""
-    kind: Literal["arm", "base"]
-    """What moves."""
-    signals: tuple[SignalSpec, ...]
-    """Every signal that has a source."""
-    command: SignalSpec
-    """What it is sent."""
-    state: tuple[Source, ...]
-    """One source for each of `signals`, in their order."""
+    kind: Literal["arm", "base"]  # what moves
+    signals: tuple[SignalSpec, ...]  # every signal that has a source
+    command: SignalSpec  # what it is sent
+    state: tuple[Source, ...]  # one source for each of `signals`, in their order
     commands: Mapping[str, tuple[Sink, ...]]
     """Modes in which a command is sent, by name, the default first. The last sink of a mode completes a command."""
-    period: float
-    """Time between two commands [s]."""
-    max_age: float
-    """Oldest state that is acted on [s]."""
-    command_timeout: float
-    """For how long a command means something [s]; see `command_life`."""
+    period: float  # time between two commands [s]
+    max_age: float  # oldest state that is acted on [s]
+    command_timeout: float  # for how long a command means something [s]; see `command_life`
     limits: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Limits of the guards that differ from their defaults, by their names in `bam_envs.safety.guards`."""
     cameras: tuple[CameraSource, ...] = ()
-    """Its cameras."""
-    readiness: tuple[Readiness, ...] = ()
-    """Where it says whether it can move; the first one that says no is told."""
+    readiness: tuple[Readiness, ...] = ()  # where it says whether it can move; the first one that says no is told
     controllers: str = ""
     """The service that lists its controllers and their states (``list_controllers``); empty: there is none."""
 

@@ -22,14 +22,10 @@ _log = logging.getLogger(__name__)
 class Caller:
     """Who published a message, or calls a service."""
 
-    name: str
-    """Unique among the callers of a bus."""
-    address: str = ""
-    """Where it is, for people."""
-    session: str = ""
-    """The session whose signature the message bears; empty without one."""
-    operator: bool = False
-    """Whether it showed the operator's token."""
+    name: str  # unique among the callers of a bus
+    address: str = ""  # where it is, for people
+    session: str = ""  # the session whose signature the message bears; empty without one
+    operator: bool = False  # whether it showed the operator's token
     silence: Callable[[], float] = field(default=lambda: math.inf, compare=False)
     """How long its connection has given no sign of life [s]; infinite where the bus does not know."""
 
@@ -44,8 +40,7 @@ class Caller:
         return f"session {self.session}" if self.session else self.shown
 
 
-UNKNOWN_CALLER = Caller("")
-"""Where the bus does not say who it is (a real ROS graph)."""
+UNKNOWN_CALLER = Caller("")  # where the bus does not say who it is (a real ROS graph)
 
 Listener = Callable[[Message, Caller], None]
 """Takes a message. Must return at once: it runs in the thread of the network. Never raises."""

@@ -307,7 +307,7 @@ async def _open_socket(endpoint: Endpoint, timeout: float, max_message: int) -> 
             sock=plain,
             ssl=context,
             server_hostname=address.host if context is not None else None,
-            additional_headers=endpoint.headers,
+            additional_headers={"Authorization": f"Bearer {endpoint.token}"} if endpoint.token else None,
             compression=None,  # deflate costs more time than a fast network saves
             open_timeout=deadline - time.monotonic(),
             close_timeout=_CLOSE_WITHIN,

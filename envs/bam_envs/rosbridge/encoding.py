@@ -16,13 +16,11 @@ from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.core.wording import brief
 from bam_envs.ros.interfaces import MAX_DEPTH, Field, normal_name, require_plain, variants
 
-COMPRESSIONS = ("none", "png", "cbor")
-"""How a message may be packed for a subscriber."""
+COMPRESSIONS = ("none", "png", "cbor")  # how a message may be packed for a subscriber
 MOST_ITEMS = 100_000
 """Largest number of values in one JSON message of a client: lists and objects count, and each thing in them. An image
 is one text."""
-MOST_ITEMS_OF_A_SERVER = 4_000_000
-"""The same for messages of a server: an image may come as a list of numbers."""
+MOST_ITEMS_OF_A_SERVER = 4_000_000  # the same for messages of a server: an image may come as a list of numbers
 _NOT_BRACKETS = bytes(set(range(256)) - set(b'"[]{}'))
 _ONE_KIND = bytes.maketrans(b"{}", b"[]")
 _LONGEST_ID = 256  # most characters of an id: it is kept, and repeated, for as long as what it names is unfinished
@@ -30,8 +28,7 @@ _LARGEST_ID = 2**53  # largest id that is a number: what every JSON reader holds
 _MOST_FRAGMENTS = 10_000  # of one outgoing message: a smaller fragment size would cost more than it carries
 _EMPTY = 100  # about what a fragment without any text costs [bytes]
 _MOST_UNFINISHED = 16  # messages of one connection of which fragments may be missing at the same time
-Id = str | int | None
-"""What a client calls an interaction; None if it does not."""
+Id = str | int | None  # what a client calls an interaction; None if it does not
 
 
 def _dtype(tag: int) -> np.dtype[Any]:

@@ -21,10 +21,8 @@ class Address(NamedTuple):
 
     host: str
     port: int
-    secure: bool
-    """Whether the connection uses TLS."""
-    namespace: str
-    """Prefix of each topic and service, e.g. ``/bam_001``; empty without one. It is not sent to the server."""
+    secure: bool  # whether the connection uses TLS
+    namespace: str  # prefix of each topic and service, e.g. `/bam_001`; empty without one. It is not sent to the server
 
     @property
     def url(self) -> str:
@@ -105,11 +103,6 @@ class Endpoint:
         except ValueError as error:
             raise InvalidValue(f"Address {url!r} has an invalid port: {error}. {_EXAMPLE}") from error
         return Address(parts.hostname, port, parts.scheme == "wss", namespace)
-
-    @property
-    def headers(self) -> dict[str, str]:
-        """HTTP headers of the WebSocket handshake."""
-        return {"Authorization": f"Bearer {self.token}"} if self.token else {}
 
     def tls_context(self) -> ssl.SSLContext | None:
         """TLS settings that check certificate and host name; None without TLS. `InvalidValue` for a bad CA file."""

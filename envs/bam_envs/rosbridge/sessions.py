@@ -17,8 +17,7 @@ from bam_envs.core.errors import ProtocolError, RemoteError
 from bam_envs.ros.freshness import Freshness, Tag, Tagger, new_session, signature
 from bam_envs.rosbridge.bus import Caller, Message
 
-SESSION_SERVICE = "/bam/session"
-"""Where a session is opened (std_srvs/Trigger)."""
+SESSION_SERVICE = "/bam/session"  # where a session is opened (std_srvs/Trigger)
 LEASE_TOPIC = "/bam/lease"
 """Where the driver says that it is there, or leaves (std_msgs/String: `RENEW` or `LEAVE`, a blank, a signed tag)."""
 RENEW, LEAVE = "renew", "leave"

@@ -59,8 +59,8 @@ class Admission:
             return None  # browsers set no headers, and an address with a token is logged: it may be a message, too
         elif self._tokens.needed:
             return _unauthorized(connection)
-        if self._is_full:
-            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, self._no_room + "\n")
+        if full := self._full():
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, full + "\n")
         connection.role = connection.role or "client"
         return None
 
@@ -74,8 +74,8 @@ class Admission:
             message = decode_frame(await asyncio.wait_for(connection.next_frame(), limit))
             if message.get("op") == "auth" and isinstance(message.get("token"), str):
                 reason = self._judge(connection, [message["token"]])
-        if reason is None and self._is_full:
-            connection.role, reason = None, self._no_room
+        if reason is None and (full := self._full()):
+            connection.role, reason = None, full
         if reason is not None:
             await connection.close(_POLICY_VIOLATION, reason)
 
@@ -89,13 +89,9 @@ class Admission:
             return "The token is wrong."
         return None
 
-    @property
-    def _is_full(self) -> bool:
-        return self._present() >= self._options.max_clients
-
-    @property
-    def _no_room(self) -> str:
-        return f"There are {self._options.max_clients} clients, and no room for more."
+    def _full(self) -> str:
+        most = self._options.max_clients
+        return f"There are {most} clients, and no room for more." if self._present() >= most else ""
 
 
 def _unauthorized(connection: BridgeConnection) -> Response:

@@ -209,7 +209,7 @@ class Bridge:
         return unsubscribe
 
     def serve(self, service: str, kind: str, handler: Handler) -> None:
-        """Answer `service` with `handler`; the events `Invoke` say when."""
+        """Answer `service` with `handler`; the events that are a `Call` say when."""
         self.services.offer(Service(canonical(service), normal_name(kind), service, handler=handler))
 
     def on_leave(self, callback: Callable[[Caller], None]) -> None:

@@ -17,8 +17,7 @@ from bam_envs.rosbridge.encoding import COMPRESSIONS, Fragments, Id, dump_json, 
 if TYPE_CHECKING:
     from bam_envs.rosbridge.server.topics import Stream
 
-LEVELS = ("none", "error", "warning", "info")
-"""Of status messages: each one includes those before it."""
+LEVELS = ("none", "error", "warning", "info")  # of status messages: each one includes those before it
 _NEVER_SPLIT = 2**31  # a fragment size above that of every message
 _NUMBERS = itertools.count(1)
 _NAME = re.compile(r"/?[A-Za-z_~][\w~]*(?:/[\w~]+)*", re.ASCII)

@@ -12,10 +12,9 @@ from websockets.protocol import Event, State
 from bam_envs.rosbridge.server.client_session import Packet, ServerOptions
 from bam_envs.rosbridge.tokens import Role
 
-TRY_AGAIN_LATER = 1013
-"""Close code of a client that does not read what it must get."""
+TRY_AGAIN_LATER = 1013  # close code of a client that does not read what it must get
+# Most sockets without an admitted client, in all and of one address; the oldest is closed for a new one.
 _STRANGERS, _STRANGERS_OF_ONE = 128, 32
-"""Most sockets without an admitted client, in all and of one address. The oldest is closed for a new one."""
 _OF_A_STRANGER = 65536  # what a stranger may say [bytes]
 _FRAME = 200  # about what a frame costs beside what it holds [bytes]
 
@@ -147,13 +146,10 @@ class BridgeConnection(ServerConnection):
         super().connection_made(transport)
         self.host = str((self.remote_address or [""])[0])
         self._sockets.add(self)
-        strangers = sorted((one for one in self._sockets if one.role is None), key=lambda one: one.born)
-        mine = [one for one in strangers if one.host == self.host]
-        if len(mine) > _STRANGERS_OF_ONE:
-            mine[0].transport.abort()
-        elif len(strangers) > _STRANGERS:
-            host, _ = Counter(one.host for one in strangers).most_common(1)[0]
-            next(one for one in strangers if one.host == host).transport.abort()
+        strangers = [one for one in self._sockets if one.role is None]
+        host, most = Counter(one.host for one in strangers).most_common(1)[0]
+        if most > _STRANGERS_OF_ONE or len(strangers) > _STRANGERS:
+            min((one for one in strangers if one.host == host), key=lambda one: one.born).transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """asyncio: the socket closed."""
