@@ -38,8 +38,13 @@ _INT64 = range(-(2**63), 2**63)
 _DTYPE = re.compile("[<>|=]?[biuf][0-9]{1,2}")
 
 
-def pack(space: Space[Any], value: Any, name: str = "value") -> Tree:
-    """The tree of `value`, which may be one already. InvalidValue names what is wrong, as in ``action['arm'][2]``."""
+def pack(space: Space[Any], value: Any, name: str = "value", *, typed: bool = False) -> Tree:
+    """The tree of `value`, which may be one already; with `typed`, the value of `exact`.
+
+    Raises:
+        InvalidValue: It does not fit; the text names the place, such as ``action['arm'][2]``.
+        UnknownName: No value of such a space can be sent.
+    """
     if isinstance(space, spaces.Box):
         return _finite(space, _array(space, value, name), name)
     if isinstance(space, spaces.Discrete):
@@ -47,10 +52,10 @@ def pack(space: Space[Any], value: Any, name: str = "value") -> Tree:
         if isinstance(plain, bool) or not isinstance(plain, int) or not 0 <= plain - int(space.start) < int(space.n):
             last = int(space.start) + int(space.n) - 1
             raise InvalidValue(f"{name} must be a whole number from {space.start} to {last}, not {brief(value)}.")
-        return plain
+        return np.dtype(space.dtype).type(plain) if typed else plain
     if isinstance(space, spaces.Dict):
         _require_keys(space, value, name)
-        return {key: pack(one, value[key], f"{name}[{key!r}]") for key, one in space.spaces.items()}
+        return {key: pack(one, value[key], f"{name}[{key!r}]", typed=typed) for key, one in space.spaces.items()}
     if isinstance(space, (spaces.MultiDiscrete, spaces.MultiBinary)):
         array = _array(space, value, name)
         if not space.contains(array):
@@ -65,34 +70,25 @@ def pack(space: Space[Any], value: Any, name: str = "value") -> Tree:
         return str(value)
     if isinstance(space, spaces.Tuple):
         _require_length(space, value, name)
-        return [pack(one, part, f"{name}[{i}]") for i, (one, part) in enumerate(zip(space.spaces, value, strict=True))]
+        parts = enumerate(zip(space.spaces, value, strict=True))
+        packed = [pack(one, part, f"{name}[{i}]", typed=typed) for i, (one, part) in parts]
+        return tuple(packed) if typed else packed
     if isinstance(space, spaces.Sequence):
         # Gymnasium stacks arrays, dicts and tuples; a list is the list of items of a tree.
         stacked = space.stack and not isinstance(value, list)
         items = _unstacked(space.feature_space, value, name) if stacked else value
         if not isinstance(items, (tuple, list)):
             raise InvalidValue(f"{name} must be a tuple of any length, not {brief(value)}.")
-        return [pack(space.feature_space, one, f"{name}[{i}]") for i, one in enumerate(items)]
+        packed = [pack(space.feature_space, one, f"{name}[{i}]", typed=typed) for i, one in enumerate(items)]
+        if typed:
+            return stack(space.feature_space, packed) if space.stack else tuple(packed)
+        return packed
     raise UnknownName("kind of space", type(space).__name__, _KINDS)
 
 
 def exact(space: Space[Any], value: Any, name: str = "value") -> Any:
     """Check `value`, which may be a tree, and return it with the types and dtypes of its space. Raises as `pack`."""
-    return _unpacked(space, pack(space, value, name))
-
-
-def _unpacked(space: Space[Any], tree: Tree) -> Any:
-    """The value of a checked tree; arrays are those of the tree."""
-    if isinstance(space, spaces.Discrete):
-        return np.dtype(space.dtype).type(tree)
-    if isinstance(space, spaces.Dict):
-        return {key: _unpacked(part, tree[key]) for key, part in space.spaces.items()}
-    if isinstance(space, spaces.Tuple):
-        return tuple(_unpacked(part, one) for part, one in zip(space.spaces, tree, strict=True))
-    if not isinstance(space, spaces.Sequence):
-        return tree
-    items = tuple(_unpacked(space.feature_space, one) for one in tree)
-    return stack(space.feature_space, items) if space.stack else items
+    return pack(space, value, name, typed=True)
 
 
 def stack(space: Space[Any], each: Sequence[Any]) -> Any:

@@ -9,7 +9,7 @@ import time
 from collections import Counter
 from contextlib import suppress
 
-from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, ProtocolError, RemoteError
+from bam_envs.core.errors import BamEnvsError, LinkLost, ProtocolError, RemoteError
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.tcp_wire import (
     FrameSocket,
@@ -27,6 +27,7 @@ from bam_envs.remote.transport import spec_to_json
 from bam_envs.remote.values import Tree
 from bam_envs.ros.freshness import FreshnessCheck, Tag
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
+from bam_envs.rosbridge.server.admission import listening_error
 from bam_envs.rosbridge.tokens import Guesses, Tokens
 
 _LOG = logging.getLogger(__name__)
@@ -84,10 +85,7 @@ class TcpServer:
         try:
             self._listener = socket.create_server((self.host, self.port), family=family, backlog=128)
         except OSError as error:
-            raise InvalidValue(
-                f"Cannot listen on {self.host} port {self.port}: {error.strerror or error}. "
-                f"Give another port; 0 takes any that is free."
-            ) from error
+            raise listening_error(self.host, self.port, error) from error
         self.port = self._listener.getsockname()[1]
         self._listener.settimeout(_POLL)
         self._thread = threading.Thread(target=self._accept, args=(self._listener,), name="bam-tcp", daemon=True)

@@ -234,7 +234,7 @@ def test_what_was_started_ends_if_the_rest_cannot_start(serve_env):
         with pytest.raises(InvalidValue, match=f"Port {theirs.port} on 127.0.0.1 is in use"):
             serve_env(env=env, port=theirs.port)
         assert env.closed > 0
-        with pytest.raises(InvalidValue, match=f"Cannot listen on 127.0.0.1 port {theirs.port}"):
+        with pytest.raises(InvalidValue, match=f"Port {theirs.port} on 127.0.0.1 is in use"):
             serve_env(tcp=theirs.port)
 
 
