@@ -337,9 +337,8 @@ def test_closing_drops_clients_and_ends_every_thread(env):
 def test_a_port_in_use(server, env):
     with pytest.raises(InvalidValue) as caught:
         TcpServer(EnvServer(env), port=server.port).start()
-    assert str(caught.value) == (
-        f"Port {server.port} on 127.0.0.1 is in use. Stop the program there, or choose another port (0 takes a free one)."
-    )
+    remedy = "Stop the program there, or choose another port (0 takes a free one)."
+    assert str(caught.value) == f"Port {server.port} on 127.0.0.1 is in use. {remedy}"
 
 
 def junk(rng, depth=0):
