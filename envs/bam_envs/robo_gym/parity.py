@@ -24,8 +24,7 @@ _INF = np.inf
 _UNSCALED = ("1", "1", "1")
 NEARER, FAILING, POWER = 50.0, -200.0, (0.30, 0.03)
 """Rewards of a metre nearer and of failure; cost of full speed, forward and turning."""
-SAFETY_RADIUS = 0.40
-"""A corner of the base nearer than this to the middle of a box is a collision [m]."""
+SAFETY_RADIUS = 0.40  # a corner of the base nearer than this to the middle of a box is a collision [m]
 BEAMS = np.round(np.linspace(0, FRONT_RAYS + BACK_RAYS - 1, 16)).astype(np.int64)
 """The rays that are observed, out of those of the front and the back scanner."""
 _CORNERS = np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]]) * np.array(FOOTPRINT) / 2
@@ -223,15 +222,12 @@ class DriveParity(DriveTask):
     """Metres and radians; the way, but none for the first step; 500 steps terminate."""
 
     success_reward: float
-
-    def labels(self) -> tuple[Label, ...]:
-        """Nothing is scaled."""
-        return (
-            Label("target_distance", "target from the base", "m", low=-_INF, high=_INF),
-            Label("target_bearing", "where the target is, seen from the base", "rad", low=-np.pi, high=np.pi),
-            Label("linear_velocity", "speed forward", "m/s", low=-1.1, high=1.1),
-            Label("angular_velocity", "speed of turning anticlockwise", "rad/s", low=-1.6, high=1.6),
-        )
+    observation_labels: tuple[Label, ...] = (
+        Label("target_distance", "target from the base", "m", low=-_INF, high=_INF),
+        Label("target_bearing", "where the target is, seen from the base", "rad", low=-np.pi, high=np.pi),
+        Label("linear_velocity", "speed forward", "m/s", low=-1.1, high=1.1),
+        Label("angular_velocity", "speed of turning anticlockwise", "rad/s", low=-1.6, high=1.6),
+    )
 
     def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
         """There is no distance of before."""
@@ -292,11 +288,10 @@ class Mir100AvoidanceParity(DriveParity, Mir100AvoidanceTask):
     """
 
     success_reward = 100.0
-
-    def labels(self) -> tuple[Label, ...]:
-        """Those of driving, and single rays."""
-        rays = (Label(f"range_{ray}", f"ray {ray} of both scanners", "m", low=0.0, high=29.0) for ray in BEAMS)
-        return (*DriveParity.labels(self), *rays)
+    observation_labels = (
+        *DriveParity.observation_labels,
+        *(Label(f"range_{ray}", f"ray {ray} of both scanners", "m", low=0.0, high=29.0) for ray in BEAMS),
+    )
 
     def seen(self, state: RobotState) -> list[Floats]:
         """Single rays. Shape: (n, 16) in two parts."""

@@ -26,8 +26,7 @@ _POSE, _TWIST = slice(3, 6), slice(6, 8)
 _FRONT = slice(8, 8 + FRONT_RAYS)
 _BACK = slice(_FRONT.stop, _FRONT.stop + BACK_RAYS)
 _COLLISION = _BACK.stop
-MIR_LENGTH = _COLLISION + 1 + 9
-"""Numbers of a base's wire state: 1030."""
+MIR_LENGTH = _COLLISION + 1 + 9  # numbers of a base's wire state: 1030
 
 
 def read_mir(wire: Sequence[float]) -> RobotState:

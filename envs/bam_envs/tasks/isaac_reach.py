@@ -18,8 +18,7 @@ DEFAULT = (0.0, -1.712, 1.712, 0.0, 0.0, 0.0)
 """Joint positions [rad] that actions and observations are measured from."""
 TARGETS = np.array([[0.35, -0.2, 0.15], [0.65, 0.2, 0.5]])
 """Where targets are: lowest and highest x, y, z [m]."""
-PITCH = np.pi / 2
-"""Of targets [rad]: the x axis of the frame at the flange points down."""
+PITCH = np.pi / 2  # of targets [rad]: the x axis of the frame at the flange points down
 CLOSE, ALIGNED = 0.02, 0.05
 """The flange has arrived within this distance [m] and this angle [rad]."""
 SPAN = np.pi

@@ -14,23 +14,29 @@ from bam_envs.tasks.mir100_navigation import DriveTask, spread
 
 SIDE = (2.1, 3.1)
 """Starts are drawn so far from the middle of the room along y, targets as far on the other side [m]."""
-WIDTH = 2.0
-"""They are drawn at most this far from the middle along x [m]."""
+WIDTH = 2.0  # they are drawn at most this far from the middle along x [m]
 BOXES = np.array([[-2.4, -1.5], [-0.5, 0.5], [1.5, 2.4]])
 """Lowest and highest x of the middle of each box [m]."""
-BOX_DEPTH = 1.0
-"""Boxes are drawn at most this far from the middle along y [m]."""
+BOX_DEPTH = 1.0  # boxes are drawn at most this far from the middle along y [m]
 NEAREST = 0.15
 """A ray shorter than this is a collision [m]."""
-SECTORS = 8
-"""The shortest ray is observed of so many sectors of each scanner."""
-SIGHT = 3.0
-"""What is farther than this is observed as if it were there [m]."""
+SECTORS = 8  # the shortest ray is observed of so many sectors of each scanner
+SIGHT = 3.0  # what is farther than this is observed as if it were there [m]
 _FRONT_STARTS = np.linspace(0, FRONT_RAYS, SECTORS + 1).astype(np.int64)[:-1]
 _BACK_STARTS = np.linspace(0, BACK_RAYS, SECTORS + 1).astype(np.int64)[:-1]
-_OF_BOXES = slice(6, 15)
-"""Which of the numbers that are drawn the boxes are made of."""
+_OF_BOXES = slice(6, 15)  # which of the numbers that are drawn the boxes are made of
 _TRIES = 1000
+_RANGES = [
+    Label(
+        f"{name}_{sector}",
+        f"shortest ray of sector {sector} of the {name} scanner, clockwise end first",
+        "m",
+        f"1 - range / {SIGHT:g}, clipped",
+        0.0,
+    )
+    for name in ("front", "back")
+    for sector in range(SECTORS)
+]
 
 
 class Mir100AvoidanceTask(DriveTask):
@@ -57,6 +63,7 @@ class Mir100AvoidanceTask(DriveTask):
         "collision" or "max_steps_exceeded".
     """
 
+    observation_labels = (*DriveTask.observation_labels, *_RANGES)
     failure = "collision"
     draws = 15
     memory: Mapping[str, str] = {**DriveTask.memory, "obstacles": "obstacles"}
@@ -65,14 +72,6 @@ class Mir100AvoidanceTask(DriveTask):
         super().__init__(num_envs, **options)
         self.obstacles = np.zeros((num_envs, len(BOXES), 3))
         """Boxes of a simulated room: x, y [m] and yaw [rad]. Shape: (n, 3, 3)."""
-
-    def labels(self) -> tuple[Label, ...]:
-        """Those of driving, and ranges."""
-        scale = f"1 - range / {SIGHT:g}, clipped"
-        meant = "shortest ray of sector {} of the {} scanner, clockwise end first"
-        sectors = [(name, sector) for name in ("front", "back") for sector in range(SECTORS)]
-        ranges = (Label(f"{name}_{sector}", meant.format(sector, name), "m", scale, 0.0) for name, sector in sectors)
-        return (*super().labels(), *ranges)
 
     def starts(self, draws: Array) -> Array:
         """On either side. Shape: (k, 3)."""

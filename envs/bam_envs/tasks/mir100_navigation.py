@@ -16,8 +16,7 @@ from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.task import Array, Flags, Floats, Label, Memory, Score, as_objects, draw_seeds, labelled_box
 from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS, SCAN_RANGE
 
-FASTEST = np.array([0.5, 0.7])
-"""Speeds of an action of 1: forward [m/s], turning anticlockwise [rad/s]."""
+FASTEST = np.array([0.5, 0.7])  # speeds of an action of 1: forward [m/s], turning anticlockwise [rad/s]
 ARRIVED = 0.2
 """The base has arrived when it is nearer than this to its target [m]."""
 MAX_STEPS = 500
@@ -26,16 +25,12 @@ BOUNDARY = 10.0
 """The floor goes this far from the origin, along x and along y [m]."""
 NEARER, ARRIVING, FAILING, TIME, POWER = 0.5, 2.0, -2.0, 0.005, (0.003, 0.0003)
 """Rewards of a metre nearer, of success and of failure; costs of a step and of full speed, forward and turning."""
-DISTANCE_SCALE = 4.0
-"""Of the distance that is observed [m]."""
+DISTANCE_SCALE = 4.0  # of the distance that is observed [m]
 START, TARGET = 2.0, 1.0
 """Starts and targets are drawn at most this far from the origin, along x and along y [m]."""
-MIN_DISTANCE = 1.0
-"""A target that is drawn is at least this far from the start [m]."""
-CANDIDATES = 64
-"""Targets that are drawn; the first is taken that is far enough from the start."""
-START_TOLERANCE = 0.2
-"""A base that is nearer than this to where it is to start is there [m], [rad]."""
+MIN_DISTANCE = 1.0  # a target that is drawn is at least this far from the start [m]
+CANDIDATES = 64  # targets that are drawn; the first is taken that is far enough from the start
+START_TOLERANCE = 0.2  # a base that is nearer than this to where it is to start is there [m], [rad]
 
 
 class DriveTask(Memory):
@@ -50,6 +45,12 @@ class DriveTask(Memory):
         Label("forward", "speed forward", "m/s", f"/ {FASTEST[0]:g}"),
         Label("turn", "speed of turning anticlockwise", "rad/s", f"/ {FASTEST[1]:g}"),
     )
+    observation_labels: tuple[Label, ...] = (
+        Label("target_distance", "target from the base", "m", f"/ {DISTANCE_SCALE:g}", 0.0, 6.0),
+        Label("target_bearing", "where the target is, seen from the base", "rad", "/ pi"),
+        Label("linear_velocity", "speed forward", "m/s", f"/ {FASTEST[0]:g}", -2.5, 2.5),
+        Label("angular_velocity", "speed of turning anticlockwise", "rad/s", f"/ {FASTEST[1]:g}", -2.5, 2.5),
+    )
     memory: Mapping[str, str] = {"target": "target", "elapsed": "elapsed", "previous": "_previous"}
     failure: str
     """What ``final_status`` says when something went wrong."""
@@ -58,7 +59,6 @@ class DriveTask(Memory):
 
     def __init__(self, num_envs: int = 1, *, rs_state_to_info: bool = False) -> None:
         self.num_envs, self.rs_state_to_info = num_envs, rs_state_to_info
-        self.observation_labels = self.labels()
         self.action_space: spaces.Box = labelled_box(self.action_labels)
         self.observation_space: spaces.Box = labelled_box(self.observation_labels)
         self.target = np.zeros((num_envs, 3))
@@ -67,15 +67,6 @@ class DriveTask(Memory):
         """Steps since the episode began. Shape: (n,)."""
         self._previous = np.full(num_envs, np.nan)  # distance one step ago [m]
         self._draws, self._asked = np.zeros((num_envs, self.draws)), np.full((num_envs, 2, 3), np.nan)
-
-    def labels(self) -> tuple[Label, ...]:
-        """What each number of an observation means."""
-        return (
-            Label("target_distance", "target from the base", "m", f"/ {DISTANCE_SCALE:g}", 0.0, 6.0),
-            Label("target_bearing", "where the target is, seen from the base", "rad", "/ pi"),
-            Label("linear_velocity", "speed forward", "m/s", f"/ {FASTEST[0]:g}", -2.5, 2.5),
-            Label("angular_velocity", "speed of turning anticlockwise", "rad/s", f"/ {FASTEST[1]:g}", -2.5, 2.5),
-        )
 
     def starts(self, draws: Array) -> Array:
         """Hook: start poses out of `draws` from [0, 1). Shapes: (k, draws) -> (k, 3)."""

@@ -20,8 +20,7 @@ START_AREA = np.array([[0.45, -0.05, 0.17], [0.55, 0.05, 0.23]])
 """Where the tool starts: lowest and highest x, y, z [m]."""
 NEAR = 0.03
 """The object is within the gripper's reach at this distance from the tool [m]."""
-LIFT = 0.10
-"""How high the cube must be lifted [m]."""
+LIFT = 0.10  # how high the cube must be lifted [m]
 HOLD_STEPS = 5
 """How long it must be held there: 0.25 s at 20 Hz."""
 TABLE_EDGE = -0.03

@@ -10,18 +10,13 @@ from bam_envs.core.task import Array, Floats, Label, Score
 from bam_envs.robots.ur5e import GRIPPER_OPEN
 from bam_envs.tasks.pick import CUBE_AREA, CUBE_EDGE, NEAR, TABLE_EDGE, CubeSense, PickTask
 
-GOAL_RADIUS = 0.02
-"""The object lies at the goal within this distance [m]."""
-GOAL_DISTANCE = 0.10
-"""A goal is at least this far from where the cube starts [m]."""
-REST_STEPS = 5
-"""How long the object must lie there, let go: 0.25 s at 20 Hz."""
+GOAL_RADIUS = 0.02  # the object lies at the goal within this distance [m]
+GOAL_DISTANCE = 0.10  # a goal is at least this far from where the cube starts [m]
+REST_STEPS = 5  # how long the object must lie there, let go: 0.25 s at 20 Hz
 CARRY = 0.05
 """How high the object is carried [m]."""
-PICKED = 0.03
-"""An object that was this high has been picked up, not pushed [m]."""
-FUNNEL = 0.08
-"""Distance from the goal at which it comes down [m]."""
+PICKED = 0.03  # an object that was this high has been picked up, not pushed [m]
+FUNNEL = 0.08  # distance from the goal at which it comes down [m]
 
 GOAL_LABELS = (
     Label("goal_dx", "goal from the object, forward", "m", "/ 0.2", -2, 2),

@@ -16,12 +16,9 @@ START_NOISE = 0.1
 """The start differs from `HOME` by at most this much in each joint [rad]."""
 GOAL_AREA = np.array([[0.30, -0.30, 0.10], [0.65, 0.30, 0.45]])
 """Where goals are: lowest and highest x, y, z [m]."""
-GOAL_RADIUS = 0.02
-"""The tool has arrived within this distance of the goal [m]."""
-LOWEST_TOOL = 0.04
-"""Commands that would bring the tool lower than this are not followed [m]."""
-JOINT_MARGIN = 0.1
-"""Commands stay this far from the joint limits [rad]."""
+GOAL_RADIUS = 0.02  # the tool has arrived within this distance of the goal [m]
+LOWEST_TOOL = 0.04  # commands that would bring the tool lower than this are not followed [m]
+JOINT_MARGIN = 0.1  # commands stay this far from the joint limits [rad]
 LEASH = 0.15
 """Farthest the commanded joints are from the measured ones [rad]."""
 

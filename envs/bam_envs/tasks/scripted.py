@@ -16,12 +16,9 @@ from bam_envs.tasks.pick_place import CARRY, PickPlaceTask
 from bam_envs.tasks.reach import HOME, ReachTask
 from bam_envs.tasks.tool_control import JOINT_STEP, LEASH, TOOL_STEP, YAW_STEP
 
-HOVER = 0.08
-"""How far above the object the tool comes in [m]."""
-DAMPING = 0.05
-"""Keeps the joints slow where the arm is nearly stretched [m/rad]."""
-PUT_DOWN = 0.004
-"""An object lower than this is let go of [m]."""
+HOVER = 0.08  # how far above the object the tool comes in [m]
+DAMPING = 0.05  # keeps the joints slow where the arm is nearly stretched [m/rad]
+PUT_DOWN = 0.004  # an object lower than this is let go of [m]
 Take = Callable[..., Array]
 """Gives the numbers of the observations with these names, side by side. Shape: (n, names)."""
 

@@ -24,8 +24,7 @@ LEASH = 0.03
 """Farthest the tool target is from the measured tool, along each axis [m]."""
 WORKSPACE = np.array([[0.30, -0.25, 0.016], [0.70, 0.25, 0.35]])
 """Box for the tool target: lowest and highest x, y, z [m]."""
-YAW_LIMIT = 1.2
-"""Farthest the gripper turns from straight ahead [rad]; a cube needs pi/4."""
+YAW_LIMIT = 1.2  # farthest the gripper turns from straight ahead [rad]; a cube needs pi/4
 
 ACTION_LABELS = (
     Label("dx", "move the tool target forward", "m", "/ 0.0124"),

@@ -23,13 +23,11 @@ from bam_envs.robots.ur import DEFAULT_MODEL, JOINTS, UrModel
 from bam_envs.robots.ur import ur_model as model_called
 
 AboveZero = Annotated[float, Meta(gt=0)]
-SHORTEST = 0.5
-"""Shortest time that a trajectory takes [s]."""
+SHORTEST = 0.5  # shortest time that a trajectory takes [s]
 LEASH = 0.2
 """An arm that is measured farther than this from what it was told last [rad] was halted or held: it begins there."""
 FOREARM = LINKS.index("forearm_link")
-WIRE_JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
-"""robo-gym's names of the joints."""
+WIRE_JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")  # robo-gym's names of the joints
 POSITIONS = tuple(f"{joint}_joint_position" for joint in WIRE_JOINTS)
 VELOCITIES = tuple(f"{joint}_joint_velocity" for joint in WIRE_JOINTS)
 

@@ -27,20 +27,15 @@ from bam_envs.tasks.ur_arm import (
     wire_states,
 )
 
-FAR = 2.0
-"""Distance that is 1 in observations [m]."""
-OFFSET = 0.1
-"""Share of the joint limits off the reference that is 1 in observations."""
+FAR = 2.0  # distance that is 1 in observations [m]
+OFFSET = 0.1  # share of the joint limits off the reference that is 1 in observations
 COLLISION = -0.1
 """Reward of a collision."""
 POSE = (-1.57, -1.31, -1.31, -2.18, 1.57, 0.0)
 """Joint positions to stay at [rad]; the obstacle's way goes past the flange."""
-NEAREST = 0.30
-"""Distance of the obstacle from flange and elbow that costs [m]."""
-RAPID = 0.5
-"""Change of an action that costs, in a joint [rad]."""
-SPREAD = 0.6
-"""Sum of the shares of their limits that the joints may be off while it is worth something."""
+NEAREST = 0.30  # distance of the obstacle from flange and elbow that costs [m]
+RAPID = 0.5  # change of an action that costs, in a joint [rad]
+SPREAD = 0.6  # sum of the shares of their limits that the joints may be off while it is worth something
 
 
 def obstacle_labels(

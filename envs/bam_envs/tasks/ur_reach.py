@@ -28,10 +28,8 @@ START_OFFSET = np.array([1.5, 0.25, 0.5, 1.0, 0.4, 3.14])
 """With `randomize_start` each joint is at most so far from there [rad]."""
 WRIST_1_RANGE = (-3.48, 0.31)
 """With `restrict_wrist_1` the whole range of its action [rad]: where it does not fold back onto the forearm."""
-NEAR = 0.1
-"""The flange has arrived within this distance of the target [m]."""
-FAR = 3.0
-"""Farthest that lengths are told, in workspace radii."""
+NEAR = 0.1  # the flange has arrived within this distance of the target [m]
+FAR = 3.0  # farthest that lengths are told, in workspace radii
 _WRIST_1 = 3
 
 

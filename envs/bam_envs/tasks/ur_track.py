@@ -29,22 +29,16 @@ _MOST_BYTES = 2**24  # which file it is may come from a stranger's checkpoint
 _Waypoint = Annotated[tuple[Finite, Finite, Finite, Finite, Finite, Finite], Meta(description="six joint positions")]
 _Segment = Annotated[list[_Waypoint], Meta(min_length=1, description="a list of waypoints")]
 _Segments = Annotated[list[_Segment], Meta(min_length=1, description="a list of segments")]
-NEAREST = 0.45
-"""Distance of the obstacle from flange or elbow that costs [m]."""
-RAPID = 0.4
-"""Change of an action that costs, in a joint [rad]."""
-CLOSE = 0.1
-"""Share of its limit that a joint may be off the reference while it is worth something."""
-ARRIVED = 0.1
-"""A waypoint at the end of a segment is reached with every joint within this [rad]."""
-BONUS = 0.05
-"""Reward of reaching it."""
+NEAREST = 0.45  # distance of the obstacle from flange or elbow that costs [m]
+RAPID = 0.4  # change of an action that costs, in a joint [rad]
+CLOSE = 0.1  # share of its limit that a joint may be off the reference while it is worth something
+ARRIVED = 0.1  # a waypoint at the end of a segment is reached with every joint within this [rad]
+BONUS = 0.05  # reward of reaching it
 AREA = np.array([[-1.0, -1.0, 0.1], [1.0, 1.0, 1.0]])
 """Where the points of the obstacle's paths are: lowest and highest x, y, z [m]."""
 AXIS, BASE = 0.2, 0.35
 """How far paths keep from the z axis and from the base [m]."""
-AROUND = (8000, 12000)
-"""How long a path takes once around: least and most hundredths of a second."""
+AROUND = (8000, 12000)  # how long a path takes once around: least and most hundredths of a second
 FIXED_PATHS, FIXED_AROUND = 50, 4000
 """How many paths `fixed_paths` has, and how long they take once around [1/100 s]."""
 

@@ -17,10 +17,8 @@ from bam_envs.core.task import Memory
 from bam_envs.robots.physics.mujoco_batch import Physics
 
 Array = NDArray[np.float64]
-ARM_COORDINATES = 8
-"""Six joints and two fingers; what comes after is the object."""
-TAPE = 256
-"""Steps of noise drawn at once."""
+ARM_COORDINATES = 8  # six joints and two fingers; what comes after is the object
+TAPE = 256  # steps of noise drawn at once
 
 
 @dataclass(frozen=True)

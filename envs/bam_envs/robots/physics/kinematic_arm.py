@@ -34,11 +34,9 @@ _PAIRS = (
     *((_UPPER, other) for other in (_WRIST_1, _WRIST_2, _WRIST_3)),
     (_FOREARM, _WRIST_3),
 )
-_LOW_LINKS = [_UPPER, _FOREARM, _WRIST_1, _WRIST_2, _WRIST_3, _ELBOW]
-"""Links that can get at the table."""
+_LOW_LINKS = [_UPPER, _FOREARM, _WRIST_1, _WRIST_2, _WRIST_3, _ELBOW]  # links that can get at the table
 _HALVINGS = 20
-LEAST_SHARE = 0.7
-"""Where arms differ: the least share of the way to its set point that one goes in a period."""
+LEAST_SHARE = 0.7  # where arms differ: the least share of the way to its set point that one goes in a period
 
 
 class Capsules(NamedTuple):

@@ -38,8 +38,7 @@ _WALL = (0.15, 0.5)  # thickness and height [m]
 _LASER_HEIGHT = 0.1914
 _EVERY = 6  # one of so many rays is drawn
 _STAYS = 2.5  # how far the base goes before the camera goes with it [m]
-GAIN_SPREAD = 0.05
-"""A randomised drive goes at most this much faster or slower than it is told."""
+GAIN_SPREAD = 0.05  # a randomised drive goes at most this much faster or slower than it is told
 
 
 class SimulatedBase(Memory, Drawn):

@@ -26,8 +26,7 @@ LOWEST, HIGHEST = np.array(COMMAND.low), np.array(COMMAND.high)
 MAX_RATE = np.array(COMMAND.max_rate)
 GRIPPER_LEASH = 0.011
 """Farthest the gripper's set point runs ahead of its fingers [m]: what full force needs, so that it opens at once."""
-LAG = 0.05
-"""How far the joints are behind their set points [s]: damping by stiffness of the actuators."""
+LAG = 0.05  # how far the joints are behind their set points [s]: damping by stiffness of the actuators
 PHYSICS_STEPS = 10  # in a period
 
 

@@ -47,7 +47,6 @@ class Physics:
         self._threads = min(cores, num_envs)
         self._chunk = max(1, num_envs // (4 * self._threads))
         self._start()
-        self._buffers: dict[int, tuple[Array, Array]] = {}
         state = np.empty(mujoco.mj_stateSize(self.model, FULL))
         mujoco.mj_getState(self.model, self._scratch, state, FULL)
         self.state: Array = np.tile(state, (num_envs, 1))
@@ -85,21 +84,9 @@ class Physics:
     def step(self, control: Array) -> None:
         """Advance all environments; `control` are the actuators' set points for each physics step (n, steps, nu)."""
         steps = control.shape[1]
-        if steps not in self._buffers:
-            states = np.empty((self.num_envs, steps, self.state.shape[1]))
-            self._buffers[steps] = states, np.empty((self.num_envs, steps, self.model.nsensordata))
-        states, sensors = self._buffers[steps]
-        self._rollout.rollout(
-            self._models,
-            self._data,
-            self.state,
-            control,
-            nstep=steps,
-            state=states,
-            sensordata=sensors,
-            skip_checks=True,
-            chunk_size=self._chunk,
-        )
+        states = np.empty((self.num_envs, steps, self.state.shape[1]))
+        options = {"nstep": steps, "state": states, "skip_checks": True, "chunk_size": self._chunk}
+        self._rollout.rollout(self._models, self._data, self.state, control, **options)
         after = states[:, -1].copy()
         # MuJoCo puts a diverged state back to its default, so its time is not what it should be, or NaN.
         diverged = ~(np.abs(after[:, 0] - (self.time + steps * self.model.opt.timestep)) < 1e-6)

@@ -14,8 +14,7 @@ from bam_envs.core.splines import Splines, splines_through
 from bam_envs.core.task import Memory
 
 Array = NDArray[np.float64]
-UPDATE_RATE = 100.0
-"""How often an obstacle moves on [Hz]."""
+UPDATE_RATE = 100.0  # how often an obstacle moves on [Hz]
 PATH_POINTS = 10
 """Points of a closed path, the last of which is the first."""
 RADIUS = 0.025

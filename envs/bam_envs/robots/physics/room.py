@@ -20,8 +20,7 @@ BOX_EDGE = 0.5
 """Edge of a box [m]."""
 NOWHERE = (1000.0, 1000.0, 0.0)
 """Pose of a box that is not there: out of sight [m, m, rad]."""
-NOISE = 0.01
-"""Standard deviation of a measured range [m]."""
+NOISE = 0.01  # standard deviation of a measured range [m]
 _HALF = (FOOTPRINT[0] / 2, FOOTPRINT[1] / 2)
 _CHUNK = 64
 _TAPE = 1 << 17
