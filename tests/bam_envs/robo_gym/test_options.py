@@ -1,12 +1,12 @@
 """What robo-gym's constructor options become here."""
 
 import logging
+import sys
 
 import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue, UnknownName
-from bam_envs.robo_gym import making
 from bam_envs.robo_gym.making import constructor_options, say_once, translate
 from bam_envs.robo_gym.table import ROBO_GYM
 
@@ -73,15 +73,17 @@ def test_parity_without_robo_gyms_trajectory(told):
 
 @pytest.mark.parametrize("name", ["gui", "gazebo_gui"])
 def test_gui_is_a_window(name, told, monkeypatch):
-    monkeypatch.setattr(making, "render_modes", lambda: ["rgb_array", "human"])
+    monkeypatch.setenv("DISPLAY", ":77")
     for _ in range(2):
         assert translate(SIM, {name: True}) == {**DEFAULTS, "render_mode": "human"}
     assert told() == [f"{name}=True is render_mode='human': a window with the simulated robot."]
     assert translate(SIM, {name: True, "render_mode": "rgb_array"})["render_mode"] == "rgb_array"
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a display")
 def test_gui_without_a_display(told, monkeypatch):
-    monkeypatch.setattr(making, "render_modes", lambda: ["rgb_array"])
+    for variable in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(variable, raising=False)
     assert translate(SIM, {"gui": True}) == DEFAULTS
     assert told() == ["gui=True: no window, for there is no display; render_mode='rgb_array' draws."]
 
