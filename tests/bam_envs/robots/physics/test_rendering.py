@@ -13,7 +13,6 @@ from bam_envs.robots.physics import rendering
 from bam_envs.robots.physics.mujoco_batch import Physics
 from bam_envs.robots.physics.rendering import RenderingUnavailable, find_backend, open_view
 
-
 ON_LINUX = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a display")
 
 
