@@ -11,21 +11,22 @@ Examples:
   python scripts/check_commands.py --only td3 --seeds 5 --folder /tmp/td3
 """
 
-import argparse
 import re
 import shlex
 import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import gymnasium as gym
+from tyro.conf import arg
 
 from bam_train.checkpoint import Checkpoint
-from bam_train.cli.experiment import ScriptParser, whole
-from bam_train.cli.program import guarded
+from bam_train.cli.flags import Count, Seed
+from bam_train.cli.program import guarded, parse
 from bam_train.evaluation import evaluate
 from bam_train.policy import FrozenPolicy
 
@@ -114,7 +115,23 @@ def row(words: tuple[str, ...], seed: int, result: Result) -> str:
     return f"| `{shlex.join(words)}` | {seed} | {numbers} |"
 
 
-def main(args: argparse.Namespace) -> int:
+@dataclass(frozen=True)
+class Flags:
+    """Which commands are run, and how."""
+
+    list: bool = False
+    """Print the commands and run nothing."""
+    only: Annotated[str, arg(metavar="TEXT")] = ""
+    """Only commands with this in them."""
+    seeds: Annotated[tuple[Seed, ...], arg(metavar="N ...")] = (0, 1, 2)
+    """Each command is run with each of these."""
+    episodes: Count = 200
+    """Fresh episodes of an evaluation."""
+    folder: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Where outputs and checkpoints go; by default a new one."""
+
+
+def main(args: Flags) -> int:
     """Run them all and print the table; 1 if one did not learn."""
     chosen = [words for words in commands() if args.only in shlex.join(words)]
     if args.list:
@@ -132,18 +149,5 @@ def main(args: argparse.Namespace) -> int:
     return int(bool({"FAILED", "NO"} & {*learnt}))
 
 
-def parse() -> argparse.Namespace:
-    """Read the command line."""
-    parser = ScriptParser(__file__, __doc__)
-    add = parser.add_argument
-    add("--list", action="store_true", help="print the commands and run nothing")
-    add("--only", default="", metavar="TEXT", help="only commands with this in them")
-    add("--seeds", type=whole(0), nargs="+", default=[0, 1, 2], metavar="N", help="default 0 1 2")
-    add("--episodes", type=whole(1), default=200, metavar="N", help="fresh episodes of an evaluation (default 200)")
-    add("--folder", type=Path, metavar="DIR", help="where outputs and checkpoints go; by default a new one")
-    args: argparse.Namespace = parser.parse_args()
-    return args
-
-
 if __name__ == "__main__":
-    raise SystemExit(guarded(lambda: main(parse()), NAME))
+    raise SystemExit(guarded(lambda: main(parse(Flags, NAME, description=__doc__)), NAME))

@@ -1,7 +1,7 @@
 """What policy_from_cp_mir.py and policy_from_cp_ur.py have in common: run the policy of a checkpoint."""
 
-import argparse
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +11,33 @@ import numpy as np
 from bam_envs.core.registry import resolve_id
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.console import say, tell
-from bam_train.cli.experiment import ScriptParser, open_env, whole
-from bam_train.cli.program import guarded
+from bam_train.cli.experiment import RobotFlags, open_env
+from bam_train.cli.flags import Assignments, CheckpointFile, Count, EnvId, Seed
+from bam_train.cli.program import guarded, parse
 from bam_train.evaluation import FIRST_SEED
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import read_env_kwargs
 
 
-def open_checkpoint(
-    args: argparse.Namespace, given: dict[str, Any], name: str, default: str, folder: str
-) -> Checkpoint:
+@dataclass(frozen=True, kw_only=True)
+class Flags(RobotFlags):
+    """Which policy is run, and how often."""
+
+    checkpoint: CheckpointFile
+    """A checkpoint.zip, or a directory that RLlib wrote."""
+    env: EnvId = None
+    """Of a directory that does not say where it was trained."""
+    set: Assignments = ()
+    """env_kwargs.NAME=VALUE: an argument of the environment, any number of times; it wins over the checkpoint's."""
+    num_episodes: Count = 5
+    """How many."""
+    seed: Seed = FIRST_SEED
+    """Of the first episode."""
+    trust_pickle: bool = False
+    """Let RLlib read its directory, which runs what is in it."""
+
+
+def open_checkpoint(args: Flags, given: dict[str, Any], name: str, default: str, folder: str) -> Checkpoint:
     """The checkpoint of `args`; one out of a directory of RLlib is written into `folder`."""
     path = args.checkpoint.expanduser()
     if not path.is_dir():
@@ -54,13 +71,13 @@ def play(env: gym.Env[Any, Any], policy: FrozenPolicy, seed: int) -> tuple[float
     return total, bool(info.get("is_success")), clipped, steps
 
 
-def run(args: argparse.Namespace, name: str, default: str, kind: str) -> None:
+def run(args: Flags, name: str, default: str, kind: str) -> None:
     """Run the episodes, in a simulation or on a live robot."""
     given = read_env_kwargs(args.set)
     with tempfile.TemporaryDirectory() as folder:
         checkpoint = open_checkpoint(args, given, name, default, folder)
         policy = FrozenPolicy.from_checkpoint(checkpoint)
-        more = {"yes": args.yes, "render": args.render, "env_kwargs": given}
+        more: Any = {"yes": args.yes, "render": args.render, "env_kwargs": given}
         with open_env(checkpoint, args.robot, who=name, episodes=args.num_episodes, **more) as env:
             moved = getattr(env.unwrapped, "robot", None)
             robot = f"a {moved.spec.name}" if moved is not None else "no robot of ours"
@@ -75,22 +92,6 @@ def run(args: argparse.Namespace, name: str, default: str, kind: str) -> None:
             tell(f"success in {successes} of {args.num_episodes} episodes on {checkpoint.manifest.env}")
 
 
-def parse(script: str, description: str, default: str) -> argparse.Namespace:
-    """Read the command line."""
-    parser = ScriptParser(script, description)
-    add = parser.add_argument
-    add("checkpoint", type=Path, metavar="CHECKPOINT", help="checkpoint.zip, or a directory that RLlib wrote")
-    add("--env", metavar="ID", help=f"of a directory that does not say where it was trained (default {default})")
-    text = "an argument of the environment, any number of times; it wins over the checkpoint's"
-    add("--set", action="append", default=[], metavar="env_kwargs.NAME=VALUE", help=text)
-    add("--num-episodes", type=whole(1), default=5, metavar="N", help="how many (default 5)")
-    add("--seed", type=whole(0), default=FIRST_SEED, metavar="N", help=f"of the first episode (default {FIRST_SEED})")
-    add("--trust-pickle", action="store_true", help="let RLlib read its directory, which runs what is in it")
-    parser.add_robot()
-    args: argparse.Namespace = parser.parse_args()
-    return args
-
-
 def main(script: str, description: str, default: str, kind: str) -> int:
     """Run `script`, whose docstring is `description`; its exit status.
 
@@ -98,4 +99,4 @@ def main(script: str, description: str, default: str, kind: str) -> int:
     that the script is for begin with `kind`.
     """
     name = Path(script).stem
-    return guarded(lambda: run(parse(script, description, default), name, default, kind), name)
+    return guarded(lambda: run(parse(Flags, name, description=description), name, default, kind), name)

@@ -8,18 +8,17 @@ Examples:
   bam-train --trainer rllib --env bam/pick --algo bc --data recorded
 """
 
-from __future__ import annotations
-
-import argparse
-import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from tyro.conf import arg
 
+from bam_envs.core.validation import NonNegative
 from bam_train.checkpoint import Checkpoint
-from bam_train.cli.experiment import ScriptParser, whole
-from bam_train.cli.program import guarded
+from bam_train.cli.flags import CheckpointFile, Count, EnvId, Seed
+from bam_train.cli.program import guarded, parse
 from bam_train.environments import environment_of, make_vector_env
 from bam_train.errors import OutputError
 from bam_train.policy import FrozenPolicy
@@ -30,7 +29,7 @@ NAME = Path(__file__).stem
 
 def main() -> None:
     """Read the options, record, say how it went."""
-    options = parse()
+    options = parse(Flags, NAME, description=__doc__)
     import pyarrow.parquet  # noqa: F401 - what is missing is said before the work
 
     checkpoint = Checkpoint.open(options.checkpoint.expanduser())
@@ -48,30 +47,24 @@ def main() -> None:
     )
 
 
-def parse() -> argparse.Namespace:
-    """Read the command line."""
-    parser = ScriptParser(__file__, __doc__)
-    add = parser.add_argument
-    add("checkpoint", type=Path, metavar="CHECKPOINT", help="checkpoint.zip of the policy")
-    add("--env", metavar="ID", help="environment it was trained on; needed for some_module:Env-v0")
-    add("--out", type=Path, required=True, metavar="DIR", help="folder for the files, without any so far")
-    add("--episodes", type=whole(1), default=100, metavar="N", help="how many (default 100)")
-    add("--seed", type=whole(0), default=0, metavar="N", help="of the environments and the noise (default 0)")
-    add("--noise", type=deviation, default=0.0, metavar="X", help="deviation added to continuous actions (default 0)")
-    add("--num-envs", type=whole(1), default=16, metavar="N", help="environments stepped side by side (default 16)")
-    options: argparse.Namespace = parser.parse_args()
-    return options
+@dataclass(frozen=True, kw_only=True)
+class Flags:
+    """What is recorded, and where it goes."""
 
-
-def deviation(text: str) -> float:
-    """A number from 0."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"expected a number from 0, found {text!r}")
-    return value
+    checkpoint: CheckpointFile
+    """Of the policy."""
+    env: EnvId = None
+    """Environment it was trained on; needed for some_module:Env-v0."""
+    out: Annotated[Path, arg(metavar="DIR")]
+    """Folder for the files, without any so far."""
+    episodes: Count = 100
+    """How many."""
+    seed: Seed = 0
+    """Of the environments and the noise."""
+    noise: Annotated[NonNegative, arg(metavar="X")] = 0.0
+    """Deviation added to continuous actions."""
+    num_envs: Count = 16
+    """Environments stepped side by side."""
 
 
 def make_folder(folder: Path) -> Path:

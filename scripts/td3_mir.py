@@ -9,15 +9,16 @@ Examples:
   python scripts/td3_mir.py --robot ws://10.0.0.5:9090  train, then drive a real one
 """
 
-import argparse
 import contextlib
+from dataclasses import dataclass
 from pathlib import Path
 
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli import experiment
 from bam_train.cli.console import number
-from bam_train.cli.experiment import ScriptParser, open_env, whole
-from bam_train.cli.program import guarded
+from bam_train.cli.experiment import open_env
+from bam_train.cli.flags import Count, Seed
+from bam_train.cli.program import guarded, parse
 from bam_train.evaluation import FIRST_SEED
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers import load_trainer
@@ -28,7 +29,19 @@ from bam_train.trainers.resolve_settings import resolve
 ENV, NAME = "bam/mir100-navigation-v0", Path(__file__).stem
 
 
-def train(args: argparse.Namespace) -> Checkpoint:
+@dataclass(frozen=True, kw_only=True)
+class Flags(experiment.TrainingFlags):
+    """How long it trains, and how often the policy is run."""
+
+    steps: Count = 15_000
+    """Steps of training."""
+    episodes: Count = 10
+    """Episodes afterwards."""
+    seed: Seed = 0
+    """Of weights, samples and episodes."""
+
+
+def train(args: Flags) -> Checkpoint:
     """Train until all steps are done or a signal comes; save twenty times on the way."""
     given = {**experiment.environment_of(args, ENV, {}), "trainer": "sb3", "algo": "td3"}
     settings = resolve({**given, "steps": args.steps, "seed": args.seed})
@@ -50,7 +63,7 @@ def train(args: argparse.Namespace) -> Checkpoint:
     return Checkpoint.open(output.path)
 
 
-def main(args: argparse.Namespace) -> None:
+def main(args: Flags) -> None:
     """Train, save, load, run."""
     checkpoint = train(args)
     policy = FrozenPolicy.load(checkpoint.path)
@@ -68,18 +81,5 @@ def main(args: argparse.Namespace) -> None:
             )
 
 
-def parse() -> argparse.Namespace:
-    """Read the command line."""
-    parser = ScriptParser(__file__, __doc__)
-    add = parser.add_argument
-    add("--steps", type=whole(1), default=15_000, metavar="N", help="steps of training (default 15000)")
-    add("--episodes", type=whole(1), default=10, metavar="N", help="episodes afterwards (default 10)")
-    add("--seed", type=whole(0), default=0, metavar="N", help="of weights, samples and episodes (default 0)")
-    parser.add_environment(ENV)
-    parser.add_robot()
-    args: argparse.Namespace = parser.parse_args()
-    return args
-
-
 if __name__ == "__main__":
-    raise SystemExit(guarded(lambda: main(parse()), NAME))
+    raise SystemExit(guarded(lambda: main(parse(Flags, NAME, description=__doc__)), NAME))

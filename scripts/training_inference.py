@@ -1,25 +1,19 @@
 """Train with RLlib, save, use the policy: what training_inference_mir.py and training_inference_ur.py share."""
 
-import argparse
 import contextlib
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium as gym
+from tyro.conf import arg
 
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.console import number
-from bam_train.cli.experiment import (
-    ScriptParser,
-    environment_of,
-    open_env,
-    require_place,
-    signals_ask,
-    whole,
-)
-from bam_train.cli.program import guarded
+from bam_train.cli.experiment import TrainingFlags, environment_of, open_env, require_place, signals_ask
+from bam_train.cli.flags import Count, Seed
+from bam_train.cli.program import guarded, parse
 from bam_train.errors import SettingsError
 from bam_train.evaluation import FIRST_SEED
 from bam_train.policy import FrozenPolicy
@@ -41,7 +35,31 @@ class Experiment:
     env_kwargs: dict[str, Any] = field(default_factory=dict)
 
 
-def train(args: argparse.Namespace, experiment: Experiment) -> tuple[Checkpoint, Any]:
+@dataclass(frozen=True, kw_only=True)
+class Flags(TrainingFlags):
+    """How it trains, when that is enough, and how the policy is used."""
+
+    run: str = "PPO"
+    """Algorithm of RLlib, in any case of letters."""
+    num_cpus: Seed = 0
+    """One learns, the others run episodes; 0 is one."""
+    framework: str = "torch"
+    """RLlib has no other any more."""
+    stop_iters: Annotated[Count | None, arg(metavar="N")] = None
+    """Iterations, by default those of the experiment."""
+    stop_timesteps: Annotated[Count | None, arg(metavar="N")] = None
+    """Steps, by default those of the experiment."""
+    stop_reward: Annotated[float | None, arg(metavar="R")] = None
+    """Mean total reward to end at, by default the one at which almost every episode of the experiment succeeds."""
+    explore_during_inference: bool = False
+    """Draw actions as in training, not the best ones."""
+    num_episodes_during_inference: Count = 10
+    """Episodes after training."""
+    seed: Seed = 0
+    """Of weights, samples and episodes."""
+
+
+def train(args: Flags, experiment: Experiment) -> tuple[Checkpoint, Any]:
     """Train until something says stop, saving after every iteration; the checkpoint, and the policy to go on with."""
     given = {
         **environment_of(args, experiment.env, experiment.env_kwargs),
@@ -49,7 +67,7 @@ def train(args: argparse.Namespace, experiment: Experiment) -> tuple[Checkpoint,
         "algo": args.run.lower(),
     }
     runners = max(0, args.num_cpus - 1)
-    settings = resolve({**given, "seed": args.seed, "steps": args.stop_timesteps, "num_env_runners": runners})
+    settings = resolve({**given, "seed": args.seed, "steps": experiment.stop_timesteps, "num_env_runners": runners})
     from bam_train.trainers.rllib.ray_resources import cores
 
     if runners > cores():
@@ -65,8 +83,8 @@ def train(args: argparse.Namespace, experiment: Experiment) -> tuple[Checkpoint,
         iterations, mean = iterations + 1, progress.statistics().return_mean
         trainer.save(output.path, {}, {})
         print(f"iteration {iterations}: {progress.steps:,} steps, mean total reward {number(mean)}", flush=True)
-        reached = mean is not None and mean >= args.stop_reward
-        return not (reached or iterations >= args.stop_iters or asked())
+        reached = mean is not None and mean >= experiment.stop_reward
+        return not (reached or iterations >= experiment.stop_iters or asked())
 
     trainer: Any = load_trainer("rllib").create(settings)
     with contextlib.closing(trainer):
@@ -89,7 +107,7 @@ def infer(env: gym.Env[Any, Any], policy: Any, episodes: int, seed: int) -> None
         print(f"episode {k + 1}: total reward {total:.2f}{', success' if info.get('is_success') else ''}", flush=True)
 
 
-def run(args: argparse.Namespace, name: str, experiment: Experiment) -> None:
+def run(args: Flags, experiment: Experiment, name: str) -> None:
     """Train, then infer in an environment of its own: simulated, or a live robot's."""
     checkpoint, policy = train(args, experiment)
     episodes = args.num_episodes_during_inference
@@ -98,53 +116,26 @@ def run(args: argparse.Namespace, name: str, experiment: Experiment) -> None:
         infer(env, policy, episodes, FIRST_SEED + args.seed)
 
 
-def parse(script: str, description: str, experiment: Experiment) -> argparse.Namespace:
-    """Read the command line."""
-    parser = ScriptParser(script, description)
-    add = parser.add_argument
-    add("--run", default="PPO", metavar="NAME", help="algorithm of RLlib, in any case of letters (default PPO)")
-    add(
-        "--num-cpus", type=whole(0), default=0, metavar="N", help="one learns, the others run episodes (default 0: one)"
-    )
-    add("--framework", default="torch", metavar="NAME", help="torch; RLlib has no other any more")
-    add(
-        "--stop-iters",
-        type=whole(1),
-        default=experiment.stop_iters,
-        metavar="N",
-        help="iterations (default %(default)s)",
-    )
-    add(
-        "--stop-timesteps",
-        type=whole(1),
-        default=experiment.stop_timesteps,
-        metavar="N",
-        help="steps (default %(default)s)",
-    )
-    add(
-        "--stop-reward",
-        type=float,
-        metavar="R",
-        help=f"mean total reward to end at (default {experiment.stop_reward} on {experiment.env})",
-    )
-    add("--explore-during-inference", action="store_true", help="draw actions as in training, not the best ones")
-    add(
-        "--num-episodes-during-inference", type=whole(1), default=10, metavar="N", help="episodes after it (default 10)"
-    )
-    add("--seed", type=whole(0), default=0, metavar="N", help="of weights, samples and episodes (default 0)")
-    parser.add_environment(experiment.env)
-    parser.add_robot()
-    args: argparse.Namespace = parser.parse_args()
-    if args.stop_reward is None:  # rewards of other environments are of another size
-        args.stop_reward = math.inf if args.env or args.parity else experiment.stop_reward
+def read(script: str, description: str, experiment: Experiment) -> tuple[Flags, Experiment]:
+    """The command line, and the experiment with its numbers."""
+    args = parse(Flags, Path(script).stem, description=description)
     if args.framework.lower() != "torch":
-        parser.error(f"--framework {args.framework}: RLlib has nothing but torch any more; leave it out")
+        raise SettingsError(f"--framework {args.framework}: RLlib has nothing but torch any more; leave it out")
     if args.explore_during_inference and args.robot is not None:
-        parser.error("--explore-during-inference draws actions at random, which is not for a live robot; leave it out")
-    return args
+        raise SettingsError(
+            "--explore-during-inference draws actions at random, which is not for a live robot; leave it out"
+        )
+    # Rewards of other environments are of another size.
+    enough = math.inf if args.env or args.parity else experiment.stop_reward
+    return args, replace(
+        experiment,
+        stop_iters=args.stop_iters or experiment.stop_iters,
+        stop_timesteps=args.stop_timesteps or experiment.stop_timesteps,
+        stop_reward=enough if args.stop_reward is None else args.stop_reward,
+    )
 
 
 def main(script: str, description: str, experiment: Experiment) -> int:
     """Run `script`, whose docstring is `description`; its exit status."""
     name = Path(script).stem
-    return guarded(lambda: run(parse(script, description, experiment), name, experiment), name)
+    return guarded(lambda: run(*read(script, description, experiment), name), name)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.console import say
+from bam_train.cli.flags import EnvId, File, Url
 from bam_train.signals import SignalMemory, handled, interrupt
 
 if TYPE_CHECKING:
@@ -18,55 +18,31 @@ if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
 
 
-class ScriptParser(argparse.ArgumentParser):
-    """Parses the options of the script `file`, described by its docstring; an error is one line, with status 2."""
+@dataclass(frozen=True, kw_only=True)
+class RobotFlags:
+    """Where the policy acts, and who watches; a script's own flags come before these."""
 
-    def __init__(self, file: str, description: str | None) -> None:
-        kind, name = argparse.RawDescriptionHelpFormatter, Path(file).stem
-        super().__init__(name, "%(prog)s.py [options]", description, formatter_class=kind, allow_abbrev=False)
-
-    def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
-        """Read the command line, or `args`; an unknown option has the closest match."""
-        known, rest = self.parse_known_args(args, namespace)
-        if rest:
-            from bam_envs.core.wording import did_you_mean
-
-            options = [text for action in self._actions for text in action.option_strings]
-            self.error(f"unknown option {rest[0]!r}. {did_you_mean(rest[0].partition('=')[0], options)}")
-        return known
-
-    def add_environment(self, own: str) -> None:
-        """Add ``--env``, ``--parity`` and ``--out``, what is trained on and where it goes."""
-        self.add_argument("--env", metavar="ID", help=f"environment, any that bam-train takes (default {own})")
-        self.add_argument("--parity", action="store_true", help="robo-gym's own arithmetic: env_kwargs.parity=true")
-        where = "checkpoint (default checkpoints/NAME.zip, or a numbered one)"
-        self.add_argument("--out", type=Path, metavar="FILE", help=where)
-
-    def add_robot(self) -> None:
-        """Add ``--robot``, ``--yes`` and ``--render``, where the policy acts and who watches."""
-        what = "use the policy on a live robot behind rosbridge, such as ws://10.0.0.5:9090"
-        self.add_argument("--robot", metavar="URL", help=what)
-        self.add_argument("--yes", action="store_true", help="do not ask before a real robot moves")
-        self.add_argument("--render", action="store_true", help="show the policy's episodes in a window")
-
-    def error(self, message: str) -> NoReturn:
-        """End the program with one line on standard error."""
-        self.exit(2, f"{self.prog}: {message.removeprefix('argument ')}\n")
+    robot: Url = None
+    """Use the policy on a live robot behind rosbridge, such as ws://10.0.0.5:9090."""
+    yes: bool = False
+    """Do not ask before a real robot moves."""
+    render: bool = False
+    """Show the policy's episodes in a window."""
 
 
-def whole(least: int) -> Callable[[str], int]:
-    """What reads a whole number that is at least `least`, as an argument's type."""
+@dataclass(frozen=True, kw_only=True)
+class TrainingFlags(RobotFlags):
+    """What is trained on, and where it goes."""
 
-    def read(text: str) -> int:
-        with contextlib.suppress(ValueError):
-            if int(text) >= least:
-                return int(text)
-        raise argparse.ArgumentTypeError(f"expected a whole number from {least}, found {text!r}")
+    env: EnvId = None
+    """Environment, any that bam-train takes, instead of the script's own."""
+    parity: bool = False
+    """robo-gym's own arithmetic: env_kwargs.parity=true."""
+    out: File = None
+    """Checkpoint (default checkpoints/NAME.zip, or a numbered one)."""
 
-    return read
 
-
-def environment_of(args: argparse.Namespace, own: str, own_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+def environment_of(args: TrainingFlags, own: str, own_kwargs: Mapping[str, Any]) -> dict[str, Any]:
     """The settings ``env`` and ``env_kwargs`` of ``--env`` and ``--parity``; without ``--env`` the script's own."""
     kwargs = dict(own_kwargs) if args.env is None else {}
     return {"env": args.env or own, "env_kwargs": kwargs | ({"parity": True} if args.parity else {})}

@@ -107,24 +107,30 @@ def _complain(prog: str, text: str) -> None:
     say(f"{prog}: {line if len(line) <= LONGEST else f'{line[:LONGEST]} ... ({len(line)} characters)'}")
 
 
-def parse(config: type[Config], prog: str, arguments: Sequence[str] | None = None) -> Config:
+def parse(
+    config: type[Config], prog: str, arguments: Sequence[str] | None = None, description: str | None = None
+) -> Config:
     """The command line as a `config`; what is wrong with it becomes one line, with status 2.
 
     Args:
-        config: A frozen dataclass; one field is one flag, its docstring the description.
+        config: A frozen dataclass; one field is one flag.
         prog: The program's name.
         arguments: Instead of those of the process.
+        description: The docstring of a script; of a program it is that of `config`.
     """
     import tyro
 
+    remedy = f"Run {prog if description is None else f'python {sys.argv[0]}'} --help"
     no_pairs = (tyro.conf.FlagCreatePairsOff,)  # --force, no --no-force
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
-            parsed = tyro.cli(config, prog=prog, description=config.__doc__, args=arguments, config=no_pairs)
+            parsed = tyro.cli(
+                config, prog=prog, description=description or config.__doc__, args=arguments, config=no_pairs
+            )
     except SystemExit as stop:
         if stop.code:
-            _complain(prog, f"{usage_error(box.getvalue(), config)} Run {prog} --help")
+            _complain(prog, f"{usage_error(box.getvalue(), config)} {remedy}")
         raise
     from bam_envs.core.errors import InvalidValue
     from bam_envs.core.validation import check_fields
@@ -133,7 +139,7 @@ def parse(config: type[Config], prog: str, arguments: Sequence[str] | None = Non
     try:
         check_fields(parsed, as_flag)
     except InvalidValue as error:
-        _complain(prog, f"{error}. Run {prog} --help")
+        _complain(prog, f"{error}. {remedy}")
         raise SystemExit(2) from error
     return parsed
 

@@ -1,7 +1,6 @@
 """The script that runs every training command of the pages: which ones these are, and what it says of a run."""
 
 import shlex
-import sys
 
 import pytest
 
@@ -11,9 +10,8 @@ def script(load_script):
     return load_script("check_commands")
 
 
-def test_the_commands_are_those_that_train_here_each_once(script, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["check_commands.py", "--list"])
-    assert script.main(script.parse()) == 0
+def test_the_commands_are_those_that_train_here_each_once(script, capsys):
+    assert script.main(script.Flags(list=True)) == 0
     found = capsys.readouterr().out.splitlines()
     assert "bam-train --trainer rllib --env bam/pick --algo ppo --num-env-runners 2" in found
     assert "bam-train --env bam/pick --algo ppo --until-success 0.95" in found  # without its --seed and --out

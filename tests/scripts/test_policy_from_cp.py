@@ -165,7 +165,7 @@ def test_what_cannot_be_is_one_line(run, arguments, text):
 
 
 def test_the_command_line(run):
-    assert run()[2] == "policy_from_cp_mir: the following arguments are required: CHECKPOINT\n"
-    assert run(PICK, "--num-episodes", 0)[2] == (
-        "policy_from_cp_mir: --num-episodes: expected a whole number from 1, found '0'\n"
-    )
+    remedy = f"Run python {SCRIPTS / 'policy_from_cp_mir.py'} --help\n"
+    assert run()[2] == f"policy_from_cp_mir: CHECKPOINT is missing. {remedy}"
+    wrong = "--num-episodes: expected a whole number of at least 1, found 0"
+    assert run(PICK, "--num-episodes", 0)[2] == f"policy_from_cp_mir: {wrong}. {remedy}"

@@ -46,10 +46,10 @@ def test_files_of_other_episodes_are_not_mixed_with(run, tmp_path):
 
 WRONG = [
     (["nowhere.zip", "--out", "rows"], 1, "nowhere.zip: no such file. "),
-    ([REACH], 2, "the following arguments are required: --out\n"),
-    ([REACH, "--out", "rows", "--episods", "3"], 2, "unknown option '--episods'. Did you mean '--episodes'?\n"),
-    ([REACH, "--out", "rows", "--episodes", "0"], 2, "--episodes: expected a whole number from 1, found '0'\n"),
-    ([REACH, "--out", "rows", "--noise", "nan"], 2, "--noise: expected a number from 0, found 'nan'\n"),
+    ([REACH], 2, "--out is missing. Run python record_parquet.py --help\n"),
+    ([REACH, "--out", "rows", "--episods", "3"], 2, "unknown option --episods, did you mean --episodes? "),
+    ([REACH, "--out", "rows", "--episodes", "0"], 2, "--episodes: expected a whole number of at least 1, found 0. "),
+    ([REACH, "--out", "rows", "--noise", "nan"], 2, "--noise: expected a number of at least 0, found nan. "),
     ([REACH, "--out", REACH], 1, f"--out: {REACH} cannot be made: File exists. Give another folder\n"),
 ]
 

@@ -1,6 +1,5 @@
 """What experiment scripts share: their command line, Ctrl-C, and the environment of a checkpoint."""
 
-import argparse
 import os
 import signal
 import sys
@@ -12,40 +11,12 @@ import pytest
 
 from bam_envs.core.errors import InvalidValue, LinkLost
 from bam_train.checkpoint import Checkpoint
-from bam_train.cli.experiment import ScriptParser, environment_of, open_env, require_place, signals_ask, whole
+from bam_train.cli.experiment import TrainingFlags, environment_of, open_env, require_place, signals_ask
 from bam_train.environments import make_env
 from bam_train.errors import SettingsError
 from bam_train.signals import Terminated
 
 PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
-DESCRIPTION = "What it does.\n\nExamples:\n  python scripts/try.py --steps 3   a few\n"
-
-
-@pytest.fixture
-def parser():
-    made = ScriptParser("/somewhere/scripts/try.py", DESCRIPTION)
-    made.add_argument("--steps", type=whole(1), default=7)
-    made.add_argument("--stop-reward", type=float)
-    return made
-
-
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (["--step", "3"], "unknown option '--step'. Did you mean '--steps'?"),
-        (["--stop-reword=3"], "unknown option '--stop-reword=3'. Did you mean '--stop-reward'?"),
-        (["--steps", "0"], "--steps: expected a whole number from 1, found '0'"),
-        (["--steps", "1.5"], "--steps: expected a whole number from 1, found '1.5'"),
-        (["--steps"], "--steps: expected one argument"),
-        (["--stop-reward", "x"], "--stop-reward: invalid float value: 'x'"),
-    ],
-)
-def test_what_cannot_be_is_one_line(parser, capsys, arguments, text):
-    assert vars(parser.parse_args(["--steps", "1_000"])) == {"steps": 1000, "stop_reward": None}
-    with pytest.raises(SystemExit) as caught:
-        parser.parse_args(arguments)
-    assert caught.value.code == 2
-    assert capsys.readouterr() == ("", f"try: {text}\n")
 
 
 @pytest.mark.parametrize(
@@ -94,7 +65,7 @@ def test_the_second_signal_interrupts(capsys):
     ],
 )
 def test_the_environment_that_is_asked_for(env, parity, expected):
-    args = argparse.Namespace(env=env, parity=parity)
+    args = TrainingFlags(env=env, parity=parity)
     assert environment_of(args, "bam/ur-reach-v0", {"ur_model": "ur5"}) == expected
 
 
