@@ -33,7 +33,7 @@ def plot(workspace: Workspace, *names: str, batch: int | Sequence[int] | None = 
     then says of how many. A notebook shows the figure, which does not belong to pyplot, as the last value of a cell.
 
     Args:
-        workspace: With at least one variable.
+        workspace: What is drawn.
         *names: The variables, in this order; without names all, but for images.
         batch: The batch column or columns to draw; None draws all.
 
@@ -66,15 +66,7 @@ def to_dataframe(workspace: Workspace, *names: str) -> DataFrame:
 
     A scalar variable is one column of its name, a vector ``name[0]``, ``name[1]``, …, a matrix ``name[0,0]``, ….
     Where a variable is shorter than another, numbers with a fraction are NaN; bool and integers are NA, in pandas'
-    nullable types.
-
-    Args:
-        workspace: With at least one variable.
-        *names: The variables, in this order; without names all, but for images.
-
-    Raises:
-        WorkspaceError: There is nothing to put into the table, or a variable holds images.
-        MissingExtra: pandas is not installed.
+    nullable types. Names and errors are those of `plot`.
     """
     try:
         import pandas

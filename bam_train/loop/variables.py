@@ -14,15 +14,7 @@ from bam_train.errors import TimeNotWritten, ValueMismatch, WorkspaceError
 
 
 class Variable:
-    """One variable of NumPy arrays, T x B x ...; B x ... at one time.
-
-    Args:
-        name: For error messages.
-        first: The first time kept; only a windowed workspace starts later than 0.
-
-    Attributes:
-        shape: The shape of one time; None before the first write, as `dtype`.
-    """
+    """One variable of NumPy arrays, T x B x ..., from the time `first` on; B x ... (its `shape`) at one time."""
 
     ARRAY: type = np.ndarray
     """The class of its values."""

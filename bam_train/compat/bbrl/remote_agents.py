@@ -144,8 +144,8 @@ class NRemoteAgent(Agents):
         """Make an agent of `num_processes` processes, and the shared workspace to call it with.
 
         A copy of `agent` runs here once, with seed 0 and `extra_kwargs`, to see what it writes. Process k writes the
-        batch columns k * B to (k + 1) * B - 1, where B is the batch size of `agent`, and has seed k until
-        ``seed(s)`` gives it s + k. Seed what is returned, not `agent`.
+        batch columns k * B to (k + 1) * B - 1, where B is the batch size of `agent`, and has seed k until ``seed(s)``
+        gives it s + k. Seed what is returned, not `agent`.
 
         Args:
             agent: What to run; it is copied.
@@ -244,10 +244,7 @@ class AsynchronousAgent(_ProcessAgent):
         if self._worker is None or self._worker.poll():
             return self._worker is not None
         if self._worker.result is not None:
-            self._last = Workspace()
-            for name, value in pickle.loads(self._worker.result).items():
-                self._last.set_full(name, value)
-            self._worker.result = None
+            self._last, self._worker.result = pickle.loads(self._worker.result), None
         return False
 
     def get_workspace(self) -> Workspace | None:

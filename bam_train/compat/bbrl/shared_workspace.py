@@ -100,13 +100,10 @@ def shared_workspace(workspace: Workspace, n_repeat: int = 1, time_size: int | N
     """A copy of a workspace in shared memory, without graph.
 
     Args:
-        workspace: What to copy.
+        workspace: What to copy: one variable at least, of dtypes that torch has.
         n_repeat: How often to repeat it over the batch.
         time_size: The number of times of the copy, which then holds zeros; None for the times and values of
             `workspace`.
-
-    Raises:
-        WorkspaceError: `workspace` is empty, has arrays that torch does not know, or a number is less than 1.
     """
     for what, number in (("n_repeat", n_repeat), ("time_size", 1 if time_size is None else time_size)):
         if number < 1:

@@ -46,7 +46,6 @@ class Worker:
 
     Attributes:
         busy: Whether a command is under way, as far as `poll` has seen.
-        closed: Whether the process has been ended.
         result: What the last command that had a result gave.
         workspace: The one that the process runs on.
     """
@@ -218,9 +217,7 @@ class _Runner:
         self.workspace = self.workspace if workspace is None else workspace
         with torch.no_grad():
             self.agent(self.workspace, **kwargs)
-        if self.workspace.is_shared:
-            return None
-        return pickle.dumps({name: one.full() for name, one in self.workspace.to("cpu").variables.items()})
+        return None if self.workspace.is_shared else pickle.dumps(self.workspace.to("cpu"))
 
     def seed(self, seed: int) -> None:
         _seed_generators(seed)

@@ -75,11 +75,7 @@ def kinds(parts: Mapping[str, Any], space: Space[Any] | None, for_torch: bool) -
 
 
 def pack(kinds: Mapping[str, Kind], observations: Sequence[Any]) -> Arrays:
-    """New arrays (n, ...) by variable from the observations of n environments.
-
-    Raises:
-        ValueMismatch: One has another shape than the first observation of all had, or lacks a key.
-    """
+    """New arrays (n, ...) by variable from the observations of n environments, which have these shapes and keys."""
     rows, packed = [flat(one) for one in observations], {}
     for name, (dtype, shape) in kinds.items():
         values = [pick(row, name) for row in rows]
@@ -156,17 +152,14 @@ class InfoRecorder:
 def each_action(workspace: Any, t: int, name: str, space: Space[Any], num_envs: int) -> Sequence[Any]:
     """One action for each environment: an int, an array (float64 or int64), or a nested dict of these.
 
+    Actions of other spaces than Box, Discrete, MultiDiscrete, MultiBinary and Dict are not checked.
+
     Args:
-        workspace: Where the actions are.
+        workspace: Raises `UnknownVariable` or `TimeNotWritten` where nobody wrote an action.
         t: The time.
         name: The variable; where actions are dicts, the first part of the variables' names.
-        space: Of one environment. Spaces of other kinds than Box, Discrete, MultiDiscrete, MultiBinary and Dict are
-            not checked.
+        space: Of one environment; what does not fit it raises `ValueMismatch`.
         num_envs: The number of environments.
-
-    Raises:
-        UnknownVariable, TimeNotWritten: Nobody wrote an action.
-        ValueMismatch: It does not fit the space, or is not for `num_envs` environments.
     """
     if isinstance(space, spaces.Dict):
         columns = {key: each_action(workspace, t, f"{name}/{key}", part, num_envs) for key, part in space.items()}

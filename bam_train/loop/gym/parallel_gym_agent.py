@@ -36,7 +36,7 @@ Env = gym.Env[Any, Any]
 def make_env(
     env_name: str, autoreset: bool = False, wrappers: Iterable[Callable[[Env], Env]] = (), **kwargs: Any
 ) -> Env:
-    """A Gymnasium environment in its wrappers.
+    """A Gymnasium environment, ``gymnasium.make(env_name, **kwargs)``, in its wrappers.
 
     Gymnasium's checker, which looks at every step and changes nothing, is off; ``disable_env_checker=False`` has it.
 
@@ -181,12 +181,7 @@ class ParallelGymAgent(GymAgent):
 
 
 def _require_envs(envs: Sequence[Any]) -> None:
-    """Refuse what cannot be stepped one by one.
-
-    Raises:
-        SettingsError: Not an environment, a vector environment, one environment several times, or a live robot, whose
-            chain has to be checked before it moves.
-    """
+    """Refuse what cannot be stepped one by one, and a live robot, whose chain has to be checked before it moves."""
     for env in envs:
         if isinstance(env, gym.vector.VectorEnv):
             raise SettingsError("make_env_fn: expected single environments, found a vector one: use VecGymAgent.")

@@ -33,10 +33,9 @@ from bam_train.loop.gym.gym_spaces import Array, Arrays, batch_action, flat, kin
 class VecGymAgent(GymAgent):
     """Resets a vector environment at t = 0, and at t > 0 steps it with the actions of t - 1.
 
-    It writes the variables of `ParallelGymAgent`, with the same meaning: see there. Vector environments that reset
-    ended environments in the same step, or not at all, must obey ``reset(options={"reset_mask": (n,) bool})``, as
-    Gymnasium's `SyncVectorEnv` and `AsyncVectorEnv` and ours do; they reset an environment twice at the end of its
-    episode.
+    It writes the variables of `ParallelGymAgent`, with the same meaning. Vector environments that reset ended
+    environments in the same step, or not at all, must obey ``reset(options={"reset_mask": (n,) bool})``, as Gymnasium's
+    `SyncVectorEnv` and `AsyncVectorEnv` and ours do; they reset an environment twice at the end of its episode.
 
     Args:
         make_envs_fn: Makes the vector environment.
