@@ -27,7 +27,11 @@ class StepsPerSecond(ProgressColumn):
 
 @contextmanager
 def progress_display(
-    progress: bool | Progress, n_steps: int | None, t: int = 0, description: str = "steps"
+    progress: bool | Progress,
+    n_steps: int | None,
+    t: int = 0,
+    description: str = "steps",
+    clock: Callable[[], float] = time.perf_counter,
 ) -> Iterator[Advance]:
     """Shows how far a loop has come; gives a function to be called with the number of steps just done.
 
@@ -39,6 +43,7 @@ def progress_display(
         n_steps: The most steps there will be; None where only a stop variable ends the loop.
         t: The time of the first step.
         description: What is written in front of the bar.
+        clock: Seconds, for the time between two pictures.
     """
     shown: AbstractContextManager[Any] = nullcontext()
     if isinstance(progress, Progress):
@@ -60,7 +65,8 @@ def progress_display(
             redraw = _notebook_line(display)
         else:
             shown, redraw = display, display.refresh
-    with shown, _task(display, n_steps, f"{description} from t={t}" if t else description, redraw) as advance:
+    text = f"{description} from t={t}" if t else description
+    with shown, _task(display, n_steps, text, redraw, clock) as advance:
         yield advance
 
 
@@ -69,10 +75,12 @@ def _nothing() -> None:
 
 
 @contextmanager
-def _task(progress: Progress, n_steps: int | None, text: str, redraw: Callable[[], None]) -> Iterator[Advance]:
+def _task(
+    progress: Progress, n_steps: int | None, text: str, redraw: Callable[[], None], clock: Callable[[], float]
+) -> Iterator[Advance]:
     """One task of a display, updated every REDRAW_SECONDS."""
     task, done = progress.add_task(text, total=n_steps), 0
-    due = time.perf_counter() + REDRAW_SECONDS
+    due = clock() + REDRAW_SECONDS
 
     def show(total: int | None = None) -> None:
         progress.update(task, completed=done, total=total)  # a total of None leaves it as it is
@@ -81,9 +89,9 @@ def _task(progress: Progress, n_steps: int | None, text: str, redraw: Callable[[
     def advance(steps: int) -> None:
         nonlocal done, due
         done += steps
-        if time.perf_counter() >= due:
+        if clock() >= due:
             show()
-            due = time.perf_counter() + REDRAW_SECONDS
+            due = clock() + REDRAW_SECONDS
 
     redraw()
     total = None

@@ -13,7 +13,7 @@ from bam_train.loop.progress import StepsPerSecond, progress_display
 
 
 @pytest.fixture
-def clock(monkeypatch):
+def clock():
     """A clock that goes on by `clock.step` seconds whenever it is read."""
 
     class Clock:
@@ -23,9 +23,7 @@ def clock(monkeypatch):
             self.now += self.step
             return self.now
 
-    fake = Clock()
-    monkeypatch.setattr("time.perf_counter", fake)
-    return fake
+    return Clock()
 
 
 @pytest.fixture
@@ -44,9 +42,9 @@ def last_line(text):
     return text.replace("\r", "\n").strip().splitlines()[-1]
 
 
-def fail(error, *args):
+def fail(error, *args, **kwargs):
     """Forty steps, then an exception."""
-    with progress_display(*args) as advance:
+    with progress_display(*args, **kwargs) as advance:
         advance(40)
         raise error
 
@@ -58,14 +56,14 @@ def undrawn():
 
 def test_a_display_of_the_callers_gets_a_task_and_keeps_it(clock):
     display = undrawn()
-    with progress_display(display, 10, 0, "rollout") as advance:
+    with progress_display(display, 10, 0, "rollout", clock=clock) as advance:
         (task,) = display.tasks
         assert (task.description, task.total, task.completed) == ("rollout", 10, 0)
         for _ in range(10):
             advance(1)
         assert task.completed == 0  # no time has passed
     assert (task.completed, task.total, task.finished) == (10, 10, True)
-    with progress_display(display, 5, 10, "rollout") as advance:
+    with progress_display(display, 5, 10, "rollout", clock=clock) as advance:
         advance(5)
     assert [one.description for one in display.tasks] == ["rollout", "rollout from t=10"]
 
@@ -73,7 +71,7 @@ def test_a_display_of_the_callers_gets_a_task_and_keeps_it(clock):
 def test_a_task_is_told_ten_times_a_second(clock):
     display, seen = undrawn(), []
     clock.step = 0.03
-    with progress_display(display, 100) as advance:
+    with progress_display(display, 100, clock=clock) as advance:
         for _ in range(20):
             advance(1)
             seen.append(display.tasks[0].completed)
@@ -83,7 +81,7 @@ def test_a_task_is_told_ten_times_a_second(clock):
 @pytest.mark.parametrize("n_steps", [100, None])
 def test_a_loop_that_stops_early_or_has_no_known_length_is_finished(clock, n_steps):
     display = undrawn()
-    with progress_display(display, n_steps) as advance:
+    with progress_display(display, n_steps, clock=clock) as advance:
         assert display.tasks[0].total == n_steps
         advance(7)
     (task,) = display.tasks
@@ -94,7 +92,7 @@ def test_a_loop_that_stops_early_or_has_no_known_length_is_finished(clock, n_ste
 def test_an_exception_leaves_the_task_stopped_where_it_was(clock, error):
     display = undrawn()
     with pytest.raises(error):
-        fail(error, display, 100)
+        fail(error, display, 100, clock=clock)
     (task,) = display.tasks
     assert (task.completed, task.total, task.finished) == (40, 100, False)
     assert task.stop_time is not None
@@ -102,7 +100,7 @@ def test_an_exception_leaves_the_task_stopped_where_it_was(clock, error):
 
 def test_a_display_of_its_own_on_a_terminal(clock, terminal):
     clock.step = 0.011
-    with progress_display(True, 1000, 0, "[red]rollout[/red]") as advance:
+    with progress_display(True, 1000, 0, "[red]rollout[/red]", clock=clock) as advance:
         terminal()
         for _ in range(95):
             advance(1)
@@ -143,7 +141,7 @@ def test_in_a_notebook_one_output_is_written_over(clock, monkeypatch):
     monkeypatch.setitem(sys.modules, "IPython.display", ipython)
     monkeypatch.setattr("rich.console._is_jupyter", lambda: True)  # where rich sees a notebook
     clock.step = 0.06
-    with progress_display(True, 4, 0, "rollout") as advance:
+    with progress_display(True, 4, 0, "rollout", clock=clock) as advance:
         for _ in range(4):
             advance(1)
     assert len(outputs) == 4
