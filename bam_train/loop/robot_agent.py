@@ -8,9 +8,9 @@ import numpy as np
 
 from bam_train.errors import LoopError, PolicyError
 from bam_train.loop.agent import Agent
+from bam_train.loop.gym.gym_agent import NUMBERS
 from bam_train.loop.gym.gym_spaces import Kind, flat, kinds, names, pack
 
-FLAGS = ("terminated", "truncated", "done")
 SUCCESS = "info/is_success"
 """Whether the task is done, where the environment's info says ``is_success``."""
 SAYS_SUCCESS = "info/_is_success"
@@ -42,8 +42,7 @@ class RobotAgent(Agent):
         self.env, self.input, self.output = env, input_string, output_string
         self.live = robot_of(env) is not None
         self.observation_names = tuple(output_string + name for name in names(env.observation_space))
-        rest = ("reward", "cumulated_reward", "timestep", *FLAGS, SUCCESS, SAYS_SUCCESS)
-        writes = (*self.observation_names, *(output_string + name for name in rest))
+        writes = (*self.observation_names, *(output_string + name for name in (*NUMBERS, SUCCESS, SAYS_SUCCESS)))
         self._declare(RobotAgent, reads=(), reads_previous=(input_string,), writes=writes)
         self._total, self._steps = 0.0, 0
         self._kinds: dict[str, Kind] = {}

@@ -6,6 +6,7 @@ import sys
 import warnings
 from abc import abstractmethod
 from collections.abc import Sequence
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -188,6 +189,14 @@ class GymAgent(SeedableAgent):
         if len(seeds) != self.num_envs:
             raise SettingsError(f"seed: expected a number or {self.num_envs} of them, found {len(seeds)}.")
         return seeds
+
+    def close(self) -> None:
+        """Close the environments; they are made anew at the next t = 0."""
+        envs, self.envs, self._running = self.envs, None, False
+        with ExitStack() as stack:  # all of them, also when one fails
+            for env in envs if isinstance(envs, list) else [envs]:
+                if env is not None:
+                    stack.callback(env.close)
 
     # -- spaces ----------------------------------------------------------------------------------------------------
 

@@ -16,7 +16,6 @@ environments depend on the number of resets; rewards that are NumPy float32 are 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack
 from functools import partial
 from operator import add
 from typing import Any
@@ -163,13 +162,6 @@ class ParallelGymAgent(GymAgent):
                 observation, _, *rest = results[k]
                 self._steps[k], self._advance[k] = partial(_repeat, (observation, 0.0, *rest)), 0
         return frame
-
-    def close(self) -> None:
-        """Close the environments; they are made anew at the next t = 0."""
-        envs, self.envs, self._running = self.envs or (), None, False
-        with ExitStack() as stack:  # all of them, also when one fails
-            for env in envs:
-                stack.callback(env.close)
 
     @staticmethod
     def _format_frame(frame: Any) -> dict[str, Any]:

@@ -172,12 +172,6 @@ class VecGymAgent(GymAgent):
         parts = flat(observations)
         return {name: np.array(pick(parts, name), dtype=kind.dtype) for name, kind in self._kinds.items()}
 
-    def close(self) -> None:
-        """Close the environment; it is made anew at the next t = 0."""
-        envs, self.envs, self._running = self.envs, None, False
-        if envs is not None:
-            envs.close()
-
     def __getstate__(self) -> dict[str, Any]:
         """A copy makes its own environment at its next t = 0: processes and simulators cannot be copied."""
         return {**super().__getstate__(), "envs": None, "_running": False}
