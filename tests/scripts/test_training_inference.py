@@ -35,7 +35,7 @@ def test_help(run_here, name, tmp_path):
     assert done.stdout.count(f"\n  python scripts/{name}.py") >= 3
     assert "\nExamples:\n" in done.stdout
     if name in RLLIB:
-        assert set(re.findall(r"^[ |│]+(--[a-z-]+)", done.stdout, re.MULTILINE)) == OPTIONS
+        assert set(re.findall(r"^[ |│]+(--[a-z][a-z-]+)", done.stdout, re.MULTILINE)) == OPTIONS
 
 
 WRONG = [
