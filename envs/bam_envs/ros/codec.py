@@ -85,9 +85,7 @@ def decode_source(source: Source, message: object, size: int) -> Array:
         raw = np.array([number_at(content, path, where) for path in source.fields])
     elif source.names:
         found = names_of(content, "name", where)
-        raw = numbers_of(
-            source.names, content, source.field, found, where, ignore=source.ignore, missing=source.missing
-        )
+        raw = numbers_of(source.names, content, source.field, found, where, source.ignore, source.missing)
     else:
         raw = numbers(value_at(content, source.field, where), f"{where}: {source.field}", missing=source.missing)
         first, last = source.skip

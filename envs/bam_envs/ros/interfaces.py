@@ -88,7 +88,7 @@ def complete(kind: str, message: object, *, lenient: bool = False) -> dict[str, 
     Byte arrays of `message` may be base64, as JSON has them, `bytes`, or lists of integers. A `lenient` check ignores
     fields that the type does not have: they may be of a newer version of it. What does not fit is an `InvalidValue`.
     """
-    name = normal_name(kind)
+    name = kind if kind in _table() else normal_name(kind)
     try:
         # Unknown types are not kept: a client could name any number of them.
         check = _check(name, None, 0, lenient) if name in _table() else _any
@@ -202,8 +202,6 @@ def _number(kind: str, first: float) -> Check:
 
 
 def _array(kind: str, one: Check, size: int | None) -> Check:
-    """The check of a list; `one` checks an item, `size` is the length if it is fixed."""
-
     def check(value: Any, depth: int) -> list[Any]:
         values = [_MISSING] * (size or 0) if value is _MISSING else value
         if not isinstance(values, (list, tuple)):

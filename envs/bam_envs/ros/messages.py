@@ -122,7 +122,6 @@ def numbers_of(
     field: str,
     found: list[str],
     where: str,
-    *,
     ignore: Sequence[str] = (),
     missing: float | None = None,
 ) -> Array:
@@ -130,11 +129,9 @@ def numbers_of(
 
     There may be others only for the names to `ignore`. `missing` is as of `number`.
     """
-    absent = [name for name in names if name not in found]
-    if absent:
+    if absent := [name for name in names if name not in found]:
         raise ProtocolError(f"{where}: {', '.join(absent)} missing; found: {', '.join(found) or 'no name'}.")
-    extra = [name for name in found if name not in names and name not in ignore]
-    if extra:
+    if extra := [name for name in found if name not in names and name not in ignore]:
         raise ProtocolError(
             f"{where}: {', '.join(extra)} not expected; expected: {', '.join(names)}. "
             f"List what is not ours in ignore of the profile."
@@ -181,7 +178,9 @@ def read_stamp(message: Message, where: str) -> float | None:
         return None
     require_message(stamp, f"{where}: header.stamp")
     names = ("secs" if "secs" in stamp else "sec", "nsecs" if "nsecs" in stamp else "nanosec")
-    seconds, nano = (number_at(message, f"header.stamp.{name}", where) for name in names)
+    if not stamp.keys() >= {*names}:
+        raise ProtocolError(f"{where}: header.stamp must have {' and '.join(names)}; found: {', '.join(stamp)}.")
+    seconds, nano = (number(stamp[name], f"{where}: header.stamp.{name}") for name in names)
     if seconds < 0 or not 0 <= nano < _NANO:
         raise ProtocolError(f"{where}: header.stamp must be seconds and nanoseconds, not {brief(stamp)}.")
     return seconds + nano / _NANO or None

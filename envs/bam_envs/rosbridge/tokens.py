@@ -44,11 +44,7 @@ class Tokens:
             raise InvalidValue("The operator's token must be another one than that of the clients.")
         self._client, self._operator = client, operator
         self.needed = client is not None  # whether a client must show one
-
-    @property
-    def exist(self) -> bool:
-        """Whether there is anything to show."""
-        return self._client is not None or self._operator is not None
+        self.exist = self.needed or operator is not None  # whether there is anything to show
 
     def role(self, shown: Iterable[str]) -> Role | None:
         """The role that one of these tokens gives; None if all are wrong."""

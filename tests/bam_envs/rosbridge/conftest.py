@@ -38,8 +38,8 @@ class ScriptedServer:
         self.connected = 0
         self._context, self._status = context, status
         self._changed = threading.Condition()
-        self._connections = set()
-        self._loop = self._server = self._thread = None
+        self.connections = set()
+        self.loop = self._server = self._thread = None
 
     @property
     def url(self):
@@ -54,7 +54,7 @@ class ScriptedServer:
 
     def stop(self, code=1001):
         with contextlib.suppress(RuntimeError):  # its loop is closed: the server has ended by itself
-            self._loop.call_soon_threadsafe(self._stop.set)
+            self.loop.call_soon_threadsafe(self.stopped.set)
         self._thread.join(DEADLINE)
         assert not self._thread.is_alive()
 
@@ -62,7 +62,7 @@ class ScriptedServer:
         """Send dicts as JSON, text and bytes as they are, to every client."""
         for message in messages:
             data = json.dumps(message) if isinstance(message, dict) else message
-            asyncio.run_coroutine_threadsafe(self._send(data), self._loop).result(DEADLINE)
+            asyncio.run_coroutine_threadsafe(self._send(data), self.loop).result(DEADLINE)
 
     def drop(self):
         """Cut every TCP connection, without a closing handshake."""
@@ -94,20 +94,20 @@ class ScriptedServer:
         done = threading.Event()
 
         def act():
-            for connection in self._connections:
+            for connection in self.connections:
                 action(connection)
             done.set()
 
-        self._loop.call_soon_threadsafe(act)
+        self.loop.call_soon_threadsafe(act)
         assert done.wait(DEADLINE)
 
     async def _run(self, started):
-        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
+        self.loop, self.stopped = asyncio.get_running_loop(), asyncio.Event()
         settings = {"ssl": self._context, "process_request": self._greet, "compression": None, "ping_interval": None}
         async with serve(self._serve, "127.0.0.1", self.port, max_size=None, close_timeout=0.5, **settings) as server:
             self.port = server.sockets[0].getsockname()[1]
             started.set()
-            await self._stop.wait()
+            await self.stopped.wait()
 
     def _greet(self, connection, request):
         self.headers.append((request.path, request.headers.get("Authorization")))
@@ -136,13 +136,17 @@ class ScriptedServer:
             await connection.send(json.dumps({**head, "values": values, "result": not isinstance(values, str)}))
 
     async def _send(self, data):
-        for connection in set(self._connections):
+        for connection in set(self.connections):
             await connection.send(data)
+
+    def send_soon(self, message):
+        """Send a dict; for the functions in `responses`, which run in the server's thread."""
+        self.loop.create_task(self._send(json.dumps(message)))
 
     def _count(self, connection, change):
         with self._changed:
             self.connected += change
-            (self._connections.add if change > 0 else self._connections.discard)(connection)
+            (self.connections.add if change > 0 else self.connections.discard)(connection)
             self._changed.notify_all()
 
 

@@ -1,6 +1,5 @@
 """`RosbridgeLink` on a server that behaves."""
 
-import json
 import threading
 import time
 
@@ -183,9 +182,7 @@ def test_a_call_gets_the_response(scripted, link):
 
 def test_an_error_status_with_the_id_of_a_call_ends_it(scripted, link):
     def refuse(args):
-        scripted._loop.create_task(
-            scripted._send(json.dumps({"op": "status", "level": "error", "msg": "type is required", "id": "call:1"}))
-        )
+        scripted.send_soon({"op": "status", "level": "error", "msg": "type is required", "id": "call:1"})
 
     scripted.responses["/add"] = refuse
     with pytest.raises(RemoteError, match=r"^type is required$"):

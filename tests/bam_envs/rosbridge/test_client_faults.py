@@ -112,12 +112,12 @@ def test_a_call_that_timed_out_is_not_made_again_after_a_cut(scripted, link):
 @pytest.mark.parametrize(
     ("end", "text"),
     [
-        (lambda server: [one.transport.abort() for one in server._connections], ""),
-        (lambda server: server._stop.set(), "the server closed it with code 1001."),
+        (lambda server: [one.transport.abort() for one in server.connections], ""),
+        (lambda server: server.stopped.set(), "the server closed it with code 1001."),
     ],
 )
 def test_a_pending_call_fails_at_once_when_the_link_ends(scripted, link, end, text):
-    scripted.responses["/step"] = lambda args: scripted._loop.call_soon(end, scripted) and None
+    scripted.responses["/step"] = lambda args: scripted.loop.call_soon(end, scripted) and None
     with pytest.raises(LinkLost) as raised:
         link.call("/step", "std_srvs/Trigger", {}, 60.0)
     assert str(raised.value).startswith(f"{scripted.url}: the link dropped: {text}")
@@ -243,8 +243,8 @@ def test_a_server_that_does_not_read_gets_nothing_more_and_is_not_left(scripted,
 def test_a_server_that_freezes_is_lost_and_connected_again(scripted, new_link):
     link = new_link(scripted, lost_after=0.3)
     lost = _loss(link)
-    freeze = lambda: [connection.transport.pause_reading() for connection in scripted._connections]  # noqa: E731
-    scripted.responses["/step"] = lambda args: scripted._loop.call_soon(freeze) and None
+    freeze = lambda: [connection.transport.pause_reading() for connection in scripted.connections]  # noqa: E731
+    scripted.responses["/step"] = lambda args: scripted.loop.call_soon(freeze) and None
     with pytest.raises(LinkLost) as raised:
         link.call("/step", "std_srvs/Trigger", {}, 60.0)
     assert str(raised.value) == f"{scripted.url}: nothing from the server for 0.3 s."
@@ -304,7 +304,7 @@ def test_fragments_are_joined_whatever_the_server_calls_their_number(scripted, l
     def answer_in_fragments(args):
         for number in (1, 0, *range(2, len(parts))):
             part = {"op": "fragment", "id": "f", "data": parts[number], "num": number, "total": len(parts) + 0.52}
-            scripted._loop.create_task(scripted._send(json.dumps(part)))
+            scripted.send_soon(part)
 
     scripted.responses["/a"] = answer_in_fragments
     assert link.call("/a", "std_srvs/Trigger", {}, 10.0) == {"n": 7}

@@ -1,6 +1,5 @@
 """Connecting fails for many reasons, each with its own text; addresses; certificates."""
 
-import json
 import socket
 import ssl
 import threading
@@ -104,11 +103,11 @@ def test_another_server(answer, text):
             "Restart the bridge.",
         ),
         (
-            lambda server: server._stop.set(),
+            lambda server: server.stopped.set(),
             "closed the connection before it answered a request: the server closed it with code 1001.",
         ),
         (
-            lambda server: server._loop.create_task(server._send(json.dumps(server.frames[-1]))) and None,
+            lambda server: server.send_soon(server.frames[-1]),
             "an echo server: it sends back what it is sent. Is it the right port?",
         ),
     ],

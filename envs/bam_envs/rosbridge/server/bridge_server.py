@@ -21,6 +21,7 @@ from websockets.protocol import State
 
 from bam_envs.core.errors import InvalidValue, LinkLost, ProtocolError
 from bam_envs.rosbridge.bus import Bus, Caller, Handler, Listener, Message
+from bam_envs.rosbridge.endpoint import Address
 from bam_envs.rosbridge.server.admission import Admission, listening_error, tls_context
 from bam_envs.rosbridge.server.bridge import Bridge, Incoming
 from bam_envs.rosbridge.server.client_session import Call, Send, ServerOptions, Session
@@ -86,8 +87,7 @@ class BridgeServer(Bus):
     @property
     def url(self) -> str:
         """Where clients find it."""
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"{'wss' if self._cert else 'ws'}://{host}:{self.port}"
+        return Address(self.host, self.port, self._cert is not None, "").url
 
     @property
     def clients(self) -> int:

@@ -14,8 +14,7 @@ from bam_envs.ros.interfaces import complete, request_type, response_type, varia
 from bam_envs.rosbridge.bus import Message, answer
 from bam_envs.rosbridge.server.client_session import Call, Event, Packet, Send, Service, Session, pack
 
-_LENIENT = ("bam_msgs/GymAPI",)
-"""Types that are still growing: fields of a newer version are ignored, as every transport does."""
+_GROWING = "bam_msgs/GymAPI"  # of which fields of a newer version are ignored, as every transport does
 _LONGEST_NUMBER = 20  # digits of the number of a call
 
 
@@ -170,4 +169,4 @@ def checked(kind: str, part: Callable[[str], str], values: Any) -> dict[str, Any
         if not fields or len(values) > len(fields[0]):
             raise ProtocolError(f"args: expected an object, found {brief(values)}.")
         values = {one.name: value for one, value in zip(fields[0], values, strict=False)}
-    return complete(name, {} if values is None else values, lenient=kind in _LENIENT)
+    return complete(name, {} if values is None else values, lenient=kind == _GROWING)
