@@ -168,20 +168,15 @@ class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
         """The action space of one environment."""
         return self._there.action_space
 
-    @property
+    @cached_property
     def observation_space(self) -> Space[Any]:  # type: ignore[override]
         """The observation space of all environments."""
-        return self._spaces[0]
-
-    @property
-    def action_space(self) -> Space[Any]:  # type: ignore[override]
-        """The action space of all environments."""
-        return self._spaces[1]
+        return batch_space(self.single_observation_space, self.num_envs)
 
     @cached_property
-    def _spaces(self) -> tuple[Space[Any], Space[Any]]:
-        there, size = self._there, self.num_envs
-        return batch_space(there.observation_space, size), batch_space(there.action_space, size)
+    def action_space(self) -> Space[Any]:  # type: ignore[override]
+        """The action space of all environments."""
+        return batch_space(self.single_action_space, self.num_envs)
 
     def reset(self, *, seed: Seed = None, options: Info | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in every environment, or in those of ``options["reset_mask"]`` (n,) bool.
