@@ -10,14 +10,14 @@ if TYPE_CHECKING:
     from bam_envs.remote.ros2_transport import RclpyTransport
     from bam_envs.remote.rosbridge_transport import RosbridgeTransport
     from bam_envs.remote.serve.env_server import EnvServer
-    from bam_envs.remote.serve.local_transport import FakeTransport, LocalTransport
+    from bam_envs.remote.serve.local_transport import LocalTransport
     from bam_envs.remote.serve.serve_options import ServeOptions
     from bam_envs.remote.serve.served_environment import ServedEnvironment
     from bam_envs.remote.serve.tcp_server import TcpServer
     from bam_envs.remote.tcp_transport import TcpTransport
     from bam_envs.remote.transport import EnvSpecMessage, Transport
 
-__all__ = ["EnvServer", "EnvSpecMessage", "FakeTransport", "LocalTransport", "RclpyTransport", "RemoteEnv"]
+__all__ = ["EnvServer", "EnvSpecMessage", "LocalTransport", "RclpyTransport", "RemoteEnv"]
 __all__ += ["RemoteVectorEnv", "RosbridgeTransport", "ServeOptions", "ServedEnvironment", "TcpServer", "TcpTransport"]
 __all__ += ["Transport", "make_remote_env", "make_remote_vector_env", "open_transport"]
 
@@ -27,7 +27,7 @@ _MODULES = {
     "ros2_transport": ("RclpyTransport",),
     "rosbridge_transport": ("RosbridgeTransport",),
     "serve.env_server": ("EnvServer",),
-    "serve.local_transport": ("FakeTransport", "LocalTransport"),
+    "serve.local_transport": ("LocalTransport",),
     "serve.serve_options": ("ServeOptions",),
     "serve.served_environment": ("ServedEnvironment",),
     "serve.tcp_server": ("TcpServer",),

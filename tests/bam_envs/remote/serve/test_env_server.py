@@ -12,9 +12,9 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from bam_envs.core.errors import InvalidValue, NotInCommand, RemoteError, ResetNeeded, UnknownName
 from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.env_server import EnvServer, describe_env
-from bam_envs.remote.serve.local_transport import FakeEnv
 from bam_envs.rosbridge.bus import Caller
 from bam_envs.testing.transports import MirrorEnv
+from tests.bam_envs.remote.fakes import FakeEnv
 
 NO_EPISODE = "No episode is running: it ended, or never began. Call reset() first."
 

@@ -15,11 +15,11 @@ from msgspec.msgpack import encode as packed
 from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, NotInCommand, ProtocolError
 from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.env_server import EnvServer
-from bam_envs.remote.serve.local_transport import FakeEnv
 from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.remote.tcp_transport import TcpTransport
 from bam_envs.remote.tcp_wire import FrameSocket, Hello, encode
 from bam_envs.testing.transports import MirrorEnv
+from tests.bam_envs.remote.fakes import FakeEnv
 
 PATIENCE = 10.0
 ACTION = np.zeros(2, np.float32)
