@@ -70,12 +70,9 @@ class IsaacReachTask(UrTask):
 
     rate, velocity_scale, max_steps = 30.0, 0.2, 600
     reset_options = ("joint_positions", "ee_target_pose")
-    yaw: float = np.pi
-    """Of targets, to either side [rad]."""
-    frame: Array = EE_LINK
-    """Axes in ``tool0`` of the frame that is brought to the target."""
-    unscaled = False
-    """Whether actions are Isaac Lab's, in units of `isaac_scale`."""
+    yaw: float = np.pi  # of targets, to either side [rad]
+    frame: Array = EE_LINK  # axes in ``tool0`` of the frame that is brought to the target
+    unscaled = False  # whether actions are Isaac Lab's, in units of `isaac_scale`
     memory: Mapping[str, str] = {
         "target": "target",
         "quaternion": "quaternion",

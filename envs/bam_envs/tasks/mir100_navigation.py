@@ -52,10 +52,8 @@ class DriveTask(Memory):
         Label("angular_velocity", "speed of turning anticlockwise", "rad/s", f"/ {FASTEST[1]:g}", -2.5, 2.5),
     )
     memory: Mapping[str, str] = {"target": "target", "elapsed": "elapsed", "previous": "_previous"}
-    failure: str
-    """What ``final_status`` says when something went wrong."""
-    draws: int
-    """How many numbers `starts` and `targets` take for each environment."""
+    failure: str  # what ``final_status`` says when something went wrong
+    draws: int  # how many numbers `starts` and `targets` take for each environment
 
     def __init__(self, num_envs: int = 1, *, rs_state_to_info: bool = False) -> None:
         self.num_envs, self.rs_state_to_info = num_envs, rs_state_to_info

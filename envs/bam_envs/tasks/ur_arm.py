@@ -50,12 +50,9 @@ class UrTask(Memory):
     """
 
     reset_options: tuple[str, ...] = ("joint_positions",)
-    rate: float
-    """Commands a second [Hz]."""
-    velocity_scale: float
-    """Share of the fastest speed that the joints go at."""
-    max_steps: int
-    """Steps of an episode."""
+    rate: float  # commands a second [Hz]
+    velocity_scale: float  # share of the fastest speed that the joints go at
+    max_steps: int  # steps of an episode
     action_meaning = ("where the joint is to be", "rad", "/ its limit")
     """Meaning, unit and scale of each number of an action."""
 

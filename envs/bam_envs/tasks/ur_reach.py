@@ -74,10 +74,8 @@ class UrReachTask(UrTask):
     rate, velocity_scale, max_steps = 10.0, 0.1, 300
     reset_options = ("joint_positions", "ee_target_pose", "randomize_start", "continue_on_success")
     start: tuple[float, ...] = START
-    forgets_success = True
-    """Whether ``continue_on_success`` looks at the last episode only."""
-    must_be_in_reach = True
-    """Whether a target that the arm cannot reach is refused."""
+    forgets_success = True  # whether ``continue_on_success`` looks at the last episode only
+    must_be_in_reach = True  # whether a target that the arm cannot reach is refused
     memory: Mapping[str, str] = {
         name: name for name in ("target", "elapsed", "_held", "_actions", "_continues", "_last_end")
     }

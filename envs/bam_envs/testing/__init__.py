@@ -4,13 +4,9 @@
 
     from bam_envs.testing import RobotContract, TaskContract, TransportContract
 
-    class TestMyRobot(RobotContract):
+    class TestMyRobot(RobotContract):  # a TaskContract likewise
         def make(self, num_robots):
             return MyRobot(num_robots)
-
-    class TestMyTask(TaskContract):
-        def make(self, num_envs):
-            return MyTask(num_envs)
 
     class TestMyTransport(TransportContract):
         def make(self, env):

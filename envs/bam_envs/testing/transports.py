@@ -24,9 +24,7 @@ _INT64 = np.iinfo(np.int64)
 class MirrorEnv(gym.Env[Any, Any]):
     """Returns each action as the next observation, which shows what the link does to it.
 
-    Args:
-        space: Of actions and observations.
-        episode_steps: Steps after which an episode is terminated.
+    `space` is of both; an episode is terminated after `episode_steps`.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 - as Gymnasium declares it
@@ -208,18 +206,15 @@ class TransportContract:
             assert "observation['x'][1] is NaN" in str(error)
 
     def test_closing_is_for_good(self) -> None:
-        """`close` is idempotent; a step afterwards is a lost link."""
+        """`close` is idempotent, does nothing before `connect`, and a step afterwards is a lost link."""
+        with self.serving(MirrorEnv(spaces.Discrete(3))) as transport:
+            transport.close()
         with self.serving(MirrorEnv(spaces.Discrete(3))) as transport:
             transport.connect()
             transport.reset()
             transport.close()
             transport.close()
             raised(LinkLost, lambda: transport.step(1))
-
-    def test_closing_before_connecting(self) -> None:
-        """Does nothing."""
-        with self.serving(MirrorEnv(spaces.Discrete(3))) as transport:
-            transport.close()
 
     def test_it_is_the_environment_in_process(self) -> None:
         """`RemoteEnv` gives what the environment gives, with the same seed and actions."""

@@ -31,13 +31,7 @@ MODELS = Path(__file__).parent / "models"
 
 
 class Physics:
-    """Environments of one MJCF model.
-
-    Args:
-        scene: File name of a model in ``models/``.
-        num_envs: How many are stepped together.
-        varied: Whether each environment has a model of its own, to be changed with `model_of`.
-    """
+    """Environments of one MJCF model in ``models/``; `varied`: each has a model of its own, to be changed."""
 
     def __init__(self, scene: str, num_envs: int, *, varied: bool = False) -> None:
         self.model: Any = mujoco.MjModel.from_xml_path(str(MODELS / scene))

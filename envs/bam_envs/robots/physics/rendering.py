@@ -52,8 +52,7 @@ class OffScreen:
         self._gl.make_current()
         self._scene = mujoco.MjvScene(model, maxgeom=MOST_GEOMS)
         self._option = mujoco.MjvOption()
-        self.camera: Any = mujoco.MjvCamera()
-        """From where it is seen; to be set."""
+        self.camera: Any = mujoco.MjvCamera()  # to be set
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         atexit.register(self.close)  # while OpenGL is still there
@@ -90,8 +89,7 @@ class Window:
         before = set(threading.enumerate())
         self._viewer: Any = viewer.launch_passive(model, self._data, show_left_ui=False, show_right_ui=False)
         self._threads = set(threading.enumerate()) - before
-        self.camera: Any = self._viewer.cam
-        """From where it is seen; the mouse moves it too."""
+        self.camera: Any = self._viewer.cam  # the mouse moves it too
 
     def show(self, data: Any, shapes: Sequence[Shape]) -> None:
         """Bring the window up to date."""
@@ -118,12 +116,7 @@ def open_view(model: Any, mode: str, camera: str | None = None) -> OffScreen | W
 
 
 class ShapeRenderer:
-    """Draws shapes on a floor, off screen or in a window; OpenGL is started by the first picture.
-
-    Args:
-        mode: ``"rgb_array"`` or ``"human"``.
-        floor: Height of the floor [m].
-    """
+    """Draws shapes on a floor at the height `floor` [m], for ``rgb_array`` or ``human``."""
 
     def __init__(self, mode: str, floor: float = 0.0) -> None:
         scene = mujoco.MjSpec.from_file(str(MODELS / "floor.xml"))
@@ -135,11 +128,9 @@ class ShapeRenderer:
         self._seen: View | None = None
 
     def render(self, shapes: Sequence[Shape], view: View) -> NDArray[np.uint8] | None:
-        """An image (480, 640, 3), or None from a window.
+        """An image (480, 640, 3), or None from a window, which the mouse turns: only a new target is followed there.
 
-        Args:
-            shapes: What there is; what is beyond MuJoCo's most bodies is left out.
-            view: From where. In a window, the mouse turns it; only a new target is followed.
+        Shapes beyond MuJoCo's most bodies are left out.
         """
         camera = self._view.camera
         if self._seen is None:
@@ -192,11 +183,7 @@ def _add_shapes(scene: Any, shapes: Sequence[Shape]) -> None:
 
 @cache
 def find_backend() -> str:
-    """The backend that ``MUJOCO_GL`` names, else the first that works here.
-
-    Raises:
-        RenderingUnavailable: None does; the text says what to install.
-    """
+    """The backend that ``MUJOCO_GL`` names, else the first that works here; `RenderingUnavailable` if none does."""
     named = os.environ.get("MUJOCO_GL", "").lower().strip()
     if named == "glfw":
         require_display()

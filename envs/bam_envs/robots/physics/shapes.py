@@ -45,14 +45,10 @@ class Shape:
 class View:
     """From where a picture is seen: MuJoCo's free camera."""
 
-    target: tuple[float, float, float]
-    """What is in the middle [m]."""
-    distance: float
-    """Of the camera [m]."""
-    azimuth: float
-    """Where it looks to, seen from above: 0 along x, 90 along y [deg]."""
-    elevation: float
-    """-90 looks straight down [deg]."""
+    target: tuple[float, float, float]  # what is in the middle [m]
+    distance: float  # of the camera [m]
+    azimuth: float  # where it looks to, seen from above: 0 along x, 90 along y [deg]
+    elevation: float  # -90 looks straight down [deg]
 
 
 def marked(marks: Sequence[tuple[Array, Colour]], radius: float = 0.02) -> list[Shape]:
@@ -63,10 +59,8 @@ def marked(marks: Sequence[tuple[Array, Colour]], radius: float = 0.02) -> list[
 class Drawn:
     """A robot simulated in NumPy that has pictures; a subclass defines `slices`, `halt` and `picture`."""
 
-    floor: float = 0.0
-    """Height of the floor [m]."""
-    mark_radius: float = 0.02
-    """Radius of the task's marks [m]."""
+    floor: float = 0.0  # height of the floor [m]
+    mark_radius: float = 0.02  # radius of the task's marks [m]
     _renderer: ShapeRenderer | None = None
     _connected = False
 
