@@ -3,12 +3,10 @@
 Where an option means something else here, that is logged, once in a process.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 
@@ -17,12 +15,9 @@ from bam_envs.core.env_options import in_our_words, require_kinds
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.registry import ENVIRONMENTS, MAKE_OPTIONS
 from bam_envs.core.robot import Robot
-from bam_envs.core.robot_env import RobotEnv, RobotVectorEnv, render_modes
+from bam_envs.core.robot_env import RobotEnv, render_modes
 from bam_envs.core.task import Task
 from bam_envs.robo_gym.table import ROBO_GYM, RoboGymId
-
-if TYPE_CHECKING:
-    from bam_envs.remote.remote_env import RemoteVectorEnv
 
 _LOG = logging.getLogger(__name__)
 _MANAGER = ("ip", "lower_bound_port", "upper_bound_port", "server_manager_port")
@@ -65,7 +60,7 @@ def make_env(env_id: str, **options: Any) -> gym.Env[Any, Any]:
     return env if options.get("parity") else gym.wrappers.TimeLimit(env, ENVIRONMENTS[entry.env_id].max_episode_steps)
 
 
-def make_vector_env(env_id: str, num_envs: int = 1, **options: Any) -> RobotVectorEnv | RemoteVectorEnv:
+def make_vector_env(env_id: str, num_envs: int = 1, **options: Any) -> gym.vector.VectorEnv[Any, Any, Any]:
     """Simulated robots and their task, stepped together; of ``rs_state`` in the infos only where it is asked for."""
     entry = ROBO_GYM[env_id]
     if entry.is_live and options.get("transport") is None:

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds, Initial, RobotState, checked_command
 from bam_envs.core.task import Memory
 from bam_envs.robots.physics.obstacles import RADIUS, Obstacles
@@ -220,8 +219,6 @@ class KinematicArm(Memory, Drawn):
     def slices(self, command: Array, parts: int) -> Iterator[RobotState]:
         """As for every `Drawn`: joint positions [rad]; a halt between two parts holds for the rest of the period."""
         self._require_link()
-        if parts < 1:
-            raise InvalidValue(f"A period cannot be divided into {parts!r} parts.")
         self._command = checked_command(command, (self.num_robots, 6))
         return self._slices(np.clip(self._command, self._low, self._high), parts)
 

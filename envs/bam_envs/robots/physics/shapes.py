@@ -1,19 +1,14 @@
 """Bodies of a picture that are in no MuJoCo model: boxes, capsules and spheres. The first picture imports MuJoCo."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import ResetNeeded
 from bam_envs.core.robot import RobotState
-
-if TYPE_CHECKING:
-    from bam_envs.robots.physics.rendering import ShapeRenderer
 
 Array = NDArray[np.float64]
 Colour = tuple[float, float, float, float]
@@ -61,7 +56,7 @@ class Drawn:
 
     floor: float = 0.0  # height of the floor [m]
     mark_radius: float = 0.02  # radius of the task's marks [m]
-    _renderer: ShapeRenderer | None = None
+    _renderer: Any = None
     _connected = False
 
     def connect(self) -> None:
@@ -102,7 +97,8 @@ class Drawn:
         if self._renderer is None:
             self._renderer = ShapeRenderer(mode, self.floor)
         shapes, view = self.picture()
-        return self._renderer.render([*marked(marks, self.mark_radius), *shapes], view)
+        image: NDArray[np.uint8] | None = self._renderer.render([*marked(marks, self.mark_radius), *shapes], view)
+        return image
 
 
 def turned(yaw: float) -> Array:

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import Initial, Robot
 from bam_envs.robots.physics.kinematic_arm import empty_arm, isaac_arm, obstacle_arm, reach_arm
 from bam_envs.robots.ur import START, UR_MODELS
@@ -71,9 +70,6 @@ def test_parts_of_a_period_end_where_the_whole_does():
     np.testing.assert_allclose(states[1].signals["joint_position"], START + np.full((2, 6), 0.02))
     np.testing.assert_allclose([one.stamp[0] for one in states], [0.02, 0.04, 0.06, 0.08, 0.1])
     assert_same_state(states[-1], whole.step(command))
-    with pytest.raises(InvalidValue) as caught:
-        parts.slices(command, 0)
-    assert str(caught.value) == "A period cannot be divided into 0 parts."
 
 
 def test_a_halt_holds_for_the_rest_of_the_period():
