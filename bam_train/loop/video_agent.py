@@ -9,13 +9,14 @@ import gymnasium as gym
 
 from bam_train.loop.agent import Agent, import_torch
 from bam_train.loop.agents import Agents, KWAgentWrapper
+from bam_train.loop.gym.parallel_gym_agent import ParallelGymAgent
 from bam_train.loop.temporal_agent import TemporalAgent
 from bam_train.loop.workspace import Workspace
 from bam_train.video import Frame, open_video, picture, require_video_path
 
 
 class VideoAgent(Agent):
-    """Gives `count` pictures of an environment, one at each t, to `add`; stands behind the environment's agent."""
+    """Gives a picture of an environment at each t to `add`, and counts them; stands behind the environment's agent."""
 
     reads = ()
     writes = ()
@@ -37,7 +38,8 @@ def record_video(env: gym.Env[Any, Any], policy: Agent, path: str | Path, *, arr
 
     Args:
         env: Made with ``render_mode="rgb_array"``.
-        policy: Called with ``t`` after every observation; it finds what `ParallelGymAgent` writes.
+        policy: Called with ``t`` after every observation (of a `TemporalAgent`, the agent in it); it finds what
+            `ParallelGymAgent` writes.
         path: Ends in ``.mp4`` or ``.gif``; without a suffix it is an ``.mp4``. Its folder is made.
         arrays: What the policy reads and writes: ``"torch"``, without gradients, or ``"numpy"``.
 
@@ -46,8 +48,6 @@ def record_video(env: gym.Env[Any, Any], policy: Agent, path: str | Path, *, arr
         OutputError: The file cannot be written.
         MissingExtra: The package that writes this kind of video is not installed.
     """
-    from bam_train.loop.gym.parallel_gym_agent import ParallelGymAgent
-
     path = Path(path).expanduser().resolve()
     path = path if path.suffix else path.with_suffix(".mp4")
     path.parent.mkdir(parents=True, exist_ok=True)
