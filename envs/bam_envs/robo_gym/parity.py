@@ -274,8 +274,7 @@ class Mir100NavigationParity(DriveParity, Mir100NavigationTask):
     def failed(self, state: RobotState) -> Flags:
         """Whether the base left the floor; a misplaced parenthesis lets it go where y is low. Shape: (n,)."""
         x, y = state.signals["base_pose"][:, 0], state.signals["base_pose"][:, 1]
-        outside: Flags = (np.abs(x) > BOUNDARY) | (y > BOUNDARY)
-        return outside
+        return (np.abs(x) > BOUNDARY) | (y > BOUNDARY)
 
 
 class Mir100AvoidanceParity(DriveParity, Mir100AvoidanceTask):

@@ -131,8 +131,7 @@ class DriveTask(Memory):
         """How far the target is [m]. Shape: (n,)."""
         pose = state.signals["base_pose"]
         dx, dy = self.target[:, 0] - pose[:, 0], self.target[:, 1] - pose[:, 1]
-        distance: Array = np.sqrt(dx * dx + dy * dy)
-        return distance
+        return np.sqrt(dx * dx + dy * dy)
 
     def bearing(self, state: RobotState) -> Array:
         """Bearing of the target, seen from the base, from -pi to pi [rad]. Shape: (n,)."""

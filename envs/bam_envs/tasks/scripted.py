@@ -68,8 +68,7 @@ class Sight:
 def grasp(sight: Sight) -> tuple[Array, Array, Array]:
     """Come down on the object through a funnel, the gripper turned to it, and close.
 
-    Returns:
-        Way of the tool target [m], shape (n, 3); turn [rad], shape (n,); 1 to close and -1 to open, shape (n,).
+    The way of the tool target [m] (n, 3), its turn [rad] (n,), and 1 to close or -1 to open (n,).
     """
     across = np.hypot(sight.offset[:, 0], sight.offset[:, 1])
     astray = np.maximum((across - 0.007) / 0.015, (np.abs(sight.turn) - 0.08) / 0.15)

@@ -73,16 +73,12 @@ class ToolControl(Memory):
         self._joints[env_ids] = joints
 
     def command(self, action: Floats, tool: Array, sent: Array) -> Array:
-        """Joint positions [rad] and gripper width [m] for an action.
+        """Joint positions [rad] and gripper width [m] for an action dx, dy, dz, dyaw, grip. Shapes: (n, 5) -> (n, 7).
 
         Args:
-            action: dx, dy, dz, dyaw, grip in [-1, 1]. Shape: (n, 5).
+            action: In [-1, 1].
             tool: Measured tool position [m]. Shape: (n, 3).
-            sent: Joints that were really sent last [rad]; where guards made others of them, the target begins there.
-                Shape: (n, 6).
-
-        Returns:
-            Shape: (n, 7).
+            sent: Joints that were really sent last [rad]; where guards changed them, the target begins there (n, 6).
         """
         held = np.flatnonzero((sent != self._joints).any(axis=1))
         if len(held):

@@ -75,6 +75,8 @@ class UrTask(Memory):
                 "At least one of the six joints must be free to move: set one of the fix_ options False."
             )
         self.num_envs, self.model, self.rs_state_to_info = num_envs, model_called(ur_model), rs_state_to_info
+        self.speed: Array = self.velocity_scale * self.model.max_velocity
+        """How fast the joints go [rad/s]. Shape: (6,)."""
         self.free = np.flatnonzero(~np.array(fixed, dtype=bool))
         """Places of the joints that are in the action."""
         self.action_labels = self._action_labels()
@@ -117,12 +119,6 @@ class UrTask(Memory):
         command: Array = np.clip(joints + step, *self.model.joint_limits)
         return command
 
-    @property
-    def speed(self) -> Array:
-        """How fast the joints go [rad/s]. Shape: (6,)."""
-        speed: Array = self.velocity_scale * self.model.max_velocity
-        return speed
-
     def initial(self, joints: Array, rngs: Sequence[np.random.Generator], **signals: Array) -> Initial:
         """Start at `joints` (k, 6) [rad]; each generator draws the seed of its robot now."""
         return Initial({"joint_position": joints, **signals}, draw_seeds(rngs))
@@ -153,8 +149,7 @@ class UrTask(Memory):
 def collisions(state: RobotState) -> Flags:
     """Which arms have touched something; none where nobody knows, as of a live robot. Shape: (n,)."""
     told: Any = state.truth.get("collision")
-    touched: Flags = np.zeros(len(state.stamp), dtype=bool) if told is None else told
-    return touched
+    return np.zeros(len(state.stamp), dtype=bool) if told is None else told
 
 
 def normalised(model: UrModel, joints: Array) -> Array:
@@ -175,8 +170,7 @@ def in_frame(point: Array, position: Array, rotation: Array) -> Array:
     """`point` as a frame at `position` with the axes `rotation` sees it. Shapes: (n, 3), (n, 3), (n, 3, 3)."""
     offset = (point - position)[:, :, None]
     # Written out: the sum for one environment does not depend on how many there are.
-    seen: Array = rotation[:, 0] * offset[:, 0] + rotation[:, 1] * offset[:, 1] + rotation[:, 2] * offset[:, 2]
-    return seen
+    return rotation[:, 0] * offset[:, 0] + rotation[:, 1] * offset[:, 1] + rotation[:, 2] * offset[:, 2]
 
 
 def joint_labels(prefix: str, meaning: str, unit: str, scale: str, bound: float = 1.0) -> tuple[Label, ...]:

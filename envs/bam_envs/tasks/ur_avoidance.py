@@ -1,7 +1,7 @@
 """Avoidance: stay at a pose, and out of the way of an obstacle that goes up and down beside it.
 
-`UrObstacleTask` is what this task and `bam_envs.tasks.ur_track` share. Frames are those of robo-gym: the end effector
-is ``tool0``, the elbow ``forearm_link``, places are in ``base_link``.
+`UrObstacleTask` is what `bam_envs.tasks.ur_track` shares. Frames are robo-gym's: ``tool0`` is the end effector,
+``forearm_link`` the elbow, places are in ``base_link``.
 """
 
 from __future__ import annotations

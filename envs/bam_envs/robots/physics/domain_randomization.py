@@ -1,8 +1,7 @@
 """What differs between a simulated robot and a real one, drawn anew for each episode: domain randomisation.
 
-Everything that an environment draws follows from one seed, so an episode can be repeated exactly. The noise of a whole
-episode is drawn at its start (a tape of `TAPE` steps, read in a circle), which costs one call of the generator for each
-episode instead of one for each step.
+Everything that an environment draws follows from one seed. The noise of a whole episode is drawn at its start (a tape
+of `TAPE` steps, read in a circle): one call of the generator for each episode, not for each step.
 """
 
 from collections.abc import Mapping
@@ -95,8 +94,7 @@ class Imperfection(Memory):
         """What reaches the robot now when `command` (n, m) is sent."""
         self._sent = np.roll(self._sent, 1, axis=1)
         self._sent[:, 0] = command
-        arrived: Array = self._sent[np.arange(len(command)), self.delay]
-        return arrived
+        return self._sent[np.arange(len(command)), self.delay]
 
     def forget(self, command: Array) -> None:
         """Drop the commands that are on their way; `command` (n, m) is what the robots hold."""

@@ -47,7 +47,7 @@ class Capsules(NamedTuple):
 
 
 class ArmContacts:
-    """Finds what arms of one model touch: themselves, the table they stand on, the ground, a ball.
+    """What arms of one model touch: themselves, the table they stand on, the ground, a ball.
 
     Each link is a tube, a segment with a radius. Links that share a joint cannot collide; of the others, pairs that are
     always apart are left out. Distances are exact: of two segments in closed form, of a segment and the table by
@@ -146,8 +146,7 @@ def _outside(point: Array) -> Array:
 
 def _dot(one: Array, other: Array) -> Array:
     """Dot products along the last axis, written out: each is the same in a batch of any size."""
-    product: Array = one[..., 0] * other[..., 0] + one[..., 1] * other[..., 1] + one[..., 2] * other[..., 2]
-    return product
+    return one[..., 0] * other[..., 0] + one[..., 1] * other[..., 1] + one[..., 2] * other[..., 2]
 
 
 class KinematicArm(Memory, Drawn):

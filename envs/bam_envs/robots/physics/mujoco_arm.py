@@ -91,13 +91,9 @@ class SimulatedArm:
         return self._begin(env_ids, initial.signals["object_pose"] if self._with_object else None, initial.seeds)
 
     def place_object(self, pose: Array | None, seeds: NDArray[np.int64]) -> RobotState:
-        """Put the object elsewhere, draw a new episode's differences; all is at rest, and the arms stay where they are.
+        """Put the object at `pose` (n, 3), x, y [m] and yaw [rad], or leave it; `seeds` (n,) are of the new episode.
 
-        A drive whose force saturates can swing about its set point for good; an arm at rest has no such swing.
-
-        Args:
-            pose: x, y [m] and yaw [rad] on the table; None leaves it where it is. Shape: (n, 3).
-            seeds: Seeds for what the robot itself draws. Shape: (n,).
+        The arms stay where they are, at rest: a drive whose force saturates can swing about its set point for good.
 
         Raises:
             InvalidValue: There is no object.

@@ -73,11 +73,9 @@ def _overlaps(x: Array, y: Array, cos: Array, sin: Array, box_x: Array, box_y: A
 
 
 class LaserScanner:
-    """One scanner at the same place of every base.
+    """One scanner at the place `mount` of every base: x, y [m], yaw [rad] in its frame.
 
-    Args:
-        mount: Where it is in the base's frame: x, y [m], yaw [rad].
-        masked: Rays that the base's own body hides, at the beginning and at the end; they are left out.
+    The `masked` rays, which the base's own body hides at the beginning and at the end, are left out.
     """
 
     def __init__(self, mount: tuple[float, float, float], masked: tuple[int, int]) -> None:
