@@ -26,8 +26,6 @@ from bam_envs.remote.gymapi_leaves import (
     is_depth,
     joined,
     leaves_of,
-    read_numbers,
-    read_pose,
 )
 from bam_envs.remote.gymapi_messages import PREFIX, GymResponse, write_feedback
 from bam_envs.remote.gymapi_versions import JUNE_22, Version
@@ -82,12 +80,14 @@ class ActionCodec:
         if prefix.startswith(PREFIX):
             tree = tree_from_json(load_json(prefix.removeprefix(PREFIX), "prefix").get("action"))
             return exact(self.space, tree, "action")
-        poses = self._poses.read(message)
-        widths = [one[GRIPPER_WIDTH] for one in message["pose_param"]] or [0.0] * len(poses)
-        ordered = self._poses.in_order(widths, message["pose_names"], "pose_param")
-        values = {leaf.path: read_pose(leaf, pose, width) for (leaf, [pose]), width in zip(poses, ordered, strict=True)}
+        values = self._poses.read(message)
+        if widths := [one[GRIPPER_WIDTH] for one in message["pose_param"]]:
+            ordered = self._poses.in_order(widths, message["pose_names"], "pose_param")
+            for pose, width in zip(values.values(), ordered, strict=True):
+                if GRIPPER_WIDTH in pose:
+                    pose[GRIPPER_WIDTH][...] = width
         for lists in self._numbers:
-            values |= {leaf.path: read_numbers(leaf, numbers) for leaf, numbers in lists.read(message)}
+            values |= lists.read(message)
         return joined(self.space, values)
 
 
@@ -132,11 +132,9 @@ class ObservationCodec:
                 if leaf.name in trees
             }
             self._read_images(feedback, values)
-            if numbers := self._missing(NUMBERS, values):
-                parts = _lists(NUMBERS, numbers).read(feedback)
-                values |= {leaf.path: read_numbers(leaf, some) for leaf, some in parts}
-            if poses := self._missing(POSE, values):
-                values |= {leaf.path: read_pose(leaf, *pose) for leaf, pose in _lists(POSE, poses).read(feedback)}
+            for kind in (NUMBERS, POSE):
+                if leaves := self._missing(kind, values):
+                    values |= _lists(kind, leaves).read(feedback)
             if unread := self._missing(EXACT, values):
                 names = ", ".join(leaf.name for leaf in unread)
                 raise ProtocolError(f"The feedback does not hold {names}: only a server of bam-train can send that.")

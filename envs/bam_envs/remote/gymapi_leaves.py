@@ -146,10 +146,11 @@ class Lists:
         fields.setdefault(self.values, []).extend(written)
         return True
 
-    def read(self, message: Mapping[str, Any]) -> list[tuple[Leaf, list[Any]]]:
-        """Each leaf with its numbers, or with its one pose. Raises ProtocolError for one missing or one too many."""
+    def read(self, message: Mapping[str, Any]) -> dict[Path, Any]:
+        """The value of each leaf. Raises ProtocolError for one that is missing, too much, or does not fit."""
         ordered = iter(self.in_order(message[self.values], message[self.names]))
-        return [(leaf, list(islice(ordered, len(leaf.labels)))) for leaf in self.leaves]
+        read = _read_pose if self.leaves and self.leaves[0].kind == POSE else _read_numbers
+        return {leaf.path: read(leaf, list(islice(ordered, len(leaf.labels)))) for leaf in self.leaves}
 
     def in_order(self, values: Sequence[Any], names: Sequence[str], field: str = "") -> Sequence[Any]:
         """`values`, which errors call `field`, by their `names` in the order of the leaves.
@@ -185,8 +186,7 @@ def _numbers(value: Any) -> list[Any] | None:
     return plain if all(-_WHOLE <= one <= _WHOLE for one in plain) else None
 
 
-def read_numbers(leaf: Leaf, numbers: Sequence[Any]) -> Any:
-    """The value of `leaf` that was written as `numbers`. Raises ProtocolError if one does not fit the dtype."""
+def _read_numbers(leaf: Leaf, numbers: Sequence[Any]) -> Any:
     dtype = np.dtype(leaf.space.dtype)
     wide = np.asarray(numbers, np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -207,13 +207,13 @@ def _pose(value: Mapping[str, Any]) -> list[dict[str, Any]] | None:
     return [{"pose": {"position": position, "orientation": orientation}}]
 
 
-def read_pose(leaf: Leaf, message: Mapping[str, Any], width: float = 0.0) -> dict[str, Any]:
-    """The pose in a checked PoseStamped, with a gripper `width` [m] if its space has one."""
-    pose = message["pose"]
+def _read_pose(leaf: Leaf, messages: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The pose in one PoseStamped; a gripper width, which that does not hold, is 0."""
+    pose = messages[0]["pose"]
     numbers = {
         "position": [pose["position"][axis] for axis in "xyz"],
         "orientation": [pose["orientation"][axis] for axis in "xyzw"],
-        GRIPPER_WIDTH: [width],
+        GRIPPER_WIDTH: [0.0],
     }
     parts = leaf.space.spaces.items()  # type: ignore[attr-defined]
     return {key: np.array(numbers[key], part.dtype).reshape(part.shape) for key, part in parts}
