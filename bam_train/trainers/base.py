@@ -1,7 +1,5 @@
 """The interface of every trainer: train in steps, save, resume, freeze the policy; and its checkpoints' manifest."""
 
-from __future__ import annotations
-
 import contextlib
 import datetime
 import functools
@@ -12,18 +10,15 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
+
+from gymnasium import Space
+from gymnasium.vector import VectorEnv
 
 from bam_envs.core.spaces import space_to_json
-
-if TYPE_CHECKING:
-    from gymnasium import Space
-    from gymnasium.vector import VectorEnv
-    from typing_extensions import Self
-
-    from bam_train.checkpoint import Checkpoint
-    from bam_train.policy import FrozenPolicy
-    from bam_train.settings import TrainSettings
+from bam_train.checkpoint import Checkpoint
+from bam_train.policy import FrozenPolicy
+from bam_train.settings import TrainSettings
 
 
 @dataclass(frozen=True)
@@ -70,11 +65,11 @@ class Trainer(Protocol):
         """Check the algorithm's own settings and fill in its defaults; no training is set up."""
 
     @classmethod
-    def create(cls, settings: TrainSettings) -> Self:
+    def create(cls, settings: TrainSettings) -> "Trainer":
         """Set up a new run of complete settings; raises SettingsError if the library refuses them."""
 
     @classmethod
-    def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None) -> Self:
+    def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None) -> "Trainer":
         """Set up a run that continues from a checkpoint, with its settings or with these."""
 
     def log_to(self, folder: Path) -> None:

@@ -93,12 +93,9 @@ def complete(algorithm: Algorithm, given: Mapping[str, Any], observation_space: 
 
 def default_policy(algorithm: Algorithm, observation_space: spaces.Space[Any]) -> str:
     """Name of the policy that fits what is observed: several inputs, images, or numbers."""
-    kind = "Mlp"
-    if isinstance(observation_space, spaces.Dict):
-        kind = "MultiInput"
-    elif is_image_space(observation_space):
-        kind = "Cnn"
-    return f"{kind}LstmPolicy" if algorithm.recurrent else f"{kind}Policy"
+    several = isinstance(observation_space, spaces.Dict)
+    kind = "MultiInput" if several else "Cnn" if is_image_space(observation_space) else "Mlp"
+    return f"{kind}{'Lstm' if algorithm.recurrent else ''}Policy"
 
 
 def complete_normalize(given: bool | Mapping[str, Any], gamma: float) -> bool | dict[str, Any]:
