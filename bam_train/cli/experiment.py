@@ -1,21 +1,20 @@
 """For scripts that run a policy in a loop of their own: a command line, and the environment, here or a live robot's."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import gymnasium as gym
+
+from bam_envs.live.building import require_robot_address
+from bam_train.checkpoint import Checkpoint
+from bam_train.cli.consent import connected_env, require_screen
 from bam_train.cli.console import say
 from bam_train.cli.flags import EnvId, File, Url
+from bam_train.env_location import Place
 from bam_train.signals import SignalMemory, handled, interrupt
-
-if TYPE_CHECKING:
-    import gymnasium as gym
-
-    from bam_train.checkpoint import Checkpoint
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,14 +50,9 @@ def environment_of(args: TrainingFlags, own: str, own_kwargs: Mapping[str, Any])
 def require_place(env_id: str, robot: str | None, render: bool) -> None:
     """Refuse a ``--robot`` that cannot be and a ``--render`` without a screen; nothing is made or connected."""
     if robot is not None:
-        from bam_envs.live.building import require_robot_address
-        from bam_train.env_location import Place
-
         require_robot_address(robot)
         Place(robot).robot_kwargs(env_id, {})
     if render:
-        from bam_train.cli.consent import require_screen
-
         require_screen(remote=robot is not None)
 
 
@@ -92,9 +86,6 @@ def open_env(
     However it is left, the robot is halted and the link dropped. Of a live robot, each `step` waits for the end of its
     period. `robot` is its address; what is `asked` is as of `bam_train.cli.consent.connected_env`.
     """
-    from bam_train.cli.consent import connected_env
-    from bam_train.env_location import Place
-
     require_place(checkpoint.manifest.env, robot, render)
     with SignalMemory() as signals:
         env = connected_env(checkpoint, Place(robot), signals, render=render, **asked)

@@ -5,8 +5,6 @@ own agents join the same chain. However it ends (all episodes done, Ctrl-C, SIGT
 closed before anything is reported.
 """
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -36,6 +34,37 @@ class Watcher(Protocol):
 
     def ended(self, record: EpisodeRecord) -> None:
         """An episode ended."""
+
+
+class Stopped(BaseException):
+    """A signal asked for the end."""
+
+
+class StopSwitch:
+    """Handles signals: while armed, one raises `Stopped`; otherwise it waits, as the robot may be being halted.
+
+    The third one raises KeyboardInterrupt, for a halt that hangs.
+    """
+
+    def __init__(self) -> None:
+        self.armed = False
+        """Whether a signal may interrupt what runs now."""
+        self.came: list[int] = []
+        """The signals so far."""
+
+    def raise_again(self) -> None:
+        """Raise `Stopped` if a signal came: Python discards an exception in a callback, such as a ``__del__``."""
+        if self.came:
+            raise Stopped
+
+    def __call__(self, number: int) -> None:
+        """Handle a signal, in the main thread, between two of its instructions."""
+        self.came.append(number)
+        if len(self.came) > 2:
+            raise KeyboardInterrupt
+        if self.armed:
+            self.armed = False
+            raise Stopped
 
 
 class Deployment:
@@ -212,37 +241,3 @@ class _JournalAgent(Agent):
                 watcher.ended(record)
         if not self.get(("env/done", t))[0]:
             self._pacer.wait()
-
-
-# ---- Ctrl-C and SIGTERM while a robot moves
-
-
-class Stopped(BaseException):
-    """A signal asked for the end."""
-
-
-class StopSwitch:
-    """Handles signals: while armed, one raises `Stopped`; otherwise it waits, as the robot may be being halted.
-
-    The third one raises KeyboardInterrupt, for a halt that hangs.
-    """
-
-    def __init__(self) -> None:
-        self.armed = False
-        """Whether a signal may interrupt what runs now."""
-        self.came: list[int] = []
-        """The signals so far."""
-
-    def raise_again(self) -> None:
-        """Raise `Stopped` if a signal came: Python discards an exception in a callback, such as a ``__del__``."""
-        if self.came:
-            raise Stopped
-
-    def __call__(self, number: int) -> None:
-        """Handle a signal, in the main thread, between two of its instructions."""
-        self.came.append(number)
-        if len(self.came) > 2:
-            raise KeyboardInterrupt
-        if self.armed:
-            self.armed = False
-            raise Stopped

@@ -1,17 +1,14 @@
 """What has happened so far, kept up to date tick by tick, and the report that can be made of it at any moment."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from bam_envs.core.timing import Lateness, Pacer
-    from bam_train.checkpoint import Checkpoint
+from bam_envs.core.timing import Lateness, Pacer
+from bam_train.checkpoint import Checkpoint
 
 
 @dataclass

@@ -113,7 +113,7 @@ def tls_context(cert: str, key: str | None) -> ssl.SSLContext:
         raise InvalidValue(f"Certificate: {files} not a certificate with its key in PEM: {reason}.") from error
     except OSError as error:
         read = cert if key is None else f"{cert} and {key}"
-        raise InvalidValue(f"Certificate: {read} cannot be read: {error.strerror}.") from error
+        raise InvalidValue(f"Certificate: {read} cannot be read: {error.strerror}. Check --cert and --key.") from error
     return context
 
 
