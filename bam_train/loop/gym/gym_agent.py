@@ -123,6 +123,7 @@ class GymAgent(SeedableAgent):
             if self._seed is None and seed is None:
                 self.seed(self.default_seed)
             self._nb_reset += 1
+            self._running = False  # until the reset has worked
             if self.envs is None:
                 self._open()
             self._infos = InfoRecorder(self.info_keys, self.num_envs, self._floats)
