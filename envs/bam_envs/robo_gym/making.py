@@ -14,9 +14,7 @@ from bam_envs import make_env as ours
 from bam_envs.core.env_options import in_our_words, require_kinds
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.registry import ENVIRONMENTS, MAKE_OPTIONS
-from bam_envs.core.robot import Robot
 from bam_envs.core.robot_env import RobotEnv, render_modes
-from bam_envs.core.task import Task
 from bam_envs.robo_gym.table import ROBO_GYM, RoboGymId
 
 _LOG = logging.getLogger(__name__)
@@ -26,7 +24,6 @@ _WINDOWS = ("gui", "gazebo_gui", "rviz_gui")
 _SIMULATED = (*_MANAGER, *_WINDOWS)
 PLACES = frozenset({*_SIMULATED, "rs_address"})
 """Options that say where an environment of robo-gym's ran, and nothing of what it is."""
-_OF_ENVIRONMENT = frozenset(MAKE_OPTIONS) | {"max_episode_steps"}
 _RANGES = [f"ee_rotation_{one}_range" for one in ("pos_x", "pos_y", "pos_z", "roll", "pitch", "yaw")]
 _NOT_HERE = {
     "max_velocity_scale_factor": "the arm's speed belongs to the environment, which would be another one",
@@ -55,7 +52,8 @@ def make_env(env_id: str, **options: Any) -> gym.Env[Any, Any]:
     if arguments.get("transport") is not None:
         return ours.make_env(env_id, **arguments)
     made: Any = ours.make_env(entry.env_id, **arguments).unwrapped
-    env = RoboGymEnv(made.robot, made.task, made.render_mode, is_live=arguments.get("robot") is not None)
+    env = RoboGymEnv(made.robot, made.task, made.render_mode)
+    env.is_live = arguments.get("robot") is not None
     # robo-gym's ids have no limit at Gymnasium: with parity the task itself terminates at the last step.
     return env if options.get("parity") else gym.wrappers.TimeLimit(env, ENVIRONMENTS[entry.env_id].max_episode_steps)
 
@@ -78,18 +76,10 @@ def make_vector_env(env_id: str, num_envs: int = 1, **options: Any) -> gym.vecto
 
 
 class RoboGymEnv(RobotEnv):
-    """A `RobotEnv` under one of robo-gym's ids, with the methods that robo-gym's environments add.
+    """A `RobotEnv` under one of robo-gym's ids, with the methods that robo-gym's environments add."""
 
-    Args:
-        robot: A robot with ``num_robots == 1``.
-        task: A task with ``num_envs == 1`` and a method ``rs_state``.
-        render_mode: ``"rgb_array"``, ``"human"`` or None.
-        is_live: Whether there is a robot behind `robot`, and no simulation.
-    """
-
-    def __init__(self, robot: Robot, task: Task, render_mode: str | None = None, *, is_live: bool = False) -> None:
-        super().__init__(robot, task, render_mode)
-        self.is_live = is_live
+    is_live = False
+    """Whether there is a robot, and no simulation."""
 
     def get_rs_state(self) -> dict[str, float] | list[float] | None:
         """The newest wire state: of an arm by key, of a base a list of 1030 numbers; None before the first `reset`."""
@@ -125,7 +115,7 @@ def translate(entry: RoboGymId, given: Mapping[str, Any]) -> dict[str, Any]:
             address, or a simulated one with one.
     """
     taken, refused = constructor_options(entry)
-    known = {*_task_options(entry), *_OF_ENVIRONMENT, *taken} - {"env_id", "task_options"}
+    known = {*_task_options(entry), *MAKE_OPTIONS, "max_episode_steps", *taken}
     for name in given:
         if name in refused and name in _NOT_HERE:
             raise InvalidValue(f"{name}= of {entry.id}: there is none here; {_NOT_HERE[name]}.")

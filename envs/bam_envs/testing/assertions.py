@@ -32,11 +32,10 @@ def raised(kind: type[Exception], act: Callable[[], Any]) -> Exception:
 def assert_same_state(one: RobotState, two: RobotState, env_ids: Sequence[int] | None = None) -> None:
     """These environments, or all, are equal, number by number."""
     chosen = np.arange(len(one.stamp)) if env_ids is None else np.array(env_ids)
-    assert list(one.signals) == list(two.signals)
-    for name, array in one.signals.items():
-        np.testing.assert_array_equal(array[chosen], two.signals[name][chosen], err_msg=name)
-    np.testing.assert_array_equal(one.stamp[chosen], two.stamp[chosen], err_msg="stamp")
-    np.testing.assert_array_equal(one.command[chosen], two.command[chosen], err_msg="command")
+    first, second = ({**state.signals, "stamp": state.stamp, "command": state.command} for state in (one, two))
+    assert list(first) == list(second)
+    for name, array in first.items():
+        np.testing.assert_array_equal(array[chosen], second[name][chosen], err_msg=name)
 
 
 def assert_same_value(one: Any, two: Any, name: str = "value") -> None:
