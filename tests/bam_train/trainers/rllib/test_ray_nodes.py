@@ -93,56 +93,6 @@ class Plan:
         return bool(self.stages)
 
 
-def test_a_runner_and_a_node_die_in_mid_training(nodes, tmp_path):
-    cluster, second = nodes
-    with contextlib.closing(RLlibTrainer.create(train_settings(cluster.address))) as trainer:
-        places = {}
-
-        def after(notice):
-            def seen():
-                return notice in trainer.notices
-
-            return seen
-
-        def kill_a_runner():
-            places.update(runners(trainer))
-            assert {node for node, _ in places.values()} == {cluster.head_node.node_id, second.node_id}
-            os.kill(next(pid for node, pid in places.values() if node != second.node_id), signal.SIGKILL)
-            return True
-
-        def kill_a_node():
-            now = runners(trainer)
-            assert len(now) == 2
-            assert now != places
-            cluster.remove_node(second, allow_graceful=False)
-            return True
-
-        later = iter(range(4))
-        plan = Plan(trainer, [kill_a_runner])
-        trainer.train(10**9, plan)
-        killed, second_index = sorted(places, key=lambda index: places[index][0] == second.node_id)
-        plan.stages = [
-            after(f"env runner {killed} is back"),
-            kill_a_node,
-            after(f"env runner {second_index} died: what it had not delivered yet is lost"),
-            lambda: next(later) == 2,
-        ]
-        trainer.train(10**9, plan)
-
-        assert list(dict.fromkeys(plan.steps)) == [BATCH * (k + 1) for k in range(len(set(plan.steps)))]
-        assert trainer.steps == plan.steps[-1]
-        assert trainer.notices == [
-            f"env runner {killed} died: what it had not delivered yet is lost",
-            "training goes on with 1 of 2 env runners",
-            f"env runner {killed} is back",
-            f"env runner {second_index} died: what it had not delivered yet is lost",
-            "training goes on with 1 of 2 env runners",
-        ]
-        assert plan.metrics["train/num_module_steps_trained_lifetime"] >= trainer.steps
-        saved = trainer.save(tmp_path / "one.zip", {}, {})
-        assert Checkpoint.open(saved.path).manifest.steps == trainer.steps
-
-
 class Blind(gym.Env):
     """Cannot be made in a process of Ray's."""
 
@@ -205,3 +155,54 @@ def test_an_environment_that_no_runner_can_make(registered):
     assert str(caught.value) == (
         "ppo on test/Faulty-v0 cannot be set up: env runner 1 died (ConnectionError: no display here)"
     )
+
+
+# Last: RLlib's registry keeps the number of the job that it first registered for, which is another one in a cluster.
+def test_a_runner_and_a_node_die_in_mid_training(nodes, tmp_path):
+    cluster, second = nodes
+    with contextlib.closing(RLlibTrainer.create(train_settings(cluster.address))) as trainer:
+        places = {}
+
+        def after(notice):
+            def seen():
+                return notice in trainer.notices
+
+            return seen
+
+        def kill_a_runner():
+            places.update(runners(trainer))
+            assert {node for node, _ in places.values()} == {cluster.head_node.node_id, second.node_id}
+            os.kill(next(pid for node, pid in places.values() if node != second.node_id), signal.SIGKILL)
+            return True
+
+        def kill_a_node():
+            now = runners(trainer)
+            assert len(now) == 2
+            assert now != places
+            cluster.remove_node(second, allow_graceful=False)
+            return True
+
+        later = iter(range(4))
+        plan = Plan(trainer, [kill_a_runner])
+        trainer.train(10**9, plan)
+        killed, second_index = sorted(places, key=lambda index: places[index][0] == second.node_id)
+        plan.stages = [
+            after(f"env runner {killed} is back"),
+            kill_a_node,
+            after(f"env runner {second_index} died: what it had not delivered yet is lost"),
+            lambda: next(later) == 2,
+        ]
+        trainer.train(10**9, plan)
+
+        assert list(dict.fromkeys(plan.steps)) == [BATCH * (k + 1) for k in range(len(set(plan.steps)))]
+        assert trainer.steps == plan.steps[-1]
+        assert trainer.notices == [
+            f"env runner {killed} died: what it had not delivered yet is lost",
+            "training goes on with 1 of 2 env runners",
+            f"env runner {killed} is back",
+            f"env runner {second_index} died: what it had not delivered yet is lost",
+            "training goes on with 1 of 2 env runners",
+        ]
+        assert plan.metrics["train/num_module_steps_trained_lifetime"] >= trainer.steps
+        saved = trainer.save(tmp_path / "one.zip", {}, {})
+        assert Checkpoint.open(saved.path).manifest.steps == trainer.steps
