@@ -72,11 +72,7 @@ class Exported:
     """Settings of a run that goes on from it, or why there is none."""
 
     def write(self, path: Path) -> Checkpoint:
-        """Write the checkpoint.zip.
-
-        Raises:
-            OutputError: It cannot be written there.
-        """
+        """Write the checkpoint.zip; raises OutputError if it cannot be written there."""
         source = {
             "directory": str(self.directory.given.expanduser().absolute()),
             "policy": self.directory.name,

@@ -32,11 +32,8 @@ from bam_train.trainers.rllib.ray_resources import cores, gpus, require_resource
 
 psutil: Any = importlib.import_module("psutil")  # Ray has it in a folder of its own
 
-OBJECT_STORE = 200 * 2**20
-"""Memory that the own Ray shares samples and weights through [bytes]; they are a few megabytes."""
-
-GRACE = 3.0
-"""How long a process of Ray's may take to end by itself once Ray has shut down [s]."""
+OBJECT_STORE = 200 * 2**20  # bytes that the own Ray shares samples and weights through; they are a few megabytes
+GRACE = 3.0  # s that a process of Ray's may take to end by itself once Ray has shut down
 
 SOCKET_TIMEOUT = 5.0
 """How long the host of a cluster may take to accept a connection [s]."""
@@ -51,11 +48,7 @@ _MODE, _TOKENS = "RAY_AUTH_MODE", ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 
 @contextlib.contextmanager
 def cluster(settings: TrainSettings) -> Iterator[None]:
-    """Ray for a run, within this; one that runs in this process already is used, and left running.
-
-    Args:
-        settings: `address` is None for a Ray of the run's own, else ``auto`` or ``host:port`` of the cluster to join;
-            runners, learners and GPUs say how much of it is asked for.
+    """Ray for a run, within this: one that runs in this process already, the cluster at `address`, else its own.
 
     Raises:
         SettingsError: More is asked for than there is, or the address cannot be one.
@@ -74,16 +67,14 @@ def cluster(settings: TrainSettings) -> Iterator[None]:
         yield
 
 
-# A Ray of the run's own
-
-
 @contextlib.contextmanager
 def _own(settings: TrainSettings) -> Iterator[None]:
     before = set(psutil.Process().children())
     root = "/tmp" if os.path.isdir("/tmp") else None  # paths of Ray's sockets must be short
     with (
         tempfile.TemporaryDirectory(prefix="bam-ray-", dir=root, ignore_cleanup_errors=True) as folder,
-        at_quit(lambda: _abandon(before, folder)),
+        at_quit(lambda: shutil.rmtree(folder, ignore_errors=True)),
+        at_quit(lambda: _kill(_started_since(before))),  # comes first; two of Ray's would go on for a minute
         _private_token(),
     ):
         try:
@@ -130,12 +121,6 @@ def _kill(processes: list[Any]) -> None:
     for process in processes:
         with contextlib.suppress(psutil.Error):
             process.kill()
-
-
-def _abandon(before: set[Any], folder: str) -> None:
-    """What `_own` does at its end, without waiting for anything; two of Ray's processes would go on for a minute."""
-    _kill(_started_since(before))
-    shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -314,7 +299,7 @@ ray.shutdown()
 
 
 def reach(place: str, timeout: float = REACH_TIMEOUT) -> None:
-    """Find out whether a run can join the cluster at ``host:port``, within so many seconds once the host accepts.
+    """Find out whether a run can join the cluster at ``host:port``, within `timeout` s once the host accepts.
 
     Raises:
         TrainingFailed: Nothing answers there, what answers is no cluster, or it refuses us; says which.

@@ -9,9 +9,7 @@ from bam_train.errors import SettingsError
 from bam_train.settings import TrainSettings
 
 VARIABLE = "RLLIB_NUM_GPUS"
-
-LONGEST_BUSY = 10.0
-"""How long to wait for CPUs and GPUs that others in the cluster use [s]."""
+LONGEST_BUSY = 10.0  # s to wait for CPUs and GPUs that others in the cluster use
 
 
 def gpus(settings: TrainSettings) -> int:

@@ -18,11 +18,8 @@ from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 
 from bam_train.errors import ProcessesLost, SettingsError, TrainingFailed
 
-LONGEST_CAUSE = 500
-"""Characters of a cause that are kept."""
-
-SAMPLE_TIMEOUT = 60.0
-"""How long an update waits for the samples of its slowest runner [s]."""
+LONGEST_CAUSE = 500  # characters
+SAMPLE_TIMEOUT = 60.0  # s that an update waits for the samples of its slowest runner
 
 PROBE_TIMEOUT = 0.25
 """How long each update waits for a sign of life of the runners that are gone [s]; RLlib's own is half a minute.
@@ -30,17 +27,12 @@ PROBE_TIMEOUT = 0.25
 They answer within milliseconds once they are back, and are asked again before the next update.
 """
 
-RESTART_DELAY = 1.0
-"""Between the failure of a runner's environment and its restart [s]; RLlib's own is a minute without samples."""
+RESTART_DELAY = 1.0  # s between the failure of a runner's environment and its restart; RLlib's own is a minute
 
-MOST_DEATHS = 5
-"""How often one runner may die within `WINDOW` updates."""
+MOST_DEATHS, WINDOW = 5, 20
+"""How often one runner may die within so many updates; those made while no runner was there do not count."""
 
-WINDOW = 20
-"""Updates over which deaths are counted; the ones that were made while no runner was there are left out."""
-
-LONGEST_ALONE = 180.0
-"""How long a run waits while all of its runners are gone [s]; a busy computer takes half a minute to start one."""
+LONGEST_ALONE = 180.0  # s that a run waits while all runners are gone; a busy computer takes half a minute to start one
 
 
 class FaultReporting:
