@@ -144,7 +144,7 @@ class LiveState:
         self._extra: dict[str, float] = {}  # how much older than `max_age` these messages may be [s]
         for source in self.sources:
             head = self._heads.setdefault((source.topic, source.names), source).signal
-            more = max(0.0, profile.age_limit(source) - profile.max_age)
+            more = max(0.0, (source.max_age or profile.max_age) - profile.max_age)
             self._extra[head] = min(self._extra.get(head, more), more)
         self.forget_ages()
 

@@ -193,10 +193,6 @@ class RobotProfile:
             raise UnknownName(f"camera of {self.name}", name, cameras)
         return cameras[name]
 
-    def age_limit(self, source: Source) -> float:
-        """Oldest state of `source` that is acted on [s]."""
-        return self.max_age if source.max_age is None else source.max_age
-
     def sinks(self, mode: str | None = None) -> tuple[Sink, ...]:
         """Where the parts of a command go; `mode` None is the default one. `UnknownName` if there is no such mode."""
         if mode is None:

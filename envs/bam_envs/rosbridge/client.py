@@ -36,8 +36,7 @@ _SEND_WITHIN = 0.5
 _LEAVE_WITHIN = 3.0
 _STATUSES_KEPT = 20
 _MOST_ANSWERING = 64  # requests of the server that are answered at the same time; more of them are refused
-_ENDED = "Timeout exceeded"
-"""What servers say of a call that they end; rosbridge from 2.2 on does after 5 s, if it is told no other time."""
+_ENDED = "Timeout exceeded"  # what servers say of a call that they end; rosbridge from 2.2 on does after 5 s by default
 _NEARLY = 0.9
 
 
@@ -124,8 +123,7 @@ class RosbridgeLink(Declarations):
     @property
     def is_up(self) -> bool:
         """Whether a message can be sent now."""
-        connection = self._up
-        return connection is not None and connection.is_open
+        return (connection := self._up) is not None and connection.is_open
 
     def wait_up(self, timeout: float) -> None:
         """Wait until the link is up; `LinkLost` if it is not after `timeout` [s]."""

@@ -1,7 +1,6 @@
 """One WebSocket connection of a client, from its handshake to its end. Everything here runs on the network thread.
 
-A connection never comes back: what was handed to it and not sent when it ended is refused, and cannot reach the server
-over the next one. What could not be opened says why: each reason has its own remedy.
+A connection never comes back: what it had not sent when it ended cannot reach the server over the next one.
 """
 
 import asyncio
@@ -128,8 +127,7 @@ class Connection:
             reason = bare_reason(self.url, error).removeprefix("the link dropped: ")
             raise NoServer(self.url, f"closed the connection before it answered a request: {reason}.") from error
         if isinstance(values, str) and _DEAD_NODE in values:
-            text = f"its ROS node has ended and its socket has not ({values}). Restart the bridge."
-            raise NoServer(self.url, text)
+            raise NoServer(self.url, f"its ROS node has ended and its socket has not ({values}). Restart the bridge.")
         found = values.get("time") if isinstance(values, Mapping) else None
         return found if isinstance(found, Mapping) else {}
 
@@ -270,8 +268,8 @@ class Connection:
                 self._dispatch(decode_server_frame(whole.encode()))
         # Before the server is known to be one: later on, a request of its own may have an id like ours.
         elif operation == "call_service" and not self._ready and identity in self._pending:
-            text = "an echo server: it sends back what it is sent. Is it the right port?"
-            self._resolve(identity, NoServer(self.url, text))
+            echo = NoServer(self.url, "an echo server: it sends back what it is sent. Is it the right port?")
+            self._resolve(identity, echo)
         else:
             # A server may answer a request that it cannot read with a status of the same id, and with nothing else.
             if operation == "status" and message.get("level") == "error":

@@ -17,9 +17,7 @@ from bam_envs.core.wording import brief
 from bam_envs.ros.interfaces import MAX_DEPTH, Field, normal_name, require_plain, variants
 
 COMPRESSIONS = ("none", "png", "cbor")  # how a message may be packed for a subscriber
-MOST_ITEMS = 100_000
-"""Largest number of values in one JSON message of a client: lists and objects count, and each thing in them. An image
-is one text."""
+MOST_ITEMS = 100_000  # values in one JSON message of a client: lists and objects count, and each thing in them
 MOST_ITEMS_OF_A_SERVER = 4_000_000  # the same for messages of a server: an image may come as a list of numbers
 _NOT_BRACKETS = bytes(set(range(256)) - set(b'"[]{}'))
 _ONE_KIND = bytes.maketrans(b"{}", b"[]")
@@ -121,9 +119,8 @@ def _untag(value: Any) -> Any:
     if dtype is None or not isinstance(value.value, bytes):
         raise ProtocolError(f"CBOR tag {value.tag} on a {type(value.value).__name__}: expected a typed array, 64 to 86")
     if len(value.value) % dtype.itemsize:
-        raise ProtocolError(
-            f"CBOR tag {value.tag}: expected a multiple of {dtype.itemsize} bytes, found {len(value.value)}"
-        )
+        size = len(value.value)
+        raise ProtocolError(f"CBOR tag {value.tag}: expected a multiple of {dtype.itemsize} bytes, found {size}")
     array = np.frombuffer(value.value, dtype)
     return array if dtype.isnative else array.astype(dtype.newbyteorder("="))
 

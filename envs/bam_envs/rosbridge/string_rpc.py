@@ -25,9 +25,8 @@ from bam_envs.rosbridge.sessions import Sessions
 
 _log = logging.getLogger(__name__)
 _STRING = "std_msgs/String"
+# Time between two publications of a request until a first reply came [s]: a ROS graph loses a topic's first ones.
 _RESEND = 0.5
-"""Time between two publications of a request until a first reply came [s]: a ROS graph loses what is published before
-the two ends of a topic found each other. The service executes one id once."""
 _MOST_WAITING = 64  # requests that a service executes or keeps waiting at once
 _WORKERS = 8
 _ANSWERS_KEPT = 32  # the newest, by the key of their request: one that comes twice is executed once

@@ -19,14 +19,9 @@ class LoopThread:
     """Runs one coroutine to its end in an asyncio loop of its own; errors name its `owner`."""
 
     def __init__(self, name: str, owner: str = "this server") -> None:
-        self._name, self._owner = name, owner
+        self._name, self._owner, self.was_started = name, owner, False
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread: threading.Thread | None = None
-
-    @property
-    def was_started(self) -> bool:
-        """Whether `start` was called."""
-        return self._thread is not None
 
     @property
     def is_current(self) -> bool:
@@ -38,7 +33,7 @@ class LoopThread:
         ready: Future[None] = Future()
         thread = threading.Thread(target=lambda: asyncio.run(self._run(main, ready)), name=self._name, daemon=True)
         thread.start()
-        self._thread = thread
+        self._thread, self.was_started = thread, True
         ready.result()
 
     def join(self, timeout: float | None = None) -> bool:

@@ -102,18 +102,16 @@ def _unauthorized(connection: BridgeConnection) -> Response:
 
 def tls_context(cert: str, key: str | None) -> ssl.SSLContext:
     """A server's side of TLS, from the files of its certificate chain and of its key (None: in the same one)."""
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    files = f"{cert} is" if key is None else f"{cert} and {key} are"
+    context, files = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), " and ".join(filter(None, (cert, key)))
     try:
         context.load_cert_chain(cert, key)
     except ssl.SSLError as error:
         if key is None and b"PRIVATE KEY" not in (content := Path(cert).read_bytes()) and b"BEGIN CERT" in content:
             raise InvalidValue(f"Certificate: {cert} holds no key; give the file with its key too (--key).") from error
-        reason = error.reason or "not PEM"
-        raise InvalidValue(f"Certificate: {files} not a certificate with its key in PEM: {reason}.") from error
+        verb, reason = "is" if key is None else "are", error.reason or "not PEM"
+        raise InvalidValue(f"Certificate: {files} {verb} not a certificate with its key in PEM: {reason}.") from error
     except OSError as error:
-        read = cert if key is None else f"{cert} and {key}"
-        raise InvalidValue(f"Certificate: {read} cannot be read: {error.strerror}. Check --cert and --key.") from error
+        raise InvalidValue(f"Certificate: {files} cannot be read: {error.strerror}. Check --cert and --key.") from error
     return context
 
 

@@ -203,7 +203,6 @@ class BridgeServer(Bus):
         await _turns()
 
     async def _serve(self, connection: BridgeConnection) -> None:
-        """Read one client's frames until its connection ends."""
         try:
             await self._admission.greet(connection)
         except ConnectionClosed:
@@ -276,7 +275,6 @@ class BridgeServer(Bus):
         self._timer = asyncio.get_running_loop().call_at(deadline, self._tick)
 
     def _work(self, call: Call) -> None:
-        """In a thread of the pool: answer one call."""
         packet = self._bridge.services.packed_answer(call)
         self._post(lambda: self._bridge.services.finish(call, packet))
 
