@@ -17,12 +17,9 @@ _UR_MODULAR = {"ur_model": "ur5", "rs_state_to_info": False}
 class RoboGymId:
     """One id of robo-gym's."""
 
-    stem: str
-    """The id without ``Sim-v0`` or ``Rob-v0``."""
-    env_id: str
-    """Key of `bam_envs.ENVIRONMENTS`."""
-    is_live: bool
-    """Whether it is the ``Rob-v0`` of the two: the same environment, with a robot."""
+    stem: str  # the id without ``Sim-v0`` or ``Rob-v0``
+    env_id: str  # key of `bam_envs.ENVIRONMENTS`
+    is_live: bool  # whether it is the ``Rob-v0`` of the two: the same environment, with a robot
     defaults: Mapping[str, Any] = field(default_factory=dict)
     """Task options that have other defaults there than here."""
 

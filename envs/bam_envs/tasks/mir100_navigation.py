@@ -61,8 +61,7 @@ class DriveTask(Memory):
         self.observation_space: spaces.Box = labelled_box(self.observation_labels)
         self.target = np.zeros((num_envs, 3))
         """x, y [m] and yaw [rad]. Shape: (n, 3)."""
-        self.elapsed = np.zeros(num_envs, dtype=np.int64)
-        """Steps since the episode began. Shape: (n,)."""
+        self.elapsed = np.zeros(num_envs, dtype=np.int64)  # steps since the episode began
         self._previous = np.full(num_envs, np.nan)  # distance one step ago [m]
         self._draws, self._asked = np.zeros((num_envs, self.draws)), np.full((num_envs, 2, 3), np.nan)
 

@@ -30,8 +30,7 @@ class DrivenRobot:
 
     def __init__(self, robot: Robot) -> None:
         self.robot, self.spec = robot, robot.spec
-        self.now = 0.0
-        """Simulated time [s]."""
+        self.now = 0.0  # see `clock`
         self.fastest = 0.0
         """Fastest joint [rad/s], or drive [m/s] or turn [rad/s], measured since this was set to 0."""
         self._state: RobotState | None = None

@@ -110,10 +110,9 @@ class ArmContacts:
 
 
 def segment_distance2(start: Array, end: Array, other_start: Array, other_end: Array) -> Array:
-    """Squared distances of segments [m^2]. Shapes: (..., 3) each -> (...).
+    """Squared distances of segments [m^2]; Ericson, "Real-Time Collision Detection", 5.1.9. Shapes: (..., 3) -> (...).
 
-    The nearest points of the lines, the one on the first clamped to its segment; then the nearest to it on the second,
-    clamped; then again the nearest to that on the first (Ericson, "Real-Time Collision Detection", 5.1.9).
+    The nearest points of the lines, each clamped to its segment in turn.
     """
     way, other_way, gap = end - start, other_end - other_start, start - other_start
     a, e = np.maximum(_dot(way, way), 1e-12), np.maximum(_dot(other_way, other_way), 1e-12)

@@ -22,9 +22,9 @@ RADIUS = 0.025
 
 
 def wave_signals(draws: Array) -> dict[str, Array]:
-    """Start signals of obstacles that go up and down at 0.125 Hz; `draws` are numbers from 0 to 1. Shape: (k, 2).
+    """Start signals of obstacles that go 0.09 to 0.35 m up and down at 0.125 Hz, by `draws` (k, 2) from [0, 1).
 
-    They go 0.09 to 0.35 m from their middle, which is at (0.12, 0.34, 0.2 to 0.6) m.
+    Their middle is at (0.12, 0.34, 0.2 to 0.6) m.
     """
     least, most, fixed = np.array([0.09, 0.2]), np.array([0.35, 0.6]), np.ones(len(draws))
     amplitude, middle = (least + draws * (most - least)).T
