@@ -114,10 +114,7 @@ class FrozenPolicy:
                 raise PolicyError(text) from error
 
     def act(self, observation: Any) -> Any:
-        """Return the action for one observation: an array, or a mapping of arrays for a Dict.
-
-        Returns:
-            A new array in the action space; an np.int64 for a Discrete.
+        """Return the action, a new array or an np.int64, for one observation: an array, or a mapping for a Dict.
 
         Raises:
             PolicyError: The observation does not fit; names the input, what was expected and what was found.

@@ -34,13 +34,9 @@ class Output:
 
 
 def choose_output(settings: TrainSettings, out: Path | None, force: bool, resumed: Checkpoint | None) -> Output:
-    """Choose where the best checkpoint goes; what killed runs left half written there is removed.
+    """Choose where the best checkpoint goes: to `out` if it is given, and over what is there if `force` says so.
 
-    Args:
-        settings: Of the run.
-        out: The path that the user gave, if any.
-        force: Overwrite what is there.
-        resumed: The checkpoint that the run continues from; its own best keeps its place.
+    The best of the run that `resumed` continues keeps its place. What killed runs left half written is removed.
     """
     own = None if resumed is None else _own_best(resumed)
     usual = FOLDER / f"{file_stem(settings.env, settings.algo, settings.trainer)}.zip"

@@ -83,14 +83,8 @@ class Outcome:
 class TrainingRun:
     """Trains, evaluates and saves until it is done.
 
-    Args:
-        trainer: Set up and ready.
-        folder: Of the run's files.
-        out: The best checkpoint's place.
-        watcher: Receives the progress.
-        best: The best evaluation before this part of the run; its checkpoint is at `out`.
-        clock: Monotonic time [s].
-        copies: Where every checkpoint that goes to `out` is copied to.
+    The best checkpoint goes to `out`, and from there to `copies`; `best` is the evaluation of the one that an earlier
+    part of the run left there. The `clock` is monotonic [s].
     """
 
     def __init__(

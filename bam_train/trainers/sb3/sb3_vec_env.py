@@ -42,13 +42,7 @@ def one_env(venv: VecEnv) -> Any:
 class BatchVecEnv(VecEnv):  # type: ignore[misc]
     """A Gymnasium vector environment whose environments restart in the same step, as a stable-baselines3 `VecEnv`.
 
-    Args:
-        batch: The environment.
-        env_id: How errors name it; None for the name of its class.
-
-    Raises:
-        EnvironmentFailed: From `reset` and `step_wait`, if an observation or a reward is NaN or infinite.
-        SettingsError: They do not restart in the same step, or actions count from another number than 0.
+    `reset` and `step_wait` raise EnvironmentFailed, which names `env_id`, if an observation or a reward is not finite.
     """
 
     def __init__(self, batch: VectorEnv[Any, Any, Any], env_id: str | None = None) -> None:
@@ -79,10 +73,7 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         return self._copy(observations)
 
     def interrupt(self, last: Observations) -> None:
-        """An evaluation used the environments: at the next step the running episodes are truncated, and new ones begin.
-
-        The `last` observations are those of the running episodes; None if there are none.
-        """
+        """Truncate the running episodes, which observed `last`, at the next step: an evaluation used them."""
         self._interrupted = last
 
     def step_async(self, actions: NDArray[Any]) -> None:
