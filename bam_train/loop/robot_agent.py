@@ -68,8 +68,10 @@ class RobotAgent(Agent):
             return
         try:
             self.halt()
-        finally:
+        except Exception:  # no third Ctrl-C, which quits as the halt hangs: closing would halt again
             self.env.close()  # type: ignore[no-untyped-call]
+            raise
+        self.env.close()  # type: ignore[no-untyped-call]
         self._closed = True
 
     def forward(self, t: int, seed: int | None = None, **kwargs: Any) -> None:

@@ -220,6 +220,7 @@ def test_a_third_signal_gives_up(corridor):
     env.robot.halt = hangs
     with pytest.raises(KeyboardInterrupt):
         run(env)
+    assert env.robot.calls == []  # closing would halt, and so hang, again
 
 
 def test_a_signal_while_closing_changes_nothing(corridor):
