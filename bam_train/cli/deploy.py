@@ -65,8 +65,7 @@ def _run(
         with live_display(make_console(), env, title, journal) if sys.stderr.isatty() else plain as watcher:
             ending = deployment.run(watcher, seed=config.seed)
         if ending.status:
-            halted = ending.reason == "interrupted" and hasattr(env.unwrapped, "robot")
-            say(f"bam-deploy: {ending.reason}{'; the robot was halted' if halted else ''}")
+            say(f"bam-deploy: {ending.reason}")
         where = place.text or "simulated here"
         report = DeployReport(checkpoint, config.seed, ending, journal, pacer, where, guards_of(env))
         for warning in report.warnings():

@@ -89,7 +89,7 @@ def test_a_signal_still_gives_the_report(corridor_checkpoint, corridor, run, mon
     found, out, err = run(main, corridor_checkpoint(), "--fast", "--json")
     report = json.loads(out)
     assert found == status
-    assert err == "bam-deploy: interrupted; the robot was halted\n"
+    assert err == "bam-deploy: interrupted\n"  # not that it was halted: over a link that is down it was not
     assert (report["stop_reason"], report["episodes"]) == ("interrupted", 0)
     assert [record["end"] for record in report["per_episode"]] == ["stopped"]
 
