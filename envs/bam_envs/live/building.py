@@ -45,7 +45,7 @@ def live_robot(
     if profile is None and spec is not None:
         chosen = profile_for(spec)
     else:
-        chosen = profile if isinstance(profile, RobotProfile) else load_profile(profile or "ur5e")
+        chosen = profile if isinstance(profile, RobotProfile) else load_profile("ur5e" if profile is None else profile)
     robot = RosbridgeRobot(endpoint, chosen, spec=spec, command=command)
     return SafeRobot(robot, limits=limits or profile_limits(chosen), tool_position=tool_position)
 

@@ -132,6 +132,8 @@ def test_its_profile():
     assert live_robot("ws://robot", profile=load_profile("mir100")).spec.name == "mir100"
     with pytest.raises(UnknownName, match="Did you mean 'ur5e'"):
         live_robot("ws://robot", profile="ur5")
+    with pytest.raises(InvalidValue, match=r"^The robot profile \. cannot be read: "):
+        live_robot("ws://robot", profile="")  # of a variable that was never set: not the default instead
     with pytest.raises(InvalidValue, match=r"^joint_position is needed, and mir100 measures only "):
         live_robot("ws://robot", arm_spec("ur5e", with_object=False), profile="mir100")
 
