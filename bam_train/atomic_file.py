@@ -1,8 +1,8 @@
-"""Files that are whole or absent: written beside their place and moved into it; a checkpoint, a video.
+"""Files that are complete or absent, such as checkpoints and videos: written to a temporary file, then renamed.
 
 The temporary file is locked while a process writes it: a process that is killed cannot remove its file, but the system
-releases its lock. A process number in the name would not do: computers and containers that share a folder number their
-processes alike.
+releases its lock. A process id in the name would not be unique: computers and containers that share a folder use the
+same ids.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ except ImportError:  # Windows: files that were left stay
 
 @contextlib.contextmanager
 def replacing(target: Path, suffix: str = ".tmp") -> Iterator[Path]:
-    """A private file beside `target`, to be written: then it becomes `target` in one step; on an error it is gone."""
+    """Yield a temporary file beside `target`; it replaces `target` in one step at the end, or is removed on error."""
     descriptor, path = _locked(target, suffix)
     try:
         yield path
@@ -53,15 +53,15 @@ def _locked(target: Path, suffix: str) -> tuple[int, Path]:
             fcntl.flock(descriptor, fcntl.LOCK_EX)
         if os.fstat(descriptor).st_nlink:
             return descriptor, Path(name)
-        os.close(descriptor)  # `remove_orphans` came between
+        os.close(descriptor)  # removed by `remove_orphans` before it was locked
 
 
 def remove_orphans(target: Path) -> None:
     """Remove temporary files of `target`, and of name-2, name-3, … beside it, whose writers are dead; never fails."""
-    ours = re.compile(rf"\.{re.escape(target.stem)}(-\d+)?{re.escape(target.suffix)}\.\w{{8}}\.tmp")
+    pattern = re.compile(rf"\.{re.escape(target.stem)}(-\d+)?{re.escape(target.suffix)}\.\w{{8}}\.tmp")
     with contextlib.suppress(OSError):
         for path in target.parent.iterdir() if fcntl is not None else ():
-            if ours.fullmatch(path.name):
+            if pattern.fullmatch(path.name):
                 with contextlib.suppress(OSError), path.open("rb+") as file:
                     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # BlockingIOError: a process still writes it
                     path.unlink()

@@ -1,4 +1,4 @@
-"""Where an environment runs: here and simulated, here with a live robot, or whole on another computer."""
+"""Where an environment runs: simulated here, here with a live robot, or entirely on another computer."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,20 +11,20 @@ from bam_train.errors import SettingsError
 
 @dataclass(frozen=True)
 class Place:
-    """An address, or none for the simulation here."""
+    """The place of an environment: an address, or none for the simulation here."""
 
     robot: str | None = None
-    """Of a live robot behind rosbridge."""
+    """Address of a live robot behind rosbridge."""
     transport: tuple[str, ...] = ()
-    """Of whole environments that run elsewhere."""
+    """Addresses of whole environments that run elsewhere."""
     profile: str | None = None
-    """What the live robot's topics are: a shipped name or a file."""
+    """Profile of the live robot: a shipped name or a file."""
     ca_file: str | None = None
     """Certificates that wss:// trusts instead of the system's."""
     token_file: str | None = None
     """File with the token that the server asks for."""
     timeout: float | None = None
-    """Longest that an answer of `transport` is waited for [s]; None for its own default."""
+    """Longest wait for an answer of `transport` [s]; None for its default."""
 
     def require_sane(self) -> None:
         """Refuse addresses and options that exclude each other.
@@ -61,28 +61,28 @@ class Place:
 
     @property
     def text(self) -> str:
-        """For people; empty for the simulation here."""
+        """The addresses, for messages; empty for the simulation here."""
         return self.robot or ", ".join(self.transport)
 
     @property
     def link_options(self) -> dict[str, Any]:
-        """What opening a transport takes beside the address."""
+        """Keyword arguments for opening a transport, besides the address."""
         return {"ca_file": self.ca_file, "token_file": self.token_file, "timeout": self.timeout}
 
     def robot_kwargs(self, env_id: str, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-        """Arguments with which `env_id` is made with the live robot.
+        """Keyword arguments that make `env_id` with the live robot.
 
         Raises:
-            SettingsError: The environment is none of ours, so that it has no robot to exchange.
+            SettingsError: The environment is not one of `bam_envs`, and has no robot to exchange.
         """
         if entry_of(env_id) is None:
             raise SettingsError(
                 f"{env_id} has no robot that --robot could exchange; serve it next to the robot with "
                 f"bam-serve --env {env_id}, and give --transport"
             )
-        own = {name: value for name, value in env_kwargs.items() if name != "randomize"}  # of simulations alone
+        kwargs = {name: value for name, value in env_kwargs.items() if name != "randomize"}  # for simulations only
         link = {"ca_file": self.ca_file, "token_file": self.token_file}
-        return {**own, "robot": self.robot, "profile": self.profile, **link}
+        return {**kwargs, "robot": self.robot, "profile": self.profile, **link}
 
 
 HERE = Place()
@@ -90,6 +90,6 @@ HERE = Place()
 
 
 def addresses(text: str | Sequence[str] | None) -> tuple[str, ...]:
-    """Addresses out of ``a,b,c``."""
+    """Split ``a,b,c`` into addresses."""
     parts = text.split(",") if isinstance(text, str) else (text or ())
     return tuple(part.strip() for part in parts if part.strip())

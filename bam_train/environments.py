@@ -1,4 +1,4 @@
-"""Making the environment that a checkpoint belongs to, and proving that it is the same one before anything moves."""
+"""Make the environment that a checkpoint belongs to, and check that both fit before a robot moves."""
 
 import contextlib
 import json
@@ -25,7 +25,7 @@ from bam_train.env_location import HERE, Place
 from bam_train.errors import CheckpointMismatch, SettingsError
 
 ENTRY_POINTS = "bam_train.environments"
-"""Group of entry points whose modules a checkpoint may name: whoever installed the package trusts it."""
+"""Group of entry points whose modules a checkpoint may name, because installed packages are trusted."""
 
 T = TypeVar("T")
 AnyEnv = gym.Env[Any, Any] | VectorEnv[Any, Any, Any]
@@ -34,14 +34,14 @@ AnyEnv = gym.Env[Any, Any] | VectorEnv[Any, Any, Any]
 def environment_of(
     checkpoint: Checkpoint, named: str | None = None, *, elsewhere: bool = False
 ) -> tuple[str, dict[str, Any]]:
-    """The environment that a checkpoint belongs to, and its arguments; a file alone makes nothing be imported.
+    """The id and the keyword arguments of the environment that a checkpoint belongs to.
 
-    The module of the environment that is `named`, by the user, is imported, unless it runs `elsewhere`.
+    A checkpoint alone imports no foreign module: the user must have `named` its environment, unless it is `elsewhere`.
 
     Raises:
-        CheckpointMismatch: It was trained on another than `named`, or in a module that was neither named nor installed.
-        SettingsError: Nothing is called what the manifest says, or it does not take these arguments.
-        UnknownName: Nothing is called `named`.
+        CheckpointMismatch: It was trained on another environment than `named`, or in a module that must be named.
+        SettingsError: The manifest names no known environment, or arguments that it does not take.
+        UnknownName: No environment is called `named`.
     """
     env_id, env_kwargs = checkpoint.manifest.env, checkpoint.manifest.env_kwargs
     module = env_id.rpartition(":")[0]
@@ -68,12 +68,12 @@ def must_be_named(env_id: str) -> bool:
     """Whether an id has a module that no installed package registers: it is imported only if the user names it."""
     module = env_id.rpartition(":")[0]
     installed = {point.module for point in metadata.entry_points(group=ENTRY_POINTS)}
-    own = module.partition(".")[0] in ("bam_envs", "bam_train", "gymnasium")
-    return bool(module) and not own and module not in installed
+    is_trusted = module.partition(".")[0] in ("bam_envs", "bam_train", "gymnasium")
+    return bool(module) and not is_trusted and module not in installed
 
 
 def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
-    """Refuse an argument that one of our environments does not take; others check theirs when they are made."""
+    """Refuse an argument that an environment of `bam_envs` does not take; others check theirs when they are made."""
     limit = given.get("max_episode_steps")  # Gymnasium's: None for the usual one, -1 for none
     if limit not in (None, -1) and (isinstance(limit, bool) or not isinstance(limit, int) or limit < 1):
         raise SettingsError(f"env_kwargs.max_episode_steps: expected a whole number from 1 on, found {limit!r}")
@@ -87,11 +87,11 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
             f"found {limit}; use {entry.id} for longer ones"
         )
     taken, refused = constructor_options(theirs) if theirs else (frozenset(), frozenset())
-    # Not what a setting cannot be, nor what says where it runs, which has settings of its own.
-    own = set(registry.MAKE_OPTIONS) - {"render_mode", "timeout"} - WHERE
-    known = own | taken | options.keys() | {"max_episode_steps"}
+    # Without options that are no settings, and without those of the place, which have their own flags.
+    make_options = set(registry.MAKE_OPTIONS) - {"render_mode", "timeout"} - WHERE
+    known = make_options | taken | options.keys() | {"max_episode_steps"}
     for name in given:
-        if name not in known | refused:  # making it says why it is refused
+        if name not in known | refused:  # the constructor explains why it refuses these
             raise SettingsError(
                 f"env_kwargs: unknown setting {name!r} of {env}. {did_you_mean(in_our_words(name), known)}"
             )
@@ -102,7 +102,7 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
 
 
 def is_batched(env_id: str) -> bool:
-    """Whether `env_id` is one of ours, of which any number share one batched simulation."""
+    """Whether `env_id` belongs to `bam_envs`, where any number of environments share one batched simulation."""
     return entry_of(env_id) is not None
 
 
@@ -115,7 +115,7 @@ def make_env(
 ) -> gym.Env[Any, Any]:
     """One environment, with its time limit and without Gymnasium's (slow) checker; nothing is connected yet.
 
-    The keyword arguments of an environment elsewhere are its own.
+    An environment at a transport ignores `env_kwargs`: its server was given them.
 
     Raises:
         SettingsError: It cannot be made: a package is missing, or it does not take these arguments.
@@ -137,22 +137,22 @@ def make_env(
 def parity_if_needed(
     env_id: str, env_kwargs: Mapping[str, Any], use: Callable[[dict[str, Any]], T], tell: Callable[[str], None]
 ) -> tuple[dict[str, Any], T]:
-    """The keyword arguments that fit, and what `use` makes of them: `env_kwargs`, or those with ``parity=True``.
+    """The keyword arguments that fit, `env_kwargs` with ``parity=True`` if need be, and the result of `use` for them.
 
-    robo-gym's own checkpoints do not say that only with parity `env_id` has their policy's spaces. `use` raises
-    `CheckpointMismatch` where the policy does not fit; `tell` is told when parity is needed.
+    The policies of robo-gym's checkpoints fit `env_id` only with parity, which these files do not record. `use` raises
+    `CheckpointMismatch` where the policy does not fit; `tell` is called with a message if parity is needed.
     """
-    given = dict(env_kwargs)
+    kwargs = dict(env_kwargs)
     try:
-        return given, use(given)
+        return kwargs, use(kwargs)
     except CheckpointMismatch:
         entry = entry_of(env_id)
-        if entry is None or "parity" not in entry.variants or "parity" in given:
+        if entry is None or "parity" not in entry.variants or "parity" in kwargs:
             raise
         with contextlib.suppress(CheckpointMismatch):
-            found = use({**given, "parity": True})
+            result = use({**kwargs, "parity": True})
             tell(f"its spaces are robo-gym's own: {env_id} is made with parity=True")
-            return {**given, "parity": True}, found
+            return {**kwargs, "parity": True}, result
         raise
 
 
@@ -161,8 +161,8 @@ def make_vector_env(
 ) -> VectorEnv[Any, Any, Any]:
     """`num_envs` environments stepped together, with automatic resets in the same step.
 
-    Ours are one batched simulation; of others, `num_envs` Python environments take turns (their own vector forms differ
-    in resets and seeds). Elsewhere there are as many as the servers have.
+    Those of `bam_envs` are one batched simulation; others are `num_envs` Python environments, stepped in turn (their
+    vector environments differ in resets and seeds). At a transport, the servers determine the number.
     """
     if place.transport:
         from bam_envs.remote.remote_env import make_remote_vector_env
@@ -185,9 +185,9 @@ def control_period(env: gym.Env[Any, Any]) -> float | None:
 
 
 def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: Place = HERE) -> None:
-    """Prove that `env` takes and gives what the checkpoint's policy was trained with.
+    """Check that `env` fits the checkpoint's policy.
 
-    Compared: both spaces, the labels and units of every signal, and the control period, as far as both sides say.
+    Both spaces, the name and unit of every signal, and the control period are compared, where both sides give them.
 
     Raises:
         CheckpointMismatch: Names the first thing that differs, and both values.
@@ -203,8 +203,8 @@ def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: Place = HERE) -> Non
     if signals and manifest.signals:
         pairs.append(("signals", _names_and_units(manifest.signals), _names_and_units(signals)))
     difference = None
-    for name, *both in pairs:
-        theirs, ours = json.loads(json.dumps(both))  # tuples as lists
+    for name, *values in pairs:
+        theirs, ours = json.loads(json.dumps(values))  # tuples as lists
         difference = difference or first_difference(theirs, ours, name)
     period = getattr(env.unwrapped, "period", None)
     if difference is None:
@@ -222,7 +222,7 @@ def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: Place = HERE) -> Non
 
 
 def first_difference(theirs: Any, ours: Any, name: str) -> tuple[str, Any, Any] | None:
-    """The first place where two JSON values differ: its name, their value and ours; None if there is none."""
+    """The first difference of two JSON values: its name and both values; None if they are equal."""
     if isinstance(theirs, dict) and isinstance(ours, dict):
         keys: list[Any] = sorted(theirs.keys() | ours.keys(), key=lambda key: (key != "type", key != "shape", key))
         pairs = [(f"{name}.{key}", theirs.get(key), ours.get(key)) for key in keys]
@@ -234,8 +234,8 @@ def first_difference(theirs: Any, ours: Any, name: str) -> tuple[str, Any, Any] 
 
 
 def _names_and_units(signals: Mapping[str, Any]) -> dict[str, Any]:
-    """Of what `RobotEnv.describe` gives, the part that the policy's meaning hangs on."""
-    return {kind: [{key: one.get(key) for key in ("name", "unit")} for one in many] for kind, many in signals.items()}
+    """The names and units of the signals that `RobotEnv.describe` returns, by kind."""
+    return {kind: [{key: entry.get(key) for key in ("name", "unit")} for entry in signals[kind]] for kind in signals}
 
 
 def _short(value: Any, most: int = 60) -> str:
@@ -244,7 +244,7 @@ def _short(value: Any, most: int = 60) -> str:
 
 
 def _made(env_id: str, make: Callable[[], T]) -> T:
-    """What `make` returns; what it can raise for the caller's sake becomes one line."""
+    """The result of `make`; an exception that the caller can avoid becomes a SettingsError of one line."""
     try:
         return make()
     except (gym.error.Error, ModuleNotFoundError, TypeError) as error:
@@ -252,7 +252,7 @@ def _made(env_id: str, make: Callable[[], T]) -> T:
         if isinstance(error, TypeError):
             raise SettingsError(f"{env_id} cannot be made with these arguments: {why}") from error
         if isinstance(error, ModuleNotFoundError):
-            # Gymnasium raises one of its own for module:Env-v0, which names no module; its cause does.
+            # For module:Env-v0, Gymnasium's exception does not name the module; its cause does.
             name = error.name or getattr(error.__cause__, "name", None) or why
             why = f"it needs the module {name!r}; install it, or run this in the folder that has it"
             if name.partition(".")[0] == "imageio":  # Gymnasium's MuJoCo environments import it for their pictures

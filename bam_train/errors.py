@@ -5,7 +5,7 @@
     BamTrainError
     ├── CheckpointError            a checkpoint that cannot be used; carries its path
     │   ├── NotACheckpoint         no such file, not a zip, truncated, or without bam/manifest.json
-    │   ├── AlteredCheckpoint      a member's bytes differ from the manifest, is missing or is extra
+    │   ├── AlteredCheckpoint      a member differs from the manifest, is missing or is extra
     │   ├── NewerFormat            written by a newer bam-train
     │   └── CheckpointMismatch     made for another environment, algorithm or setting
     ├── FormatError                bytes that do not follow their file format (safetensors, ONNX)
@@ -13,15 +13,15 @@
     ├── SettingsError              a setting or option that does not exist or does not fit
     ├── LoopError                  the interaction loop
     │   ├── UnknownVariable        a variable that no agent wrote
-    │   ├── TimeNotWritten         a time at which it is not written, or that has left the window
+    │   ├── TimeNotWritten         a time at which the variable is not written, or that has left the window
     │   ├── ValueMismatch          another shape, dtype, device or kind of array than before
     │   ├── WorkspaceError         anything else that a workspace refuses, such as variables of different lengths
     │   ├── WiringError            an agent reads what no agent writes
     │   ├── RemoteAgentError       an agent in another process failed, or its process ended
     │   └── AgentInUse             an agent is called by two threads at once
     ├── EnvironmentFailed          an environment gave NaN or infinity
-    ├── TrainingFailed             training cannot go on (a NaN loss); the last good checkpoint is kept
-    │   └── ProcessesLost          other processes that it needs are gone; what was learnt so far is good
+    ├── TrainingFailed             training cannot continue (a NaN loss); the last good checkpoint is kept
+    │   └── ProcessesLost          processes that training needs have ended; earlier checkpoints are good
     └── OutputError                no space, no permission, or a file that is in the way
 
 Third-party errors are mapped to these at the border, with the cause kept by ``from``.
@@ -32,7 +32,7 @@ from pathlib import Path
 
 
 class BamTrainError(Exception):
-    """Root of the tree; its text is one line that says what, why and what to do."""
+    """Root of the tree; its message is one line: what failed, why, and what to do."""
 
 
 class CheckpointError(BamTrainError):
@@ -48,7 +48,7 @@ class NotACheckpoint(CheckpointError):  # noqa: N818 - reads as what happened
 
 
 class AlteredCheckpoint(CheckpointError):  # noqa: N818
-    """A member is not what the manifest says; `member` is its name."""
+    """A member differs from the manifest; `member` is its name."""
 
     def __init__(self, path: str | Path, member: str, message: str) -> None:
         self.member = member
@@ -64,7 +64,7 @@ class CheckpointMismatch(CheckpointError):  # noqa: N818
 
 
 class FormatError(BamTrainError, ValueError):
-    """Bytes that do not follow their file format; the text says where."""
+    """Bytes that do not follow their file format; the message names the place."""
 
 
 class PolicyError(BamTrainError, ValueError):
@@ -76,7 +76,7 @@ class SettingsError(BamTrainError, ValueError):
 
 
 class LoopError(BamTrainError):
-    """The interaction loop cannot do what it was asked to."""
+    """An error of the interaction loop."""
 
 
 class UnknownVariable(LoopError, LookupError):  # noqa: N818 - reads as what happened
@@ -102,7 +102,7 @@ class ValueMismatch(LoopError, ValueError):  # noqa: N818
 
 
 class WorkspaceError(LoopError, ValueError):
-    """Something else that a workspace refuses."""
+    """An operation that a workspace refuses for any other reason."""
 
 
 class WiringError(LoopError):
@@ -126,11 +126,11 @@ class EnvironmentFailed(BamTrainError):  # noqa: N818
 
 
 class TrainingFailed(BamTrainError):  # noqa: N818
-    """Training cannot go on; the text names the last good checkpoint."""
+    """Training cannot continue; the message names the last good checkpoint."""
 
 
 class ProcessesLost(TrainingFailed):
-    """Processes that training needs are gone, and do not come back; what was learnt so far is good."""
+    """Processes that training needs have ended and are not restarted; earlier checkpoints are good."""
 
 
 class OutputError(BamTrainError, OSError):

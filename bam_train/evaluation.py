@@ -1,7 +1,7 @@
 """Seeded evaluation of a policy: success, return and length over a fixed list of episodes; and videos of some.
 
-Episode k starts from ``reset(seed=seed + k)`` however many environments run side by side. They are run in waves: every
-environment plays one episode, and what it does after its end, because others are not done, is not counted.
+Episode k starts from ``reset(seed=seed + k)``, independently of the number of environments. Environments run in waves
+of one episode each; the steps after the end of an episode, while others are still running, are not counted.
 """
 
 import math
@@ -29,7 +29,7 @@ _Z95 = 1.959963984540054  # 97.5 % quantile of the normal distribution, for a tw
 
 
 class BatchPolicy(Protocol):
-    """What can be evaluated: a `FrozenPolicy`, or a trainer's model behind an adapter."""
+    """A policy that can be evaluated: a `FrozenPolicy`, or an adapter of a trainer's model."""
 
     def reset(self, env_ids: Any = None) -> None:
         """Forget the recurrent state of `env_ids` (indices), or of all environments."""
@@ -43,18 +43,18 @@ class Episode:
     """One counted episode."""
 
     seed: int
-    """The seed its reset got."""
+    """Seed of its reset."""
     total: float
     """Undiscounted sum of its rewards."""
     length: int
-    """Its steps."""
+    """Number of steps."""
     success: bool | None
-    """`is_success` of its last step's info; None if the environment has no such thing."""
+    """`is_success` in the info of its last step; None if the environment does not report it."""
 
 
 @dataclass(frozen=True)
 class EvaluationReport:
-    """Figures over all episodes; None where the environment does not say, or a number is not finite."""
+    """Statistics over all episodes; None where the environment reports no success, or a number is not finite."""
 
     env: str
     """Environment id."""
@@ -79,7 +79,7 @@ class EvaluationReport:
 
 
 def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:
-    """Wilson's score interval at 95 % for a proportion; right also at 0 and at all.
+    """Wilson's score interval at 95 % for a proportion; valid also for no success and for all.
 
     Centre (p + z²/2n) / (1 + z²/n), half width z sqrt(p(1-p)/n + z²/4n²) / (1 + z²/n).
     """
@@ -130,14 +130,14 @@ def evaluate(
     """Run `episodes` seeded episodes of the environment `env_id` under `policy` and summarise them.
 
     Args:
-        policy: What acts; its recurrent state is forgotten at every start of an episode.
+        policy: The policy to evaluate; its recurrent state is reset at the start of every episode.
         env_id: Gymnasium id.
         env_kwargs: Keyword arguments of the environment.
         episodes: At least 1.
-        seed: Of the first episode; episode k gets ``seed + k``.
-        num_envs: Environments stepped side by side; by default as many as is quick and not more than `episodes`.
-        env: What `make_vector_env` made, to use instead of making one; it is left open.
-        on_progress: Called after every wave with the episodes done and the episodes wanted.
+        seed: Seed of the first episode; episode k gets ``seed + k``.
+        num_envs: Number of environments stepped together; by default that of `default_num_envs`.
+        env: A vector environment of `make_vector_env`, used instead of a new one; it is left open.
+        on_progress: Called after every wave with the number of episodes done and the number of all episodes.
 
     Raises:
         SettingsError: `episodes`, `seed` or `num_envs` out of range.
@@ -147,7 +147,7 @@ def evaluate(
     check(seed, NonNegativeInt, "seed", SettingsError)
     check(episodes, PositiveInt, "episodes", SettingsError)
     check(num_envs, PositiveInt | None, "num_envs", SettingsError)
-    own = env is None
+    is_new = env is None
     if env is None:
         env = make_vector_env(env_id, env_kwargs, num_envs or default_num_envs(env_id, episodes))
     elif env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
@@ -159,24 +159,24 @@ def evaluate(
             if on_progress is not None:
                 on_progress(len(done), episodes)
     finally:
-        if own:
+        if is_new:
             env.close()
     return summarise(env_id, done)
 
 
 def play_wave(env: VectorEnv[Any, Any, Any], policy: BatchPolicy, seed: int, count: int) -> list[Episode]:
-    """One episode in each of the first `count` environments; environment i is seeded ``seed + i``, also beyond them."""
+    """Play one episode in each of the first `count` environments; every environment i gets the seed ``seed + i``."""
     batch = _Batch(lambda: env, auto_reset=False, arrays="numpy", info_keys=("is_success",))
     acting = PolicyAgent(policy, [f"env/{name}" for name in names(env.single_observation_space)])
     workspace = Workspace(window=2)
     seeds = [seed + i for i in range(env.num_envs)]
     loop = TemporalAgent(Agents(batch, _Wave(count), acting))
     loop(workspace, t=0, stop_variable="wave/done", seed=seeds)
-    last = {name: workspace.get(name, -1) for name in workspace}  # at the end it repeats until all have ended
+    last = {name: workspace.get(name, -1) for name in workspace}  # repeats until all have ended
 
     def success(i: int) -> bool | None:
-        says = "env/info/is_success" in last and last["env/info/_is_success"][i]
-        return bool(last["env/info/is_success"][i]) if says else None
+        is_reported = "env/info/is_success" in last and last["env/info/_is_success"][i]
+        return bool(last["env/info/is_success"][i]) if is_reported else None
 
     totals, lengths = last["env/cumulated_reward"], last["env/timestep"]
     return [Episode(seed + i, float(totals[i]), int(lengths[i]), success(i)) for i in range(count)]
@@ -188,12 +188,12 @@ def record_video(env: gym.Env[Any, Any], policy: Any, add: Callable[[Frame], Any
     Args:
         env: Made with ``render_mode="rgb_array"``.
         policy: Has ``reset()`` and ``act(observation)``: a `FrozenPolicy`.
-        add: Takes a picture, such as what `bam_train.video.open_video` gives.
-        episodes: How many.
-        seed: Of the first.
+        add: Called with each picture, such as the function that `bam_train.video.open_video` yields.
+        episodes: Number of episodes.
+        seed: Seed of the first episode.
 
     Returns:
-        How many pictures there are.
+        The number of pictures.
     """
     robot, video = RobotAgent(env), VideoAgent(env, add)
     loop = TemporalAgent(Agents(robot, video, PolicyAgent(policy, robot.observation_names, single=True)))
@@ -203,14 +203,14 @@ def record_video(env: gym.Env[Any, Any], policy: Any, add: Callable[[Frame], Any
 
 
 class _Batch(VecGymAgent):
-    """An environment of the caller: an exception does not close it."""
+    """An environment of the caller, which an exception does not close."""
 
     def close(self) -> None:
         """Nothing."""
 
 
 class _Wave(Agent):
-    """Writes ``wave/done`` (B,): the environments that have ended, and those that do not count."""
+    """Writes ``wave/done`` (B,) bool: True for environments that have ended and for those that are not counted."""
 
     reads = ("env/done",)
     writes = ("wave/done",)
@@ -226,6 +226,6 @@ class _Wave(Agent):
 
 
 def default_num_envs(env_id: str, episodes: int) -> int:
-    """Environments that share `episodes` in the fewest waves, evenly: 100 episodes of ours are two waves of 50."""
+    """The number of environments for the fewest waves of equal size: 100 batched episodes are two waves of 50."""
     most = 64 if is_batched(env_id) else 16  # batched physics, or Python environments one after the other
     return math.ceil(episodes / math.ceil(episodes / most))

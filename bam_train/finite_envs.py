@@ -1,6 +1,6 @@
-"""Environments that are refused as soon as they give NaN or infinity: learning and evaluation get finite numbers only.
+"""Wrappers that raise an error as soon as an environment returns NaN or infinity.
 
-What learns from such a number is broken by it much later, and then points at the policy or the learning rate.
+Training on such a number fails much later, and then the policy or the learning rate seems to be the cause.
 """
 
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from bam_train.errors import EnvironmentFailed
 
 
 class FiniteEnv(gym.Wrapper[Any, Any, Any, Any]):
-    """One environment whose observations and rewards are finite; errors call it `env_id`, and say `which` it is."""
+    """One environment whose observations and rewards are finite; errors name it `env_id`, and its index `which`."""
 
     def __init__(self, env: gym.Env[Any, Any], env_id: str, which: int | None = None) -> None:
         super().__init__(env)
@@ -39,7 +39,7 @@ class FiniteEnv(gym.Wrapper[Any, Any, Any, Any]):
 class FiniteVectorEnv(VectorWrapper):
     """A vector environment whose observations and rewards are finite; its environments restart in the same step.
 
-    Errors call it `env_id`, or by its class.
+    Errors name it `env_id`, or by its class.
     """
 
     def __init__(self, envs: VectorEnv[Any, Any, Any], env_id: str | None = None) -> None:
@@ -49,7 +49,7 @@ class FiniteVectorEnv(VectorWrapper):
         """Steps of each running episode. Shape: (n,)."""
 
     def __getattr__(self, name: str) -> Any:
-        """Whatever else is asked for is the environment's own."""
+        """Any other attribute is the environment's."""
         if name == "env":  # it is being copied or unpickled
             raise AttributeError(name)
         return getattr(self.env, name)
@@ -65,7 +65,7 @@ class FiniteVectorEnv(VectorWrapper):
         return observations, infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step every environment; what ended ones observed last is looked at too."""
+        """Step every environment; the last observations of ended episodes are checked too."""
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         self.episode_steps += 1
         self._require("reward", rewards)
@@ -82,7 +82,7 @@ class FiniteVectorEnv(VectorWrapper):
 
 
 def _of(observations: Any, which: int) -> Any:
-    """One environment of a batch, which is a mapping of arrays, or an array, of objects too."""
+    """The observation of one environment from a batch: a mapping of arrays, or an array (of objects too)."""
     if isinstance(observations, Mapping):
         return {key: _of(one, which) for key, one in observations.items()}
     return observations[which]
@@ -101,9 +101,9 @@ def _not_finite(name: str, value: Any) -> tuple[str, list[int], float] | None:
 
 
 def _require_finite(env: Any, env_id: str, signal: str, value: Any, steps: Any, which: int | None = None) -> None:
-    """Refuse the first number of an observation or a reward (`signal`) that is not finite, by its label if it has one.
+    """Raise an error that names the first number of `signal`, an observation or a reward, that is not finite.
 
-    `value` is of the environment `which` at step `steps`; or of one alone, or of a batch with an array of steps.
+    `value` is of the environment `which` at step `steps`, of a single one, or of a batch with an array (n,) of steps.
     """
     found = _not_finite(signal, value)
     if found is None:

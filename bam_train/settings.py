@@ -1,7 +1,7 @@
-"""What makes a training run: one frozen dataclass, merged from presets, files and flags.
+"""Settings of a training run: one frozen dataclass, merged from presets, files and flags.
 
-Layers, later ones win: the trainer's defaults, the preset of the environment and algorithm, the ``--config`` file,
-``--set`` and flags. Every field but the tables is a flag of `bam-train`, and its docstring the line of ``--help``.
+Later layers override earlier ones: the trainer's defaults, the preset of the environment and algorithm, the
+``--config`` file, ``--set`` and flags. Every field but the tables is a flag of `bam-train`, with its docstring as help.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 
 TABLES = frozenset({"env_kwargs", "normalize", "hyperparameters"})
-"""Settings that are tables of names of their own."""
+"""Settings that are tables of named values."""
 
 _Steps = Annotated[int, Meta(ge=1, le=10**15)]
 _Processes = Annotated[int, Meta(ge=0, le=1000)]
@@ -35,9 +35,9 @@ _Share = Annotated[float, Meta(gt=0, le=1, description="a share above 0 and at m
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """Everything that makes a run; saved as JSON in ``config.json`` and in every checkpoint.
+    """All settings of a run; saved as JSON in ``config.json`` and in every checkpoint.
 
-    The ranges of what asks for memory, processes or hours end where no run has more.
+    Upper limits of numbers that cost memory, processes or time are larger than any run needs.
     """
 
     env: str
@@ -50,7 +50,7 @@ class TrainSettings:
     seed: Annotated[int, Meta(ge=0, le=10**15)] = 0
     """Seed of weights, exploration and environments (environment i gets seed + i)."""
     num_envs: Annotated[int, Meta(ge=1, le=100_000)] = 1
-    """Environments stepped side by side, in all: the runners of rllib share them."""
+    """Environments stepped together, in all: the runners of rllib share them."""
     device: str = "auto"
     """Where to compute: auto (the GPU for images if there is one, else the CPU), cpu, cuda, cuda:1."""
     threads: Annotated[int, Meta(ge=1, le=1024)] = 1
@@ -72,9 +72,9 @@ class TrainSettings:
     token_file: str | None = None
     """File with the token that the servers ask for."""
     num_env_runners: Annotated[int, Meta(ge=0, le=10_000)] = 0
-    """Processes of rllib that collect samples (default 0: the trainer's own does)."""
+    """Processes of rllib that collect samples (default 0: the trainer's own process)."""
     num_learners: _Processes = 0
-    """Processes of rllib that update the weights (default 0: the trainer's own does)."""
+    """Processes of rllib that update the weights (default 0: the trainer's own process)."""
     num_gpus: _Processes | None = None
     """GPUs that learners of rllib use in all (default RLLIB_NUM_GPUS, else 0)."""
     address: str | None = None
@@ -84,11 +84,11 @@ class TrainSettings:
     normalize: bool | dict[str, Any] = False
     """Normalise observations and rewards by running statistics; a table gives VecNormalize's arguments."""
     hyperparameters: dict[str, Any] = field(default_factory=dict)
-    """The algorithm's own arguments."""
+    """Arguments of the algorithm."""
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any], source: str = "settings") -> TrainSettings:
-        """The settings of JSON values, whose names, types and ranges are checked; errors name their `source`."""
+        """Make settings from JSON values; names, types and ranges are checked, and errors name the `source`."""
         check_names(values, source)
         for name in ("env", "algo"):
             if values.get(name) is None:
@@ -136,8 +136,8 @@ def _checked(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 def _require_finite(name: str, value: Any) -> None:
     """Refuse NaN and infinity, which neither JSON nor a checkpoint can hold."""
     if isinstance(value, (dict, list)):
-        for key, one in value.items() if isinstance(value, dict) else enumerate(value):
-            _require_finite(f"{name}.{key}", one)
+        for key, entry in value.items() if isinstance(value, dict) else enumerate(value):
+            _require_finite(f"{name}.{key}", entry)
     elif isinstance(value, float) and not math.isfinite(value):
         raise SettingsError(f"{name}: expected a finite number, found {value}")
 
@@ -164,9 +164,9 @@ def parse_assignment(text: str, example: str) -> tuple[list[str], Any]:
 
 
 def read_assignments(texts: Sequence[str]) -> dict[str, Any]:
-    """The layer that ``--set name=value`` texts make.
+    """Parse the texts of ``--set name=value`` into a layer of settings.
 
-    A top-level setting's name goes there, any other to the algorithm: ``gamma=0.9`` is ``hyperparameters.gamma=0.9``.
+    A name that is no top-level setting belongs to the algorithm: ``gamma=0.9`` is ``hyperparameters.gamma=0.9``.
     """
     layer: dict[str, Any] = {}
     for text in texts:
@@ -182,17 +182,17 @@ def read_assignments(texts: Sequence[str]) -> dict[str, Any]:
 
 
 def read_env_kwargs(texts: Sequence[str]) -> dict[str, Any]:
-    """Arguments of an environment out of ``--set env_kwargs.NAME=VALUE`` texts, where nothing else can be set."""
+    """Parse the texts of ``--set env_kwargs.NAME=VALUE``, for a program that has no other settings."""
     for text in texts:
         path, _ = parse_assignment(text, "env_kwargs.NAME=VALUE")
         if path[0] != "env_kwargs" or len(path) == 1:
             raise SettingsError(f"--set {text}: expected env_kwargs.NAME=VALUE, such as env_kwargs.parity=true")
-    found: dict[str, Any] = read_assignments(texts).get("env_kwargs", {})
-    return found
+    env_kwargs: dict[str, Any] = read_assignments(texts).get("env_kwargs", {})
+    return env_kwargs
 
 
 def merge(*layers: Mapping[str, Any]) -> dict[str, Any]:
-    """One mapping out of several, later ones winning; tables within are merged too. No layer is changed."""
+    """Merge mappings, later ones overriding earlier ones; nested tables are merged too. No layer is changed."""
     merged: dict[str, Any] = {}
     for layer in layers:
         for name, value in layer.items():
@@ -219,7 +219,7 @@ def read_config(path: str | Path) -> dict[str, Any]:
 
 
 def parse_config(name: str, text: str) -> dict[str, Any]:
-    """Read settings from the text of a file called `name`, whose suffix says the format."""
+    """Read settings from the text of a file called `name`, whose suffix gives the format."""
     try:
         values = json.loads(text) if name.endswith(".json") else tomllib.loads(text)
     except (ValueError, RecursionError) as error:
@@ -229,11 +229,11 @@ def parse_config(name: str, text: str) -> dict[str, Any]:
         raise SettingsError(f"{name}: expected a table of settings, found a {type(values).__name__}")
     check_names(values, name)
     _checked({setting: value for setting, value in values.items() if value is not None}, f"{name}: ")
-    return values  # a flag may give what is None
+    return values  # a flag may replace None
 
 
 def differences(wanted: Mapping[str, Any], found: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any, Any]]:
-    """Name, wanted and found value of every entry of `wanted` that `found` has otherwise; tables are looked into."""
+    """Name, wanted and found value of every entry of `wanted` that differs in `found`, nested tables included."""
     differing: list[tuple[str, Any, Any]] = []
     for name, value in wanted.items():
         other = found.get(name)
@@ -249,6 +249,6 @@ def file_stem(env: str, algo: str, trainer: str = "sb3") -> str:
 
     Another trainer than sb3 is named: ``pick-rllib-ppo``.
     """
-    own = re.fullmatch(r"bam/(.+)-v\d+", env)
-    name = own[1] if own else env
+    match = re.fullmatch(r"bam/(.+)-v\d+", env)
+    name = match[1] if match else env
     return re.sub(r"[^\w.-]+", "-", f"{name}-{algo if trainer == 'sb3' else f'{trainer}-{algo}'}").strip("-.")

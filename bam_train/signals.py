@@ -1,7 +1,7 @@
-"""Ctrl-C (SIGINT), SIGTERM and SIGHUP: the one place where this process decides what they do.
+"""Ctrl-C (SIGINT), SIGTERM and SIGHUP: the only module that installs handlers for them.
 
-Python runs a handler in the main thread, between two bytecodes of whatever runs there. So handlers are installed in the
-main thread only; in any other one, everything here does nothing.
+Python runs handlers in the main thread, between two bytecodes. So they are installed in the main thread only; in other
+threads the functions of this module do nothing.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from types import FrameType
 from typing import NoReturn
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
-"""What asks a program to end; Windows has no SIGHUP."""
+"""Signals that ask a program to end; Windows has no SIGHUP."""
 
 TOGETHER = 0.5
-"""A signal of a program that comes again within this time is the same one [s]: ``timeout`` sends SIGTERM to the process
-and then to its group. Ctrl-C is a person's, and counts each time."""
+"""Time [s] in which repeated signals, except Ctrl-C, count as one: ``timeout`` sends SIGTERM to the process and then to
+its group."""
 
 
 class Terminated(KeyboardInterrupt):
-    """Another `signal` than Ctrl-C asked for the end; Ray, waiting in C++, passes on KeyboardInterrupt alone."""
+    """A `signal` other than Ctrl-C; a KeyboardInterrupt because Ray, waiting in C++, passes on no other exception."""
 
     def __init__(self, number: int) -> None:
         self.signal = signal.Signals(number)
-        super().__init__(self.signal)  # what it is made from, so that it can be copied
+        super().__init__(self.signal)  # the constructor's argument, so that it can be copied
 
 
 def interrupt(number: int) -> NoReturn:
@@ -37,7 +37,7 @@ def interrupt(number: int) -> NoReturn:
 
 
 class _Handler:
-    """Passes signals on to `handle`, except one of a program that comes again at once."""
+    """Passes signals on to `handle`, but a repeated one (see `TOGETHER`) only once."""
 
     def __init__(self, handle: Callable[[int], object], around: object) -> None:
         self._handle = handle
@@ -57,17 +57,17 @@ class _Handler:
 def handled(
     handle: Callable[[int], object], numbers: Sequence[int] = SIGNALS, *, ignored_too: bool = False
 ) -> Iterator[None]:
-    """Within this, `handle` is called with the number of each signal.
+    """Within the ``with`` block, call `handle` with the number of each signal.
 
     Args:
-        handle: Runs in the main thread; what it raises comes out of whatever runs there.
-        numbers: Which signals.
-        ignored_too: Whether to handle also those that are ignored, as ``nohup`` does with SIGHUP and a shell with the
-            SIGINT of a background job.
+        handle: Runs in the main thread; its exceptions are raised in the code that runs there.
+        numbers: The signals.
+        ignored_too: Whether to handle ignored signals too: ``nohup`` ignores SIGHUP, and a shell the SIGINT of a
+            background job.
     """
-    unheard = (None,) if ignored_too else (None, signal.SIG_IGN)  # None: of a handler that is not Python's
-    here = threading.current_thread() is threading.main_thread()
-    before = {n: signal.getsignal(n) for n in numbers if here and signal.getsignal(n) not in unheard}
+    left_alone = (None,) if ignored_too else (None, signal.SIG_IGN)  # None: the handler was not installed by Python
+    is_main = threading.current_thread() is threading.main_thread()
+    before = {n: signal.getsignal(n) for n in numbers if is_main and signal.getsignal(n) not in left_alone}
     for number, around in before.items():
         signal.signal(number, _Handler(handle, around))
     try:
@@ -79,7 +79,7 @@ def handled(
 
 @contextlib.contextmanager
 def waiting() -> Iterator[None]:
-    """Within this, signals interrupt nothing; on leaving, the first one does what it would have done."""
+    """Delay signals: none interrupts the ``with`` block, and the first one is raised again at its end."""
     came: list[int] = []
     with handled(came.append):
         yield
@@ -88,10 +88,10 @@ def waiting() -> Iterator[None]:
 
 
 class SignalMemory(contextlib.ExitStack):
-    """Within this, signals interrupt, and are remembered.
+    """Signals interrupt the ``with`` block, and are remembered.
 
-    Python discards what is raised in callbacks such as ``__del__`` and those of an import, so a program asks again
-    before anything moves.
+    Python discards exceptions of callbacks such as ``__del__`` and those of an import, so a program calls `raise_again`
+    before a robot moves.
     """
 
     def __init__(self) -> None:
@@ -108,15 +108,15 @@ class SignalMemory(contextlib.ExitStack):
         interrupt(number)
 
     def raise_again(self) -> None:
-        """`interrupt` for a signal that came before now, if one did."""
+        """Call `interrupt` for the first signal so far, if there was one."""
         if self.came:
             interrupt(self.came[0])
 
 
 def drop_handlers() -> None:
-    """In a forked process: forget the handlers that the fork has copied, then let signals come that it held back.
+    """In a forked process: remove the handlers that the fork has copied, then unblock all signals.
 
-    Ctrl-C reaches the whole group of processes and is the parent's to handle; SIGTERM ends this process at once.
+    Ctrl-C reaches the whole process group, and the parent handles it; SIGTERM ends this process at once.
     """
     for number in signal.valid_signals():
         if callable(signal.getsignal(number)):
@@ -126,14 +126,14 @@ def drop_handlers() -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, signal.valid_signals())
 
 
-# A program that quits at once runs no `finally`, but only what is registered here.
+# A process that quits at once runs no `finally`, only the functions that are registered here.
 
 _CALLS: list[Callable[[], None]] = []
 
 
 @contextlib.contextmanager
 def at_quit(call: Callable[[], None]) -> Iterator[None]:
-    """Within, `call` is called before the process quits at once; it is short, and fit for a signal handler."""
+    """Within the ``with`` block, `call` runs if the process quits at once; it is short and safe in a signal handler."""
     _CALLS.append(call)
     try:
         yield
@@ -142,7 +142,7 @@ def at_quit(call: Callable[[], None]) -> Iterator[None]:
 
 
 def before_quitting() -> None:
-    """Call what is registered, the latest first, whatever becomes of it."""
+    """Call the registered functions, the latest first, and ignore their exceptions."""
     for call in reversed(_CALLS):
         with contextlib.suppress(Exception):  # quitting must not fail
             call()

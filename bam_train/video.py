@@ -1,4 +1,4 @@
-"""Pictures of a policy at work, as an animated GIF (Pillow) or an MP4 (imageio with its ffmpeg)."""
+"""Videos of a policy, as an animated GIF (Pillow) or an MP4 (imageio with its ffmpeg)."""
 
 import importlib
 import os
@@ -20,7 +20,7 @@ Frame = NDArray[np.uint8]
 
 
 def require_video_path(path: Path) -> Path:
-    """The path with ``~`` expanded, if a video could be written there; to be called before the work is done.
+    """Check, before any work is done, that a video can be written to the path; returns it with ``~`` expanded.
 
     Raises:
         SettingsError: Neither ``.gif`` nor ``.mp4``.
@@ -44,7 +44,7 @@ def require_video_path(path: Path) -> Path:
 
 
 def picture(env: gym.Env[Any, Any]) -> Frame:
-    """What `env` shows now; SettingsError if it gives no picture."""
+    """Render the current picture of `env`; raises SettingsError if it renders none."""
     name = env.spec.id if env.spec else env
     try:
         image: Any = env.render()
@@ -59,7 +59,7 @@ def picture(env: gym.Env[Any, Any]) -> Frame:
 def open_video(path: Path, rate: float) -> Iterator[Callable[[Frame], None]]:
     """A ``.gif`` or ``.mp4`` video of `rate` pictures a second, to which frames of one size are added.
 
-    It is there at the end, whole, or not at all after an exception.
+    The file appears at the end; after an exception there is none.
     """
     count = 0
 
@@ -79,7 +79,7 @@ def open_video(path: Path, rate: float) -> Iterator[Callable[[Frame], None]]:
 
 @contextmanager
 def _gif(path: Path, rate: float) -> Iterator[Callable[[Frame], None]]:
-    """One palette, from the first picture, for the whole video: what stands still does not flicker or cost."""
+    """The palette of the first picture serves the whole video: still parts do not flicker, and take no space."""
     from PIL import Image
 
     pictures: list[Image.Image] = []
@@ -89,7 +89,7 @@ def _gif(path: Path, rate: float) -> Iterator[Callable[[Frame], None]]:
         pictures.append(Image.fromarray(frame).quantize(**palette, dither=Image.Dither.NONE))
 
     yield add
-    # GIF counts in hundredths of a second, and players slow down what is faster than 2 of them.
+    # A GIF's durations are in hundredths of a second, and players slow down pictures shorter than 2 of them.
     duration = 10 * max(2, round(100 / rate))
     first, rest = pictures[0], pictures[1:]
     first.save(path, format="GIF", save_all=True, append_images=rest, duration=duration, loop=0, optimize=False)

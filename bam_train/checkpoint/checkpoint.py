@@ -2,13 +2,13 @@
 
 ::
 
-    data, policy.pth, ...     what the trainer's own library wrote; hashed, never opened by us
-    bam/manifest.json         what this is, and the sha256 of every other member
+    data, policy.pth, ...     written by the trainer's library; hashed, never opened here
+    bam/manifest.json         environment, settings, and the sha256 of every other member
     bam/policy.onnx           the frozen policy
-    bam/golden.safetensors    observations and the trainer's own actions for them
-    bam/resume/...            everything needed to go on exactly
+    bam/golden.safetensors    observations, and the trainer's actions for them
+    bam/resume/...            everything needed to resume exactly
 
-It is whole or absent: written to a temporary file in the same folder, flushed to the disk, then moved into place.
+The file is complete or absent: written to a temporary file in the same folder, flushed to the disk, then renamed.
 Reading never unpickles.
 """
 
@@ -49,7 +49,7 @@ _MISFITS = (RuntimeError, ValueError, LookupError, TypeError, AttributeError, Ar
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint.zip; what deployment uses was verified when it was opened, the rest is when it is read."""
+    """A checkpoint.zip; members for deployment are verified when it is opened, those for resuming when read."""
 
     path: Path
     manifest: Manifest
@@ -69,7 +69,7 @@ class Checkpoint:
             manifest = parse_manifest(path, b"".join(chunks(path, archive, infos[MANIFEST])))
             require_same_members(path, set(infos), set(manifest.sha256))
             for name, expected in manifest.sha256.items():
-                if not name.startswith(RESUME):  # may have gigabytes, and is verified when it is read
+                if not name.startswith(RESUME):  # may have gigabytes; `read` verifies it
                     deque(chunks(path, archive, infos[name], expected), maxlen=0)
         return cls(path, manifest)
 
@@ -117,7 +117,7 @@ class Checkpoint:
 
     @contextlib.contextmanager
     def fitting(self, member: str) -> Iterator[None]:
-        """Map what is raised where a member's state does not fit what it is restored into to `AlteredCheckpoint`."""
+        """Turn exceptions of restoring a member's state into `AlteredCheckpoint`."""
         try:
             yield
         except _MISFITS as error:
@@ -125,17 +125,17 @@ class Checkpoint:
             raise AlteredCheckpoint(self.path, member, text) from error
 
     def requires_env(self, env_id: str) -> None:
-        """Refuse another environment than its own (CheckpointMismatch); a name of robo-gym for it is no other."""
+        """Raise CheckpointMismatch unless `env_id` is the environment of the checkpoint, also by robo-gym's name."""
         from bam_envs.core.registry import are_same
 
         if not are_same(env_id, self.manifest.env):
-            own = self.manifest.env
-            text = f"was trained on {own}, not on {env_id}. Use --env {own}, or train one for {env_id}"
+            trained = self.manifest.env
+            text = f"was trained on {trained}, not on {env_id}. Use --env {trained}, or train one for {env_id}"
             raise CheckpointMismatch(self.path, text)
 
 
 def write_checkpoint(path: str | Path, manifest_fields: Mapping[str, Any], members: Mapping[str, bytes]) -> Checkpoint:
-    """Write a checkpoint, whole or not at all; an existing file is replaced in one step.
+    """Write a checkpoint completely or not at all; an existing file is replaced in one step.
 
     Args:
         path: A link is followed, missing folders are made.
@@ -143,8 +143,8 @@ def write_checkpoint(path: str | Path, manifest_fields: Mapping[str, Any], membe
         members: Name to bytes.
 
     Raises:
-        OutputError: No space, no permission, or something in the way; nothing was changed.
-        CheckpointError: A field or member that no checkpoint may have.
+        OutputError: No space, no permission, or a folder of that name; an existing file is unchanged.
+        CheckpointError: A field or member is not allowed.
     """
     path = Path(path).expanduser()
     for name, data in members.items():

@@ -1,4 +1,4 @@
-"""`bam/manifest.json`: what a checkpoint is; read against one schema, for a checkpoint may be untrusted."""
+"""`bam/manifest.json` describes a checkpoint; it is checked against one schema, as a checkpoint may be untrusted."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ FORMAT = 1
 MANIFEST = "bam/manifest.json"
 AGAIN = "Copy it again from its source, or train again"
 MOST_MANIFEST = 8 * 2**20
-"""Bytes of a manifest at most; it is read before anything vouches for it."""
+"""Maximum bytes of a manifest, which is read before anything is verified."""
 MOST_NUMBERS = 2**26
-"""Numbers of an observation or action at most; a colour picture of 3840 x 2160 pixels has 25 million."""
+"""Maximum numbers of an observation or action; a colour picture of 3840 x 2160 pixels has 25 million."""
 WHERE = frozenset({"robot", "transport", "profile", "ca_file", "token_file", "rs_address"})
-"""Arguments of an environment that say where it runs; only a person says that, never a file."""
+"""Arguments of an environment that determine where it runs; only a person gives them, never a file."""
 
 
 _Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
@@ -41,19 +41,19 @@ class Manifest:
     env_kwargs: dict[str, Any]
     """Keyword arguments that the environment was made with."""
     observation_space: dict[str, Any]
-    """The environment's own, as written by `bam_envs.core.spaces.space_to_json`."""
+    """The environment's observation space, as written by `bam_envs.core.spaces.space_to_json`."""
     action_space: dict[str, Any]
-    """The same for actions."""
+    """The environment's action space, in the same form."""
     signals: dict[str, list[dict[str, Any]]]
     """Name, unit, low and high of every entry of observation, action, command and state; {} if unknown."""
     period: Annotated[float, Meta(gt=0)] | None
-    """Time between two actions [s]; None if the environment does not say."""
+    """Time between two actions [s]; None if the environment has no period."""
     algorithm: str
     """Such as ppo."""
     trainer: str
     """Such as sb3."""
     settings: dict[str, Any]
-    """Everything that made the run."""
+    """All settings of the run."""
     steps: _Count
     """Environment steps trained."""
     seed: _Count
@@ -63,7 +63,7 @@ class Manifest:
     versions: dict[str, Any]
     """Versions of Python and of the packages that made it."""
     git_commit: str | None
-    """Of the source tree, if there was one."""
+    """Commit of the source tree; None if it was installed."""
     created: str
     """UTC, ISO 8601."""
     sha256: dict[str, _Digest]
@@ -116,7 +116,7 @@ class _Scores(Struct):
 
 
 class _Contents(Struct):
-    """Checked beside the types of `Manifest`."""
+    """Fields whose content is checked besides the types of `Manifest`."""
 
     observation_space: _Space
     action_space: _Space
@@ -128,11 +128,11 @@ class _Head(Struct):
 
 
 def parse_manifest(path: Path, data: bytes) -> Manifest:
-    """Read the manifest of the checkpoint at `path`; fields that this version does not know are left out.
+    """Read the manifest of the checkpoint at `path`; fields that this version does not know are ignored.
 
     Raises:
         NewerFormat: Written by a newer bam-train.
-        AlteredCheckpoint: A field is missing, of the wrong type or not to be had from a file.
+        AlteredCheckpoint: A field is missing, of the wrong type or not allowed in a file.
     """
     try:
         manifest = _parse(path, data)
@@ -140,7 +140,7 @@ def parse_manifest(path: Path, data: bytes) -> Manifest:
         raise AlteredCheckpoint(path, MANIFEST, f"{MANIFEST}: {error}. {AGAIN}") from error
     try:
         require_no_place(manifest.env_kwargs)
-    except ValueError as error:  # a copy of it would say the same
+    except ValueError as error:  # another copy would be the same
         remedy = "Ask whoever made it, or train again"
         raise AlteredCheckpoint(path, MANIFEST, f"{MANIFEST}: {error}. {remedy}") from error
     return manifest
@@ -162,7 +162,7 @@ def manifest_bytes(path: Path, values: Mapping[str, Any]) -> bytes:
 
 
 def require_no_place(env_kwargs: Mapping[str, Any]) -> None:
-    """Refuse arguments that say where an environment runs, or which one it is (ValueError)."""
+    """Raise ValueError for arguments that determine where an environment runs, or which one it is."""
     for name in sorted(env_kwargs.keys() & (WHERE | {"env_id", "id"})):
         what = "where the environment runs" if name in WHERE else "which environment it is"
         raise ValueError(f"env_kwargs.{name} says {what}: flags such as --robot say that, never a file")

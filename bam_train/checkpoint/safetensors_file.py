@@ -1,7 +1,7 @@
-"""Arrays (`dump`, `parse`) and nested states (`pack`, `unpack`) in formats in which nothing can be executed.
+"""Arrays (`dump`, `parse`) and nested states (`pack`, `unpack`) in formats that cannot execute code.
 
-A state is a JSON skeleton and the safetensors file that it names arrays of. It is exact both ways: ints of any size,
-floats to the last bit, arrays and torch tensors with dtype and shape, tuples, and mappings with keys other than text.
+A state is a JSON skeleton and a safetensors file with its arrays. Packing is lossless: ints of any size, floats to the
+last bit, arrays and torch tensors with dtype and shape, tuples, and mappings with keys other than text.
 """
 
 import json
@@ -16,12 +16,12 @@ from safetensors import SafetensorError
 from bam_train.errors import FormatError
 
 MOST_HEADER = 2**23
-"""Most bytes of a file's JSON header, which takes many times as much memory once it is read."""
+"""Maximum bytes of a file's JSON header, which takes many times as much memory once it is parsed."""
 _MARKS = {"$array", "$scalar", "$tensor", "$tuple", "$items", "$float"}
 
 
 def dump(arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Write arrays of bool, (u)int8-64 and float16-64 as one safetensors file; others are a FormatError."""
+    """Write arrays of bool, (u)int8-64 and float16-64 as one safetensors file; raises FormatError for others."""
     for name, array in arrays.items():
         if np.asarray(array).dtype.kind not in "biuf":
             expected = "expected bool, an integer or a float type"
@@ -46,8 +46,8 @@ def parse(data: bytes) -> dict[str, np.ndarray]:
 def pack(name: str, tree: Any) -> dict[str, bytes]:
     """Turn a tree into the members ``name.json``, its skeleton, and ``name.safetensors``.
 
-    It may have None, bool, int, float, str, NumPy scalars and arrays, torch tensors; lists, tuples and mappings of
-    these. Anything else is a FormatError that names where.
+    It may hold None, bool, int, float, str, NumPy scalars and arrays, torch tensors; lists, tuples and mappings of
+    these. Any other value raises a FormatError that names its place.
     """
     arrays: dict[str, np.ndarray] = {}
 
@@ -84,9 +84,9 @@ def pack(name: str, tree: Any) -> dict[str, bytes]:
 
 
 def unpack(skeleton: bytes, arrays: bytes, to_tensor: Callable[[np.ndarray], Any] | None = None) -> Any:
-    """Turn what `pack` wrote into the tree again; `to_tensor` makes tensors, which else become arrays.
+    """Restore the tree that `pack` wrote; `to_tensor` makes its tensors, which are arrays without it.
 
-    Raises FormatError if the two do not belong together, or are not as `pack` writes them.
+    Raises FormatError if the two members do not belong together, or do not have the form that `pack` writes.
     """
 
     def get(value: Any) -> Any:
@@ -104,13 +104,13 @@ def unpack(skeleton: bytes, arrays: bytes, to_tensor: Callable[[np.ndarray], Any
             return tuple(get(item) for item in inside)
         if mark == "$float":
             return float(inside)
-        array = found[inside]
+        array = stored[inside]
         if mark == "$tensor" and to_tensor is not None:
             return to_tensor(array)
         return array[()] if mark == "$scalar" else array
 
     try:
-        found = parse(arrays)
+        stored = parse(arrays)
         return get(json.loads(skeleton))
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise FormatError(f"a saved state cannot be read: {type(error).__name__}: {error}") from error

@@ -1,4 +1,4 @@
-"""Reading a zip that may be damaged or hostile: every fault is one clear line, and nothing is unpacked to the disk."""
+"""Read a zip that may be damaged or hostile: errors are one clear line, and nothing is unpacked to the disk."""
 
 import contextlib
 import hashlib
@@ -15,7 +15,7 @@ from bam_train.errors import AlteredCheckpoint, NotACheckpoint
 CHUNK = 2**20  # bytes read at once
 MOST_MEMBERS = 10_000
 RESUME = "bam/resume/"
-"""Beginning of the names of members that only resumed training needs."""
+"""Prefix of the members that only resumed training needs."""
 _MOST_DIRECTORY = 4 * 2**20  # bytes of the zip's own list of members
 _MOST_BYTES = {
     MANIFEST: MOST_MANIFEST,
@@ -24,23 +24,23 @@ _MOST_BYTES = {
     RESUME: 64 * 2**30,  # the largest replay buffers are a tenth of this
     "": 2**29,
 }
-"""Bytes of a member at most, unpacked, by the beginning of its name; the first that fits."""
+"""Maximum bytes of a member, unpacked, by the prefix of its name; the first match applies."""
 _MOST_JSON = 2**24
-"""Bytes at most of a JSON member, which is many times as large once it is read."""
+"""Maximum bytes of a JSON member, which takes many times as much memory once it is parsed."""
 # Exceptions of zipfile for damaged headers and streams; NotImplementedError and RecursionError are RuntimeErrors.
 _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError, KeyError, OverflowError, struct.error)
 
 
 @contextlib.contextmanager
 def open_zip(path: Path) -> Iterator[zipfile.ZipFile]:
-    """Open the zip; whatever damage zipfile meets in it becomes one clear line."""
+    """Open the zip; any damage that zipfile finds becomes an error of one line."""
     try:
         if path.is_dir():
             raise NotACheckpoint(
                 path,
                 "is a folder, expected a checkpoint.zip. Give the file in it; bam-export makes one of RLlib's folders",
             )
-        with path.open("rb") as file:  # zipfile reads the list of members whole, and has no public way to ask first
+        with path.open("rb") as file:  # zipfile reads the whole list of members, and its size has no public name
             record: Any = zipfile._EndRecData(file)  # type: ignore[attr-defined]
         found = record[zipfile._ECD_SIZE] if record else 0  # type: ignore[attr-defined]
         if found > _MOST_DIRECTORY:
@@ -60,7 +60,7 @@ def open_zip(path: Path) -> Iterator[zipfile.ZipFile]:
 
 
 def list_members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """List the members; refuse what no checkpoint has, and sizes that only an attack has, before unpacking any."""
+    """List the members; before any is unpacked, refuse duplicates, other compression and sizes beyond the limits."""
     infos: dict[str, zipfile.ZipInfo] = {}
     for info in archive.infolist():
         name = info.filename
@@ -93,7 +93,7 @@ def list_members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipI
 
 
 def chunks(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, expected: str | None = None) -> Iterator[bytes]:
-    """A member's bytes, a part at a time; after the last, its sha256 in hex is compared with the expected one."""
+    """Yield a member's bytes in chunks; after the last, its sha256 in hex is compared with the expected one."""
     name, found, sha256 = info.filename, 0, hashlib.sha256()
     try:
         with archive.open(info) as stream:
@@ -111,7 +111,7 @@ def chunks(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, expected
 
 
 def require_same_members(path: Path, found: set[str], expected: set[str]) -> None:
-    """Refuse a file that lacks a member of the manifest, or has one more beside the manifest."""
+    """Refuse a file that lacks a member of the manifest, or has a member that the manifest does not list."""
     found = found - {MANIFEST}
     for name in sorted(expected - found):
         raise AlteredCheckpoint(path, name, f"{name} is missing, although {MANIFEST} lists it. {AGAIN}")
@@ -120,6 +120,6 @@ def require_same_members(path: Path, found: set[str], expected: set[str]) -> Non
 
 
 def most_bytes(name: str) -> int:
-    """How many bytes a member of this name may have at most, unpacked."""
+    """Maximum bytes of a member of this name, unpacked."""
     most = next(most for start, most in _MOST_BYTES.items() if name.startswith(start))
     return min(most, _MOST_JSON) if name.endswith(".json") else most

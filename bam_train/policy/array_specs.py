@@ -16,19 +16,19 @@ class ArraySpec:
     """One array of an observation, or the action."""
 
     name: str
-    """Such as observation.camera; the graph's input of the same name takes it."""
+    """Name of the graph's input, such as observation.camera, or ``action``."""
     kind: str
     """Box, Discrete, MultiDiscrete or MultiBinary."""
     shape: tuple[int, ...]
     """Without a batch axis."""
     dtype: np.dtype[Any]
-    """As the environment gives it."""
+    """The dtype of the environment."""
     low: np.ndarray | None = None
     """Lowest value; None for a MultiBinary."""
     high: np.ndarray | None = None
 
     def checked(self, value: Any, batch: tuple[int, ...]) -> np.ndarray:
-        """Return the value as an array (*batch, *shape) that can be copied into this one; the batch is () or (n,)."""
+        """Return the value as an array (*batch, *shape) that can be cast to this dtype; the batch is () or (n,)."""
         shape = (*batch, *self.shape)
         try:
             array = np.asarray(value)

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from bam_train.policy.onnx_session import OnnxSession
 
 TOLERANCE = 1e-5
-"""Largest difference from the trainer's own action; a Box wider than 2 is measured in half its range."""
+"""Largest difference from the trainer's action; relative to half the range of a Box that is wider than 2."""
 MOST_GOLDEN = 1024
-"""Golden actions at most; a few hundred are written."""
-_SINGLE = 8  # golden observations that are acted on one by one too
+"""Maximum number of golden actions; checkpoints have a few hundred."""
+_SINGLE = 8  # golden observations that `act` is checked with, and `act_batch` with the others
 
 
 class FrozenPolicy:
@@ -40,15 +40,15 @@ class FrozenPolicy:
         self._session = session
         states = {name: tensor for name, tensor in session.inputs.items() if name.startswith("state.")}
         _require_fit(session, self._arrays, states)
-        self._zero_state = {name: np.zeros([n or 1 for n in one.shape], one.dtype) for name, one in states.items()}
+        self._zero_state = {name: np.zeros([n or 1 for n in spec.shape], spec.dtype) for name, spec in states.items()}
         self._state: dict[str, np.ndarray] | None = None
         self._outputs = ["action", *(f"next_{name}" for name in states)]
         self.recurrent = bool(states)
-        found = self._act({part.name: np.zeros((2, *part.shape), part.dtype) for part in self._arrays}).shape
+        shape = self._act({part.name: np.zeros((2, *part.shape), part.dtype) for part in self._arrays}).shape
         self._state = None
-        if found != (2, *self._action.shape):
-            raise PolicyError(f"action: expected shape {self._action.shape}, the graph gives {found[1:]}")
-        # A plain array of numbers, as most policies take, is copied into an array that is there already.
+        if shape != (2, *self._action.shape):
+            raise PolicyError(f"action: expected shape {self._action.shape}, the graph gives {shape[1:]}")
+        # An observation that is one array, as for most policies, is copied into an array that is allocated once.
         plain = not (self.recurrent or self._is_dict) and self._arrays[0].kind == "Box"
         self._shape, self._dtype = self._arrays[0].shape, self._arrays[0].dtype
         self._buffer = np.zeros((1, *self._shape), self._dtype) if plain else None
@@ -66,7 +66,7 @@ class FrozenPolicy:
 
     @classmethod
     def from_checkpoint(cls, checkpoint: Checkpoint) -> FrozenPolicy:
-        """Load the policy of a checkpoint that is open already."""
+        """Load the policy of an open checkpoint."""
         manifest = checkpoint.manifest
         policy = cls.from_graph(checkpoint.read(POLICY), manifest.observation_space, manifest.action_space)
         try:
@@ -102,7 +102,7 @@ class FrozenPolicy:
         return cls(OnnxSession(onnx), observation_space, action_space)
 
     def reset(self, env_ids: Any = None) -> None:
-        """Forget what was observed, at the start of an episode of `env_ids` (indices or a mask) or of all."""
+        """Reset the recurrent state of `env_ids` (indices or a mask), or of all environments, as an episode starts."""
         if env_ids is None:
             self._state = None
         elif self._state is not None:
@@ -117,7 +117,7 @@ class FrozenPolicy:
         """Return the action, a new array or an np.int64, for one observation: an array, or a mapping for a Dict.
 
         Raises:
-            PolicyError: The observation does not fit; names the input, what was expected and what was found.
+            PolicyError: The observation does not fit; the message names the input, the expected and the found value.
         """
         buffer = self._buffer
         if buffer is None:
@@ -168,7 +168,7 @@ class FrozenPolicy:
         """Act on recorded observations; return the largest difference from the recorded actions and its row.
 
         Args:
-            golden: ``action`` and the observations by name, (n, ...) each; of a recurrent policy one episode's steps.
+            golden: ``action`` and the observations by name, (n, ...) each; if recurrent, the steps of one episode.
         """
         names = {"action", *(part.name for part in self._arrays)}
         if set(golden) != names:
@@ -203,7 +203,7 @@ class FrozenPolicy:
 
 
 def _int64(array: np.ndarray) -> np.ndarray:
-    """Whole numbers as NumPy's int64: those of onnxruntime are of the C type long long, which NumPy keeps apart."""
+    """Integers as np.int64: onnxruntime returns the C type long long, which is another dtype in NumPy."""
     return array.view(np.int64) if array.dtype.char == "q" else array
 
 

@@ -16,9 +16,9 @@ from google.protobuf.message import DecodeError
 from bam_train.errors import FormatError
 
 MOST_NODES = 1000
-"""Most operations of a graph; the largest that is exported has about a hundred."""
+"""Maximum number of operations of a graph; exported policies have up to about a hundred."""
 MOST_STRUCTURE = 2**20
-"""Most bytes of a file that are not weights, 16 more for each field: protobuf takes many times as much memory."""
+"""Maximum bytes of a file besides weights, with 16 more for each field: protobuf takes many times as much memory."""
 
 OPERATIONS = frozenset(
     """Abs Add ArgMax AveragePool BatchNormalization Cast Celu Clip Concat Constant ConstantOfShape Conv Cos Div Elu
@@ -26,12 +26,12 @@ OPERATIONS = frozenset(
     LeakyRelu Less Log LogSoftmax MatMul Max MaxPool Min Mish Mul Neg Or Pad Pow ReduceMean ReduceSum Relu Reshape Selu
     Sigmoid Sin Slice Softmax Softplus Softsign Split Sqrt Squeeze Sub Tanh Transpose Unsqueeze Where""".split()  # noqa: SIM905 - a list of literals has one a line
 )
-"""Operations of exported policies; none repeats others, chooses between graphs or opens a file."""
+"""Operations of exported policies; none loops, branches or opens a file."""
 _SIZES = {"ConstantOfShape": 0, "Pad": 1, "Reshape": 1, "Slice": 1}
-"""Operations of which an input, this one or a later one, says how large the result is."""
+"""Operations whose result size depends on inputs, from this index on."""
 
 _ITEM_SIZE = {1: 4, 2: 1, 3: 1, 4: 2, 5: 2, 6: 4, 7: 8, 9: 1, 10: 2, 11: 8, 12: 4, 13: 8}
-"""TensorProto.DataType of numbers to their bytes."""
+"""Bytes of each TensorProto.DataType of numbers."""
 _ATTRIBUTE_TYPES = frozenset({1, 2, 3, 4, 6, 7})
 """AttributeProto.AttributeType: float, int, string, tensor, floats, ints."""
 
@@ -53,7 +53,7 @@ _TO_WEIGHTS: dict[int, Any] = {7: {1: {5: {5: {9: {}}}}, 5: {9: {}}}}
 
 
 def require_policy(data: bytes) -> None:
-    """Refuse an ONNX file that is damaged, too large, or has something that no policy has (FormatError)."""
+    """Raise FormatError for an ONNX file that is damaged, too large, or holds more than a policy."""
     try:
         _require_small(memoryview(data), _TO_WEIGHTS, MOST_STRUCTURE)
         model = _MODEL.FromString(data)
@@ -81,7 +81,7 @@ def _require_graph(graph: Any) -> None:
 
 
 def _require_node(node: Any, varying: set[str]) -> None:
-    """Refuse an unknown operation, and one of whose result `varying` inputs say the size."""
+    """Refuse an unknown operation, and one whose result size depends on `varying` inputs."""
     op = f"{node.domain}.{node.op_type}" if node.domain else node.op_type
     for attribute in node.attribute:
         inner = [attribute.g, attribute.tensors, attribute.graphs, attribute.sparse_tensor, attribute.sparse_tensors]
@@ -96,7 +96,7 @@ def _require_node(node: Any, varying: set[str]) -> None:
 
 
 def _require_tensor(tensor: Any) -> None:
-    """Refuse numbers that are in another file, or more or fewer than the shape says."""
+    """Refuse a tensor whose data are in another file, or do not match its shape."""
     name, shape = tensor.name, tuple(tensor.dims)
     if tensor.external_data or tensor.data_location:
         raise FormatError(f"tensor {name!r}: its numbers are in another file; export with everything in one")
@@ -109,7 +109,7 @@ def _require_tensor(tensor: Any) -> None:
 
 
 def _require_small(data: memoryview, to_weights: Mapping[int, Any], left: int) -> int:
-    """Return how many of `left` bytes remain after everything in a message that is not weights."""
+    """Return how many of `left` bytes remain after the parts of a message that are not weights."""
     for number, value in _split(data):
         inside = to_weights.get(number)
         left -= 16 if inside is not None else 16 + len(value)
@@ -121,7 +121,7 @@ def _require_small(data: memoryview, to_weights: Mapping[int, Any], left: int) -
 
 
 def _split(data: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """Number and bytes of each field of a protobuf message: its size is known without reading what is in it."""
+    """Yield the number and the bytes of each field of a protobuf message, without parsing the content."""
     at = 0
     while at < len(data):
         key, at = _varint(data, at)
@@ -139,7 +139,7 @@ def _split(data: memoryview) -> Iterator[tuple[int, memoryview]]:
 
 
 def _varint(data: memoryview, at: int) -> tuple[int, int]:
-    """Read a number of 7 bits a byte, the lowest first; return it and where it ends."""
+    """Read a number of 7 bits a byte, the lowest first; return its value and its end."""
     value = 0
     for shift in range(0, 70, 7):
         value |= (data[at + shift // 7] & 0x7F) << shift
@@ -149,7 +149,7 @@ def _varint(data: memoryview, at: int) -> tuple[int, int]:
 
 
 def _model_class() -> Any:
-    """Make the class of a ModelProto of `_FIELDS`."""
+    """Make the class of a ModelProto with `_FIELDS`."""
     file = descriptor_pb2.FileDescriptorProto(name="bam_onnx.proto", package="bam_onnx", syntax="proto2")
     for message, fields in _FIELDS.items():
         described = file.message_type.add(name=message)

@@ -1,8 +1,8 @@
 """Run a policy's ONNX graph with onnxruntime, on one thread.
 
-A graph may be untrusted, and onnxruntime cannot be interrupted by Ctrl-C. So its memory is bounded, and it is
-loaded and run for the first time in a thread that is waited for only so long. A later run takes as long as the first:
-no operation of a policy takes longer for other numbers.
+A graph may be untrusted, and onnxruntime cannot be interrupted by Ctrl-C. So its memory is bounded, and loading and the
+first run happen in a thread with a time limit. Later runs take as long as the first: the time of an operation does not
+depend on the values.
 """
 
 import functools
@@ -25,7 +25,7 @@ MOST_MEMORY = 2**30
 
 _FAULTS = (faults.Fail, faults.InvalidArgument, faults.InvalidGraph, faults.InvalidProtobuf, faults.NotImplemented)
 _DTYPES = {"float": "float32", "double": "float64"}
-"""Names of onnxruntime that are not those of NumPy."""
+"""Names of dtypes in onnxruntime that differ from NumPy's."""
 T = TypeVar("T")
 
 
@@ -34,13 +34,13 @@ class Tensor:
     """An input of the graph."""
 
     shape: tuple[int | None, ...]
-    """None where the length is free, as the batch axis is."""
+    """None where the length is free, such as that of the batch axis."""
     dtype: str
-    """As NumPy calls it."""
+    """Name of the NumPy dtype."""
 
 
 class OnnxSession:
-    """A graph that `require_policy` accepted, in onnxruntime; raises PolicyError if that cannot run it.
+    """A graph that `require_policy` accepted, in onnxruntime; raises PolicyError if onnxruntime cannot run it.
 
     Attributes:
         inputs: Its inputs, by name.
@@ -54,11 +54,11 @@ class OnnxSession:
         except _FAULTS as error:
             raise PolicyError(f"onnxruntime {onnxruntime.__version__} cannot run the policy: {error}") from error
         self.inputs: dict[str, Tensor] = {}
-        for one in self._session.get_inputs():  # described as ``tensor(float)`` and ``['n', 3]``
-            dtype = re.sub(r"^tensor\((\w+)\)$", r"\1", one.type)
-            shape = tuple(n if isinstance(n, int) else None for n in one.shape)
-            self.inputs[one.name] = Tensor(shape, _DTYPES.get(dtype, dtype))
-        self.outputs = [one.name for one in self._session.get_outputs()]
+        for node in self._session.get_inputs():  # described as ``tensor(float)`` and ``['n', 3]``
+            dtype = re.sub(r"^tensor\((\w+)\)$", r"\1", node.type)
+            shape = tuple(n if isinstance(n, int) else None for n in node.shape)
+            self.inputs[node.name] = Tensor(shape, _DTYPES.get(dtype, dtype))
+        self.outputs = [node.name for node in self._session.get_outputs()]
         self.most_seconds = MOST_SECONDS
         self._options = onnxruntime.RunOptions()
         self._has_run = False
@@ -66,11 +66,11 @@ class OnnxSession:
     def run(self, inputs: Mapping[str, np.ndarray], outputs: Sequence[str]) -> list[np.ndarray]:
         """Return the named outputs, new arrays (n, ...), for every input by name, (n, ...)."""
         try:
-            # Without options of ours, onnxruntime makes some for each run: 3 us of 13.
+            # Without these options, onnxruntime makes new ones for each run: 3 of 13 µs.
             if self._has_run:
                 results: list[np.ndarray] = self._session.run(outputs, inputs, self._options)
                 return results
-            end = functools.partial(setattr, self._options, "terminate", True)  # before its next operation
+            end = functools.partial(setattr, self._options, "terminate", True)  # stops before the next operation
             results = _within(self.most_seconds, lambda: self._session.run(outputs, inputs, self._options), end)
         except _FAULTS as error:
             raise PolicyError(f"onnxruntime {onnxruntime.__version__} failed: {error}") from error
@@ -93,7 +93,7 @@ def _load(onnx: bytes) -> onnxruntime.InferenceSession:
 
 
 def _within(seconds: float, call: Callable[[], T], stop: Callable[[], None] = lambda: None) -> T:
-    """Return what `call` returns in another thread: Ctrl-C interrupts waiting for a thread, but not C++."""
+    """Run `call` in another thread and return its result: Ctrl-C interrupts waiting for a thread, but not C++."""
     results: list[T] = []
     errors: list[BaseException] = []
     done = threading.Event()  # Ctrl-C in Thread.join makes the thread look ended in Python 3.11
@@ -118,7 +118,7 @@ def _within(seconds: float, call: Callable[[], T], stop: Callable[[], None] = la
     return results[0]
 
 
-# Bounds what sessions that ask for it may allocate together; onnxruntime keeps one such setting per process.
+# Bounds the memory of all sessions with ``session.use_env_allocators``; onnxruntime has one such bound per process.
 onnxruntime.create_and_register_allocator(
     onnxruntime.OrtMemoryInfo(
         "Cpu", onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, onnxruntime.OrtMemType.DEFAULT
