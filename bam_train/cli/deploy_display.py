@@ -83,7 +83,7 @@ class LiveDisplay(PlainDisplay):
         }
         table = Table.grid(padding=(0, 2))
         for name, text in rows.items():
-            table.add_row(rich_text(name, "dim"), rich_text(text, no_wrap=True, overflow="ellipsis"))
+            table.add_row(rich_text(name, "dim"), rich_text(text, no_wrap=name != "action", overflow="ellipsis"))
         self._live.update(Group(rich_text(self._title, "bold"), table), refresh=True)
 
 

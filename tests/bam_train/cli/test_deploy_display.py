@@ -99,3 +99,14 @@ def test_panel_fits_a_screen_and_says_it_all():
     assert any(line.startswith("loop") and line.endswith("no rate yet of 20") for line in lines)
     assert any("p50 0.00 ms, p99 0.00 ms, max 0.00 ms, no deadline missed" in line for line in lines)
     assert not any(line.strip() == "..." for line in lines)
+
+
+def test_panel_shows_every_number_of_an_action_on_a_narrow_screen():
+    env, screen = gym.make("bam/ur-reach-v0"), io.StringIO()
+    env.reset(seed=0)
+    console = Console(file=screen, force_terminal=True, width=80, height=24, color_system=None)
+    journal = Journal(1)
+    with live_display(console, env, "ur-reach.zip", journal) as display:
+        display.ticked(journal.begin(0), np.arange(1, 6, dtype=np.float32) / 8, Pacer(None))
+    env.close()
+    assert [number in screen.getvalue() for number in ("+0.125", "+0.250", "+0.375", "+0.500", "+0.625")] == [True] * 5
