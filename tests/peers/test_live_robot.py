@@ -145,7 +145,7 @@ def test_a_paused_program_is_named(rosbridge, robot_node, wait_until):
             command = start(robot).command
             robot.step(command)
             assert robot.info.text.endswith(
-                "; it does not say safety_mode, robot_mode, speed_scaling, list_controllers)"
+                "; it does not report safety_mode, robot_mode, speed_scaling, list_controllers)"
             )
             robot_node.ask("pause")
             wait_until(robot.not_ready, paused)
@@ -173,7 +173,7 @@ def with_source(signal, **changes):
     ("changes", "text"),
     [
         ({"topic": "/fingers/joint_states"}, r"/fingers/joint_states \(sensor_msgs/JointState\): no message in 3 s"),
-        ({"type": "std_msgs/String"}, r"The server said: .*/gripper/joint_states has another type"),
+        ({"type": "std_msgs/String"}, r"The server reported: .*/gripper/joint_states has another type"),
     ],
 )
 def test_a_topic_that_is_not_what_the_profile_says(changes, text, rosbridge, robot_node):

@@ -28,7 +28,7 @@ def brief(value: Any) -> str:
 
 
 def listed(names: Iterable[object], most: int = 8) -> str:
-    """``a, b, c``; of more than `most` the first ones and how many there are; ``none`` of nothing."""
+    """``a, b, c``; the first `most` and the total of a longer list; ``none`` of an empty one."""
     texts = [str(name) for name in names]
     if len(texts) > most:
         return f"{', '.join(texts[:most])}, ... ({len(texts)} in all)"
@@ -41,12 +41,12 @@ def as_flag(field: str) -> str:
 
 
 def closest(name: object, known: Iterable[str], cutoff: float = 0.65) -> str | None:
-    """The most similar of the `known` names, upper or lower case alike; None if none is similar.
+    """The most similar of the `known` names, ignoring case; None if none is similar.
 
     Args:
-        name: As it was given.
-        known: The names there are.
-        cutoff: How similar a match must be, from 0 to 1.
+        name: The misspelt name.
+        known: The names to choose from.
+        cutoff: Least similarity of a match, from 0 to 1.
     """
     names = sorted(known)
     same = [one for one in names if one.lower() == str(name).lower()]
@@ -57,13 +57,13 @@ def closest(name: object, known: Iterable[str], cutoff: float = 0.65) -> str | N
 def did_you_mean(
     name: object, known: Iterable[str], cutoff: float = 0.65, examples: Iterable[str] | None = None
 ) -> str:
-    """The sentence that follows an unknown name: ``Did you mean 'pick'?``, or what there is to choose from.
+    """The sentence that follows an unknown name: ``Did you mean 'pick'?``, or the names to choose from.
 
     Args:
-        name: As it was given.
-        known: The names there are.
-        cutoff: As of `closest`.
-        examples: What to name where nothing is similar; every known name by default.
+        name: The misspelt name.
+        known: The names to choose from.
+        cutoff: Least similarity of a match, from 0 to 1.
+        examples: Names to list if none is similar; by default all of `known`.
     """
     names = sorted(known)
     match = closest(name, names, cutoff)

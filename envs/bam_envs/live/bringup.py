@@ -1,7 +1,7 @@
-"""Connecting a live robot: who it is, whether its topics fit the profile, whether it is ready to move; its session.
+"""Connect a live robot: read its description, check its topics and its readiness, and open a session.
 
-A rosbridge server does not report a wrong topic or type. So each one is checked by its effect: by its type if the
-server can tell it (rosapi), and by the first message of every source.
+A rosbridge server does not report a wrong topic or type. Each topic is therefore checked by its type, if the server
+offers rosapi, and each source by its first message.
 """
 
 import threading
@@ -22,11 +22,11 @@ from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.sessions import LEASE_TOPIC, LEAVE, RENEW, SESSION_SERVICE, read_session
 
 TIMEOUT = 3.0
-"""Longest wait for the answer of a service, and for a first message, if the endpoint says nothing else [s]."""
+"""Longest wait for the answer of a service, and for a first message, unless the endpoint has a timeout [s]."""
 _TRIES, _TRY_AGAIN = 3, 0.1
-"""How often a service is called within that time, and the time between two looks at a topic [s]."""
+"""Number of calls of a service within `TIMEOUT`, and the time between two checks of a topic [s]."""
 FIRST_WITHIN = 0.3
-"""Longest wait for the latched topics by which a robot says whether it is ready [s]."""
+"""Longest wait for the latched topics that report whether the robot is ready [s]."""
 _ANSWER_WITHIN = 2.0
 _RENEW_EVERY, _RENEWAL_LIFE = 0.5, 1.0
 """Time between two renewals of the lease, and how long each is valid [s]; the robot's side waits for several of them
@@ -36,7 +36,7 @@ _ACTIVE = ("active", "running")
 
 
 def ask(link: RosbridgeLink, service: str, tries: int = _TRIES) -> dict[str, Any] | None:
-    """The answer of `service`, which takes no arguments; None if there is no such service, `LinkLost` without answer.
+    """Call `service`, which takes no arguments; None if it does not exist, `LinkLost` if it does not answer.
 
     It is called several times: a ROS 2 bridge creates a client for each call, and loses an answer that comes before
     client and service have discovered each other.
@@ -52,9 +52,9 @@ def ask(link: RosbridgeLink, service: str, tries: int = _TRIES) -> dict[str, Any
 
 
 def info_by_profile(url: str, profile: RobotProfile, unknown: Iterable[str] = ()) -> RobotInfo:
-    """What is known of a robot at `url` that does not describe itself; `unknown` names topics that said nothing."""
+    """A description of a robot at `url` that does not describe itself; `unknown` names its silent topics."""
     silent = ", ".join(name.rpartition("/")[2] for name in unknown)
-    rest = f"; it does not say {silent}" if silent else ""
+    rest = f"; it does not report {silent}" if silent else ""
     known = f"profile {profile.name}: {', '.join(profile.command.labels)}"
     return RobotInfo(profile.name, text=f"the robot at {url}, which does not describe itself ({known}{rest})")
 
@@ -72,21 +72,21 @@ class TopicTypes:
         self._link, self._profile, self._timeout, self._answers = link, profile, timeout, True
 
     def check(self, topic: str, expected: str) -> str:
-        """The type to use for `topic`, `expected` if the server does not know; `ProtocolError` if it has another."""
-        found = self._found(topic) or expected
-        if not same_type(found, expected):
-            raise self._misfit(topic, expected, found)
-        return found
+        """The type of `topic` on the server, `expected` if it is unknown; `ProtocolError` for a different one."""
+        kind = self._type_of(topic) or expected
+        if not same_type(kind, expected):
+            raise self._wrong_type(topic, expected, kind)
+        return kind
 
     def may_be(self, topic: str, kind: str) -> bool:
-        """Whether `topic` is of type `kind` there, or the server does not know."""
-        found = self._found(topic)
-        return same_type(found, kind) if found else not self._answers
+        """Whether `topic` is of type `kind` on the server, or its type is unknown."""
+        actual = self._type_of(topic)
+        return same_type(actual, kind) if actual else not self._answers
 
     def check_listened(self, topic: str, sink: Sink) -> str:
-        """As `check`, for the `topic` of `sink`, which somebody must listen to, with or without stamp as expected."""
+        """As `check`, for the `topic` of `sink`: it needs a subscriber, and the expected type, stamped or not."""
         deadline, expected = Deadline(self._timeout), sink.type
-        while not self._found(topic) and self._answers:
+        while not self._type_of(topic) and self._answers:
             if deadline.passed:
                 raise ProtocolError(
                     f"Nobody listens to {topic} ({expected}), which takes {', '.join(sink.labels)}. Is the controller "
@@ -94,24 +94,24 @@ class TopicTypes:
                     f"this may be another robot than it describes.{namespaces_with(self._link, 'topics', sink.topic)}"
                 )
             time.sleep(_TRY_AGAIN)  # nodes of a ROS graph take a while to discover each other
-        found = self._found(topic) or expected
-        if bare_type(found) != bare_type(expected):  # reading ignores a stamp, writing does not
-            raise self._misfit(topic, expected, found)
-        return found
+        kind = self._type_of(topic) or expected
+        if bare_type(kind) != bare_type(expected):  # reading ignores a stamp, writing does not
+            raise self._wrong_type(topic, expected, kind)
+        return kind
 
-    def _misfit(self, topic: str, expected: str, found: str) -> ProtocolError:
+    def _wrong_type(self, topic: str, expected: str, kind: str) -> ProtocolError:
         return ProtocolError(
-            f"{topic} is a {found} there, and {expected} was expected. "
+            f"{topic} is a {kind} there, and {expected} was expected. "
             f"Correct the topic or its type in the profile of {self._profile.name}."
         )
 
-    def _found(self, topic: str) -> str:
-        """The type of `topic` there; empty if the server does not know."""
+    def _type_of(self, topic: str) -> str:
+        """The type of `topic` on the server; empty if it is unknown."""
         if not self._answers:
             return ""
         try:
             answer = self._link.call("/rosapi/topic_type", "rosapi/TopicType", {"topic": topic}, self._timeout)
-        except RemoteError:  # rosapi is a node of its own, which does not run
+        except RemoteError:  # the rosapi node does not run
             self._answers = False
             return ""
         kind = answer.get("type")
@@ -123,59 +123,59 @@ def await_first(link: RosbridgeLink, state: LiveState, profile: RobotProfile, ti
     wanted = {source.signal: f"{link.namespace}{source.topic} ({source.type})" for source in state.sources}
     arrived = state.mailbox.wait_for(lambda slots: wanted.keys() <= slots.keys() or not link.is_up, timeout)
     if not link.is_up:
-        raise LinkLost(f"{link.url}: the link dropped while the robot's topics were looked at.")
+        raise LinkLost(f"{link.url}: the link dropped while the robot's topics were checked.")
     if arrived:
         return
     newest = state.mailbox.newest()
     silent = dict.fromkeys(topic for signal, topic in wanted.items() if signal not in newest)
-    said = [str(status.get("msg")) for status in link.statuses]
+    reports = [str(status.get("msg")) for status in link.statuses]
     raise StaleState(
         f"{', '.join(silent)}: no message in {timeout:g} s. Does it run, and is the topic called so? "
-        f"Topics are in the profile of {profile.name}." + (f" The server said: {said[-1]}" if said else "")
+        f"Topics are in the profile of {profile.name}." + (f" The server reported: {reports[-1]}" if reports else "")
     )
 
 
 class LiveReadiness:
-    """What a robot says of being ready to move: the topics in `profile.readiness`, and the controllers of `sinks`.
+    """Whether a robot is ready to move, by the topics in `profile.readiness` and the controllers of `sinks`.
 
-    All of it is optional: a robot that does not say something is driven without, and `unknown` names it.
+    All of them are optional: a robot is driven without those that it does not report, which `unknown` names.
     """
 
     def __init__(self, profile: RobotProfile, sinks: tuple[Sink, ...], types: TopicTypes) -> None:
         self._profile, self._types = profile, types
         self.mailbox = Mailbox()
         """Messages by topic; to be cleared when the link is down."""
-        self._heard: tuple[Readiness, ...] = ()
+        self._subscribed: tuple[Readiness, ...] = ()
         named = dict.fromkeys(sink.controller for sink in sinks if sink.controller)
         self._controllers = tuple(named) if profile.controllers else ()
         self._states: Mapping[str, str] | None = None  # of the controllers, by name
         self._answers = bool(self._controllers)  # whether the server has the service that lists them
 
     def begin(self, link: RosbridgeLink) -> None:
-        """Subscribe to the topics, wait a little for their latched messages, and ask for the controllers."""
-        if not self._heard:  # on a later connection the link subscribes again by itself
+        """Subscribe to the topics, wait briefly for their latched messages, and query the controllers."""
+        if not self._subscribed:  # on a later connection the link subscribes again by itself
             every = self._profile.readiness
-            self._heard = tuple(one for one in every if self._types.may_be(link.namespace + one.topic, one.type))
-            for one in self._heard:
+            self._subscribed = tuple(one for one in every if self._types.may_be(link.namespace + one.topic, one.type))
+            for one in self._subscribed:
                 link.subscribe(link.namespace + one.topic, one.type, self._listener(one.topic))
-        topics = {one.topic for one in self._heard}
+        topics = {one.topic for one in self._subscribed}
         self.mailbox.wait_for(lambda slots: topics <= slots.keys() or not link.is_up, FIRST_WITHIN)
-        self._ask(link)
+        self._query(link)
 
     def _listener(self, topic: str) -> Listener:
         return lambda message, caller: self.mailbox.put([topic], message)
 
     def owns(self, status: Mapping[str, Any], namespace: str) -> bool:
-        """Whether a `status` of the server is about these topics: it is no error if the server cannot offer one."""
-        return status.get("id") in {f"subscribe:{namespace}{one.topic}" for one in self._heard}
+        """Whether a `status` of the server is about these topics, which a server need not offer."""
+        return status.get("id") in {f"subscribe:{namespace}{one.topic}" for one in self._subscribed}
 
     def fault(self, *, moving: bool) -> str | None:
-        """Why the robot is not ready, by the newest messages; None if nothing says so. Any thread.
+        """Why the newest messages report that the robot is not ready, or None. Thread-safe.
 
-        While it is `moving`, measured numbers (`at_least`) are left out, for they may dip.
+        While it is `moving`, measured numbers (`at_least`) are ignored, because they may dip.
         """
         letters = self.mailbox.newest()
-        for one in self._heard:
+        for one in self._subscribed:
             if one.topic in letters and not (moving and one.at_least is not None):
                 trouble = one.trouble(letters[one.topic].message)
                 if trouble is not None:
@@ -183,19 +183,19 @@ class LiveReadiness:
         return None
 
     def not_ready(self, link: RosbridgeLink) -> str | None:
-        """As `fault`, including the controllers, which are asked for now."""
-        said = self.fault(moving=False)
-        if said is not None:
-            return said
-        self._ask(link)
+        """As `fault`, including the controllers, whose states are queried now."""
+        reason = self.fault(moving=False)
+        if reason is not None:
+            return reason
+        self._query(link)
         for name in self._controllers:
             state = "active" if self._states is None else self._states.get(name, "not loaded")
             if state not in _ACTIVE:
                 return f"the controller {name} is {state}: ros2 control switch_controllers --activate {name}"
         return None
 
-    def _ask(self, link: RosbridgeLink) -> None:
-        """Ask for the states of the controllers; a server without that service is not asked again."""
+    def _query(self, link: RosbridgeLink) -> None:
+        """Query the states of the controllers; a server without that service is not queried again."""
         if not self._answers:
             return
         try:
@@ -203,7 +203,7 @@ class LiveReadiness:
         except (RemoteError, ProtocolError):
             self._answers = False
             return
-        except LinkLost:  # what was known may have changed
+        except LinkLost:  # the states may have changed
             self._states = None
             return
         listed: Any = answer.get("controller")
@@ -212,7 +212,7 @@ class LiveReadiness:
 
     @property
     def unknown(self) -> tuple[str, ...]:
-        """Topics, and the service of the controllers, that gave nothing readable."""
+        """Topics without a readable message, and the service of the controllers if its answer was unreadable."""
         letters = self.mailbox.newest()
         topics = (
             one.topic
@@ -225,12 +225,12 @@ class LiveReadiness:
 class DrivingSession:
     """The session of a client: opened by a service call, left at the end.
 
-    While it drives, a thread of its own renews the lease: a slow driver must not lose it.
+    While the client drives, a separate thread renews the lease, so that a slow policy does not lose it.
     """
 
     def __init__(self) -> None:
         self.tagger = Tagger()
-        """Signs for the open session; without a session, as for robots that are not served by us, it signs nothing."""
+        """Signs messages for the open session; without one, as for robots without sessions, it signs nothing."""
         self._link: RosbridgeLink | None = None  # of the open session
         self._thread: threading.Thread | None = None
         self._left = threading.Event()
@@ -249,7 +249,7 @@ class DrivingSession:
         return self._thread is not None
 
     def drive(self) -> None:
-        """Renew the lease from now on."""
+        """Start to renew the lease."""
         if self._link is not None and self._thread is None:
             self._left = threading.Event()
             self._thread = threading.Thread(target=self._renew, args=(self._left,), name="bam-lease", daemon=True)
@@ -260,14 +260,14 @@ class DrivingSession:
         self._left.set()
         if self._thread is not None:
             self._thread.join()
-        self._say(LEAVE)
+        self._send(LEAVE)
         self._link = self._thread = None
 
     def _renew(self, left: threading.Event) -> None:
         while not left.wait(_RENEW_EVERY):
-            self._say(RENEW)
+            self._send(RENEW)
 
-    def _say(self, word: str) -> None:
+    def _send(self, word: str) -> None:
         link = self._link
         if link is None:
             return

@@ -26,18 +26,18 @@ def live_robot(
     """A live robot behind its guards. Nothing is connected yet.
 
     Args:
-        url: ``ws://host:port`` or ``wss://host:port``, with a namespace behind it if its topics have one.
-        spec: What the task needs of it, such as the spec of its simulated robot; None: everything it measures.
-        profile: Its topics: a shipped name or a file. None: the shipped one that takes the commands of `spec`.
-        limits: How far the guards let it go; None: those of the profile.
+        url: ``ws://host:port`` or ``wss://host:port``, followed by the namespace of its topics, if any.
+        spec: Signals and commands that the task needs; None: all of the profile that are not optional.
+        profile: The profile of its topics: a shipped name or a file. None: the shipped one with the commands of `spec`.
+        limits: The limits of the guards; None: those of the profile.
         tool_position: Forward kinematics of an arm other than a UR5e, (n, k) [rad] to (n, 3) [m].
         command: Command mode, such as ``"trajectory"``; None: the profile's default.
         ca_file: PEM file of the authorities to trust instead of the system's.
         token_file: File with the server's shared secret.
 
     Raises:
-        InvalidValue: The address is not that of a robot, a file cannot be read, or the robot does not measure, or take,
-            what `spec` names.
+        InvalidValue: The address is not that of a robot, a file cannot be read, or the profile lacks a signal or
+            command of `spec`.
         UnknownName: There is no such profile, or no such command mode.
     """
     require_robot_address(url)
@@ -51,12 +51,12 @@ def live_robot(
 
 
 def profile_limits(profile: RobotProfile) -> Limits:
-    """How far the guards let the robot of `profile` go."""
+    """The limits of the guards for a robot of `profile`."""
     return Limits.of({"max_age": profile.max_age, **profile.limits})
 
 
 def require_robot_address(url: str) -> None:
-    """Check the form of a live robot's address: `InvalidValue` says what was expected."""
+    """Check the form of a live robot's address; `InvalidValue` names the expected form."""
     scheme, separator, rest = url.partition("://")
     if separator and scheme in ("ws", "wss"):
         return

@@ -1,7 +1,7 @@
-"""A live robot's camera: the newest image, decoded when it is asked for, on a connection of its own.
+"""A live robot's camera: the newest image, decoded on request.
 
-Images, compressed or raw, come as CBOR, on a connection and in a thread of their own: as JSON a raw one costs more time
-than a control period, and a compressed one holds up the commands and states behind it.
+Images, compressed or raw, arrive as CBOR on a separate connection with its own thread: as JSON a raw one takes longer
+than a control period, and a compressed one delays the commands and states behind it.
 """
 
 import time
@@ -21,7 +21,7 @@ from bam_envs.rosbridge.endpoint import Endpoint
 
 Pixels = NDArray[Any]
 FIRST_IMAGE = 3.0
-"""Longest wait for a first image, if the endpoint says nothing else [s]."""
+"""Longest wait for a first image, unless the endpoint has a timeout [s]."""
 _SLOT = "image"
 _COLOURS = {
     "rgb8": [0, 1, 2],
@@ -43,9 +43,9 @@ class CameraImage:
     pixels: Pixels
     """uint8, (height, width, 3 or 4) RGB or RGBA, (height, width) if grey; depth: float32, (height, width) [m]."""
     stamp: float | None
-    """When it was taken, on the camera's clock [s]; None without a stamp."""
+    """Time when it was taken, on the camera's clock [s]; None without a stamp."""
     number: int
-    """Counts the images that arrived."""
+    """Number of images that have arrived, this one included."""
 
 
 class LiveCamera:

@@ -1,7 +1,7 @@
 """A live robot behind a rosbridge server, driven over topics at a fixed rate.
 
-It has two connections: one carries states and commands, the other one only the halt, because a ROS 2 bridge holds back
-everything behind a service call that is running. While a connection is down, nothing is sent and nothing is kept.
+It has two connections: one carries states and commands, the other only the halt, because a ROS 2 bridge delays every
+message behind a running service call. While a connection is down, nothing is sent or queued.
 Longer than other modules because it is one object with one lifecycle: connect, reset, step, halt, close.
 """
 
@@ -45,19 +45,19 @@ Array = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
 _LOST_AFTER = 1.0
 _STATES = 5
-"""How many states of a topic should arrive in a period, and in the time after which one is too old."""
+"""Number of states of a topic that should arrive per period, and within the age at which a state is too old."""
 _ANSWER_TIMEOUT = 5.0
-"""Longest time that a robot in lockstep takes for a period, if the endpoint says nothing else [s]."""
+"""Longest time that a robot in lockstep takes for a period, unless the endpoint has a timeout [s]."""
 _RESET_TIMEOUT = 3.0
 """Longest wait for a fresh state, or for a scene to be set [s]."""
 _HALT_WAITS = 0.05
-"""Longest that a halt waits for a command that is being sent, so that it comes after it [s]."""
+"""Longest wait of a halt for a command that is being sent, so that the halt arrives after it [s]."""
 _BY_HAND = "stop it by hand if it moves; a robot with a command timeout stops by itself"
-_AS_SAID = ". Nothing was sent, and nothing is kept"
+_NOTHING_SENT = ". Nothing was sent, and nothing is kept"
 _FAR, _CANNOT_BE_FAR = 0.3, 1.0
-"""An arm that was commanded in the last second [s] cannot be farther than this [rad] from its command."""
+"""Farthest that an arm can be from a recent command [rad], and the greatest age of such a command [s]."""
 _LATE = ("expired", "old message", "old connection")
-"""How the robot's side reports that a command came too late: it holds, and the next command counts."""
+"""Reports of the robot's side that a command came too late: the robot holds, and the next command is executed."""
 
 
 class RosbridgeRobot:
@@ -86,7 +86,7 @@ class RosbridgeRobot:
         self.profile = profile.narrowed(self.spec.command.labels, command)
         self._mode, self._sinks = command, self.profile.sinks(command)
         self._info = RobotInfo(self.profile.name)
-        self._describes_itself = False  # and so hears halts, and has sessions
+        self._describes_itself = False  # such a robot takes halts and has sessions
         self._clock, self._state = clock, LiveState(self.profile, self.spec, clock)
         self._readiness: bringup.LiveReadiness | None = None  # of a robot that is real
         self._pacer, self._session = Pacer(self.spec.period, now=clock), bringup.DrivingSession()
@@ -96,13 +96,13 @@ class RosbridgeRobot:
         self._epoch = 0  # of the connection that was verified; another one needs a reset
         self._cut = threading.Event()
         self._sending, self._halts = threading.Lock(), 0
-        self._halt_failed = False  # and that was reported
+        self._halt_failed = False  # and the failure was reported
         self._commanded = False  # since `connect`
-        self._session_over = False  # as the robot's side said
+        self._session_over = False  # as the robot's side reported
         self._refusals: list[BamEnvsError] = []
         self._sent: Array | None = None
         self._sent_at = -math.inf
-        self._answers = False  # whether it reports which command it has executed, while its time goes on
+        self._answers = False  # whether it reports the commands it has executed, in real time
         self._owed: dict[int, float] = {}  # number of each command without an answer -> when it was sent [s]
 
     @property
@@ -112,17 +112,17 @@ class RosbridgeRobot:
 
     @property
     def info(self) -> RobotInfo:
-        """What the robot says of itself; known after `connect`."""
+        """The robot's description of itself; known after `connect`."""
         return self._info
 
     def connect(self) -> None:
-        """Open both connections, learn who is there, and check that every topic is what the profile says.
+        """Open both connections, read the robot's description, and check every topic against the profile.
 
         The robot is closed, and so halted, when Python ends.
 
         Raises:
             NoServer: There is no usable server.
-            ProtocolError: A topic is not what the profile says, or nobody listens to commands.
+            ProtocolError: A topic differs from the profile, or has no subscriber for commands.
             StaleState: A topic is silent.
         """
         if self._control is not None:
@@ -147,35 +147,35 @@ class RosbridgeRobot:
         halting.connect()
         service = self.namespace + INFO_SERVICE
         answer = bringup.ask(control, service)
-        said = None if answer is None else read_info(answer.get("message"), service)
-        self._describes_itself, self._info = said is not None, said or bringup.info_by_profile(self.url, self.profile)
-        if said is not None:
+        info = None if answer is None else read_info(answer.get("message"), service)
+        self._describes_itself, self._info = info is not None, info or bringup.info_by_profile(self.url, self.profile)
+        if info is not None:
             tagged = bringup.tagged_sinks(self.profile, self._mode)
-            self._sinks, self._answers = tagged or self._sinks, tagged is not None and not said.lockstep
-            if said.lockstep and tagged is None:
+            self._sinks, self._answers = tagged or self._sinks, tagged is not None and not info.lockstep
+            if info.lockstep and tagged is None:
                 raise InvalidValue(
-                    f"{said.name} goes on with each command, and its answers cannot be told apart: "
+                    f"{info.name} advances with each command, and its answers cannot be told apart: "
                     f"{self._mode or next(iter(self.profile.commands))} of the profile of {self.profile.name} has no "
                     "room for a tag. Give it a mode that has, such as stamped messages."
                 )
-            if said.lockstep and said.period is not None and said.period != self.spec.period:
+            if info.lockstep and info.period is not None and info.period != self.spec.period:
                 raise InvalidValue(
-                    f"{said.name} goes on {said.period:g} s with each command, and the task's period is "
-                    f"{self.spec.period:g} s. Serve the environment that the task is of."
+                    f"{info.name} advances {info.period:g} s with each command, and the task's period is "
+                    f"{self.spec.period:g} s. Serve the environment of this task."
                 )
         self._state.server_offset = lambda: control.clock_offset
         types = bringup.TopicTypes(control, self.profile, self._timeout)
         self._declare(control, halting, types)
-        self._readiness = bringup.LiveReadiness(self.profile, self._sinks, types) if said is None else None
+        self._readiness = bringup.LiveReadiness(self.profile, self._sinks, types) if info is None else None
 
     def _declare(self, control: RosbridgeLink, halting: RosbridgeLink, types: bringup.TopicTypes) -> None:
-        """Subscribe states and advertise commands, with the types that they have there."""
+        """Subscribe states and advertise commands, with their types on the server."""
         shared = {source.topic for source in self.profile.state if source.partial}
         fewest = int(1000 * min(self.spec.period, self.profile.max_age) / _STATES)
         for topic, kind in {source.topic: source.type for source in self._state.sources}.items():
             name = self.namespace + topic
             # A driver may send 500 states a second, and the queues of a busy bridge delay them all. Where several
-            # publish on a topic, the bridge might always drop the messages of the same one. A robot that describes
+            # publish on a topic, the bridge might always drop those of the same publisher. A robot that describes
             # itself sends no more than is needed.
             least = 0 if self._describes_itself or topic in shared else fewest
             listener, kind = self._state.listener(topic), types.check(name, kind)
@@ -188,7 +188,7 @@ class RosbridgeRobot:
         halting.advertise(self.namespace + HALT_TOPIC, "std_msgs/Empty")
 
     def _begin(self, control: RosbridgeLink) -> None:
-        """From now on this connection counts; messages of an older one do not."""
+        """Use this connection from now on, and ignore messages of an older one."""
         self._cut.clear()
         self._epoch = control.epoch
         self._state.forget_ages()
@@ -202,7 +202,7 @@ class RosbridgeRobot:
         self._sent = None
 
     def _open_session(self, control: RosbridgeLink) -> None:
-        """From now on commands are signed for a new session, if the robot's side has sessions."""
+        """Sign commands for a new session from now on, if the robot's side has sessions."""
         if self._describes_itself:
             self._session.open(control)
         self._session_over = False
@@ -214,7 +214,7 @@ class RosbridgeRobot:
             self._readiness.mailbox.clear()
 
     def _on_status(self, status: Mapping[str, Any]) -> None:
-        """The server, or the robot's side behind it, reports an error."""
+        """Take a status of the server, or of the robot's side behind it; `step` raises the first error."""
         if self._readiness is not None and self._readiness.owns(status, self.namespace):
             return
         if status.get("level") == "error":
@@ -229,11 +229,11 @@ class RosbridgeRobot:
                 self._state.mailbox.wake()
 
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
-        """A fresh state. Nothing real moves; a simulated robot is at rest, its object where `initial` says.
+        """A fresh state. A real robot does not move; a simulated one is put at rest, its object at its `initial` pose.
 
         Raises:
             LinkLost: The link is down.
-            NotReady: The robot says that it cannot move now.
+            NotReady: The robot reports that it cannot move now.
             RemoteError: The other end refused the scene.
             StaleState: No fresh state came.
         """
@@ -242,7 +242,7 @@ class RosbridgeRobot:
         if control.epoch != self._epoch or self._cut.is_set():
             self._begin(control)
         elif self._session_over or (self._session.is_driving and self._state.echo()[0] != self._session.tagger.session):
-            self._open_session(control)  # the robot's side began anew, and does not know the old one
+            self._open_session(control)  # the robot's side restarted and lost the session
         self._refusals.clear()
         self._require_ready(self.not_ready())
         if self.info.simulated:
@@ -261,7 +261,7 @@ class RosbridgeRobot:
         finally:
             rpc.close()
         before = {name: letter.number for name, letter in self._state.mailbox.newest().items()}
-        # Two more of each: one may have been under way when the scene was set.
+        # Two more of each signal: one may have been under way when the scene was set.
         self._await(lambda slots: all(slots[name].number >= number + 2 for name, number in before.items()))
 
     def _await(self, ready: Callable[[Mapping[str, Letter]], bool]) -> None:
@@ -279,10 +279,10 @@ class RosbridgeRobot:
         Raises:
             InvalidValue: The command did not pass the guards.
             LinkLost: A connection dropped, before or during this step; nothing more is sent until `reset`.
-            NotReady: The robot says that it cannot move now.
+            NotReady: The robot reports that it cannot move now.
             RemoteError: The robot's side refused a command; `NotInCommand` if another client is in command.
             StaleState: The robot did not answer in time.
-            ProtocolError: The state is not what the profile says.
+            ProtocolError: The state differs from the profile.
         """
         control, halts = self._connected(), self._halts
         if not isinstance(command, ClearedCommand):
@@ -290,7 +290,7 @@ class RosbridgeRobot:
         values = command.for_robot(self)[0]
         self._require_link()
         self._require_accepted()
-        lockstep = self.info.lockstep  # no time passes between commands: a late one does no harm until it is given up
+        lockstep = self.info.lockstep  # no time passes between commands: a late one is valid until the wait times out
         tag = self._session.tagger.next(self._epoch, self._answer_timeout if lockstep else self._command_life)
         self._pacer.tick()
         self._send(control, values, tag, halts)
@@ -322,7 +322,7 @@ class RosbridgeRobot:
                     self._owed[tag.sequence] = self._sent_at
 
     def measure(self) -> RobotState:
-        """The newest state, with the command that was sent last. Raises as `step`."""
+        """The newest state, with the command that was sent last. Raises the errors of `step`."""
         self._connected()
         signals, stamp = self._state.read()
         command = self._at_rest(signals) if self._sent is None else self._sent
@@ -334,7 +334,7 @@ class RosbridgeRobot:
         return 0.0 if self.info.lockstep and math.isfinite(age) else age
 
     def waiting(self) -> float:
-        """How long the robot has owed the answer to a command [s]; 0 if it owes none, or never answers."""
+        """Time since the oldest unanswered command was sent [s]; 0 if there is none, or the robot never answers."""
         session, answered = self._state.echo()
         if session == self._session.tagger.session:
             for number in list(self._owed):
@@ -344,10 +344,10 @@ class RosbridgeRobot:
         return self._clock() - owed[0] if owed else 0.0
 
     def halt(self) -> None:
-        """Stop moving and keep the link, on the connection that does nothing else. From any thread; never raises."""
+        """Stop moving and keep the link, over the separate connection. Thread-safe; never raises."""
         self._halts += 1
         halting = self._halting
-        self._owed.clear()  # commands that were not executed yet will not be
+        self._owed.clear()  # pending commands will not be executed
         if halting is None:
             return
         first = self._sending.acquire(timeout=_HALT_WAITS)
@@ -358,7 +358,7 @@ class RosbridgeRobot:
             self._halt_failed = False
         except BamEnvsError as error:  # reported once: several threads and `close` try it too
             if not self._halt_failed:
-                why = bare_reason(halting.url, error).removesuffix(_AS_SAID)
+                why = bare_reason(halting.url, error).removesuffix(_NOTHING_SENT)
                 _LOG.warning("%s: the halt could not be sent, %s: %s.", self.url, why, _BY_HAND)
             self._halt_failed = True
         finally:
@@ -366,9 +366,9 @@ class RosbridgeRobot:
                 self._sending.release()
 
     def _publish_hold(self, halting: RosbridgeLink) -> None:
-        """Send a robot that hears no halts what it holds with; what is not known is not commanded."""
+        """Send a robot without a halt topic a command to hold; unknown numbers are not commanded."""
         try:
-            # Going back to where the robot was some time ago would be a motion.
+            # Returning to an outdated position would be a motion.
             signals = self._state.read()[0] if self._state.age() <= self.profile.max_age else {}
         except BamEnvsError:  # the measurement cannot be read: hold what was sent
             signals = {}
@@ -379,7 +379,7 @@ class RosbridgeRobot:
                 hold[places] = np.nan if sent is None else sent[places]
         if sent is not None and self._clock() - self._sent_at <= _CANNOT_BE_FAR:
             joints = np.array([unit == "rad" for unit in self.spec.command.units])
-            if (np.abs(hold - sent)[joints] > _FAR).any():  # no guard lets it get so far: wrongly measured
+            if (np.abs(hold - sent)[joints] > _FAR).any():  # no guard allows such a gap: a wrong measurement
                 hold[joints] = sent[joints]
         tag = self._session.tagger.next(self._epoch, self._command_life)
         for sink in self._sinks:
@@ -388,7 +388,7 @@ class RosbridgeRobot:
                 halting.publish(self.namespace + topic, message)
 
     def _at_rest(self, signals: Mapping[str, Array]) -> Array:
-        """The command of a robot at rest: speeds 0, the rest as measured, NaN where it is not. Shape: (m,)."""
+        """The command of a robot at rest: speeds 0, the rest as measured, NaN if not measured. Shape: (m,)."""
         rest = np.full(len(self.spec.command.labels), np.nan)
         for place, name, column in measured_places(self.spec, self.spec.command.units) if signals else ():
             rest[place] = signals[name][0, column]
@@ -402,8 +402,8 @@ class RosbridgeRobot:
         return [self.spec.command.labels.index(label) for label in sink.labels]
 
     def close(self) -> None:
-        """Halt if anything was commanded from here, then drop both connections. Idempotent."""
-        if self._commanded:  # a client that only looked must not stop another one
+        """Halt if this client sent a command, then drop both connections. Idempotent."""
+        if self._commanded:  # a client that only reads must not stop the robot of another one
             self.halt()
         self._session.leave()
         control, halting = self._control, self._halting
@@ -420,7 +420,7 @@ class RosbridgeRobot:
         return self._control
 
     def _require_link(self) -> None:
-        """Both connections are up, and have been since `connect` or `reset`."""
+        """Raise `LinkLost` unless both connections have been up since `connect` or `reset`."""
         control, halting = self._connected(), self._halting
         if not control.is_up:
             self._halt_failed = self._commanded  # this error reports it
@@ -432,7 +432,7 @@ class RosbridgeRobot:
             raise LinkLost(f"{self.url}: the connection that halts the robot is down. Nothing is sent without it.")
 
     def not_ready(self) -> str | None:
-        """Why the robot cannot move now, as it says itself; None if it does not say so. May ask it: at rest only."""
+        """Why the robot reports that it cannot move now, or None. May call its services: only at rest."""
         control = self._control
         return None if control is None or self._readiness is None else self._readiness.not_ready(control)
 

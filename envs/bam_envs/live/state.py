@@ -1,10 +1,9 @@
-"""The newest messages of a live robot as its state, and how old that state is.
+"""The newest messages of a live robot as its state, and the age of that state.
 
-The network thread does nothing but put messages into a `Mailbox`; the thread that drives the robot decodes them.
+The network thread only puts messages into a `Mailbox`; the thread that drives the robot decodes them.
 
-The age of a message is judged twice, since its arrival and by its stamp, and the greater age counts. The clock of the
-stamps may differ from ours: the offset comes from the server's clock if the link knows it, and from the message that
-took the least time.
+The age of a message is the greater of two: since its arrival, and by its stamp. The clock of the stamps may differ from
+the local one: the offset comes from the server's clock if the link knows it, and from the message with the least delay.
 """
 
 import math
@@ -27,9 +26,9 @@ from bam_envs.rosbridge.bus import Caller, Listener, Message
 
 Array = NDArray[np.float64]
 _SIMULATED_BEFORE = 1e8
-"""An earlier stamp [s since 1970] comes from a simulator's clock, of any speed: it only has to go on."""
+"""An earlier stamp [s since 1970] comes from a simulator's clock, which may have any speed but must advance."""
 _OTHER_CLOCK = 60.0
-"""A stamp farther than this [s] from the server's clock comes from a clock that nobody set."""
+"""A stamp farther than this [s] from the server's clock comes from a clock that was never set."""
 
 
 @dataclass(frozen=True)
@@ -39,20 +38,20 @@ class Letter:
     message: Any
     """As it arrived, unchecked."""
     arrived: float
-    """When it arrived [s], our monotonic clock."""
+    """When it arrived [s], local monotonic clock."""
     number: int
-    """Counts the messages of its slot, from 1."""
+    """Position among the messages of its slot, from 1."""
 
 
 class Mailbox:
-    """The newest message of each signal, by name, for threads that look or wait; `clock` is monotonic [s]."""
+    """The newest message of each signal, by name, for threads that read or wait; `clock` is monotonic [s]."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._changed = clock, threading.Condition()
         self._slots: dict[str, Letter] = {}
 
     def put(self, names: Iterable[str], message: Any) -> None:
-        """Replace what is in the slots `names` by `message`, which arrives now."""
+        """Replace the content of the slots `names` by `message`, which arrives now."""
         with self._changed:
             arrived = self._clock()
             for name in names:
@@ -72,34 +71,34 @@ class Mailbox:
             self._changed.notify_all()
 
     def wake(self) -> None:
-        """Let whoever waits check its condition again."""
+        """Let waiting threads check their conditions again."""
         with self._changed:
             self._changed.notify_all()
 
     def wait_for(self, ready: Callable[[dict[str, Letter]], bool], timeout: float) -> bool:
-        """Wait until `ready` is true of the slots, at most `timeout` [s]; whether it became true."""
+        """Wait until `ready` is true of the slots, at most `timeout` [s]; False if it did not become true."""
         with self._changed:
             return self._changed.wait_for(lambda: ready(self._slots), timeout)
 
 
 class SourceAge:
-    """The newest message of one topic: its stamp, its tag, and how old it is.
+    """Stamp, tag and age of the newest message of one topic.
 
-    `wall_ahead` is our wall clock minus our monotonic one [s].
+    `wall_ahead` is the local wall clock minus the local monotonic clock [s].
     """
 
     def __init__(self, wall_ahead: float) -> None:
         self.stamp: float | None = None
-        """When it was measured, as it says [s]; None without a stamp, and before the first message."""
+        """Time of the measurement by the sender's clock [s]; None without a stamp, and before the first message."""
         self.tag: object = None
-        """What it says of the command that it answers; see `bam_envs.ros.freshness.read_echo`."""
+        """Tag with the command that it answers; see `bam_envs.ros.freshness.read_echo`."""
         self._quickest, self._wall_ahead = ClockOffset(), wall_ahead
         self._number, self._newest, self._measured = 0, -math.inf, -math.inf
 
     def look(self, letter: Letter, where: str, server_offset: float | None) -> None:
         """Read stamp and tag of a message of the topic `where`, if it is new; `ProtocolError` for a wrong stamp.
 
-        `server_offset` is our wall clock minus the server's [s]; None if it is not known.
+        `server_offset` is the local wall clock minus the server's [s]; None if it is not known.
         """
         if letter.number == self._number:
             return
@@ -107,7 +106,7 @@ class SourceAge:
         stamp = read_stamp(message, where)
         if stamp is None:
             self._measured = arrived
-        elif stamp != self._newest:  # a stamp that stands still is stale, however many messages repeat it
+        elif stamp != self._newest:  # a repeated stamp is stale, however many messages repeat it
             delay = 0.0
             if stamp >= _SIMULATED_BEFORE:
                 delay = self._quickest.age(stamp, arrived)
@@ -118,7 +117,7 @@ class SourceAge:
         self.stamp, self.tag, self._number = stamp, tag_text(message), letter.number
 
     def at(self, now: float) -> float:
-        """Age [s] at `now`, our monotonic clock; infinite if nothing came."""
+        """Age [s] at `now`, local monotonic clock; infinite before the first message."""
         return now - self._measured
 
 
@@ -137,7 +136,7 @@ class LiveState:
         self.sources = tuple(profile.source(signal.name) for signal in spec.signals)
         """Where each signal comes from, in the order of the spec."""
         self.server_offset: Callable[[], float | None] = lambda: None
-        """Our wall clock minus the server's [s], where it is known."""
+        """The local wall clock minus the server's [s], or None."""
         self._clock, self._wall = clock, wall
         self._sizes = {signal.name: len(signal.labels) for signal in spec.signals}
         self._heads: dict[tuple[str, tuple[str, ...]], Source] = {}  # the first signal of each message
@@ -149,32 +148,32 @@ class LiveState:
         self.forget_ages()
 
     def forget_ages(self) -> None:
-        """Forget ages: behind another connection there may be other clocks."""
+        """Forget ages: another connection may lead to other clocks."""
         ahead = self._wall() - self._clock()
         self._ages = {head.signal: SourceAge(ahead) for head in self._heads.values()}
 
     def listener(self, topic: str) -> Listener:
-        """The listener to subscribe `topic` with."""
-        mine = [source for source in self.sources if source.topic == topic]
+        """The listener for messages of `topic`."""
+        sources = [source for source in self.sources if source.topic == topic]
 
         def listen(message: Message, caller: Caller) -> None:
             names: Any = message.get("name") if isinstance(message, Mapping) else None
-            # On a shared topic the names say whose message it is; a malformed one counts for every source.
+            # On a shared topic the names identify the source of a message; a malformed one counts for every source.
             named = isinstance(names, Sequence)
-            ours = [one for one in mine if not (one.partial and named) or any(name in one.names for name in names)]
-            self.mailbox.put([source.signal for source in ours], message)
+            fits = [one for one in sources if not (one.partial and named) or any(name in one.names for name in names)]
+            self.mailbox.put([source.signal for source in fits], message)
 
         return listen
 
     def read(self) -> tuple[dict[str, Array], float]:
         """The newest values [SI] of each signal, shape (1, k), and the stamp of the first source that has one [s].
 
-        Without any stamp it is when the newest message arrived. `StaleState` if a signal has no message.
+        Without any stamp, the arrival of the newest message replaces it. `StaleState` if a signal has no message.
         """
         letters = self.mailbox.newest()
         for source in self.sources:
             if source.signal not in letters:
-                raise StaleState(f"{source.topic} ({source.type}): nothing came yet.")
+                raise StaleState(f"{source.topic} ({source.type}): no message yet.")
         self._look(letters)
         signals = {
             source.signal: decode_source(source, letters[source.signal].message, self._sizes[source.signal])[None]
@@ -200,7 +199,7 @@ class LiveState:
     def await_answer(self, tag: str, stop: Callable[[], bool], timeout: float) -> bool:
         """Wait until the command with the echo `tag` is answered, and no source is older than the answer.
 
-        Whether that happened within `timeout` [s], or `stop` became true; `Mailbox.wake` has it checked.
+        True if that happened, or `stop` became true, within `timeout` [s]; `Mailbox.wake` triggers a check of `stop`.
         """
 
         def is_answered(letters: Mapping[str, Letter]) -> bool:

@@ -1,8 +1,8 @@
 """The guards of an arm.
 
-They guarantee three things, whatever the arm is commanded: it stays inside its position limits; no joint goes beyond
-the farthest position that it was commanded to; and whatever slows one joint down slows all of them down, so that the
-arm keeps its direction.
+They guarantee three things for any commands: the arm stays inside its position limits; no joint goes beyond the
+farthest position that it was commanded to; and a limit that slows one joint slows all of them, so that the arm keeps
+its direction.
 """
 
 import math
@@ -18,13 +18,13 @@ Array = NDArray[np.float64]
 ROUNDING = 1 + 1e-9
 """A step that is exactly as long as its limit must not exceed it by floating point rounding."""
 _ROUNDS = 8
-"""How often a step is shortened until the tool is slow enough."""
+"""Most times that a step is shortened until the tool is slow enough."""
 JUMP = 0.05
-"""A joint may be measured this much farther away than it can have turned [rad]."""
+"""Tolerance of the measured change of a joint beyond its fastest turn [rad]."""
 
 
 def fastest_joints(spec: RobotSpec, limits: Limits, unlimited: float = math.inf) -> Array:
-    """Maximum speed of each joint [rad/s]: of the limits and of the data sheet; `unlimited` where neither has one."""
+    """Maximum speed of each joint (k,) [rad/s], the lower of limit and data sheet; `unlimited` without either."""
     fastest: Array = np.minimum(limits.joint_speed, max_rate(spec.command)[columns_in(spec.command, "rad")])
     return np.where(np.isfinite(fastest), fastest, unlimited)
 
@@ -76,7 +76,7 @@ class RampIn(Guard):
         self._left: int | None = None
 
     def restart(self) -> None:
-        """Look at the next command."""
+        """Treat the next command as the first."""
         self._left = None
 
     def limit(self, tick: Tick) -> bool:
@@ -150,7 +150,7 @@ class JointAcceleration(Guard):
 
 
 class GripperSpeed(Guard):
-    """The gripper's width changes by no more than it can in a period, from the last command or the measured width."""
+    """The gripper's width changes no faster than its data sheet allows, from the last command or the measured width."""
 
     number, name, unit = "G8", "gripper speed", "m/s"
 
@@ -167,7 +167,7 @@ class GripperSpeed(Guard):
 
 
 class MeasuredJump(Guard):
-    """A joint measured farther from its last position than it can have turned since then is a wrong measurement."""
+    """A joint that is measured farther from its last position than it can have turned is wrongly measured."""
 
     number, name, unit = "G7", "measured jump", "rad"
 
@@ -177,7 +177,7 @@ class MeasuredJump(Guard):
         self._labels = np.array(spec.command.labels)[self._joints]
 
     def fault(self, tick: Tick) -> str | None:
-        """Names the joint that jumped most."""
+        """Report the joint with the largest jump."""
         turned = np.abs(tick.measured - tick.before)[self._joints]
         most = self._fastest * (max(tick.period, tick.pause) + tick.age) + self.limit_value
         over = turned > most  # NaN: there was no tick before
@@ -191,12 +191,12 @@ class MeasuredJump(Guard):
 
 
 def tool_travel(tool_position: ToolPosition, here: Array, there: Array) -> float:
-    """How far the tool is at the joints `there` from where it is at `here` [m]."""
+    """Distance between the tool positions at the joints `here` and `there`, both (k,) [rad]; in m."""
     return math.dist(*tool_position(np.stack([here, there])))
 
 
 def within_reach(tool_position: ToolPosition, here: Array, there: Array, reach: float) -> Array:
-    """The joints `there`, or so much nearer to `here` that the tool goes `reach` [m] at most."""
+    """The joints `there` (k,), moved so near to `here` that the tool travels `reach` [m] at most."""
     near = there
     for _ in range(_ROUNDS):
         travel = tool_travel(tool_position, here, near)
@@ -222,7 +222,7 @@ def longest_step(distance: Array, change: float) -> Array:
 
 
 def _shorten(tick: Tick, joints: Any, reach: Any) -> bool:
-    """Shorten the step of all `joints` until none is longer than its `reach`; whether one was."""
+    """Shorten the step of all `joints` until none is longer than its `reach`; True if one was."""
     last = tick.last[joints]
     step = tick.command[joints] - last
     share = _least_share(reach, np.abs(step))
@@ -233,6 +233,6 @@ def _shorten(tick: Tick, joints: Any, reach: Any) -> bool:
 
 
 def _least_share(allowed: Any, wanted: Array) -> float:
-    """The largest number, at most 1, that makes all of `wanted` as small as `allowed`."""
+    """The largest factor, at most 1, that makes all of `wanted` as small as `allowed`."""
     over = wanted > allowed * ROUNDING
     return float((allowed / np.where(over, wanted, 1.0))[over].min()) if over.any() else 1.0

@@ -1,8 +1,8 @@
-"""Following (G23): a robot that does not follow its commands is held where it is, and stopped if that goes on.
+"""Following (G23): a robot that does not follow its commands is held in place, and stopped if that continues.
 
 A joint follows if it is behind its commands by no more than its known lag at its measured speed. The rest of the gap is
-how far it would jump when it is let go. At rest that is at most what the joint may go in a period, so that it never
-moves faster than its limit.
+its jump if whatever holds it lets go. At rest that is at most the joint's limit for one period, so that it never moves
+faster than its limit.
 """
 
 import math
@@ -17,9 +17,9 @@ from bam_envs.safety.guard import Guard, Limits, Tick, ToolPosition, clip, colum
 
 Array = NDArray[np.float64]
 SHARE = 0.75
-"""The gap that is allowed, as a share of how far the robot may go in a period."""
+"""The allowed gap, as a share of the limit for one period."""
 STRIKES = 3
-"""How often a robot is held for not following before it is stopped."""
+"""Number of times that a robot does not follow until it is stopped; fewer hold it."""
 FORGIVEN = 2.0
 """Following for this long [s] sets that count back to 0."""
 LIKELY = (
@@ -28,22 +28,22 @@ LIKELY = (
 
 
 class Following(Guard):
-    """What the guards of arms and bases share: recent commands, and how often the robot did not follow them."""
+    """Base class for arms and bases: the recent commands, and the number of times the robot did not follow them."""
 
     number = "G23"
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self._lag = spec.lag if limits.lag is None else limits.lag
-        # A command counts for a period from when it is sent, and the robot is behind it by its lag.
+        # A command lasts for a period after it is sent, and the robot is behind it by its lag.
         self._sent: deque[Array] = deque(maxlen=2 + ticks_of(self._lag, spec))
         self._strikes, self._good, self._forgiven = 0, 0, ticks_of(FORGIVEN, spec)
 
     def restart(self) -> None:
-        """The next command begins where the robot is."""
+        """Forget the commands: the next one begins at the robot's position."""
         self._sent.clear()
 
     def forgive(self) -> None:
-        """An episode begins, or a person resumed the robot."""
+        """Reset the count, when an episode begins or a person resumes the robot."""
         self._strikes = self._good = 0
 
     def off(self, sent: Array, measured: Array) -> Array:
@@ -54,7 +54,7 @@ class Following(Guard):
         return off
 
     def is_struck(self, over: bool) -> bool:
-        """Count a tick whose gap was `over` the limit; after `STRIKES` of them the robot is stopped."""
+        """Count a tick whose gap is `over` the limit; after `STRIKES` of them the robot is stopped."""
         if not over:
             self._good += 1
             self._strikes = 0 if self._good >= self._forgiven else self._strikes
@@ -87,7 +87,7 @@ class JointFollowing(Following):
         return reach
 
     def fault(self, tick: Tick) -> str | None:
-        """Names the joint, the gap, and what may be the cause."""
+        """Report the joint, the gap, and likely causes."""
         sent, measured = tick.last[self._joints], tick.measured[self._joints]
         off, allowed = self.off(sent, measured), SHARE * self._reach(tick)
         over = bool((np.abs(off) > allowed).any())  # NaN: it is not measured
@@ -103,13 +103,13 @@ class JointFollowing(Following):
         )
 
     def hold(self, tick: Tick) -> Array:
-        """Where the joints are, approached no faster than they may go."""
+        """The measured joints, approached no faster than the joints' limits. Shape: (m,)."""
         held: Array = tick.last.copy()
         held[self._joints] = self._near(tick, tick.measured[self._joints])
         return held
 
     def limit(self, tick: Tick) -> bool:
-        """Bring the command so near that a joint that is let go cannot jump: no farther than one step from there."""
+        """Bring the command within one step of the explained position, so that a released joint cannot jump."""
         wanted, measured = tick.command[self._joints], tick.measured[self._joints]
         ahead = np.clip(np.nan_to_num(tick.velocity[self._joints]), -self._fastest, self._fastest) * self._lag
         explained = measured + np.clip(wanted - measured, np.minimum(ahead, 0.0), np.maximum(ahead, 0.0))
@@ -117,7 +117,7 @@ class JointFollowing(Following):
         reach = self._reach(tick)
         near = np.clip(wanted, explained - reach, explained + reach)
         farther = (jump > np.abs(wanted - tick.last[self._joints]) + self._tolerance).any()
-        if farther and self._tool is not None:  # only as far from there as the tool may go in a period
+        if farther and self._tool is not None:  # at most the tool's limit for one period from there
             near = within_reach(self._tool, explained, near, self._tool_reach)
         if (near == wanted).all():
             return False
@@ -125,7 +125,7 @@ class JointFollowing(Following):
         return True
 
     def _near(self, tick: Tick, wanted: Array) -> Array:
-        """`wanted`, at most one step from the last command: what is measured may be wrong."""
+        """`wanted`, at most one step from the last command: the measurement may be wrong."""
         last, step = tick.last[self._joints], (self._slowest if tick.approach else self._fastest) * self._period
         near: Array = np.clip(wanted, last - step, last + step)
         return near
@@ -146,12 +146,12 @@ class BaseFollowing(Following):
         self._reached: Array | None = None  # speed of a base that follows as well as its acceleration allows
 
     def restart(self) -> None:
-        """The base may still be moving."""
+        """Forget the reached speed as well: the base may still be moving."""
         super().restart()
         self._reached = None
 
     def fault(self, tick: Tick) -> str | None:
-        """Names the measured speed and the commanded one."""
+        """Report the measured speed and the commanded one."""
         sent, measured = tick.last[self._columns], tick.measured[self._columns]
         before = measured if self._reached is None else self._reached
         self._reached = np.clip(sent, before - self._change, before + self._change)
@@ -160,7 +160,7 @@ class BaseFollowing(Following):
             return None
         at = int(np.argmax(off))
         return (
-            f"the base does not follow its commands: it goes at {measured[at]:.3f} {self.unit}, and was told "
+            f"the base does not follow its commands: it goes at {measured[at]:.3f} {self.unit}, and was sent "
             f"{sent[at]:.3f} {self.unit}; beyond a lag of {self._lag:g} s it may be off by {self._allowed[at]:.3f} "
             f"{self.unit}: {LIKELY}"
         )

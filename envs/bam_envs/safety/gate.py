@@ -3,7 +3,7 @@
 If a command or state cannot be used, the robot holds at once: an arm is sent its last command again, a base zero.
 Several such ticks in a row, or a measurement beyond the data sheet, stop the robot until a person calls `resume`.
 
-Longer than most files here: the gate stands beside the seal of what it lets through, so that nobody else can make one.
+Longer than most files: `SafeRobot` and `ClearedCommand` share a file so that no other module can clear a command.
 """
 
 import math
@@ -41,12 +41,12 @@ GRIPPER_TIME = 1.0
 GRIPPER_NEAR = 0.002
 """The gripper is open when it is this near to its widest [m]."""
 FRESH_LOOKS, FRESH_PAUSE = 50, 0.005
-"""How often a fresh state is looked for before a motion begins, and the time between two looks [s]."""
+"""Number of checks for a fresh state before a motion begins, and the time between two checks [s]."""
 
 
 @final
 class ClearedCommand(metaclass=Sealed):
-    """A command that passed the guards, for one robot and one tick; a `SafeRobot` makes it, and keeps its content."""
+    """A command that passed the guards, for one robot and one tick; made by a `SafeRobot`, which keeps its numbers."""
 
     __slots__ = ("__weakref__",)
 
@@ -60,7 +60,7 @@ class ClearedCommand(metaclass=Sealed):
         raise InvalidValue("A cleared command cannot be copied: it is good for one tick.")
 
     def for_robot(self, robot: object) -> Array:
-        """What to send to `robot` in this tick, read-only (1, m); `InvalidValue` for another one, and later."""
+        """The command to `robot` in this tick, read-only (1, m); `InvalidValue` for another robot, or a later tick."""
         if self not in _CLEARED:
             raise InvalidValue(
                 "The tick that this command was cleared for is over. Give the next one to the SafeRobot."
@@ -75,7 +75,7 @@ _CLEARED: weakref.WeakKeyDictionary[ClearedCommand, tuple[object, Array]] = weak
 
 
 def _clear(robot: object, command: Array) -> ClearedCommand:
-    """A copy of `command` (1, m) for `robot`, until it is taken out of `_CLEARED`."""
+    """Clear a copy of `command` (1, m) for `robot`, valid until it is removed from `_CLEARED`."""
     cleared, kept = object.__new__(ClearedCommand), command.copy()
     kept.flags.writeable = False
     _CLEARED[cleared] = robot, kept
@@ -86,20 +86,20 @@ def _clear(robot: object, command: Array) -> ClearedCommand:
 class SafeRobot(metaclass=Sealed):
     """One robot behind the guards of `default_guards`: a `Robot` around a `Robot`.
 
-    A live robot (one whose ``needs_clearance`` is true) is handed a `ClearedCommand`, any other a plain array. It has
+    A live robot (one whose ``needs_clearance`` is true) receives a `ClearedCommand`, any other a plain array. It has
     ``measure()``, the newest state; ``age()``, the age of that state [s]; and, if it answers commands, ``waiting()``,
-    how long it has owed the answer to one [s]. Its ``reset`` moves nothing: it measures.
+    the time since the oldest unanswered command [s]. Its ``reset`` only measures.
 
     Args:
         robot: One robot, simulated or live.
-        guards: Further guards, asked before the default ones, which have the last word.
-        limits: How far the guards let the robot go; those of a live robot are inside `guard.BOUNDS`.
+        guards: Further guards, applied before the default ones.
+        limits: The limits of the guards; those of a live robot are inside `guard.BOUNDS`.
         tool_position: Forward kinematics of an arm other than a UR5e, (n, k) [rad] to (n, 3) [m].
         clock: Monotonic clock [s].
 
     Raises:
         InvalidValue: Several robots, a joint that is not measured, a limit that no live robot may have, or a live robot
-            that stands behind guards already.
+            that has a `SafeRobot` already.
     """
 
     __slots__ = (
@@ -151,7 +151,7 @@ class SafeRobot(metaclass=Sealed):
         self._places = measured_places(robot.spec, command.units)
         self._speeds = measured_places(robot.spec, [f"{unit}/s" for unit in command.units])
         unmeasured = {*columns_in(command, "rad").tolist()} - {place for place, _, _ in self._places}
-        if unmeasured:  # the guards could not know where the arm is
+        if unmeasured:  # the guards need the position of the arm
             names = ", ".join(command.labels[at] for at in sorted(unmeasured))
             raise InvalidValue(f"The guards need {names} of {robot.spec.name} measured in rad; no signal has it.")
         self._report: dict[str, dict[str, Any]] = {}
@@ -162,7 +162,7 @@ class SafeRobot(metaclass=Sealed):
         self._bad, self._halts, self._status = 0, 0, ""
         self._sent_at: float | None = None
         self._forget()
-        if self._live is not None:  # of two gates, each would let a whole step through
+        if self._live is not None:  # two gates would each allow a whole step
             other = _GUARDED.get(robot)
             if other is not None and other() is not None:
                 raise InvalidValue(f"{self.spec.name} stands behind a SafeRobot already; command it through that one.")
@@ -178,26 +178,26 @@ class SafeRobot(metaclass=Sealed):
         )
 
     def _forget(self) -> None:
-        """Nothing is known of the robot."""
+        """Forget all states and commands."""
         self._state: RobotState | None = None
-        self._before: Array | None = None  # what was measured a tick ago
-        self._sent: Array | None = None  # what the robot was really sent last
-        self._last: Array | None = None  # the same; None where the next command begins at what is measured
+        self._before: Array | None = None  # measured values of the tick before
+        self._sent: Array | None = None  # the last command that the robot was sent
+        self._last: Array | None = None  # the same; None if the next command begins at the measured position
         self._speed = np.zeros(len(self.spec.command.labels))  # of the last command [unit/s]
 
     @property
     def spec(self) -> RobotSpec:
-        """Of the robot."""
+        """The spec of the robot."""
         return self._spec
 
     @property
     def num_robots(self) -> int:
-        """1."""
+        """Always 1."""
         return 1
 
     @property
     def limits(self) -> Limits:
-        """How far the guards let it go."""
+        """The limits of the guards."""
         return self._limits
 
     @property
@@ -207,11 +207,11 @@ class SafeRobot(metaclass=Sealed):
 
     @property
     def info(self) -> Any:
-        """What the robot says of itself, or None."""
+        """The robot's description of itself, or None."""
         return getattr(self._robot, "info", None)
 
     def not_ready(self) -> str | None:
-        """Why a live robot cannot move now, as it says itself; None if it does not say so. May ask it: at rest only."""
+        """Why a live robot reports that it cannot move now, or None. May call its services: only at rest."""
         why: str | None = getattr(self._live, "not_ready", lambda: None)()
         return why
 
@@ -231,11 +231,11 @@ class SafeRobot(metaclass=Sealed):
         self._robot.connect()
 
     def step(self, command: Array) -> RobotState:
-        """Send `command` (1, m), as far as the guards let it; the state one period later says what was sent.
+        """Send `command` (1, m), as limited by the guards; returns the state one period later, with the sent command.
 
         Raises:
             InvalidValue: It has another shape; nothing was sent.
-            ResetNeeded: Nothing is known of the robot yet.
+            ResetNeeded: No state is known yet.
             SafetyStop: A guard stopped the robot, now or earlier.
             StaleState: The same, because there was no fresh state.
         """
@@ -247,7 +247,7 @@ class SafeRobot(metaclass=Sealed):
         halts = self._halts
         try:
             tick = self._tick(goal, approach)
-        except RobotFault:  # nobody knows where it is, and a base would drive on
+        except RobotFault:  # its position is unknown, and a base would drive on
             self.halt()
             raise
         fault = self._fault(tick)
@@ -284,16 +284,16 @@ class SafeRobot(metaclass=Sealed):
 
     def _pause(self) -> float:
         """Time since the last command of a motion [s]; 0 for the first one, and in lockstep."""
-        sent_at = self._sent_at  # looked at once: a halt in another thread clears it
+        sent_at = self._sent_at  # read once: a halt in another thread clears it
         if self._live is None or sent_at is None or self._in_lockstep():
             return 0.0
         return self._clock() - sent_at
 
     def _begin_at(self, pause: float) -> Array:
-        """The last command if the robot still follows it; else where the robot is, at rest. Shape: (m,)."""
-        goes_on = self._sent_at is not None or self._live is None or self._in_lockstep()
-        last = self._last  # looked at once: a halt in another thread clears it
-        if last is not None and goes_on and pause <= LATE * self.spec.period:
+        """The last command if the robot still follows it, else its measured position, at rest. Shape: (m,)."""
+        in_motion = self._sent_at is not None or self._live is None or self._in_lockstep()
+        last = self._last  # read once: a halt in another thread clears it
+        if last is not None and in_motion and pause <= LATE * self.spec.period:
             return last
         if self._live is not None and self._state is not None:
             self._state = self._fresh_state()
@@ -303,7 +303,7 @@ class SafeRobot(metaclass=Sealed):
         elif self._sent is None:
             # A gripper that is not measured is taken as open; fingers may be measured a little beyond their range.
             last = np.clip(np.where(np.isfinite(measured), measured, command.high), command.low, command.high)
-        else:  # the gripper goes on holding
+        else:  # the gripper keeps its grip
             last, joints = self._sent.copy(), columns_in(command, "rad")
             last[joints] = measured[joints]
         self._last, self._speed, self._before = last, np.zeros_like(last), None
@@ -311,7 +311,7 @@ class SafeRobot(metaclass=Sealed):
         return last
 
     def _measured(self, places: list[tuple[int, str, int]]) -> Array:
-        """What is measured at `places`, for each number of the command; NaN where nothing is. Shape: (m,)."""
+        """The measured value of each number of the command, from `places`; NaN if not measured. Shape: (m,)."""
         if self._state is None:
             raise ResetNeeded("Nothing is known of the robot yet. Call reset() first.")
         measured = np.full(len(self.spec.command.labels), np.nan)
@@ -320,13 +320,13 @@ class SafeRobot(metaclass=Sealed):
         return measured
 
     def _fresh_state(self) -> RobotState:
-        """The newest state, or `StaleState`: even holding where the robot was some time ago would be a motion.
+        """The newest state, or `StaleState`: even holding an outdated position would be a motion.
 
-        An old one is waited out briefly: after a pause of this process newer ones lie unread.
+        Waits briefly for a newer one: after a pause of this process, messages may be unread.
         """
         limit = next(guard.limit_value for guard in self._guards if isinstance(guard, Freshness))
         for _ in range(FRESH_LOOKS):
-            age = self.age()  # asked first: what is measured afterwards can only be newer
+            age = self.age()  # read first: a later measurement can only be newer
             state: RobotState = self._live.measure()
             if age <= limit:
                 return state
@@ -365,12 +365,12 @@ class SafeRobot(metaclass=Sealed):
             if guard.limit(tick) and not tick.approach:
                 self._note(guard, "altered")
 
-    def _note(self, guard: Guard, what: str) -> None:
+    def _note(self, guard: Guard, effect: str) -> None:
         self._status = guard.title
-        self._report[guard.name][what] += 1
+        self._report[guard.name][effect] += 1
 
     def _hold(self, tick: Tick, guard: Guard, reason: str) -> None:
-        """Send what leaves the robot where it is; stop the robot if that has happened too often."""
+        """Send a command that holds the robot in place; stop the robot after too many ticks in a row."""
         self._note(guard, "held")
         self._bad += 1
         if self._bad >= guard.patience:
@@ -379,7 +379,7 @@ class SafeRobot(metaclass=Sealed):
         tick.last = tick.command  # at rest: the next command begins there
 
     def _send(self, tick: Tick, halts: int) -> RobotState:
-        """Hand the command over; if anything goes wrong, the robot is halted."""
+        """Send the command; halt the robot if that fails."""
         cleared = _clear(self._robot, tick.command[None])
         handed: Any = tick.command[None].copy() if self._live is None else cleared
         done, self._sent_at = False, self._clock()
@@ -406,8 +406,8 @@ class SafeRobot(metaclass=Sealed):
         self.halt()
         self._report[guard.name]["stopped"] += 1
         why = self.not_ready()
-        said = "" if why is None else f"not ready: {why}: "
-        self._stopped = guard.name, f"{guard.title}: {said}{reason}"
+        readiness = "" if why is None else f"not ready: {why}: "
+        self._stopped = guard.name, f"{guard.title}: {readiness}{reason}"
         message = f"The robot was stopped by {self._stopped[1]}. When it is safe, call resume()."
         if isinstance(guard, Freshness):
             raise StaleState(message, self.age(), guard.limit_value)
@@ -419,7 +419,7 @@ class SafeRobot(metaclass=Sealed):
             raise SafetyStop(name, f"The robot is still stopped by {reason}. When it is safe, call resume().")
 
     def resume(self) -> None:
-        """Let a stopped robot move again, from where it is. A person decides this, never a program."""
+        """Let a stopped robot move again, from its position. A person decides this, never a program."""
         self._stopped, self._bad, self._last, self._sent_at, self._before = None, 0, None, None, None
         self._restart(forgive=True)
 
@@ -428,7 +428,7 @@ class SafeRobot(metaclass=Sealed):
 
         Raises:
             InvalidValue: The start pose is outside the position limits; nothing moved.
-            StartNotReached: The arm was not there in time; carries the joints.
+            StartNotReached: The arm was not there in time; the error holds the joints.
             SafetyStop: A guard stopped the robot, now or earlier.
         """
         self._require_free()
@@ -441,14 +441,14 @@ class SafeRobot(metaclass=Sealed):
         state = self._take(self._robot.reset(env_ids, initial))
         if start is not None and (self._joints_off(start) or not self._is_open()):
             self._approach(start)
-            state = self._take(self._robot.reset(env_ids, initial))  # put back what the arm may have pushed
+            state = self._take(self._robot.reset(env_ids, initial))  # put back objects that the arm may have pushed
         self._restart(forgive=True)
         begin = self._begin_at(self._pause())
-        self._sent_at = None  # the first command may take its time
+        self._sent_at = None  # the first command may come at any time
         return replace(_copied(state), command=begin[None].copy())
 
     def _take(self, state: RobotState) -> RobotState:
-        """Begin anew with `state`."""
+        """Restart from `state`."""
         self._state, self._before, self._bad, self._status = state, None, 0, ""
         self._require_in_range(state)
         return state
@@ -469,18 +469,18 @@ class SafeRobot(metaclass=Sealed):
         return start
 
     def _joints_off(self, start: Array) -> dict[str, float]:
-        """The joints that are not measured at `start` (m,), with how far they have to go [rad]."""
+        """The joints that are not measured at `start` (m,), with their remaining distance [rad]."""
         far, near = start - self._measured(self._places), self.limits.reset_tolerance
         columns = columns_in(self.spec.command, "rad")
         return {self.spec.command.labels[at]: float(far[at]) for at in columns if not abs(far[at]) <= near}
 
     def _is_open(self) -> bool:
-        """Whether the gripper is measured open; one that is not measured (NaN) is not waited for."""
+        """Whether the gripper is measured open; one that is not measured (NaN) counts as open."""
         far = np.array(self.spec.command.high) - self._measured(self._places)
         return not (np.abs(far)[columns_in(self.spec.command, "m")] > GRIPPER_NEAR).any()
 
     def _approach(self, start: Array) -> None:
-        """Open the gripper where the arm is, then go to `start` (m,)."""
+        """Open the gripper with the arm in place, then go to `start` (m,)."""
         joints, grippers = columns_in(self.spec.command, "rad"), columns_in(self.spec.command, "m")
 
         def is_reached() -> bool:  # all joints are measured there, and were sent there
@@ -499,15 +499,15 @@ class SafeRobot(metaclass=Sealed):
             self.halt()
             off, why = self._joints_off(start), self.not_ready()
             where = ", ".join(f"{name} is {far:+.3f} rad from it" for name, far in off.items()) or "it is on its way"
-            said = "" if why is None else f"Not ready: {why}. "
+            readiness = "" if why is None else f"Not ready: {why}. "
             raise StartNotReached(
-                f"{said}The arm did not reach its start pose in {self.limits.reset_timeout:g} s: {where}. "
+                f"{readiness}The arm did not reach its start pose in {self.limits.reset_timeout:g} s: {where}. "
                 "Look for what holds it, or raise the limit reset_timeout.",
                 off,
             )
 
     def halt(self) -> None:
-        """Stop moving and keep the link; the next command begins where the robot is. From any thread; never raises."""
+        """Stop moving and keep the link; the next command begins at the robot's position. Thread-safe; never raises."""
         self._halts += 1
         self._last = self._sent_at = None
         self._robot.halt()
@@ -528,5 +528,5 @@ def _copied(state: RobotState) -> RobotState:
 
 
 def _copy(tick: Tick) -> Tick:
-    """The tick for a user's guard: only what the guard does to the command is taken over."""
+    """A copy of the tick for a user's guard, which may change the command only."""
     return replace(tick, **{name: value.copy() for name, value in vars(tick).items() if isinstance(value, np.ndarray)})

@@ -1,4 +1,4 @@
-"""What a guard is and what it looks at, and the limits up to which guards let a robot go."""
+"""The base class of guards, the tick that a guard checks, and the limits of a robot."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 ToolPosition = Callable[[Array], Array]
 """Forward kinematics: joints (n, k) [rad] to tool positions (n, 3) [m]."""
 LONGEST_PERIOD = 1.0
-"""Longest time between two commands to a live robot [s]: a command may go as far as its limits allow in that time."""
+"""Longest time between two commands to a live robot [s]: a robot may move for that long before the next check."""
 
 
 _ABOVE_ZERO = Annotated[float, Meta(gt=0, description="a number above 0")]
@@ -29,14 +29,14 @@ _FINITE = Annotated[float, Meta(gt=0, le=sys.float_info.max, description="a fini
 
 
 def _limit(default: float | None, least: float, most: float, unit: str, *, finite: bool = False) -> Any:
-    """A limit, with the minimum and maximum that a live robot may have; `finite` if it cannot be switched off."""
+    """A limit, with its minimum and maximum for a live robot; `finite` if it cannot be disabled."""
     kind: Any = _FINITE if finite else _ABOVE_ZERO
     return field(default=default, metadata={"bounds": (least, most, unit), "type": kind if default else kind | None})
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How far the guards let a robot go; infinity switches a speed, an acceleration, an age or a count off."""
+    """The limits of the guards; infinity disables a limit on a speed, an acceleration, an age or a count."""
 
     position_margin: float = _limit(0.1, 0.01, 1.0, "rad", finite=True)
     """Distance of the joints from the ends of their travel [rad]."""
@@ -55,17 +55,17 @@ class Limits:
     turn_acceleration: float = _limit(3.2, 0.1, 5.0, "rad/s^2")
     """Maximum turning acceleration of a base [rad/s^2]."""
     max_age: float | None = _limit(None, 0.01, 1.0, "s")
-    """Age of the oldest state that is acted on [s]; None for 0.1 of an arm and 0.5 of a base."""
+    """Maximum age of a state [s]; None: 0.1 for an arm, 0.5 for a base."""
     bad_ticks: float = _limit(3, 1.0, 10.0, "ticks")
-    """This many commands in a row that are not finite stop the robot."""
+    """Number of commands in a row that are not finite after which the robot is stopped."""
     hold_time: float = _limit(0.5, 0.05, 2.0, "s")
-    """How long the robot is held without a fresh state, or without an answer, before it is stopped [s]."""
+    """Time for which the robot is held without a fresh state, or without an answer, before it is stopped [s]."""
     max_pause: float = _limit(1.0, 0.1, 5.0, "s")
-    """Longest time between two commands after which the robot is not stopped [s]."""
+    """Maximum time between two commands; a longer pause stops the robot [s]."""
     answer_time: float = _limit(0.3, 0.05, 2.0, "s")
-    """Longest time in which a robot that answers commands has to answer one [s]."""
+    """Maximum time for the answer to a command, of a robot that answers commands [s]."""
     lag: float | None = _limit(None, 0.001, 0.5, "s")
-    """How far a robot that follows is behind its commands [s]; None for the lag in its spec."""
+    """Delay of the measured position behind the commands [s]; None: the lag in the robot's spec."""
     follow_tolerance: float = _limit(0.005, 0.001, 0.05, "rad", finite=True)
     """How far a joint at rest may be from its command, where `joint_speed` times the period is less [rad]."""
     reset_speed: float = _limit(0.25, 0.01, 1.0, "rad/s", finite=True)
@@ -100,7 +100,7 @@ class Limits:
         return limits
 
     def require_bounded(self) -> None:
-        """`InvalidValue` if a limit is outside `BOUNDS`, in which those of live robots are."""
+        """`InvalidValue` if a limit is outside `BOUNDS`, as no limit of a live robot may be."""
         for name, (least, most, unit) in BOUNDS.items():
             value = getattr(self, name)
             if value is not None and not least <= value <= most:
@@ -112,7 +112,7 @@ class Limits:
 BOUNDS: Mapping[str, tuple[float, float, str]] = MappingProxyType(
     {one.name: one.metadata["bounds"] for one in fields(Limits)}
 )
-"""Minimum and maximum of each limit of a live robot, with its unit, whoever sets it: no typing error opens a guard."""
+"""Minimum, maximum and unit of each limit of a live robot: no typing error can disable a guard."""
 
 
 def require_bounded(limits: Limits, spec: RobotSpec) -> None:
@@ -142,27 +142,27 @@ class Tick:
     """One command on its way through the guards. Arrays have shape (m,)."""
 
     goal: Array
-    """Where the command wants the robot to be; inside the position limits from `PositionLimits` on."""
+    """Goal of the command; inside the position limits from `PositionLimits` on."""
     command: Array
-    """What will be sent, as far as the guards have changed it."""
+    """Command to send, as changed by the guards so far."""
     last: Array
-    """What was sent last, or what was measured if nothing was sent."""
+    """Command that was sent last, or the measured values if none was sent."""
     last_step: Array
-    """How far the last command went in a time of `period`."""
+    """Change of the last command in a time of `period`."""
     measured: Array
     """The measured value of each number of the command; NaN where nothing is measured."""
     before: Array
-    """`measured` one tick ago."""
+    """`measured` one tick before."""
     velocity: Array
     """Measured rate of change of each number of the command [unit/s]; NaN where nothing is measured."""
     age: float
     """Age of the newest state [s]."""
     period: float
-    """Time for which the command counts [s]: since the last one was sent, and at most one period of the robot."""
+    """Duration of the command [s]: the time since the last one was sent, at most one period of the robot."""
     pause: float = 0.0
     """Time since the last command was sent [s]; 0 for the first one, and where time passes only with commands."""
     waiting: float = 0.0
-    """How long the robot has owed the answer to a command [s]; 0 if it owes none, or never answers."""
+    """Time since the oldest unanswered command was sent [s]; 0 if there is none, or the robot never answers."""
     approach: bool = False
     """Whether the robot is on its way to a start pose."""
 
@@ -178,41 +178,41 @@ class Sealed(type):
 
 
 class Guard(metaclass=Sealed):
-    """One rule that allows everything: a subclass overrides what it restricts."""
+    """Base class of guards, which allows everything; subclasses override its methods to restrict commands."""
 
     number: str
-    """As in the table of guards in the documentation, ``"G8"``."""
+    """Number in the table of guards in the documentation, such as ``"G8"``."""
     name: str
     unit: str
     limit_value: float
     """The limit, in `unit`."""
     patience: float = 1
-    """This many faults in a row stop the robot; before that it is held."""
+    """Number of faults in a row that stop the robot; fewer hold it."""
 
     @property
     def title(self) -> str:
-        """Name and number, as messages have them: ``joint speed (G8)``."""
+        """Name and number for messages: ``joint speed (G8)``."""
         return f"{self.name} ({self.number})"
 
     def restart(self) -> None:
-        """The robot was connected, reset or halted: the next command begins where the robot is."""
+        """Forget the motion: after a connection, reset or halt the next command begins at the robot's position."""
 
     def fault(self, tick: Tick) -> str | None:
         """Why `tick` must not be executed at all, or None."""
         return None
 
     def hold(self, tick: Tick) -> Array:
-        """What an arm is sent if `tick` is not executed: by default the last command again. Shape: (m,)."""
+        """The command to an arm if `tick` is not executed: by default the last command again. Shape: (m,)."""
         held: Array = tick.last.copy()
         return held
 
     def limit(self, tick: Tick) -> bool:
-        """Bring ``tick.command`` inside the limit; whether that changed it."""
+        """Bring ``tick.command`` inside the limit; True if that changed it."""
         return False
 
 
 def clip(tick: Tick, columns: Any, low: Array, high: Array) -> bool:
-    """Clip `columns` of the command to `low` and `high`; whether that changed it."""
+    """Clip `columns` of the command to `low` and `high`; True if that changed it."""
     wanted = tick.command[columns]
     tick.command[columns] = clipped = np.clip(wanted, low, high)
     return bool((clipped != wanted).any())
@@ -224,12 +224,12 @@ def columns_in(signal: SignalSpec, unit: str) -> NDArray[np.int64]:
 
 
 def is_base(spec: RobotSpec) -> bool:
-    """Whether commands are speeds of a base; else they are positions of an arm's joints."""
+    """True if commands are speeds of a base, False if they are positions of an arm's joints."""
     return "m/s" in spec.command.units
 
 
 def ticks_of(seconds: float, spec: RobotSpec) -> int:
-    """The periods in a time [s], rounded up."""
+    """Number of periods in a time [s], rounded up."""
     return math.ceil(seconds / spec.period - 1e-9)
 
 
@@ -239,7 +239,7 @@ def max_rate(command: SignalSpec) -> Array:
 
 
 def position_range(spec: RobotSpec, limits: Limits) -> tuple[Array, Array]:
-    """Lowest and highest command, with the margin of the joints taken off; `InvalidValue` if that leaves no room."""
+    """Lowest and highest command (m,), less the margin of the joints; `InvalidValue` if that leaves no room."""
     margin = np.where([unit == "rad" for unit in spec.command.units], limits.position_margin, 0.0)
     low, high = np.array(spec.command.low) + margin, np.array(spec.command.high) - margin
     if (low > high).any():
@@ -249,7 +249,7 @@ def position_range(spec: RobotSpec, limits: Limits) -> tuple[Array, Array]:
 
 
 def measured_places(spec: RobotSpec, units: Sequence[str]) -> list[tuple[int, str, int]]:
-    """Index in the command, signal, and column of the first signal that has the same label in that one of `units`."""
+    """For each measured number of the command: its index, and the first signal and column with its label and unit."""
     measured = {
         pair: (signal.name, column)
         for signal in reversed(spec.signals)

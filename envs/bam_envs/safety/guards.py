@@ -1,6 +1,6 @@
 """The guards between a live robot and its commands, in one list: `default_guards`.
 
-All of them look at one robot and at the last command that was *sent*; speeds and accelerations hold over the real time
+Each guard checks one robot against the last command that was *sent*; speeds and accelerations are over the real time
 since then.
 """
 
@@ -19,18 +19,18 @@ from bam_envs.safety.guard import Guard, Limits, Tick, ToolPosition, clip, colum
 
 Array = NDArray[np.float64]
 LATE = 2.0
-"""After this many periods without a command a live robot need not be where it was going: its watchdog may have stopped
-it."""
+"""After this many periods without a command a live robot may be short of its last command: its watchdog may have
+stopped it."""
 LATE_TICKS = 10
 """This many late commands in a row stop the robot."""
 MEASURED_MARGIN = 1.3
-"""A measured speed may be this many times its limit: commands keep the limit, and controllers overshoot a little."""
+"""A measured speed may be this many times its limit: controllers overshoot commands slightly."""
 MEASURED_PATIENCE = 3
-"""Ticks: a network that bunches commands up has them executed within one, and a robot that is held slows down."""
+"""Faults in a row before a stop: a robot may execute bunched commands within one tick, and slows down when held."""
 
 
 class Shape(Guard):
-    """A command has one number for each label. Another shape is a bug in the program, and raises at once."""
+    """A command has one number for each label. Any other shape is a bug in the program, and raises at once."""
 
     number, name, unit = "G2", "shape", "numbers"
 
@@ -38,7 +38,7 @@ class Shape(Guard):
         self.limit_value = len(spec.command.labels)
 
     def numbers(self, command: Array) -> Array:
-        """A copy of `command` (1, m) as numbers (m,); `InvalidValue` for another shape, and for what are no numbers."""
+        """A copy of `command` (1, m) as numbers (m,); `InvalidValue` if it has another shape or is not numeric."""
         try:
             array = np.array(command, dtype=np.float64)
         except (TypeError, ValueError) as error:
@@ -60,7 +60,7 @@ class Finite(Guard):
         self._labels = spec.command.labels
 
     def fault(self, tick: Tick) -> str | None:
-        """Names the numbers that are not finite."""
+        """Report the numbers that are not finite."""
         finite = np.isfinite(tick.goal)
         if finite.all():
             return None
@@ -69,7 +69,7 @@ class Finite(Guard):
 
 
 class Freshness(Guard):
-    """While the newest state is too old, nobody knows where the robot is, and no new command is sent."""
+    """While the newest state is too old, the robot's position is unknown, and no new command is sent."""
 
     number, name, unit = "G3", "state age", "s"
 
@@ -78,7 +78,7 @@ class Freshness(Guard):
         self.patience = ticks_of(limits.hold_time, spec)
 
     def fault(self, tick: Tick) -> str | None:
-        """Says how old the state is."""
+        """Report the age of the state."""
         if tick.age <= self.limit_value:
             return None
         return f"the newest state is {tick.age:.3f} s old, and at most {self.limit_value:g} s are allowed"
@@ -93,7 +93,7 @@ class Pace(Guard):
         self.limit_value, self._period = limits.max_pause, spec.period
 
     def fault(self, tick: Tick) -> str | None:
-        """Says how late the command is."""
+        """Report the delay of the command."""
         if tick.pause <= LATE * self._period:
             return None
         self.patience = 1 if tick.pause > self.limit_value else LATE_TICKS
@@ -104,7 +104,7 @@ class Pace(Guard):
 
 
 class Answers(Guard):
-    """A robot that reports which command it has executed does so in time; else commands do not arrive, or too late."""
+    """A robot that answers commands does so in time; otherwise commands arrive too late or not at all."""
 
     number, name, unit = "G4", "answer to a command", "s"
 
@@ -112,12 +112,12 @@ class Answers(Guard):
         self.limit_value, self.patience = limits.answer_time, ticks_of(limits.hold_time, spec)
 
     def fault(self, tick: Tick) -> str | None:
-        """Says how long the answer has been missing."""
+        """Report the age of the unanswered command."""
         if tick.waiting <= self.limit_value:
             return None
         return (
             f"a command that was sent {tick.waiting:.3f} s ago is not answered, and at most {self.limit_value:g} s are "
-            "allowed: commands do not arrive, or late; look at the network and at who else commands the robot"
+            "allowed: commands arrive late or not at all; check the network, and other clients that command the robot"
         )
 
 
@@ -134,7 +134,7 @@ class BaseSpeed(Guard):
         self.limit_value = float(self._high.max())
 
     def limit(self, tick: Tick) -> bool:
-        """Clip this speed; the other one stays."""
+        """Clip this speed; the other one is unchanged."""
         return clip(tick, self._columns, self._low, self._high)
 
 
@@ -150,7 +150,7 @@ class BaseAcceleration(Guard):
         self.limit_value, self._fastest = float(fastest.max()), fastest
 
     def limit(self, tick: Tick) -> bool:
-        """Clip the speed around the last one."""
+        """Clip the speed to the range around the last one."""
         last, change = tick.last[self._columns], self._fastest * tick.period
         low = np.where(last > 0, np.minimum(0.0, last - change), last - change)
         high = np.where(last < 0, np.maximum(0.0, last + change), last + change)
@@ -168,11 +168,11 @@ class MeasuredSpeed(Guard):
         self._before: Array | None = None
 
     def restart(self) -> None:
-        """The mean needs two ticks."""
+        """Forget the last tick: the mean needs two."""
         self._before = None
 
     def fault(self, tick: Tick) -> str | None:
-        """Says how fast the robot is."""
+        """Report the measured speed."""
         now = np.abs(self._speeds(tick))
         before, self._before = self._before, now
         if before is None:
@@ -194,7 +194,7 @@ class MeasuredLimits(Guard):
         self._ranges = {one.name: (np.array(one.low), np.array(one.high)) for one in self._watched}
 
     def trip(self, state: RobotState) -> str | None:
-        """Why a robot that measured `state` must be stopped: the first number that is outside; or None."""
+        """The first number of `state` that is outside its range, as the reason for a stop; or None."""
         for signal in self._watched:
             low, high = self._ranges[signal.name]
             values = state.signals[signal.name][0]
@@ -211,12 +211,12 @@ class MeasuredLimits(Guard):
 def default_guards(
     spec: RobotSpec, limits: Limits | None = None, *, tool_position: ToolPosition | None = None
 ) -> list[Guard]:
-    """Every guard that a robot of `spec` has, in the order in which they are asked.
+    """The guards of a robot of `spec`, in the order in which they are applied.
 
     Args:
         spec: An arm is commanded in rad, a base in m/s and rad/s.
-        limits: How far they let it go.
-        tool_position: Forward kinematics; those of a UR5e are known.
+        limits: The limits of the guards.
+        tool_position: Forward kinematics, (n, k) [rad] to (n, 3) [m]; None only for a UR5e.
 
     Raises:
         InvalidValue: The command has numbers that no guard limits, or the tool of an arm would have no speed limit.
@@ -226,8 +226,8 @@ def default_guards(
     if not (units == speeds if is_base(spec) else "rad" in units and not units & speeds):
         found = ", ".join(dict.fromkeys(spec.command.units))
         raise InvalidValue(
-            f"The command of {spec.name} cannot be guarded: a base is told m/s and rad/s and nothing else, an arm rad "
-            f"and no speeds; found {found}."
+            f"The command of {spec.name} cannot be guarded: a base takes m/s and rad/s only, an arm takes rad and no "
+            f"speeds; found {found}."
         )
     moving = _base_guards(spec, limits) if is_base(spec) else _arm_guards(spec, limits, tool_position)
     first = [Finite(spec, limits), Freshness(spec, limits), Pace(spec, limits), Answers(spec, limits)]
@@ -258,14 +258,14 @@ def _arm_guards(spec: RobotSpec, limits: Limits, tool_position: ToolPosition | N
 
 
 def _kinematics(spec: RobotSpec, tool_position: ToolPosition | None) -> ToolPosition:
-    """Forward kinematics; `InvalidValue` if they are not known, or say that the tool stays when the joints turn."""
+    """Forward kinematics; `InvalidValue` if they are not known, or the tool stays in place when the joints turn."""
     joints = columns_in(spec.command, "rad")
     if tool_position is None:
         if tuple(np.array(spec.command.labels)[joints]) == UR_JOINTS:
             return UR5E_GRIPPER.tool_position
         raise InvalidValue(
             f"The tool speed of {spec.name} cannot be limited: its kinematics are not known. "
-            "Give tool_position=; a simulated robot may do with the limit tool_speed = inf."
+            "Give tool_position=; a simulated robot may have the limit tool_speed = inf."
         )
     middle = (np.array(spec.command.low) + np.array(spec.command.high))[joints] / 2
     turned = tool_position(middle + 0.5 * np.vstack([np.zeros_like(middle), np.eye(len(middle))]))

@@ -70,7 +70,7 @@ def test_before_everything_came(state):
     assert state.age() == np.inf
     with pytest.raises(StaleState) as caught:
         state.read()
-    assert str(caught.value) == "/gripper/joint_states (sensor_msgs/JointState): nothing came yet."
+    assert str(caught.value) == "/gripper/joint_states (sensor_msgs/JointState): no message yet."
 
 
 def test_age_since_arrival(state, clock):

@@ -189,7 +189,7 @@ def test_a_base_that_does_not_follow_is_told_to_stand_and_stopped():
     assert caught.value.guard == "base following"
     assert str(caught.value) == (
         "The robot was stopped by base following (G23): the base does not follow its commands: it goes at 0.000 m/s, "
-        "and was told 0.200 m/s; beyond a lag of 0 s it may be off by 0.150 m/s: look for a protective stop, a paused "
+        "and was sent 0.200 m/s; beyond a lag of 0 s it may be off by 0.150 m/s: look for a protective stop, a paused "
         "program, an inactive controller, a low speed slider, or something in its way. When it is safe, call resume()."
     )
 

@@ -168,7 +168,7 @@ def test_an_arm_without_kinematics_has_no_tool_speed_that_could_be_limited():
         default_guards(other_arm())
     assert str(caught.value) == (
         "The tool speed of other cannot be limited: its kinematics are not known. "
-        "Give tool_position=; a simulated robot may do with the limit tool_speed = inf."
+        "Give tool_position=; a simulated robot may have the limit tool_speed = inf."
     )
     blind = [one.name for one in default_guards(other_arm(), Limits(tool_speed=math.inf))]
     assert not [name for name in blind if "tool" in name]
@@ -191,7 +191,7 @@ def test_a_command_with_numbers_that_no_guard_limits_is_refused(units):
     with pytest.raises(InvalidValue) as caught:
         default_guards(RobotSpec("other", (), command, 0.1), Limits(tool_speed=math.inf))
     assert str(caught.value) == (
-        "The command of other cannot be guarded: a base is told m/s and rad/s and nothing else, an arm rad and no "
+        "The command of other cannot be guarded: a base takes m/s and rad/s only, an arm takes rad and no "
         f"speeds; found {', '.join(units)}."
     )
 
