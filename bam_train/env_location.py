@@ -49,7 +49,7 @@ class Place:
                 raise SettingsError(f"--transport: {url} comes twice, and an address is one environment; give it once")
         without = [url for url in (self.robot, *self.transport) if url is not None and not url.startswith("wss://")]
         if self.ca_file is not None and without:
-            raise SettingsError(f"--ca-file says whom wss:// trusts, and {without[0]} is without TLS; leave it out")
+            raise SettingsError(f"--ca-file is for wss:// only, and {without[0]} is without TLS; leave it out")
         if self.timeout is not None and not self.transport:
             raise SettingsError("--timeout is how long an answer of --transport is waited for; leave it out")
         check(self.timeout, Positive | None, "--timeout", SettingsError)

@@ -32,11 +32,11 @@ def test_addresses(text, found):
         ),
         (
             Place(robot="ws://a:1", ca_file="ca.pem"),
-            "--ca-file says whom wss:// trusts, and ws://a:1 is without TLS; leave it out",
+            "--ca-file is for wss:// only, and ws://a:1 is without TLS; leave it out",
         ),
         (
             Place(transport=("wss://a:1", "tcp://b:2"), ca_file="ca.pem"),
-            "--ca-file says whom wss:// trusts, and tcp://b:2 is without TLS; leave it out",
+            "--ca-file is for wss:// only, and tcp://b:2 is without TLS; leave it out",
         ),
         (
             Place(transport=("tcp://a:1", "tcp://b:2", "tcp://a:1/")),

@@ -1,1 +1,1 @@
-"""The rosbridge v2 protocol: a sans-I/O core, the server that speaks it, the link of a client, and what both share."""
+"""The rosbridge v2 protocol: a sans-I/O core, a server around it, the link of a client, and their common parts."""

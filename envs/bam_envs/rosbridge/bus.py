@@ -1,7 +1,7 @@
 """Topics and services over any carrier: the embedded server, a link to a server, a ROS 2 node.
 
 Messages are plain dicts in the JSON form of rosbridge; a byte array is `bytes`. Types are written ``pkg/Type``;
-``pkg/msg/Type`` and ``pkg/srv/Type`` are taken too.
+``pkg/msg/Type`` and ``pkg/srv/Type`` are accepted too.
 """
 
 import logging
@@ -20,37 +20,37 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Caller:
-    """Who published a message, or calls a service."""
+    """The sender of a message, or the caller of a service."""
 
     name: str  # unique among the callers of a bus
-    address: str = ""  # where it is, for people
+    address: str = ""  # its network address, for people
     session: str = ""  # the session whose signature the message bears; empty without one
     operator: bool = False  # whether it showed the operator's token
     silence: Callable[[], float] = field(default=lambda: math.inf, compare=False)
-    """How long its connection has given no sign of life [s]; infinite where the bus does not know."""
+    """Time since the last sign of life of its connection [s]; infinite if the bus does not know."""
 
     @property
     def shown(self) -> str:
-        """What others are told of it."""
+        """The name that other clients see."""
         return self.address or self.name or (f"session {self.session}" if self.session else "a sender without a name")
 
     @property
     def client(self) -> str:
-        """Who it is to a `CommandLease`: its session, else its connection."""
+        """Its name in a `CommandLease`: its session, else its connection."""
         return f"session {self.session}" if self.session else self.shown
 
 
-UNKNOWN_CALLER = Caller("")  # where the bus does not say who it is (a real ROS graph)
+UNKNOWN_CALLER = Caller("")  # of a bus that does not report callers (a real ROS graph)
 
 Listener = Callable[[Message, Caller], None]
-"""Takes a message. Must return at once: it runs in the thread of the network. Never raises."""
+"""Takes a message. Must return at once: it runs in the network thread."""
 Handler = Callable[[Message, Caller], Message]
-"""Answers a service request with its response; runs in a thread of its own. What it raises of our errors is the text of
-a failed response."""
+"""Answers a service request with its response, in a separate thread. The text of a `BamEnvsError` that it raises is
+sent as a failed response."""
 
 
 def tell(callback: Callable[[T], object], news: T) -> None:
-    """Call foreign code; an exception in it is logged, and others are told all the same."""
+    """Call a callback of other code; an exception in it is logged, so that the remaining callbacks run."""
     try:
         callback(news)
     except Exception:
@@ -58,7 +58,7 @@ def tell(callback: Callable[[T], object], news: T) -> None:
 
 
 def deliver(listener: Listener, message: Message, caller: Caller, topic: str) -> str:
-    """Give a listener a message; why it refuses it, empty if it does not. Foreign errors are logged."""
+    """Give a listener a message; returns why it refuses it, or an empty text. Other errors are logged."""
     try:
         listener(message, caller)
         return ""
@@ -68,11 +68,11 @@ def deliver(listener: Listener, message: Message, caller: Caller, topic: str) ->
         return f"{topic}: {rest if named else error}"
     except Exception:
         _log.exception("%s: a listener failed", topic)
-        return f"{topic}: The receiver failed; its log says more."
+        return f"{topic}: The receiver failed; see its log."
 
 
 def answer(handler: Handler, request: Message, caller: Caller, name: str) -> Message:
-    """The response of the handler of `name`; a foreign error of it is logged, and raised as a `RemoteError`."""
+    """The response of the handler of `name`; an error other than ours is logged, and raised as a `RemoteError`."""
     try:
         return handler(request, caller)
     except BamEnvsError:
@@ -84,13 +84,13 @@ def answer(handler: Handler, request: Message, caller: Caller, name: str) -> Mes
 
 
 class Bus(Protocol):
-    """Publish, subscribe, serve, from any thread. A subclass inherits `publish`, and an `on_leave` that never calls."""
+    """Publish, subscribe, serve, from any thread. Subclasses inherit `publish`, and an `on_leave` without effect."""
 
     def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
-        """Say that `topic` of type `kind` will be published; a latched one repeats its last message to newcomers."""
+        """Declare `topic` of type `kind`; if latched, its last message is repeated to newcomers."""
 
     def publish(self, topic: str, message: Message) -> None:
-        """Send `message` now, or not at all. Raises as `publish_all`."""
+        """Send `message` now, or not at all. Raises the errors of `publish_all`."""
         self.publish_all([(topic, message)])
 
     def publish_all(self, messages: Sequence[tuple[str, Message]]) -> None:
@@ -102,13 +102,13 @@ class Bus(Protocol):
         """
 
     def subscribe(self, topic: str, kind: str, listener: Listener) -> Callable[[], None]:
-        """Call `listener` for each message, until what is returned is called. Other listeners are not touched."""
+        """Call `listener` for each message. Returns a function that ends this subscription only."""
 
     def serve(self, service: str, kind: str, handler: Handler) -> None:
-        """Answer `service` of type `kind`: always, also when the handler fails."""
+        """Answer `service` of type `kind`, even when the handler fails."""
 
     def on_leave(self, callback: Callable[[Caller], None]) -> None:
-        """Call `callback` when a caller's connection ends, where the bus knows; elsewhere never."""
+        """Call `callback` when a caller's connection ends, if the bus reports that."""
         return
 
     def close(self) -> None:
@@ -121,8 +121,8 @@ def namespaces_with(link: Any, kind: Literal["topics", "services"], name: str) -
         names = link.call(f"/rosapi/{kind}", f"rosapi/{kind.capitalize()}", {}, 1.0).get(kind) or []
     except (RemoteError, LinkLost):
         return ""
-    found = [one.removesuffix(name) for one in names if isinstance(one, str) and one.endswith(name)]
-    if not found:
+    namespaces = [one.removesuffix(name) for one in names if isinstance(one, str) and one.endswith(name)]
+    if not namespaces:
         return ""
-    addresses = listed(f"ws://HOST:PORT{namespace}" for namespace in sorted(found))
+    addresses = listed(f"ws://HOST:PORT{namespace}" for namespace in sorted(namespaces))
     return f" It is there at another address: {addresses}."

@@ -1,7 +1,7 @@
-"""A link to a rosbridge server, for a robot: what is sent is sent now or not at all.
+"""A link to a rosbridge server, for a robot: a message is sent now or not at all.
 
-A thread of its own connects, reads and writes, so that a slow listener of one link never delays the halt on another.
-After a cut the server gets the declarations (topics, subscriptions, services) again and no message from before it.
+Each link has a thread that connects, reads and writes, so that a slow listener of one link never delays the halt on
+another. After a cut the server gets the declarations (topics, subscriptions, services) again, but no older message.
 """
 
 import asyncio
@@ -31,12 +31,12 @@ from bam_envs.rosbridge.threads import LoopThread, Workers
 
 _LOG = logging.getLogger(__name__)
 _FIRST_DELAY, _LONGEST_DELAY = 0.05, 2.0
-_STEADY = 2.0  # a connection that lasted so long [s] is tried again at once
+_STEADY = 2.0  # a connection that lasted this long [s] is reopened without a longer delay
 _SEND_WITHIN = 0.5
 _LEAVE_WITHIN = 3.0
 _STATUSES_KEPT = 20
 _MOST_ANSWERING = 64  # requests of the server that are answered at the same time; more of them are refused
-_ENDED = "Timeout exceeded"  # what servers say of a call that they end; rosbridge from 2.2 on does after 5 s by default
+_ENDED = "Timeout exceeded"  # servers' error for a call that they end; rosbridge from 2.2 on does so after 5 s
 _NEARLY = 0.9
 
 
@@ -44,9 +44,9 @@ class RosbridgeLink(Declarations):
     """A client of a rosbridge server; a `Bus` that can also call services.
 
     Args:
-        endpoint: The server; the text of a URL stands for `Endpoint(url)`.
-        name: What it is for; in the names of its threads.
-        lost_after: The link drops when the server answers no WebSocket ping for so long [s]. Infinite: only when the
+        endpoint: The server; a URL stands for `Endpoint(url)`.
+        name: Its purpose, for the names of its threads.
+        lost_after: The link drops when the server answers no WebSocket ping for this time [s]. Infinite: only when the
             network reports it.
         max_message: Largest message, in either direction [bytes].
     """
@@ -65,11 +65,11 @@ class RosbridgeLink(Declarations):
         self.statuses: deque[dict[str, Any]] = deque(maxlen=_STATUSES_KEPT)
         """The last `status` messages of the server."""
         self.epoch = 0
-        """Counts the connections; 0 before the first."""
+        """Number of the connection; 0 before the first."""
         self.ros: str | None = None
-        """``"ros1"`` or ``"ros2"``, by how the server spells a time; None until it has shown that."""
+        """``"ros1"`` or ``"ros2"``, by the server's spelling of a time; None until it has sent one."""
         self.clock_offset: float | None = None
-        """Our wall clock minus the server's [s]; None where it tells no time."""
+        """The local wall clock minus the server's [s]; None if the server does not report its time."""
         if not lost_after > 0.0:
             raise InvalidValue(f"lost_after: expected a time above 0 s, found {lost_after!r}.")
         self._lost_after, self._max_message = lost_after, max_message
@@ -88,10 +88,10 @@ class RosbridgeLink(Declarations):
     # ---- connecting
 
     def connect(self) -> None:
-        """Connect, and see that the server answers. Afterwards the link comes back by itself whenever it drops.
+        """Connect, and check that the server answers. Afterwards the link reconnects by itself whenever it drops.
 
         Raises:
-            NoServer: There is no server that can be used; the text says why.
+            NoServer: There is no usable server; the text gives the reason.
             LinkLost: The link was closed, or dropped and is not back yet.
         """
         self._require_waiting_allowed("connect")
@@ -102,13 +102,13 @@ class RosbridgeLink(Declarations):
                 return
             try:
                 self._thread.start(self._main)
-            except BaseException:  # also Ctrl-C: a connection that opened later would have no owner
+            except BaseException:  # even Ctrl-C: a connection that opened later would have no owner
                 self._thread.post(self._stop)
                 self._thread = LoopThread(f"bam-link-{self.name}", self.url)
                 raise
 
     def close(self) -> None:
-        """Leave with a closing handshake, and stay away. Idempotent; a forked child leaves the parent's link alone."""
+        """Close the link for good, with a closing handshake. Idempotent; does nothing in a forked child."""
         if self._pid != os.getpid():
             return
         self._closed = True
@@ -138,13 +138,13 @@ class RosbridgeLink(Declarations):
         self._down_callbacks.append(callback)
 
     def stamp(self, t: float) -> dict[str, int]:
-        """A time [s] as the server spells it; as ROS 2 does where that is not known."""
+        """A time [s] in the server's spelling; in that of ROS 2 if it is not known."""
         return write_stamp(t, ros1=self.ros == "ros1")
 
     # ---- topics and services
 
     def publish_all(self, messages: Sequence[tuple[str, Message]]) -> None:
-        """Send several messages now or not at all: on return they have been written to the socket. See `Bus`."""
+        """Send several messages now or not at all: on return they are written to the socket. See `Bus`."""
         connection = self._require_up()
         for topic, _ in messages:
             if topic not in self._topics:
@@ -157,14 +157,14 @@ class RosbridgeLink(Declarations):
         self._status_callbacks.append(callback)
 
     def call(self, service: str, kind: str, args: Message, timeout: float) -> dict[str, Any]:
-        """Ask `service` of type `kind`, and wait for its response.
+        """Call `service` of type `kind`, and wait for its response.
 
-        With an empty `kind` the server looks the type up, and says at once if there is no such service; a server that
-        is told the type waits for it to appear.
+        With an empty `kind` the server looks the type up, and reports a missing service at once; with a type it waits
+        for the service to appear.
 
         Raises:
             LinkLost: The link is down, and nothing was sent. Or it drops while waiting, or no answer comes in `timeout`
-                [s] or in the time that the server itself allows: what was asked may have been done.
+                [s] or in the time that the server itself allows: the service may have been executed.
             RemoteError: The service, or the server, refused or failed.
             InvalidValue: `args` are not plain and finite, `timeout` is no time, or this is the network thread.
         """
@@ -172,23 +172,23 @@ class RosbridgeLink(Declarations):
         if not isinstance(timeout, int | float) or not 0.0 < timeout < float("inf"):
             raise InvalidValue(f"{service}: timeout is {timeout!r}: expected a time above 0 s, for a call can be lost.")
         connection, identity, begun = self._require_up(), f"call:{next(self._numbers)}", time.monotonic()
-        # Servers that know the field `timeout` end the call then, and not after a shorter time of their own.
+        # Servers that know the field `timeout` use it instead of a shorter default.
         request = {"op": "call_service", "id": identity, "service": service, "args": args, "timeout": timeout}
         frame = dump_json({**request, "type": normal_name(kind)} if kind else request)
         response: Future[dict[str, Any]] = Future()
         try:
             self._thread.do(lambda: connection.ask(identity, frame, response), timeout)
-            said = response.result(begun + timeout - time.monotonic())
+            reply = response.result(begun + timeout - time.monotonic())
         except NoResultYet as error:
             self._thread.post(lambda: connection.forget(identity))
             raise LinkLost(f"{self.url}: {service} did not answer in {timeout:g} s; it may still be at it.") from error
         finally:
             response.cancel()
-        return self._response(service, said, time.monotonic() - begun, timeout)
+        return self._response(service, reply, time.monotonic() - begun, timeout)
 
-    def _response(self, service: str, said: Mapping[str, Any], waited: float, timeout: float) -> dict[str, Any]:
-        values = said.get("values")
-        if said.get("result") is False and _ENDED in str(values):
+    def _response(self, service: str, reply: Mapping[str, Any], waited: float, timeout: float) -> dict[str, Any]:
+        values = reply.get("values")
+        if reply.get("result") is False and _ENDED in str(values):
             if waited > _NEARLY * timeout:
                 raise LinkLost(f"{self.url}: {service} did not answer in {timeout:g} s; it may still be at it.")
             raise LinkLost(
@@ -196,7 +196,7 @@ class RosbridgeLink(Declarations):
                 f"may still be at it. Start the bridge with default_call_service_timeout:={timeout:.1f}, or use a pair "
                 'of topics instead of the service (channel="topics").'
             )
-        if said.get("result") is False:
+        if reply.get("result") is False:
             raise RemoteError(values if isinstance(values, str) and values else f"{service} failed: {values!r}.")
         if values is None:
             return {}
@@ -204,10 +204,10 @@ class RosbridgeLink(Declarations):
             raise ProtocolError(f"{service}: expected a response with fields, found {values!r}.")
         return values
 
-    # ---- what any thread may ask for
+    # ---- used by any thread
 
     def _announce(self, request: dict[str, Any]) -> None:
-        # In the lock of the declarations: they reach the network thread in the order in which they were made.
+        # Within the lock of the declarations, so that they reach the network thread in order.
         self._thread.post(partial(self._tell, request, dump_json(request)))
 
     def _require_up(self) -> Connection:
@@ -237,13 +237,13 @@ class RosbridgeLink(Declarations):
             connection = await self._first()
             ready.set_result(None)
             await self._stay_connected(connection)
-        except asyncio.CancelledError:  # by `_stop`; not `finally`, which would run in a forked child, too
+        except asyncio.CancelledError:  # by `_stop`; not in `finally`, which would also run in a forked child
             if not ready.done():
                 ready.set_exception(LinkLost(f"{self.url}: this link was closed. Make a new one."))
             await self._leave()
 
     def _stop(self) -> None:
-        task, self._main_task = self._main_task, None  # once: a second one would interrupt the leaving
+        task, self._main_task = self._main_task, None  # once: a second cancellation would interrupt `_leave`
         if task is not None:
             task.cancel()
 
@@ -255,7 +255,7 @@ class RosbridgeLink(Declarations):
             try:
                 return await self._open(deadline - time.monotonic())
             except NoServer as error:
-                # A server that refuses connections may still be starting; no other error goes away by itself.
+                # A server that refuses connections may still be starting; other errors persist.
                 if not isinstance(error.__cause__, ConnectionRefusedError) or time.monotonic() + delay >= deadline:
                     raise
             await asyncio.sleep(delay)
@@ -266,7 +266,7 @@ class RosbridgeLink(Declarations):
         while True:
             since = time.monotonic()
             await connection.ended.wait()
-            # A connection that breaks at once, again and again, is tried after longer and longer delays.
+            # A connection that repeatedly breaks at once is reopened after longer and longer delays.
             if time.monotonic() - since > _STEADY:
                 delay = _FIRST_DELAY
             while connection.error is not None:
@@ -276,7 +276,7 @@ class RosbridgeLink(Declarations):
                     connection = await self._open(self._endpoint.connect_timeout)
                 except BamEnvsError as error:
                     self._why = bare_reason(self.url, error)
-                except Exception as error:  # a link that gives up is worse than one that tries again
+                except Exception as error:  # the link must keep trying
                     _LOG.exception("%s: connecting failed", self.url)
                     self._why = f"{type(error).__name__}: {error}"
 
@@ -348,7 +348,7 @@ class RosbridgeLink(Declarations):
             connection.pass_over(f"a message with op {operation!r:.40}")
 
     def _answer(self, connection: Connection, request: dict[str, Any]) -> None:
-        """Answer a request of the server in a worker thread; the network thread waits for no handler."""
+        """Answer a request of the server in a worker thread, so that the network thread waits for no handler."""
         service = request.get("service")
         response = {"op": "service_response", "service": service, "id": request.get("id")}
         handler = self._services.get(str(service), (None, None))[1]
@@ -365,14 +365,14 @@ class RosbridgeLink(Declarations):
         self, connection: Connection, handler: Handler, request: dict[str, Any], response: dict[str, Any]
     ) -> None:
         args, service = request.get("args"), str(response["service"])
-        asked = args if isinstance(args, Mapping) else {}
+        fields = args if isinstance(args, Mapping) else {}
         try:
-            values = answer(lambda *given: dict(handler(*given)), asked, UNKNOWN_CALLER, service)
+            values = answer(lambda *arguments: dict(handler(*arguments)), fields, UNKNOWN_CALLER, service)
             frame = dump_json({**response, "values": values, "result": True})
         except BamEnvsError as error:
             frame = dump_json({**response, "values": str(error), "result": False})
         self._may_answer.release()
         try:
             self._thread.do(lambda: connection.send(frame), _SEND_WITHIN)
-        except BamEnvsError as gone:
-            _LOG.warning("%s: the response could not be sent: %s", service, gone)
+        except BamEnvsError as error:
+            _LOG.warning("%s: the response could not be sent: %s", service, error)

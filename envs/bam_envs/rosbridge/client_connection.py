@@ -1,6 +1,6 @@
 """One WebSocket connection of a client, from its handshake to its end. Everything here runs on the network thread.
 
-A connection never comes back: what it had not sent when it ended cannot reach the server over the next one.
+A connection is never reopened: messages that it had not sent cannot reach the server over the next one.
 """
 
 import asyncio
@@ -25,28 +25,28 @@ from bam_envs.rosbridge.endpoint import Address, Endpoint
 
 _LOG = logging.getLogger(__name__)
 _QUIET = logging.getLogger(f"{__name__}.websockets")
-_QUIET.setLevel(logging.CRITICAL)  # a link says itself, and in one line, why it ended or did not open
+_QUIET.setLevel(logging.CRITICAL)  # a link itself reports in one line why it ended or did not open
 _CLOSE_WITHIN = 1.0  # longest time for a closing handshake [s]
 _CLOCK_PROBES = 3
-_LOOK = 0.5  # time between two looks at a connection whose silence is no loss [s]
-_PINGS = 5  # how often a server is asked for a sign of life before its silence is a loss
-_MOST_UNSENT = 1024 * 1024  # bytes that wait for the server to read, from which on nothing more is sent
-_MOST_PASSED_OVER = 20  # meaningless messages of one connection, after which it is ended
+_LOOK = 0.5  # time between two checks of a connection whose silence is no loss [s]
+_PINGS = 5  # pings to a server before its silence is a loss
+_MOST_UNSENT = 1024 * 1024  # bytes that may wait for the server to read before sending fails
+_MOST_PASSED_OVER = 20  # meaningless messages of one connection, after which it is closed
 _TOO_LARGE = 1009  # WebSocket's close code for a message above the limit
-_DEAD_NODE = "context is invalid"  # what rosbridge_suite answers to everything after its node was told to end
+_DEAD_NODE = "context is invalid"  # answer of rosbridge_suite to every request after its node has shut down
 _HOST_MISMATCH = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
 
 
 def bare_reason(url: str, error: BamEnvsError) -> str:
-    """What `error` says, without the address and the full stop: for a text that begins with the address."""
+    """The text of `error` without the address and the full stop, for a text that begins with the address."""
     return str(error).removeprefix(f"{url}: ").rstrip(".")
 
 
 class Connection:
     """Connection number `epoch` of a link; `max_message` and `lost_after` are the link's.
 
-    `on_message` takes each message that is not an answer: publish, call_service, status. `on_end` is called once, when
-    it has ended, before pending answers get the error.
+    `on_message` takes each message that is not an answer: publish, call_service, status. `on_end` is called once, at
+    the end of the connection, before pending answers get the error.
     """
 
     def __init__(
@@ -61,9 +61,9 @@ class Connection:
         self.url, self.epoch = endpoint.address.url, epoch
         self.error: BamEnvsError | None = None  # why it ended; None before
         self.ended = asyncio.Event()
-        self.announced: dict[str, str] = {}  # what has been declared on it: id of the declaration -> its frame
-        self.ros: str | None = None  # as of `RosbridgeLink`, known once it is open, to within half a round trip
-        self.clock_offset: float | None = None
+        self.announced: dict[str, str] = {}  # declarations sent on it: id of the declaration -> its frame
+        self.ros: str | None = None  # as in `RosbridgeLink`; both are known once it is open
+        self.clock_offset: float | None = None  # to within half a round trip
         self._endpoint, self._max_message, self._lost_after = endpoint, max_message, lost_after
         self._on_message, self._on_end = on_message, on_end
         self._heard_at = time.monotonic()  # when the server last gave a sign of life [s]
@@ -77,9 +77,9 @@ class Connection:
     # ---- opening
 
     async def open(self, timeout: float) -> None:
-        """Connect, and see that a rosbridge server answers, all within `timeout` [s].
+        """Connect, and check that a rosbridge server answers, all within `timeout` [s].
 
-        `NoServer` says why not; a `ConnectionRefusedError` is its cause where the server may just not be up yet.
+        `NoServer` gives the reason; its cause is a `ConnectionRefusedError` if the server may still be starting.
         """
         deadline = time.monotonic() + timeout
         self._socket = await _open_socket(self._endpoint, timeout, self._max_message)
@@ -87,7 +87,7 @@ class Connection:
         loop = asyncio.get_running_loop()
         self._tasks = [loop.create_task(work(self._socket)) for work in (self._read, self._watch)]
         try:
-            await asyncio.wait_for(self._see_answers(), deadline - time.monotonic())
+            await asyncio.wait_for(self._probe(), deadline - time.monotonic())
             self._ready = True
         except asyncio.TimeoutError as error:
             raise NoServer(
@@ -99,21 +99,21 @@ class Connection:
             if not self._ready:
                 self.drop(LinkLost(f"{self.url}: no answer."))
 
-    async def _see_answers(self) -> None:
+    async def _probe(self) -> None:
         best = math.inf
         for probe in range(_CLOCK_PROBES):
             asked = time.time()
-            found = await self._ask_time(f"ready:{self.epoch}:{probe}")
+            server_time = await self._ask_time(f"ready:{self.epoch}:{probe}")
             trip = time.time() - asked
             for ros, seconds, nanoseconds in (("ros2", "sec", "nanosec"), ("ros1", "secs", "nsecs")):
-                whole, rest = found.get(seconds), found.get(nanoseconds)
+                whole, rest = server_time.get(seconds), server_time.get(nanoseconds)
                 if isinstance(whole, int) and isinstance(rest, int) and trip < best:
                     best, self.ros, self.clock_offset = trip, ros, asked + trip / 2 - whole - rest * 1e-9
             if self.ros is None:
                 return
 
     async def _ask_time(self, identity: str) -> Mapping[str, Any]:
-        # Any answer will do, also that there is no such service: it comes from the part that does the work.
+        # Any answer will do, even that there is no such service: it shows that the server's node works.
         request = {"op": "call_service", "id": identity, "service": "/rosapi/get_time", "type": "rosapi/GetTime"}
         answer: Future[dict[str, Any]] = Future()
         try:
@@ -128,18 +128,18 @@ class Connection:
             raise NoServer(self.url, f"closed the connection before it answered a request: {reason}.") from error
         if isinstance(values, str) and _DEAD_NODE in values:
             raise NoServer(self.url, f"its ROS node has ended and its socket has not ({values}). Restart the bridge.")
-        found = values.get("time") if isinstance(values, Mapping) else None
-        return found if isinstance(found, Mapping) else {}
+        server_time = values.get("time") if isinstance(values, Mapping) else None
+        return server_time if isinstance(server_time, Mapping) else {}
 
     # ---- sending
 
     @property
     def is_open(self) -> bool:
-        """Whether a message can be sent. Any thread may ask."""
+        """Whether a message can be sent. Thread-safe."""
         return self.error is None and self._socket is not None and self._socket.state is State.OPEN
 
     def send(self, *frames: str) -> None:
-        """Write frames to the socket now, all or none; `LinkLost` if it cannot, `InvalidValue` for one too large."""
+        """Write frames to the socket now, all or none; `LinkLost` if that fails, `InvalidValue` for one too large."""
         socket = self._socket
         if socket is None or not self.is_open or socket.transport.is_closing():
             why = "it is being closed" if self.error is None else bare_reason(self.url, self.error)
@@ -153,28 +153,28 @@ class Connection:
                 "sent. Send less at once, or raise max_message on both ends."
             )
         for frame in frames:
-            # `send` of websockets would wait while the server does not read, and send late what is stale by then.
+            # `send` of websockets would wait while the server does not read, and send stale messages later.
             broadcast([socket], frame)
 
     def ask(self, identity: str, frame: str, answer: Future[dict[str, Any]]) -> None:
-        """Send a request; `answer` gets the whole response, or why there is none. Raises as `send`."""
+        """Send a request; `answer` gets the whole response, or an error. Raises the errors of `send`."""
         self.send(frame)
         self._pending[identity] = answer
 
     def forget(self, identity: str) -> None:
-        """Nobody waits for this answer any more."""
+        """Stop waiting for an answer."""
         self._pending.pop(identity, None)
 
     # ---- ending
 
     def drop(self, error: BamEnvsError) -> None:
-        """End it at once, without a word to the server; what is still unsent is thrown away."""
+        """End it at once, without a closing handshake; unsent messages are discarded."""
         self._end(error)
         if self._socket is not None:
             self._socket.transport.abort()
 
     async def close(self) -> None:
-        """End it with a closing handshake, or without one where the server does not take part in time."""
+        """End it with a closing handshake, or without one if the server does not answer in time."""
         if self._socket is not None and self.error is None:
             self._end(LinkLost(f"{self.url}: the link was closed."))
             with contextlib.suppress(asyncio.TimeoutError):
@@ -205,7 +205,7 @@ class Connection:
                 self._heard_at = time.monotonic()
 
         while self.error is None:
-            # A server that does not read what waits for it answers no ping either.
+            # A server that does not read its pending messages answers no ping either.
             if lost_after < math.inf and self.is_open and not socket.transport.get_write_buffer_size():
                 with contextlib.suppress(ConnectionClosed):
                     asyncio.ensure_future(await socket.ping()).add_done_callback(ponged)
@@ -213,7 +213,7 @@ class Connection:
             await asyncio.sleep(woken - time.monotonic())
             now = time.monotonic()
             if now - woken > every:
-                self._heard_at = now  # this process itself stood still, and what came meanwhile is still unread
+                self._heard_at = now  # this process itself was paused, and messages may be unread
             closing_since = math.inf if self.is_open else min(closing_since, now)
             if now - self._heard_at >= lost_after:
                 self.drop(LinkLost(f"{self.url}: nothing from the server for {lost_after:g} s."))
@@ -238,15 +238,15 @@ class Connection:
                     "Take compressed images, or raise max_message."
                 )
             elif end.rcvd is not None:
-                said = ", ".join(filter(None, (f"code {end.rcvd.code}", end.rcvd.reason)))
-                reason = LinkLost(f"{self.url}: the link dropped: the server closed it with {said}.")
+                cause = ", ".join(filter(None, (f"code {end.rcvd.code}", end.rcvd.reason)))
+                reason = LinkLost(f"{self.url}: the link dropped: the server closed it with {cause}.")
             else:
                 why = f": {end.__cause__}" if end.__cause__ is not None and str(end.__cause__) else ""
                 reason = LinkLost(f"{self.url}: the link dropped: the connection was cut{why}.")
             self._end(reason)
 
     def pass_over(self, text: str) -> None:
-        """Take note of a message that means nothing here; a server that sends many of them is left."""
+        """Log a meaningless message; after many of them, drop the connection."""
         _LOG.info("%s: passed over: %s", self.url, text)
         self._passed_over += 1
         if self._passed_over == _MOST_PASSED_OVER:
@@ -266,12 +266,12 @@ class Connection:
             whole = self._fragments.add(message, self._heard_at)
             if whole is not None:
                 self._dispatch(decode_server_frame(whole.encode()))
-        # Before the server is known to be one: later on, a request of its own may have an id like ours.
+        # Only before the server is known: later, one of its requests may have an id like ours.
         elif operation == "call_service" and not self._ready and identity in self._pending:
             echo = NoServer(self.url, "an echo server: it sends back what it is sent. Is it the right port?")
             self._resolve(identity, echo)
         else:
-            # A server may answer a request that it cannot read with a status of the same id, and with nothing else.
+            # A server may answer a request that it cannot read only with a status of the same id.
             if operation == "status" and message.get("level") == "error":
                 self._resolve(identity, RemoteError(str(message.get("msg"))))
             self._on_message(self, message)
@@ -286,16 +286,16 @@ class Connection:
             answer.set_result(outcome)
 
 
-# ---- the socket, and in words why it could not be opened
+# ---- the socket, and the reasons why it could not be opened
 
 
 async def _open_socket(endpoint: Endpoint, timeout: float, max_message: int) -> ClientConnection:
-    """Connect and do the WebSocket handshake, in `timeout` [s]; messages of up to `max_message` bytes are received."""
+    """Connect and do the WebSocket handshake in `timeout` [s]; `max_message` limits received messages [bytes]."""
     address, context = endpoint.address, endpoint.tls_context()
     deadline = time.monotonic() + timeout
     try:
-        # TCP first, so that a port that is closed, one behind a firewall and one that is silent are told apart; and
-        # so that websockets goes through no proxy, behind which no robot is.
+        # TCP first, to tell apart a closed port, one behind a firewall and a silent one; and so that websockets uses
+        # no proxy, behind which there is no robot.
         plain = await asyncio.wait_for(_open_tcp(address), timeout)
     except (OSError, asyncio.TimeoutError) as error:
         raise NoServer(address.url, _no_connection(address, error, timeout)) from error
@@ -321,7 +321,7 @@ async def _open_socket(endpoint: Endpoint, timeout: float, max_message: int) -> 
         raise NoServer(address.url, text) from error
     except TimeoutError as error:
         hint = " Does it speak TLS? If not, use ws://." if address.secure else ""
-        text = f"the port is open, and what listens there says nothing within {timeout:.1f} s. "
+        text = f"the port is open, and what listens there is silent for {timeout:.1f} s. "
         raise NoServer(address.url, f"{text}Is it a rosbridge server?{hint}") from error
     except OSError as error:
         raise NoServer(address.url, _no_connection(address, error, timeout)) from error
@@ -350,7 +350,7 @@ async def _open_tcp(address: Address) -> socket.socket:
 
 
 def _no_connection(address: Address, error: OSError | asyncio.TimeoutError, timeout: float) -> str:
-    """Why TCP or TLS did not come about within `timeout` [s]."""
+    """The reason why no TCP or TLS connection was made within `timeout` [s]."""
     if isinstance(error, ssl.SSLCertVerificationError):
         reason = error.verify_message.rstrip(".")
         if error.verify_code in _HOST_MISMATCH:

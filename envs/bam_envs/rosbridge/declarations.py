@@ -1,7 +1,7 @@
-"""What a client has declared: its topics, subscriptions and services, and the listeners of each topic.
+"""The declarations of a client: its topics, subscriptions and services, and the listeners of each topic.
 
-Each new connection is told all of it again. The server gets one subscription per topic, whatever the number of
-listeners: it sends one stream per topic, and ends it at the first unsubscribe.
+Each new connection repeats all of them. The server gets one subscription per topic for any number of listeners: it
+sends one stream per topic, and ends it at the first unsubscribe.
 """
 
 import logging
@@ -19,7 +19,7 @@ _LOG = logging.getLogger(__name__)
 
 
 class Declarations(Bus):
-    """The half of a link that declares; a subclass tells the server of `url`, and may be used in this process only."""
+    """The half of a link that declares; a subclass sends it to the server of `url`. Usable in one process only."""
 
     def __init__(self, url: str) -> None:
         self.url = url
@@ -30,11 +30,11 @@ class Declarations(Bus):
 
     @property
     def declared(self) -> dict[str, tuple[str, str]]:
-        """What was declared: id of the declaration, which a `status` may name -> topic or service, and type."""
+        """Id of each declaration, which a `status` may name -> topic or service, and type."""
         return {one["id"]: (one.get("topic") or one["service"], one["type"]) for one in self._greeting()}
 
     def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
-        """Say that `topic` of type `kind` will be published."""
+        """Declare that `topic` of type `kind` will be published."""
         self._require_process()
         request = {"op": "advertise", "id": f"advertise:{topic}", "topic": topic, "type": normal_name(kind)}
         with self._lock:
@@ -51,21 +51,21 @@ class Declarations(Bus):
         queue_length: int = 0,
         compression: str = "none",
     ) -> Callable[[], None]:
-        """Call `listener` for each message on the network thread, until what is returned is called.
+        """Call `listener` for each message on the network thread. Returns a function that ends the subscription.
 
         Args:
             topic: Its name.
             kind: Its type, the same for all listeners.
             listener: Must return at once.
             throttle_ms: Least time between two messages [ms], the lowest of all listeners; the server drops the others.
-            queue_length: How many messages the server keeps while they are throttled, the newest; 0: none.
+            queue_length: Number of the newest messages that the server keeps while they are throttled; 0: none.
             compression: ``"none"`` for JSON, or ``"cbor"``, seven times as fast for images and large arrays; its typed
-                arrays come as NumPy arrays, byte arrays as `bytes`.
+                arrays arrive as NumPy arrays, byte arrays as `bytes`.
         """
         self._require_process()
         wish = {"throttle_rate": throttle_ms, "queue_length": queue_length}
         for name, value in (("throttle_ms", throttle_ms), ("queue_length", queue_length)):
-            # The Python servers drop a subscription without a word for anything but an integer.
+            # The Python servers silently drop a subscription for anything but an integer.
             if type(value) is not int or value < 0:
                 raise InvalidValue(f"{name} is {value!r}: expected a whole number, 0 or more.")
         request = {"op": "subscribe", "id": f"subscribe:{topic}", "topic": topic, "type": normal_name(kind), **wish}
@@ -75,7 +75,7 @@ class Declarations(Bus):
         with self._lock:
             known, listeners = self._subscriptions.get(topic, (request, {}))
             request = {**_same_type(known, topic, kind), **{name: min(known[name], wish[name]) for name in wish}}
-            # A new table each time, so that the fan-out can walk over the old one without a lock.
+            # A new table each time, so that delivery can iterate over the old one without a lock.
             self._subscriptions[topic] = request, {**listeners, key: listener}
             self._announce(request)
         return partial(self._unsubscribe, topic, key)
@@ -103,7 +103,7 @@ class Declarations(Bus):
             self._announce(request)
 
     def _announce(self, request: dict[str, Any]) -> None:
-        """Tell the server `request` if there is a connection: the greeting of the next one contains it anyway."""
+        """Send `request` if there is a connection; the greeting of the next one contains it anyway."""
         raise NotImplementedError
 
     def _require_process(self) -> None:
@@ -120,13 +120,13 @@ class Declarations(Bus):
                 _LOG.info("a message was refused: %s", refusal)
 
     def _greeting(self) -> list[dict[str, Any]]:
-        """Everything, for a server that knows nothing yet."""
+        """All declarations, for a new connection."""
         with self._lock:
             services = (request for request, _ in self._services.values())
             return [*self._topics.values(), *services, *(request for request, _ in self._subscriptions.values())]
 
     def _farewell(self) -> list[dict[str, Any]]:
-        """What to take back before leaving: some servers keep a service whose client has left."""
+        """The withdrawals to send before leaving: some servers keep a service whose client has left."""
         with self._lock:
             return [
                 *({"op": "unadvertise_service", "service": service} for service in self._services),

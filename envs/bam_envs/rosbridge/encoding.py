@@ -1,4 +1,4 @@
-"""What WebSocket frames of rosbridge hold: JSON, CBOR with typed arrays (RFC 8746), JSON inside a PNG, fragments."""
+"""Contents of rosbridge frames: JSON, CBOR with typed arrays (RFC 8746), JSON inside a PNG, fragments."""
 
 import base64
 import json
@@ -16,21 +16,21 @@ from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.core.wording import brief
 from bam_envs.ros.interfaces import MAX_DEPTH, Field, normal_name, require_plain, variants
 
-COMPRESSIONS = ("none", "png", "cbor")  # how a message may be packed for a subscriber
-MOST_ITEMS = 100_000  # values in one JSON message of a client: lists and objects count, and each thing in them
+COMPRESSIONS = ("none", "png", "cbor")  # encodings of a message for a subscriber
+MOST_ITEMS = 100_000  # values in one JSON message of a client: lists, objects, and each value in them
 MOST_ITEMS_OF_A_SERVER = 4_000_000  # the same for messages of a server: an image may come as a list of numbers
 _NOT_BRACKETS = bytes(set(range(256)) - set(b'"[]{}'))
 _ONE_KIND = bytes.maketrans(b"{}", b"[]")
-_LONGEST_ID = 256  # most characters of an id: it is kept, and repeated, for as long as what it names is unfinished
-_LARGEST_ID = 2**53  # largest id that is a number: what every JSON reader holds exactly
-_MOST_FRAGMENTS = 10_000  # of one outgoing message: a smaller fragment size would cost more than it carries
-_EMPTY = 100  # about what a fragment without any text costs [bytes]
-_MOST_UNFINISHED = 16  # messages of one connection of which fragments may be missing at the same time
-Id = str | int | None  # what a client calls an interaction; None if it does not
+_LONGEST_ID = 256  # most characters of an id, which is kept and repeated until its operation ends
+_LARGEST_ID = 2**53  # largest numeric id that every JSON reader holds exactly
+_MOST_FRAGMENTS = 10_000  # of one outgoing message: smaller fragments would cost more than they carry
+_EMPTY = 100  # approximate cost of a fragment without text [bytes]
+_MOST_UNFINISHED = 16  # messages of one connection that may be incomplete at the same time
+Id = str | int | None  # a client's id of an operation; None without one
 
 
 def _dtype(tag: int) -> np.dtype[Any]:
-    """What a typed array of RFC 8746 holds; its tag has bits for floating point, signed, little-endian and size."""
+    """The dtype of a typed array of RFC 8746; its tag has bits for floating point, signed, little-endian and size."""
     kind = "f" if tag & 16 else "i" if tag & 8 else "u"
     size = (2 if tag & 16 else 1) << (tag & 3)
     return np.dtype(f"{'<' if tag & 4 else '>'}{kind}{size}")
@@ -45,18 +45,18 @@ _TYPED = {_DTYPES[tag].name: (tag, _DTYPES[tag]) for tag in (69, 70, 71, 72, 77,
 
 def decode_frame(data: str | bytes) -> dict[str, Any]:
     """The message in a frame of a client: one JSON object, alone and bounded, in UTF-8."""
-    # NaN and infinities are read, so that what refuses them can say in which message and field they were.
+    # NaN and infinities are read, so that a later check can name their message and field.
     return _object(data, MOST_ITEMS, _STRICT)
 
 
 def decode_server_frame(data: bytes) -> dict[str, Any]:
-    """The message in a frame of a server, in JSON or CBOR; NaN and Infinity, which are not JSON but sent, are None."""
-    # No text in UTF-8 begins with a byte from 0x80 to 0xbf, and an object in CBOR does.
+    """The message in a frame of a server, in JSON or CBOR; NaN and Infinity, which some servers send, become None."""
+    # An object in CBOR begins with a byte from 0x80 to 0xbf, and no text in UTF-8 does.
     return decode_cbor(data) if b"\x80" <= data[:1] <= b"\xbf" else _object(data, MOST_ITEMS_OF_A_SERVER, _PATIENT)
 
 
 def load_json(text: object, what: str, most_items: int = MOST_ITEMS_OF_A_SERVER) -> dict[str, Any]:
-    """The object that `text` is in JSON, with finite numbers and at most `most_items` values; errors name it `what`."""
+    """The object in the JSON `text`, with finite numbers and at most `most_items` values; errors name it `what`."""
     if not isinstance(text, str):
         raise ProtocolError(f"{what} must be a string with a JSON object, not {type(text).__name__}.")
     try:
@@ -68,7 +68,7 @@ def load_json(text: object, what: str, most_items: int = MOST_ITEMS_OF_A_SERVER)
 
 def _object(data: str | bytes, most_items: int, decoder: json.JSONDecoder) -> dict[str, Any]:
     data = data.encode(errors="surrogatepass") if isinstance(data, str) else data
-    # Before it is parsed, what is too much work is refused, from a few passes over its bytes in C.
+    # A message that would be too much work is refused before it is parsed, by a few fast passes over its bytes.
     openings = data.count(b"[") + data.count(b"{")
     if openings + data.count(b",") > most_items:  # commas and brackets in texts count too
         raise ProtocolError(f"Message: expected at most {most_items} values, found more.")
@@ -80,7 +80,7 @@ def _object(data: str | bytes, most_items: int, decoder: json.JSONDecoder) -> di
         raise ProtocolError(f"Message: expected text in UTF-8: {error.reason} at byte {error.start}.") from None
     except ValueError as error:  # JSONDecodeError, and Python's own limit for the digits of an integer
         if str(error).startswith("Extra data"):
-            raise ProtocolError("Message: expected one in a frame, found more behind it.") from None
+            raise ProtocolError("Message: expected one in a frame, found more after it.") from None
         raise ProtocolError(f"Message: expected JSON: {error}.") from None
     if not isinstance(value, dict):
         raise ProtocolError(f"Message: expected an object, found {brief(value)}.")
@@ -90,7 +90,9 @@ def _object(data: str | bytes, most_items: int, decoder: json.JSONDecoder) -> di
 def _is_deep(data: bytes) -> bool:
     if b"\\" in data:
         data = data.replace(b"\\\\", b"").replace(b'\\"', b"")
-    outside = b"".join(data.translate(_ONE_KIND, _NOT_BRACKETS).split(b'"')[::2])  # every second part is in a text
+    outside = b"".join(
+        data.translate(_ONE_KIND, _NOT_BRACKETS).split(b'"')[::2]
+    )  # every second part is inside a string
     for _ in range(MAX_DEPTH):  # each pass removes the innermost pairs
         outside = outside.replace(b"[]", b"")
     return b"[" in outside
@@ -129,7 +131,7 @@ def _untag(value: Any) -> Any:
 
 
 def dump_json(value: Any, what: str = "message") -> str:
-    """`value` as JSON in ASCII, `bytes` as base64; `InvalidValue` names what is not finite or plain in `what`."""
+    """`value` as JSON in ASCII, `bytes` as base64; `InvalidValue` names any value in `what` that is not plain."""
     try:
         return _ENCODER.encode(value)
     except (TypeError, ValueError, RecursionError) as error:
@@ -138,7 +140,7 @@ def dump_json(value: Any, what: str = "message") -> str:
 
 
 def encode_png(text: str) -> str:
-    """ASCII `text` as the pixels of an RGB image, filled up with line ends: a PNG as base64."""
+    """ASCII `text` as the pixels of an RGB image, padded with line ends: a PNG as base64."""
     pixels = math.ceil(len(text) / 3)
     width = max(1, math.isqrt(pixels))
     height = max(1, math.ceil(pixels / width))
@@ -154,7 +156,7 @@ def _chunk(name: bytes, data: bytes) -> bytes:
 
 
 def encode_cbor(message: Mapping[str, Any], kind: str | None = None) -> bytes:
-    """A message as CBOR. The lists of numbers in ``msg``, of type `kind`, travel as typed arrays."""
+    """A message as CBOR. The lists of numbers in ``msg``, of type `kind`, become typed arrays."""
     if kind is not None:
         message = {**message, "msg": _typed(normal_name(kind), message["msg"])}
     return cbor2.dumps(message)
@@ -191,7 +193,7 @@ def _finite(text: str) -> float:
 
 
 def split(text: str, size: int, name: str) -> list[str]:
-    """`text` as messages ``fragment`` with `size` characters of it in each; `text` itself if it is short enough."""
+    """`text` as messages ``fragment`` of `size` characters each; `text` itself if it is short enough."""
     if len(text) <= size:
         return [text]
     size = max(size, math.ceil(len(text) / _MOST_FRAGMENTS))
@@ -203,7 +205,7 @@ def split(text: str, size: int, name: str) -> list[str]:
 
 
 def read_id(message: Mapping[str, Any], where: str = "id") -> Id:
-    """The id of a message: a text or an integer that is not too long to be kept, if there is one."""
+    """The id of a message, a text or an integer; None without one. `ProtocolError` if it is too long to be kept."""
     value = message.get("id")
     if isinstance(value, bool) or not (value is None or isinstance(value, (str, int))):
         raise ProtocolError(f"{where}: expected a text or an integer, found {brief(value)}.")
@@ -219,7 +221,7 @@ class _Parts:
     total: int
     deadline: float
     texts: dict[int, str] = field(default_factory=dict)
-    size: int = 0  # bytes: a text that is not ASCII takes up to four for a character
+    size: int = 0  # [bytes]; up to four for a character that is not ASCII
 
 
 class Fragments:
@@ -231,22 +233,22 @@ class Fragments:
 
     @property
     def size(self) -> int:
-        """What the unfinished messages hold [bytes]."""
+        """Size of the unfinished messages [bytes]."""
         return sum(parts.size for parts in self._unfinished.values())
 
     def clear(self) -> None:
-        """Give all unfinished messages up."""
+        """Discard all unfinished messages."""
         self._unfinished.clear()
 
     @property
     def deadline(self) -> float:
-        """When the first unfinished message is given up [s], clock of the caller; infinite if there is none."""
+        """When the first unfinished message expires [s], clock of the caller; infinite if there is none."""
         return min((parts.deadline for parts in self._unfinished.values()), default=math.inf)
 
     def add(self, message: Mapping[str, Any], now: float) -> str | None:
-        """Take a message ``fragment``; returns the whole text when it was the last one missing.
+        """Take a message ``fragment``; returns the whole text if it was the last one missing.
 
-        One that does not fit is a `ProtocolError`, and what there was of its message is given up.
+        `ProtocolError` for one that does not fit; the other fragments of its message are discarded.
         """
         name = read_id(message, "fragment.id")
         if name is None:
@@ -258,7 +260,7 @@ class Fragments:
             raise
 
     def expire(self, now: float) -> list[Id]:
-        """Give up what is too old; returns the ids."""
+        """Discard the messages that are too old; returns their ids."""
         late = [name for name, parts in self._unfinished.items() if parts.deadline <= now]
         for name in late:
             del self._unfinished[name]
@@ -295,6 +297,6 @@ def _count(message: Mapping[str, Any], name: str) -> int:
 
 
 _ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False, check_circular=False, default=_base64)
-# json.loads and json.dumps with options would make one for each message.
+# json.loads and json.dumps with options would create one for each message.
 _STRICT, _PATIENT = json.JSONDecoder(), json.JSONDecoder(parse_constant=lambda _: None)
 _FINITE = json.JSONDecoder(parse_constant=_finite, parse_float=_finite)

@@ -1,4 +1,4 @@
-"""Where a server is, and what a client needs to be let in: one frozen value that is passed whole."""
+"""The address of a server and the credentials of a client, in one frozen value."""
 
 import re
 import ssl
@@ -13,7 +13,7 @@ from bam_envs.rosbridge.tokens import read_token
 
 _DEFAULT_PORT = 9090
 _NAMESPACE = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)*")
-_EXAMPLE = "Expected ws://host:port or wss://host:port, with a namespace behind it if there is one."
+_EXAMPLE = "Expected ws://host:port or wss://host:port, followed by a namespace if there is one."
 
 
 class Address(NamedTuple):
@@ -33,9 +33,9 @@ class Address(NamedTuple):
 
 @dataclass(frozen=True)
 class Endpoint:
-    """A server as a client sees it: a rosbridge server (``ws://``, ``wss://``) or a whole environment (``tcp://``, …).
+    """The address of a rosbridge server (``ws://``, ``wss://``) or of a whole environment (``tcp://``, …).
 
-    `InvalidValue` for an address, a token or a time-out that is not valid, and for `ca_file` without TLS.
+    `InvalidValue` for an address, a token or a timeout that is not valid, and for `ca_file` without TLS.
     """
 
     url: str
@@ -51,7 +51,7 @@ class Endpoint:
 
     def __post_init__(self) -> None:
         if self.url.startswith(("ws://", "wss://")):
-            self.address  # noqa: B018 - parsed here, so that a wrong one is reported where it was written
+            self.address  # noqa: B018 - parsed here to report a wrong one at once
             if self.token is not None and not re.fullmatch(r"[!-~]+", self.token):
                 raise InvalidValue(
                     "The token is empty, or contains blanks, line ends or characters beyond ASCII, which HTTP headers "
@@ -59,7 +59,7 @@ class Endpoint:
                 )
         if self.ca_file is not None and not self.url.startswith("wss://"):
             raise InvalidValue(
-                f"{self.url}: ca_file says whom wss:// trusts, and this address is without TLS; leave it out."
+                f"{self.url}: ca_file is for wss:// only, and this address is without TLS; leave it out."
             )
         for name, value in (("connect_timeout", self.connect_timeout), ("timeout", self.timeout)):
             if value is not None and not value > 0:
@@ -69,13 +69,13 @@ class Endpoint:
     def with_token_file(
         cls, url: str, *, ca_file: str | Path | None = None, token_file: str | Path | None = None
     ) -> "Endpoint":
-        """The endpoint whose token is in `token_file`, as commands and ``gym.make`` take it."""
+        """An endpoint with the token in `token_file`, as command lines and ``gym.make`` take it."""
         token = None if token_file is None else read_token(token_file)
         return cls(url, None if ca_file is None else str(ca_file), token)
 
     @cached_property
     def address(self) -> Address:
-        """The parts of `url`, with rosbridge's port 9090 where it is left out; `InvalidValue` for a wrong one."""
+        """The parts of `url`, with port 9090 by default; `InvalidValue` for a wrong one."""
         url = self.url
         try:
             parts = urlsplit(url)

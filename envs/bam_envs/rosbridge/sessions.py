@@ -19,7 +19,7 @@ from bam_envs.rosbridge.bus import Caller, Message
 
 SESSION_SERVICE = "/bam/session"  # where a session is opened (std_srvs/Trigger)
 LEASE_TOPIC = "/bam/lease"
-"""Where the driver says that it is there, or leaves (std_msgs/String: `RENEW` or `LEAVE`, a blank, a signed tag)."""
+"""Where the driver renews its lease, or leaves (std_msgs/String: `RENEW` or `LEAVE`, a blank, a signed tag)."""
 RENEW, LEAVE = "renew", "leave"
 _NOT_OPEN, _ELSEWHERE = "is not open here", "is of another connection"
 _MOST = 64  # sessions of one caller; the oldest is closed for a new one
@@ -42,17 +42,17 @@ class Sessions:
         """Answer `SESSION_SERVICE`: a new session of `caller`."""
         name = new_session()
         with self._lock:
-            mine = [one for one, session in self._sessions.items() if session.caller == caller.name]
-            if len(mine) >= _MOST:
-                del self._sessions[next(one for one in mine if not self._is_driving(one))]
+            names = [one for one, session in self._sessions.items() if session.caller == caller.name]
+            if len(names) >= _MOST:
+                del self._sessions[next(one for one in names if not self._is_driving(one))]
             self._sessions[name] = session = _Session(caller.name, secrets.token_bytes(32), Freshness())
         return {"success": True, "message": json.dumps({"session": name, "key": session.key.hex()})}
 
     def prove(self, tag: Tag, channel: str, content: bytes, caller: Caller, *, anywhere: bool = False) -> Freshness:
-        """Check that `content` was signed for `channel` by the session of `tag`; returns what is fresh of the session.
+        """Check that `content` was signed for `channel` by the session of `tag`; returns the session's `Freshness`.
 
-        It must come over the connection that opened the session, or, with `anywhere`, over any. `RemoteError` if the
-        session is not open, or did not send this.
+        It must come over the connection that opened the session or, with `anywhere`, over any. `RemoteError` if the
+        session is not open, or did not sign it.
         """
         with self._lock:
             session = self._sessions.get(tag.session)
@@ -70,7 +70,7 @@ class Sessions:
         return session.fresh
 
     def left(self, caller: Caller) -> list[str]:
-        """Close the sessions of `caller`, whose connection ended; their names."""
+        """Close the sessions of `caller`, whose connection ended; returns their names."""
         with self._lock:
             gone = [name for name, session in self._sessions.items() if session.caller == caller.name]
             for name in gone:
@@ -91,8 +91,8 @@ def is_over(error: RemoteError) -> bool:
 def read_session(response: Mapping[str, Any], where: str) -> Tagger:
     """The tagger, with its key, of the session that `response` of `SESSION_SERVICE` opened, or `ProtocolError`."""
     try:
-        said = json.loads(response["message"])
-        name, key = said["session"], bytes.fromhex(said["key"])
+        content = json.loads(response["message"])
+        name, key = content["session"], bytes.fromhex(content["key"])
         if not isinstance(name, str) or not name.isalnum() or len(key) < 16:
             raise ValueError
     except (KeyError, TypeError, ValueError) as error:

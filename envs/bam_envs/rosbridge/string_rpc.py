@@ -2,8 +2,8 @@
 
 Every ROS graph has std_msgs, and a topic pair goes through a bridge several times faster than a service. A request on
 ``<name>/request`` is ``{"id": …, "tag": …, "payload": {…}}``; its reply on ``<name>/reply`` is
-``{"id": …, "payload": {…}}`` or ``{"id": …, "error": text, "kind": name}``. A request without a tag, as other people's
-clients send it, is executed too; one whose tag is signed belongs to its session.
+``{"id": …, "payload": {…}}`` or ``{"id": …, "error": text, "kind": name}``. A request without a tag, as other clients
+may send it, is executed too; one with a signed tag belongs to its session.
 """
 
 import logging
@@ -25,17 +25,17 @@ from bam_envs.rosbridge.sessions import Sessions
 
 _log = logging.getLogger(__name__)
 _STRING = "std_msgs/String"
-# Time between two publications of a request until a first reply came [s]: a ROS graph loses a topic's first ones.
+# Time between two publications of a request before the first reply [s]: a ROS graph loses a topic's first messages.
 _RESEND = 0.5
 _MOST_WAITING = 64  # requests that a service executes or keeps waiting at once
 _WORKERS = 8
-_ANSWERS_KEPT = 32  # the newest, by the key of their request: one that comes twice is executed once
+_ANSWERS_KEPT = 32  # newest answers, by the key of their request: a repeated request is executed once
 
 
 class StringRpc:
-    """Calls what a `StringRpcService` of the same name, such as ``/bam/scene``, answers; `tagger` is of the session.
+    """Calls the `StringRpcService` of the same name, such as ``/bam/scene``; `tagger` signs for a session.
 
-    Any thread; the first call opens the topics. When the link drops, calls under way fail at once.
+    Thread-safe; the first call opens the topics. When the link drops, calls under way fail at once.
     """
 
     def __init__(self, link: RosbridgeLink, name: str, tagger: Tagger | None = None) -> None:
@@ -43,7 +43,7 @@ class StringRpc:
         self._link, self._tagger, self._lock = link, tagger or Tagger(), threading.Lock()
         self._pending: dict[str, Future[dict[str, Any]]] = {}
         self._unsubscribe: Callable[[], None] | None = None
-        self._answered = -1  # the connection on which a reply came last
+        self._answered = -1  # the connection of the last reply
         link.on_down(lambda *_: self._fail(f"the link dropped while {name} was to answer"))
 
     def call(self, payload: dict[str, Any], timeout: float) -> dict[str, Any]:
@@ -52,7 +52,7 @@ class StringRpc:
         Raises:
             InvalidValue: `payload` is not plain finite JSON; nothing was sent.
             LinkLost: The link is down or dropped, or there was no reply in time: whether it was executed is unknown.
-            RemoteError: The other end refused or failed; `NotInCommand` if somebody else is in command there.
+            RemoteError: The other end refused or failed; `NotInCommand` if another client is in command there.
         """
         deadline, epoch = time.monotonic() + timeout, self._link.epoch
         tag = self._tagger.next(epoch, timeout)
@@ -89,7 +89,7 @@ class StringRpc:
     def _on_reply(self, message: Message, _caller: Caller) -> None:
         reply = load_json(message.get("data"), f"{self.name}/reply")
         future = self._pending.pop(str(reply.get("id")), None)
-        if future is not None:  # the replies to everybody else come here too
+        if future is not None:  # replies to other clients arrive here too
             future.set_result(reply)
 
     def _payload_of(self, reply: dict[str, Any]) -> dict[str, Any]:
@@ -108,10 +108,10 @@ class StringRpc:
 
 
 class StringRpcService:
-    """Answers requests, each once, in threads of its own; what is old is refused.
+    """Answers requests, each once, in separate threads; outdated requests are refused.
 
-    The `handler` makes the reply's payload; what it raises of our errors is the text of the reply's error. Requests may
-    be signed for `sessions`; without them a signature means nothing.
+    The `handler` returns the reply's payload; the text of a `BamEnvsError` that it raises is the reply's error.
+    Requests may be signed for `sessions`; without them a signature is ignored.
     """
 
     def __init__(self, bus: Bus, name: str, handler: Handler, sessions: Sessions | None = None) -> None:
@@ -124,13 +124,13 @@ class StringRpcService:
         self._unsubscribe: Callable[[], None] | None = None
 
     def start(self) -> "StringRpcService":
-        """Advertise and listen; itself, so that one line makes and starts it."""
+        """Advertise and listen. Returns itself."""
         self._bus.advertise(f"{self.name}/reply", _STRING)
         self._unsubscribe = self._bus.subscribe(f"{self.name}/request", _STRING, self._on_request)
         return self
 
     def close(self) -> None:
-        """Listen no more and wait for what is being answered. Idempotent."""
+        """Stop listening and wait for running answers. Idempotent."""
         unsubscribe, self._unsubscribe = self._unsubscribe, None
         if unsubscribe is not None:
             unsubscribe()
@@ -151,7 +151,7 @@ class StringRpcService:
             raise RemoteError(f"{self.name} is closed.") from error
 
     def _proven(self, request: dict[str, Any], identity: str, caller: Caller) -> tuple[Caller, str]:
-        """Who asks, and why a request that is new here must not be executed, found at arrival; empty if it may."""
+        """The caller with its session, and why a new request must not be executed, or an empty text."""
         tag = read_tag(request.get("tag"))
         if tag is None or not identity.startswith(tag.session):
             return caller, ""
@@ -177,7 +177,7 @@ class StringRpcService:
                     self._answers.popitem(last=False)
             if new:
                 future.set_result(self._reply(request, caller, refused, arrived))
-            if new or future.done():  # while the first one is being answered, nothing
+            if new or future.done():  # a repetition gets no reply while the first request runs
                 self._bus.publish(f"{self.name}/reply", {"data": future.result()})
         except LinkLost as error:
             _log.warning("%s: a reply was dropped: %s", self.name, error)

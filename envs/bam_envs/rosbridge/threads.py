@@ -1,4 +1,4 @@
-"""Threads that do not keep a program from ending: an asyncio loop in one, and a pool for work that takes its time."""
+"""Threads that do not keep a program from ending: one with an asyncio loop, and a pool for slow work."""
 
 import asyncio
 import queue
@@ -16,7 +16,7 @@ _PATIENCE = 10.0
 
 
 class LoopThread:
-    """Runs one coroutine to its end in an asyncio loop of its own; errors name its `owner`."""
+    """Runs one coroutine to its end in a separate asyncio loop; errors name its `owner`."""
 
     def __init__(self, name: str, owner: str = "this server") -> None:
         self._name, self._owner, self.was_started = name, owner, False
@@ -56,9 +56,9 @@ class LoopThread:
         return True
 
     def do(self, work: Callable[[], T], within: float = _PATIENCE) -> T:
-        """Run `work` in the thread, in the caller's where the loop does not run, and return its result.
+        """Run `work` in the thread, or in the caller's if the loop does not run, and return its result.
 
-        `LinkLost` if it had not begun after `within` [s], and never will.
+        `LinkLost` if it had not begun after `within` [s]; it is not run later.
         """
         done: Future[T] = Future()
 
@@ -66,7 +66,7 @@ class LoopThread:
             if done.set_running_or_notify_cancel():
                 try:
                     done.set_result(work())
-                except BaseException as error:  # it is raised where the result is waited for
+                except BaseException as error:  # raised in the thread that waits for the result
                     done.set_exception(error)
 
         if self.is_current or not self.post(run):
@@ -79,9 +79,9 @@ class LoopThread:
                     f"{self._owner}: the network thread took nothing for {within:g} s; nothing was sent. "
                     "A listener must return at once: do work in another thread."
                 ) from None
-            return done.result()  # it is being done
+            return done.result()  # it is running
         finally:
-            done.cancel()  # also after Ctrl-C: what has not begun by now is not wanted any more
+            done.cancel()  # also after Ctrl-C: work that has not begun is not wanted any more
 
     async def _run(self, main: Callable[[Future[None]], Coroutine[Any, Any, None]], ready: Future[None]) -> None:
         self._loop = asyncio.get_running_loop()

@@ -1,4 +1,4 @@
-"""Shared secrets: what servers ask for, and clients show; and how often somebody may guess."""
+"""Shared secrets that clients show to servers, and the limit on guesses."""
 
 import hmac
 import ipaddress
@@ -21,7 +21,7 @@ _MOST_ADDRESSES = 4096
 
 
 def read_token(path: str | Path, *, private: bool = False) -> str:
-    """The secret in a file, without white space around it; with `private`, of a file that nobody else may read."""
+    """The secret in a file, without white space around it; with `private`, no other user may read the file."""
     try:
         if private and os.name == "posix" and os.stat(path).st_mode & (stat.S_IRWXG | stat.S_IRWXO):
             raise InvalidValue(f"The token file {path} is open to other users of this computer. Run: chmod 600 {path}")
@@ -35,7 +35,7 @@ def read_token(path: str | Path, *, private: bool = False) -> str:
 
 
 class Tokens:
-    """The secrets of one server: what clients must show, and operators, who may take command from others; or None."""
+    """The secrets of one server, each may be None: of clients, and of operators, who may take command from others."""
 
     def __init__(self, client: str | None = None, operator: str | None = None) -> None:
         if "" in (client, operator):
@@ -48,21 +48,21 @@ class Tokens:
 
     def role(self, shown: Iterable[str]) -> Role | None:
         """The role that one of these tokens gives; None if all are wrong."""
-        found: Role | None = None
-        # In constant time: how long a refusal takes must not tell how much of the token was right.
+        role: Role | None = None
+        # In constant time: the duration of a refusal must not reveal how much of the token was right.
         for text in shown:
-            data = text.encode("utf-8", "surrogatepass")  # a stranger may send anything, also what is no text
+            data = text.encode("utf-8", "surrogatepass")  # a stranger may send anything, even invalid text
             if self._client is not None and hmac.compare_digest(data, self._client.encode()):
-                found = found or "client"
+                role = role or "client"
             if self._operator is not None and hmac.compare_digest(data, self._operator.encode()):
-                found = "operator"
-        return found
+                role = "operator"
+        return role
 
 
 class Guesses:
-    """How often wrong tokens are looked at: a few a second from one address, and some more from all together.
+    """Limits how often wrong tokens are checked: a few per second from one address, and some more from all together.
 
-    An address that was not wrong lately is looked at whatever the others do, so nobody can keep it out. Any thread.
+    An address without a recent wrong token is always checked, so that others cannot lock it out. Thread-safe.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -71,28 +71,28 @@ class Guesses:
         self._all: deque[float] = deque(maxlen=_OF_ALL)
 
     def may_try(self, address: str) -> bool:
-        """Whether a token from the IP address `address` is to be looked at."""
+        """Whether a token from the IP address `address` may be checked."""
         with self._lock:
-            now, mine = self._clock(), self._wrong.get(_network(address))
-            if mine is None or now - mine[-1] > _LATELY:
+            now, recent = self._clock(), self._wrong.get(_network(address))
+            if recent is None or now - recent[-1] > _LATELY:
                 return True
-            # Full queues (4 of one address, 32 of all) whose oldest is not a second old.
-            return not any(len(times) == times.maxlen and now - times[0] < _WINDOW for times in (mine, self._all))
+            # Full queues (4 of one address, 32 of all) whose oldest entry is not a second old.
+            return not any(len(times) == times.maxlen and now - times[0] < _WINDOW for times in (recent, self._all))
 
     def wrong(self, address: str) -> None:
-        """One from there was wrong."""
+        """Record a wrong token from `address`."""
         with self._lock:
             network = _network(address)
-            mine = self._wrong.pop(network, None) or deque(maxlen=_OF_ONE)
-            self._wrong[network] = mine
-            for times in (mine, self._all):
+            recent = self._wrong.pop(network, None) or deque(maxlen=_OF_ONE)
+            self._wrong[network] = recent
+            for times in (recent, self._all):
                 times.append(self._clock())
             if len(self._wrong) > _MOST_ADDRESSES:
                 del self._wrong[next(iter(self._wrong))]
 
 
 def _network(address: str) -> str:
-    """What one attacker surely has: an address, of IPv6 a network of 64 bits."""
+    """The addresses that one attacker surely has: one of IPv4, a network of 64 bits of IPv6."""
     try:
         parsed = ipaddress.ip_address(address.partition("%")[0])
     except ValueError:

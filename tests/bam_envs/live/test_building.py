@@ -120,7 +120,7 @@ def test_certificates_without_tls():
     with pytest.raises(InvalidValue) as caught:
         live_robot("ws://robot", ca_file="ca.pem")
     assert str(caught.value) == (
-        "ws://robot: ca_file says whom wss:// trusts, and this address is without TLS; leave it out."
+        "ws://robot: ca_file is for wss:// only, and this address is without TLS; leave it out."
     )
     live_robot("wss://robot", ca_file="ca.pem")
 

@@ -191,8 +191,8 @@ def test_what_is_not_said_is_in_the_description(driver, connected, start_pose):
     robot = connected()
     assert robot.not_ready() is None
     assert robot.info.text.endswith(
-        "wrist_3_joint, gripper_width; it does not report safety_mode, robot_mode, robot_program_running, speed_scaling, "
-        "list_controllers)"
+        "wrist_3_joint, gripper_width; it does not report safety_mode, robot_mode, robot_program_running, "
+        "speed_scaling, list_controllers)"
     )
     robot.reset(ROW, start_pose)
 

@@ -208,8 +208,7 @@ def test_another_period(server, robot_on):
     robot_on(server, info=RobotInfo("box", simulated=True, lockstep=True, period=0.1))
     robot = robot_at(server.url)
     assert raised(InvalidValue, robot.connect) == (
-        "box advances 0.1 s with each command, and the task's period is 0.05 s. "
-        "Serve the environment of this task."
+        "box advances 0.1 s with each command, and the task's period is 0.05 s. Serve the environment of this task."
     )
 
 
@@ -222,8 +221,8 @@ def test_a_base_in_lockstep(server, robot_on, connect):
     assert [topic for topic, _, _ in scripted.commands] == ["/cmd_vel_stamped"]
     robot = robot_at(server.url, "mir100", command="velocity")
     assert raised(InvalidValue, robot.connect) == (
-        "mir100 advances with each command, and its answers cannot be told apart: velocity of the profile of mir100 has "
-        "no room for a tag. Give it a mode that has, such as stamped messages."
+        "mir100 advances with each command, and its answers cannot be told apart: velocity of the profile of mir100 "
+        "has no room for a tag. Give it a mode that has, such as stamped messages."
     )
 
 

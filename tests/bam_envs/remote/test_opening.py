@@ -55,9 +55,7 @@ def test_options_that_a_transport_does_not_have():
 def test_certificates_without_tls(url):
     with pytest.raises(InvalidValue) as caught:
         open_transport(url, ca_file="ca.pem")
-    assert str(caught.value) == (
-        f"{url}: ca_file says whom wss:// trusts, and this address is without TLS; leave it out."
-    )
+    assert str(caught.value) == (f"{url}: ca_file is for wss:// only, and this address is without TLS; leave it out.")
     open_transport("wss://x:1", ca_file="ca.pem")
 
 

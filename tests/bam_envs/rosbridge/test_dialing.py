@@ -54,7 +54,7 @@ def test_refused(free_port):
 
 
 def test_silent():
-    text = "the port is open, and what listens there says nothing within 0.3 s. Is it a rosbridge server?"
+    text = "the port is open, and what listens there is silent for 0.3 s. Is it a rosbridge server?"
     with answering() as url:
         assert failure(url) == text
     with answering() as url:
@@ -188,7 +188,7 @@ def test_an_address(url, address):
     assert Endpoint("ws://[::1]/a").address.url == "ws://[::1]:9090"
 
 
-EXAMPLE = "Expected ws://host:port or wss://host:port, with a namespace behind it if there is one."
+EXAMPLE = "Expected ws://host:port or wss://host:port, followed by a namespace if there is one."
 
 
 @pytest.mark.parametrize(
@@ -219,7 +219,7 @@ def test_an_address_that_is_none(url, text):
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"ca_file": "ca.pem"}, "ca_file says whom wss:// trusts, and this address is without TLS; leave it out."),
+        ({"ca_file": "ca.pem"}, "ca_file is for wss:// only, and this address is without TLS; leave it out."),
         ({"connect_timeout": 0}, "connect_timeout: expected a time above 0 s, found 0."),
         ({"timeout": float("nan")}, "timeout: expected a time above 0 s, found nan."),
         *(

@@ -751,8 +751,8 @@ def test_a_robot_that_does_not_answer_is_held_and_then_stopped():
             told = str(stop)
     assert told == (
         "The robot was stopped by answer to a command (G4): a command that was sent 0.760 s ago is not answered, and "
-        "at most 0.3 s are allowed: commands arrive late or not at all; check the network, and other clients that command "
-        "the robot, 10 ticks in a row. When it is safe, call resume()."
+        "at most 0.3 s are allowed: commands arrive late or not at all; check the network, and other clients that "
+        "command the robot, 10 ticks in a row. When it is safe, call resume()."
     )
 
 

@@ -118,7 +118,7 @@ NUMBER = "std_msgs/Float64MultiArray.data[0]: expected a"
         ("", "x", "Message: expected JSON: Expecting value: line 1 column 1 (char 0)."),
         ("", "[]", "Message: expected an object, found []."),
         ("", b"\xa1\x00\x01", "Message: expected text in UTF-8: invalid start byte at byte 0."),
-        ("", '{"op": "a"}{"op": "a"}', "Message: expected one in a frame, found more behind it."),
+        ("", '{"op": "a"}{"op": "a"}', "Message: expected one in a frame, found more after it."),
         ("", "{}", "message: op: expected a text, found None."),
         ("", '{"op": 3}', "message: op: expected a text, found 3."),
         ("set_level", '"level": "loud"', "level: expected one of none, error, warning, info, found 'loud'."),
@@ -318,7 +318,7 @@ def test_a_listener_that_breaks_silences_nobody(peers, caplog):
     peers.bridge.subscribe("/cmd", FLOATS, lambda message, caller: {}["missing"])
     peers.bridge.subscribe("/cmd", FLOATS, lambda message, caller: heard.append(message))
     answer = peers.say(peers.client(), op="publish", topic="/cmd", msg={"data": [1]})
-    assert answer == status("/cmd: The receiver failed; its log says more.")
+    assert answer == status("/cmd: The receiver failed; see its log.")
     assert len(heard) == 1
     assert "/cmd: a listener failed" in caplog.text
 
