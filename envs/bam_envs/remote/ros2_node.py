@@ -120,7 +120,8 @@ class RclpyBus(Bus):
 
         def receive(message: Any) -> None:
             nonlocal logged
-            refusal = deliver(listener, to_dict(message), UNKNOWN_CALLER, topic)
+            # A message that cannot be read must not end the thread of every topic, among them the one that halts.
+            refusal = deliver(lambda one, caller: listener(to_dict(one), caller), message, UNKNOWN_CALLER, topic)
             if refusal and refusal != logged:
                 _log.warning("%s", refusal)
             logged = refusal

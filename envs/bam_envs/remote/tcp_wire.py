@@ -184,7 +184,7 @@ def read_result(spec: EnvSpecMessage, tree: Tree, size: int) -> tuple[Any, ...]:
     each, space = [], spec.observation_space
     try:
         for i, (observation, *ends, info) in enumerate(spec.split(tree)):
-            if spec.vector and "final_obs" in info:
+            if spec.vector and isinstance(info, dict) and "final_obs" in info:
                 info = {**info, "final_obs": exact(space, info["final_obs"])}
             where = f" of environment {i}" if spec.vector else ""
             each.append((exact(space, observation, f"observation{where}"), *ends, info))

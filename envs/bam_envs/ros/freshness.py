@@ -13,7 +13,7 @@ import time
 import uuid
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from bam_envs.core.errors import RemoteError
 
@@ -32,10 +32,12 @@ class Tag:
     sent: float  # when it was sent [s], on the sender's steady clock; the receiver estimates the offset
     deadline: float  # time after which it must not be executed [s], same clock
     mac: str = ""  # the signature that came with it; empty without one
+    received: str = field(default="", compare=False)  # the text it was read from, without `mac`: that text is signed
 
     def to_text(self) -> str:
         """The tag as it travels, without a signature."""
-        return f"{_MARK} s={self.session} e={self.epoch} q={self.sequence} t={self.sent:.6f} d={self.deadline:.6f}"
+        new = f"{_MARK} s={self.session} e={self.epoch} q={self.sequence} t={self.sent:.6f} d={self.deadline:.6f}"
+        return self.received or new
 
     @property
     def echo(self) -> str:
@@ -48,9 +50,10 @@ def read_tag(text: object) -> Tag | None:
     if not isinstance(text, str) or len(text) > _LONGEST or not text.startswith(_MARK + " "):
         return None
     fields = dict(part.split("=", 1) for part in text.split()[1:] if "=" in part)
+    mac = fields.get("m", "")
     try:
         numbers = int(fields["e"]), int(fields["q"]), float(fields["t"]), float(fields["d"])
-        tag = Tag(fields["s"], *numbers, fields.get("m", ""))
+        tag = Tag(fields["s"], *numbers, mac, text.rpartition(" m=")[0] if mac else "")
     except (KeyError, ValueError):
         return None
     return tag if math.isfinite(tag.sent) and math.isfinite(tag.deadline) else None

@@ -182,8 +182,6 @@ class RosbridgeLink(Declarations):
         except NoResultYet as error:
             self._thread.post(lambda: connection.forget(identity))
             raise LinkLost(f"{self.url}: {service} did not answer in {timeout:g} s; it may still be at it.") from error
-        finally:
-            response.cancel()
         return self._response(service, reply, time.monotonic() - begun, timeout)
 
     def _response(self, service: str, reply: Mapping[str, Any], waited: float, timeout: float) -> dict[str, Any]:

@@ -229,6 +229,13 @@ def test_results_of_several_environments(space, each):
         assert_same_value(there, here, "observation")
 
 
+@pytest.mark.parametrize("info", [3, "final_obs", np.zeros(2), None])
+def test_an_info_that_is_none_ends_in_words(info):
+    result = [[{}, {}], [1.0, 2.0], [True, False], [False, False], [info, {}]]
+    with pytest.raises(ProtocolError, match="observation of environment 0"):
+        read_result(two(BOX), result, 5)
+
+
 @pytest.mark.parametrize(
     ("tree", "text"),
     [

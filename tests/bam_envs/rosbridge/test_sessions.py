@@ -1,5 +1,6 @@
 """Sessions: opened by a call, used by who opened them alone."""
 
+import hmac
 import json
 
 import pytest
@@ -47,6 +48,15 @@ def test_a_wrong_key_is_noticed_and_changes_nothing():
     text = f"session {tagger.session}: the signature of a message on /go is wrong"
     assert say(sessions, forger, UNKNOWN_CALLER) == text
     assert say(sessions, tagger, UNKNOWN_CALLER) is None  # its number is not old
+
+
+def test_the_text_of_a_tag_is_signed_as_its_sender_writes_numbers():
+    sessions = Sessions()
+    said = json.loads(sessions.open({}, A)["message"])
+    text = f"bam1 s={said['session']} e=1 q=1 t=12.5 d=13"
+    mac = hmac.digest(bytes.fromhex(said["key"]), f"{text}\n/go\n1.0".encode(), "sha256")[:16].hex()
+    tag = read_tag(f"{text} m={mac}")
+    sessions.prove(tag, "/go", b"1.0", A).require(tag, "/go")
 
 
 def test_many_new_sessions_take_the_place_of_old_ones_but_not_of_who_drives():

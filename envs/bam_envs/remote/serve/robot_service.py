@@ -185,8 +185,10 @@ class RobotService:
         return order
 
     def _on_leave(self, caller: Caller) -> None:
-        self._sessions.left(caller)
-        self._lease.release(connection=caller.name)
+        # What another service gave command to, that one takes it from and halts, behind the step that runs.
+        for name in self._sessions.left(caller):
+            self._lease.release(replace(caller, session=name).client)
+        self._lease.release(caller.client)
 
     def _on_change(self, before: str | None, after: str | None) -> None:
         if before is not None:  # what it sent is not to go on under another one

@@ -2,13 +2,17 @@ import json
 import threading
 import time
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from bam_envs.core.errors import LinkLost, PhysicsDiverged
 from bam_envs.core.robot import Initial
 from bam_envs.remote.serve.command_lease import CommandLease
+from bam_envs.remote.serve.env_server import EnvServer
+from bam_envs.remote.serve.gymapi_service import GymApiService
 from bam_envs.remote.serve.robot_service import CommandSlot, Order, RobotService
 from bam_envs.remote.serve.served_robot import ServedRobot
 from bam_envs.robots.fake import FakeRobot
@@ -20,6 +24,7 @@ from bam_envs.ros.codec import RobotInfo, read_info
 from bam_envs.ros.freshness import Tagger, read_echo
 from bam_envs.rosbridge.bus import Caller
 from bam_envs.rosbridge.sessions import LEASE_TOPIC, read_session
+from bam_envs.testing.transports import MirrorEnv
 from tests.bam_envs.making import encode_command
 
 HOME = np.array([[0.0, -1.2, 1.6, -2.0, -1.57, 0.0]])
@@ -307,6 +312,33 @@ def test_a_session_ends_with_the_connection_that_opened_it(serve, bus):
     bus.leave("control")
     assert service.lease.holder is None
     assert "is not open here" in service.send(command(0.02), tagger, "again")
+
+
+def test_a_step_that_outlives_its_client_ends_at_rest(serve, bus):
+    service, begun, go = serve(), threading.Event(), threading.Event()
+
+    class Env(MirrorEnv):
+        robot = service.robot
+
+        def step(self, action):
+            begun.set()
+            assert go.wait(10)
+            self.robot.step(command(0.01)[None])
+            return super().step(action)
+
+    gym_api = GymApiService(EnvServer(Env(spaces.Discrete(3)), lease=service.lease, env_id="x"), bus).start()
+    ask = partial(bus.services["/gym_env/gym_api_request"][1], caller=Caller("c", "c:1"))
+    ask({"header": {"request_type": 2}})
+    action = {"header": {"request_type": 1}, "action": [{"discrete_action": [1]}]}
+    stepping = threading.Thread(target=ask, args=[action])
+    stepping.start()
+    assert begun.wait(10)
+    bus.leave("c")
+    go.set()
+    stepping.join(10)
+    gym_api.close()  # waits for who leaves
+    assert service.robot.resting
+    gym_api.env.close()
 
 
 def test_who_comes_back_leaves_over_the_new_connection(serve):
